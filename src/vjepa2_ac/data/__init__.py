@@ -1,0 +1,1 @@
+"""Which clips, and in which order?"""

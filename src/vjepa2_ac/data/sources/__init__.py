@@ -1,0 +1,1 @@
+"""Where do episodes come from?"""
