@@ -1,0 +1,189 @@
+"""In which worlds is the arm filmed? Where the camera stands, how things look, how the arm is mounted.
+
+The world frame stands on the table under the robot: x to the front, y to the robot's left, z up. The robot base may be
+mounted turned about z (`base_yaw_deg`); states and actions are in the *base* frame, pictures show the world.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from vjepa2_ac.errors import InputError
+
+Rgb = tuple[float, float, float]
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class CameraPlace:
+    """Where a camera stands and looks: around `look_at_m`; azimuth 0 is in front of the robot, 90 at its left."""
+
+    azimuth_deg: float
+    elevation_deg: float
+    distance_m: float
+    look_at_m: tuple[float, float, float] = (0.40, 0.0, 0.30)
+    vertical_fov_deg: float = 36.0
+
+    def pose(self) -> Float[np.ndarray, "4 4"]:
+        """Return the camera's frame in the world: x right, y down, z into the picture (OpenCV's convention)."""
+        azimuth, elevation = np.deg2rad(self.azimuth_deg), np.deg2rad(self.elevation_deg)
+        outward = np.array(
+            [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+        )
+        right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(-outward, right), -outward], axis=1)
+        pose[:3, 3] = np.array(self.look_at_m) + self.distance_m * outward
+        return pose
+
+    def turned(self, angle_deg: float) -> CameraPlace:
+        """Return the place further round the same circle."""
+        return replace(self, azimuth_deg=self.azimuth_deg + angle_deg)
+
+
+@dataclass(frozen=True)
+class Look:
+    """Colours (RGB, 0 to 1) and light of a scene."""
+
+    arm: Rgb
+    joints: Rgb
+    hand: Rgb
+    table: Rgb
+    floor: Rgb
+    wall: Rgb
+    light_azimuth_deg: float = 100.0
+    light_elevation_deg: float = 55.0
+    ambient: float = 0.45  # share of the light that comes from everywhere
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A world in which episodes are recorded."""
+
+    name: str
+    camera: CameraPlace
+    look: Look
+    base_yaw_deg: float = (
+        0.0  # mounting of the robot: the same action moves the arm in another direction in the picture
+    )
+    lag_s: float = 0.08  # time constant with which the measured pose follows the commanded one
+    clutter_seed: int = 0  # decides what lies on the table, and where
+
+    def base_pose(self) -> Float[np.ndarray, "4 4"]:
+        """Return the robot base frame in the world."""
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.from_euler("z", self.base_yaw_deg, degrees=True).as_matrix()
+        return pose
+
+
+@dataclass(frozen=True)
+class DomainRanges:
+    """From what `sample_domain` draws, uniformly."""
+
+    azimuth_deg: Range = (25.0, 75.0)
+    elevation_deg: Range = (18.0, 38.0)
+    distance_m: Range = (1.20, 1.50)
+    look_at_jitter_m: float = 0.03
+    base_yaw_deg: Range = (-12.0, 12.0)
+    lag_s: Range = (0.06, 0.10)
+    light_azimuth_deg: Range = (0.0, 360.0)
+    light_elevation_deg: Range = (40.0, 75.0)
+    ambient: Range = (0.35, 0.6)
+
+
+DOMAIN_A = Domain(
+    name="A",
+    camera=CameraPlace(azimuth_deg=50.0, elevation_deg=27.0, distance_m=1.35),
+    look=Look(
+        arm=(0.93, 0.93, 0.91),
+        joints=(0.22, 0.24, 0.28),
+        hand=(0.95, 0.45, 0.10),
+        table=(0.30, 0.38, 0.46),
+        floor=(0.36, 0.33, 0.31),
+        wall=(0.47, 0.53, 0.58),
+    ),
+)
+"""The nominal world: camera at the robot's front left, a white arm before blue-grey."""
+
+DOMAIN_B = Domain(
+    name="B",
+    camera=CameraPlace(azimuth_deg=93.0, elevation_deg=32.0, distance_m=1.30, look_at_m=(0.40, 0.0, 0.34)),
+    look=Look(
+        arm=(0.20, 0.28, 0.42),
+        joints=(0.90, 0.78, 0.30),
+        hand=(0.75, 0.12, 0.18),
+        table=(0.80, 0.68, 0.50),
+        floor=(0.55, 0.52, 0.45),
+        wall=(0.78, 0.80, 0.70),
+        light_azimuth_deg=-60.0,
+        light_elevation_deg=48.0,
+        ambient=0.5,
+    ),
+    base_yaw_deg=30.0,
+    lag_s=0.10,
+    clutter_seed=7,
+)
+"""The shifted world: camera turned by 43 degrees, a dark arm before wood, other light, the robot turned by 30."""
+
+DOMAINS = {domain.name: domain for domain in (DOMAIN_A, DOMAIN_B)}
+
+
+def named_domain(name: str) -> Domain:
+    """Return domain `A` or `B`.
+
+    Raises:
+        InputError: There is no domain of that name.
+    """
+    if name not in DOMAINS:
+        raise InputError(where="domain", found=repr(name), needed=f"one of {', '.join(DOMAINS)}, or random")
+    return DOMAINS[name]
+
+
+def sample_domain(rng: np.random.Generator, ranges: DomainRanges | None = None) -> Domain:
+    """Return a random world: camera, light, colours and mounting, for training a base over many of them.
+
+    The arm is always light before dark or dark before light, so that it can be seen.
+    """
+    ranges = ranges or DomainRanges()
+
+    def draw(bounds: Range) -> float:
+        return float(rng.uniform(*bounds))
+
+    centre = np.array(CameraPlace(0.0, 0.0, 1.0).look_at_m)
+    jitter = rng.uniform(-ranges.look_at_jitter_m, ranges.look_at_jitter_m, size=3)
+    x, y, z = (float(value) for value in centre + jitter)
+    return Domain(
+        name="random",
+        camera=CameraPlace(draw(ranges.azimuth_deg), draw(ranges.elevation_deg), draw(ranges.distance_m), (x, y, z)),
+        look=replace(
+            _sample_colours(rng),
+            light_azimuth_deg=draw(ranges.light_azimuth_deg),
+            light_elevation_deg=draw(ranges.light_elevation_deg),
+            ambient=draw(ranges.ambient),
+        ),
+        base_yaw_deg=draw(ranges.base_yaw_deg),
+        lag_s=draw(ranges.lag_s),
+        clutter_seed=int(rng.integers(2**31)),
+    )
+
+
+def _sample_colours(rng: np.random.Generator) -> Look:
+    def colour(value: Range, saturation: Range) -> Rgb:
+        return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(*saturation), rng.uniform(*value))
+
+    light, dark = (0.80, 1.0), (0.12, 0.30)
+    bright_arm = bool(rng.uniform() < 0.5)
+    ground = (0.25, 0.50) if bright_arm else (0.60, 0.90)
+    return Look(
+        arm=colour(light if bright_arm else dark, (0.0, 0.35)),
+        joints=colour(dark if bright_arm else light, (0.0, 0.4)),
+        hand=colour((0.75, 1.0) if bright_arm else (0.4, 0.8), (0.6, 0.95)),
+        table=colour(ground, (0.05, 0.35)),
+        floor=colour(ground, (0.0, 0.3)),
+        wall=colour(ground, (0.0, 0.4)),
+    )
