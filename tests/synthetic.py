@@ -33,7 +33,7 @@ def synthetic_states(steps: int, *, seed: int = 0) -> Float[np.ndarray, "steps 7
 def draw_frame(
     state: Float[np.ndarray, " 7"], *, size: tuple[int, int] = (180, 320), camera: int = 0
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Return a picture that tells the pose: a disc at the gripper, coloured by closedness, a bar that turns with yaw."""
+    """Return a picture that tells the pose: a disc at the gripper, coloured by closedness, and a bar for yaw."""
     height, width = size
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float32)
     frame = np.stack(

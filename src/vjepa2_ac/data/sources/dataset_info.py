@@ -1,0 +1,127 @@
+"""Which TFRecord shards make up an RLDS data set? What its dataset_info.json says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.sources.tfrecord import RecordSpan, index_records
+from vjepa2_ac.errors import InputError
+
+_INFO = "dataset_info.json"
+_DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
+_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One TFRecord file of a data set, and how many episodes it must hold."""
+
+    path: str
+    episodes: int
+
+
+def find_shards(folder: str) -> list[Shard]:
+    """Return the shards of every split that dataset_info.json lists, in its order; empty shards are left out.
+
+    Raises:
+        InputError: No data set, an unreadable or foreign description, or missing shards (names them).
+    """
+    where = storage.join(folder, _INFO)
+    info = _read_info(folder, where)
+    if info.get("fileFormat", "tfrecord") != "tfrecord":
+        raise InputError(
+            where=where, found=f"fileFormat {info['fileFormat']}", needed="tfrecord", fix="Convert it with TFDS"
+        )
+    try:
+        shards = [shard for split in info["splits"] for shard in _shards_of(folder, str(info["name"]), split)]
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            where=where, found=f"not a description of a data set ({error!r})", needed="TFDS's own"
+        ) from None
+    if not shards:
+        raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
+    _require_all(folder, shards)
+    return shards
+
+
+def index_shards(shards: list[Shard]) -> list[RecordSpan]:
+    """Return where every episode lies, shard by shard.
+
+    Raises:
+        InputError: A shard is not a TFRecord, is truncated, or holds another number of episodes than promised.
+    """
+    spans: list[RecordSpan] = []
+    for shard in shards:
+        found = index_records(shard.path)
+        if len(found) != shard.episodes:
+            raise InputError(
+                where=shard.path,
+                found=f"{len(found)} records",
+                needed=f"{shard.episodes}, says {_INFO}",
+                fix="Download the file again",
+            )
+        spans += found
+    return spans
+
+
+def _read_info(folder: str, where: str) -> dict[str, Any]:
+    try:
+        info = json.loads(storage.read_bytes(where))
+    except FileNotFoundError:
+        raise InputError(where="data.path", found=_nothing_in(folder), needed=f"a folder with {_INFO}") from None
+    except (OSError, ValueError) as error:
+        raise InputError(where=where, found=f"cannot be read ({error})", needed="JSON as TFDS writes it") from None
+    if not isinstance(info, dict):
+        raise InputError(where=where, found="JSON of another kind", needed="a description as TFDS writes it")
+    return info
+
+
+def _nothing_in(folder: str) -> str:
+    names = storage.list_names(folder)
+    if not names:
+        return f"{folder} {'is empty' if storage.exists(folder) else 'does not exist'}"
+    inner = [name for name in names if storage.exists(storage.join(storage.join(folder, name), _INFO))]
+    if inner:
+        return f"no {_INFO} in {folder}; did you mean {storage.join(folder, inner[0])}?"
+    return f"no {_INFO} in {folder}, only {_shorten(names)}"
+
+
+def _shards_of(folder: str, dataset: str, split: dict[str, Any]) -> list[Shard]:
+    counts = [int(count) for count in split.get("shardLengths", [])]
+    template = split.get("filepathTemplate") or _DEFAULT_TEMPLATE
+    shards = []
+    for number, count in enumerate(counts):
+        values = {
+            "DATASET": dataset,
+            "SPLIT": split["name"],
+            "FILEFORMAT": "tfrecord",
+            "SHARD_INDEX": f"{number:05d}",
+            "NUM_SHARDS": f"{len(counts):05d}",
+            "SHARD_X_OF_Y": f"{number:05d}-of-{len(counts):05d}",
+        }
+        name = template
+        for key, value in values.items():
+            name = name.replace("{" + key + "}", value)
+        if count:
+            shards.append(Shard(path=storage.join(folder, name), episodes=count))
+    return shards
+
+
+def _require_all(folder: str, shards: list[Shard]) -> None:
+    present = set(storage.list_names(folder))
+    missing = [name for shard in shards if (name := shard.path.replace("\\", "/").rsplit("/", 1)[-1]) not in present]
+    if missing:
+        raise InputError(
+            where=folder,
+            found=f"{len(missing)} of {len(shards)} shards are missing: {_shorten(missing)}",
+            needed=f"every shard that {_INFO} lists",
+            fix="Download them",
+        )
+
+
+def _shorten(names: list[str]) -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more

@@ -1,0 +1,293 @@
+"""How do RLDS episodes become `Episode`s? One tf.train.Example each, read without TensorFlow, pictures on demand."""
+
+from __future__ import annotations
+
+import difflib
+import io
+import logging
+from collections import OrderedDict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import simplejpeg
+from jaxtyping import Float, UInt8
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig, RldsFields
+from vjepa2_ac.data.sources.dataset_info import find_shards, index_shards
+from vjepa2_ac.data.sources.example_index import NotAnExampleError, locate_features
+from vjepa2_ac.data.sources.tfrecord import Kind, RecordSpan, decode_feature, read_record
+from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
+
+_STEP_FLAG = "steps/is_first"
+_CACHED_EPISODES = 4
+_REACH_LIMIT_M = 5.0
+_ANGLE_LIMIT_RAD = 2 * np.pi + 0.1
+_GRIPPER_TOLERANCE = 0.05
+
+
+class RldsSource:
+    """The episodes of an RLDS data set, in the order of its shards.
+
+    Nothing is read before the first call. `infos` reads a few hundred bytes of each episode; `read` reads the whole
+    record and checks its CRC, and its pictures are decoded when asked for. The last few episodes are kept per process.
+    """
+
+    def __init__(self, config: DataConfig) -> None:
+        self._config = config
+        self._kept: OrderedDict[int, Episode] = OrderedDict()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Travel to a loader worker with the index, without the kept episodes."""
+        return self.__dict__ | {"_kept": OrderedDict()}
+
+    def infos(self) -> Sequence[EpisodeInfo]:
+        """Return identity, length and outcome of every episode.
+
+        Raises:
+            InputError: No data set, a damaged one, a missing field, or two episodes of the same identity.
+        """
+        return self._infos
+
+    def read(self, index: int) -> Episode:
+        """Return one episode.
+
+        Raises:
+            InputError: The record is damaged, lacks a field, or holds what cannot be a robot's state.
+        """
+        if index in self._kept:
+            self._kept.move_to_end(index)
+            return self._kept[index]
+        episode = self._read(self._spans[index])
+        self._kept[index] = episode
+        if len(self._kept) > _CACHED_EPISODES:
+            self._kept.popitem(last=False)
+        return episode
+
+    @cached_property
+    def _spans(self) -> list[RecordSpan]:
+        return index_shards(find_shards(self._config.path))
+
+    @cached_property
+    def _infos(self) -> list[EpisodeInfo]:
+        infos = []
+        path, file = "", io.BytesIO()
+        for span in self._spans:
+            if span.path != path:
+                file.close()
+                path, file = span.path, storage.open_to_read(span.path)  # type: ignore[assignment]
+            infos.append(self._scan(file, span))
+        file.close()
+        self._require_distinct(infos)
+        logger.info("%s: %d episodes, %d steps", self._config.path, len(infos), sum(info.num_steps for info in infos))
+        return infos
+
+    @property
+    def _needed(self) -> list[str]:
+        fields = self._config.fields
+        language = [fields.language] if fields.language else []
+        return [*fields.identity, *fields.state, fields.cameras[self._config.camera], *language]
+
+    def _scan(self, file: Any, span: RecordSpan) -> EpisodeInfo:
+        try:
+            record = _Record(file, span, span.data_offset)
+            record.require(self._needed)
+            return _info_of(record, self._config.fields)
+        except InputError:
+            read_record(span)  # if the CRC says that the record is damaged, that is the error to show
+            raise
+
+    def _read(self, span: RecordSpan) -> Episode:
+        data = read_record(span, check_crc=self._config.check_crc)
+        record = _Record(io.BytesIO(data), span, 0)
+        fields = self._config.fields
+        info = _info_of(record, fields)
+        where = f"{span} ({info.id})"
+        pictures = record.values(fields.cameras[self._config.camera], "bytes_list")
+        if len(pictures) != info.num_steps:
+            raise InputError(
+                where=f"{where}: {fields.cameras[self._config.camera]}",
+                found=f"{len(pictures)} pictures",
+                needed=f"one for each of the {info.num_steps} steps",
+            )
+        metadata = {}
+        if fields.language:
+            metadata["language"] = b"".join(record.values(fields.language, "bytes_list")[:1]).decode(errors="replace")
+        return Episode(
+            info=info,
+            states=_states_of(record, fields, info.num_steps, where),
+            read_frames=JpegReader(pictures, where=f"{where}: {fields.cameras[self._config.camera]}"),
+            control_rate_hz=fields.control_rate_hz,
+            metadata=metadata,
+        )
+
+    def _require_distinct(self, infos: list[EpisodeInfo]) -> None:
+        seen: dict[str, int] = {}
+        for number, info in enumerate(infos):
+            if info.id in seen:
+                raise InputError(
+                    where=str(self._spans[number]),
+                    found=f"the same identity as {self._spans[seen[info.id]]}: {info.id}",
+                    needed="episodes that can be told apart: the split is a hash of the identity",
+                    fix="Add a feature to data.fields.identity that differs between them",
+                )
+            seen[info.id] = number
+
+
+@dataclass(frozen=True)
+class JpegReader:
+    """Decodes the JPEGs of one camera, those that are asked for; equal to TensorFlow's decoder bit for bit."""
+
+    pictures: Sequence[bytes]
+    where: str
+
+    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
+        """Return the RGB pictures at these control steps, in this order.
+
+        Raises:
+            InputError: A picture is not a JPEG, or differs in size from the first one.
+            ValueError: No steps, or a step outside the episode.
+        """
+        if not steps or min(steps) < 0 or max(steps) >= len(self.pictures):
+            raise ValueError(f"{self.where}: steps {list(steps)} of {len(self.pictures)}")
+        frames = [self._decode(step) for step in steps]
+        for step, frame in zip(steps, frames, strict=True):
+            if frame.shape != frames[0].shape:
+                raise InputError(
+                    where=f"{self.where}: step {step}",
+                    found=f"a picture of {frame.shape[0]}x{frame.shape[1]}",
+                    needed=f"{frames[0].shape[0]}x{frames[0].shape[1]} as at step {steps[0]}",
+                )
+        return np.stack(frames)
+
+    def _decode(self, step: int) -> UInt8[np.ndarray, "height width 3"]:
+        picture = self.pictures[step]
+        try:
+            return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB", fastdct=True))
+        except ValueError as error:
+            raise InputError(
+                where=f"{self.where}: step {step}",
+                found=f"{len(picture)} bytes that are not a JPEG, starting with {bytes(picture[:4])!r} ({error})",
+                needed="a JPEG picture",
+            ) from None
+
+
+class _Record:
+    """The features of one Example, read from a file or from memory when asked for."""
+
+    def __init__(self, file: Any, span: RecordSpan, start: int) -> None:
+        self._file, self._start, self._span = file, start, span
+        self._located: dict[str, tuple[int, int]] = {}
+
+    def locate(self, wanted: Sequence[str] | None = None) -> dict[str, tuple[int, int]]:
+        """Return where features lie: at least the wanted ones that there are."""
+        if wanted is None or not self._located.keys() >= set(wanted):
+            try:
+                self._located = locate_features(self._file, self._start, self._span.length, wanted=wanted)
+            except NotAnExampleError as error:
+                raise InputError(
+                    where=str(self._span), found=f"not a tf.train.Example ({error})", needed="an RLDS data set"
+                ) from None
+        return self._located
+
+    def require(self, names: Iterable[str]) -> None:
+        """Refuse a record that lacks a feature."""
+        for name in names:
+            if name not in self.locate():
+                raise self._missing(name)
+
+    def values(self, name: str, *kinds: Kind) -> Sequence[Any]:
+        """Return a feature's values.
+
+        Raises:
+            InputError: There is no such feature, or it holds values of another kind.
+        """
+        if name not in self.locate([name]):
+            raise self._missing(name)
+        offset, length = self._located[name]
+        self._file.seek(offset)
+        where = f"{self._span}: {name}"
+        found, values = decode_feature(self._file.read(length), where=where)
+        if found is not None and found not in kinds:
+            raise InputError(where=where, found=f"a {found}", needed=f"a {' or '.join(kinds)}", fix="Check data.fields")
+        return values
+
+    def _missing(self, name: str) -> InputError:
+        names = sorted(self.locate())
+        close = difflib.get_close_matches(name, names, n=1)
+        hint = f"Did you mean {close[0]}? " if close else ""
+        return InputError(
+            where=str(self._span),
+            found=f"no feature {name}; the record has {', '.join(names) or 'none'}",
+            needed="the features that data.fields names",
+            fix=f"{hint}Set data.fields",
+        )
+
+
+def _info_of(record: _Record, fields: RldsFields) -> EpisodeInfo:
+    parts = []
+    for name in fields.identity:
+        values = record.values(name, "bytes_list", "int64_list")
+        parts += [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
+    identity = IDENTITY_SEPARATOR.join(parts)
+    success = True if "/success/" in identity else False if "/failure/" in identity else None
+    return EpisodeInfo(id=identity, num_steps=_num_steps(record, fields), success=success)
+
+
+def _num_steps(record: _Record, fields: RldsFields) -> int:
+    """Count the steps by their first flag; a data set without it by its states."""
+    if _STEP_FLAG in record.locate([_STEP_FLAG]):
+        return len(record.values(_STEP_FLAG, "int64_list"))
+    return sum(len(record.values(name, "float_list")) for name in fields.state) // STATE_DIM
+
+
+def _states_of(record: _Record, fields: RldsFields, steps: int, where: str) -> Float[np.ndarray, "steps 7"]:
+    columns = []
+    for name in fields.state:
+        values = np.asarray(record.values(name, "float_list"), dtype=np.float64)
+        if steps == 0 or len(values) == 0 or len(values) % steps:
+            raise InputError(
+                where=f"{where}: {name}", found=f"{len(values)} numbers", needed=f"as many for each of {steps} steps"
+            )
+        columns.append(values.reshape(steps, -1))
+    states = np.concatenate(columns, axis=1)
+    if states.shape[1] != STATE_DIM:
+        found = " + ".join(f"{name} [{column.shape[1]}]" for name, column in zip(fields.state, columns, strict=True))
+        raise InputError(
+            where=f"{where}: data.fields.state", found=found, needed=f"{STATE_DIM} numbers a step: xyz, Euler, gripper"
+        )
+    _require_plausible(states, where)
+    if fields.gripper == "openness":
+        states[:, 6] = 1.0 - states[:, 6]
+    return states
+
+
+def _require_plausible(states: Float[np.ndarray, "steps 7"], where: str) -> None:
+    """Refuse what cannot be metres, radians and closedness."""
+    gripper = (states[:, 6] < -_GRIPPER_TOLERANCE) | (states[:, 6] > 1 + _GRIPPER_TOLERANCE)
+    checks = (
+        (~np.isfinite(states).all(axis=1), "finite numbers"),
+        (
+            abs(states[:, :3]).max(axis=1) > _REACH_LIMIT_M,
+            f"a position within {_REACH_LIMIT_M:g} m of the base, in metres",
+        ),
+        (abs(states[:, 3:6]).max(axis=1) > _ANGLE_LIMIT_RAD, "Euler angles in radians"),
+        (gripper, "a gripper between 0 and 1"),
+    )
+    for wrong, needed in checks:
+        if wrong.any():
+            step = int(wrong.argmax())
+            raise InputError(
+                where=f"{where}: step {step}",
+                found=f"the state {np.array2string(states[step], precision=4)}",
+                needed=needed,
+                fix="Check data.fields.state",
+            )

@@ -1,0 +1,168 @@
+"""Which clips are there, which split do they belong to, and in which order are they seen?
+
+Everything here is a pure function of the episodes' identities and lengths, the seed and a position: nothing depends on
+the number of shards, workers or ranks, and nothing needs to be saved to go on where a run stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Int
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+Split = Literal["train", "validation", "test"]
+
+_ROUNDS = 8
+_MASK64 = (1 << 64) - 1
+_NAMED = 5
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Every clip of a split: all starts in all episodes that are long enough, in the order of the identities."""
+
+    episodes: Int[np.ndarray, " episodes"]  # index into the source
+    ends: Int[np.ndarray, " episodes"]  # windows up to and including each episode
+    short: tuple[str, ...]  # identities of the episodes left out because they are shorter than a clip
+
+    def __len__(self) -> int:
+        return int(self.ends[-1])
+
+    def __getitem__(self, index: int) -> tuple[int, int]:
+        """Return (episode, first control step) of a window."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"window {index} of {len(self)}")
+        place = int(np.searchsorted(self.ends, index, side="right"))
+        return int(self.episodes[place]), index - (int(self.ends[place - 1]) if place else 0)
+
+
+@dataclass(frozen=True)
+class ClipOrder:
+    """The endless order of training: every window once per epoch, each epoch in an order of its own."""
+
+    windows: Windows
+    seed: int
+
+    def window(self, position: int) -> tuple[int, int]:
+        """Return (episode, first control step) of the clip at a position of the run."""
+        epoch, index = divmod(position, len(self.windows))
+        return self.windows[permuted(index, size=len(self.windows), seed=self.seed, epoch=epoch)]
+
+
+def split_of(episode_id: str, config: DataConfig) -> Split:
+    """Return where an episode belongs: a hash of its identity, as a number in [0, 1), against the shares."""
+    digest = hashlib.sha256(episode_id.encode()).digest()
+    number = int.from_bytes(digest[:8], "big") / 2**64
+    if number < config.test_share:
+        return "test"
+    return "validation" if number < config.test_share + config.validation_share else "train"
+
+
+def windows_of(infos: Sequence[EpisodeInfo], config: DataConfig, split: Split) -> Windows:
+    """Return the windows of a split: every start from which a clip fits into its episode.
+
+    Raises:
+        InputError: The split has no episodes, or only short ones, or `data.short_episodes` forbids short ones.
+    """
+    members = [number for number, info in enumerate(infos) if split_of(info.id, config) == split]
+    if not members:
+        raise _empty_split(infos, config, split)
+    members.sort(key=lambda number: infos[number].id)
+    counts = [infos[number].num_steps - config.clip_steps + 1 for number in members]
+    short = [infos[number] for number, count in zip(members, counts, strict=True) if count < 1]
+    if short and (config.short_episodes == "error" or len(short) == len(members)):
+        raise _too_short(short, len(members), config, split)
+    if short:
+        names = ", ".join(info.id for info in short[:_NAMED]) + (", …" if len(short) > _NAMED else "")
+        logger.warning(
+            "%s: %d of %d episodes are shorter than a clip of %d control steps and left out: %s",
+            split, len(short), len(members), config.clip_steps, names,
+        )  # fmt: skip
+    kept = [(number, count) for number, count in zip(members, counts, strict=True) if count >= 1]
+    return Windows(
+        episodes=np.array([number for number, _ in kept], dtype=np.int64),
+        ends=np.cumsum([count for _, count in kept], dtype=np.int64),
+        short=tuple(info.id for info in short),
+    )
+
+
+def spread(size: int, count: int) -> list[int]:
+    """Return at most `count` of `range(size)`, evenly spread, each once."""
+    count = min(size, count)
+    return [(2 * number + 1) * size // (2 * count) for number in range(count)]
+
+
+def permuted(index: int, *, size: int, seed: int, epoch: int) -> int:
+    """Return where a keyed permutation of `range(size)` sends an index; nothing of that size is ever in memory.
+
+    A Feistel network permutes the next larger power of four; what falls outside is sent on until it falls inside.
+    """
+    if not 0 <= index < size:
+        raise ValueError(f"index {index} of {size}")
+    half = max(1, ((size - 1).bit_length() + 1) // 2)
+    keys = _round_keys(size, seed, epoch)
+    index = _feistel(index, half, keys)
+    while index >= size:
+        index = _feistel(index, half, keys)
+    return index
+
+
+def _feistel(value: int, half: int, keys: tuple[int, ...]) -> int:
+    mask = (1 << half) - 1
+    left, right = value >> half, value & mask
+    for key in keys:
+        left, right = right, left ^ (_mix(right ^ key) & mask)
+    return left << half | right
+
+
+def _mix(value: int) -> int:
+    """Scatter 64 bits. Source: Steele, Lea, Flood (2014), SplitMix64 (constants of Stafford's variant 13)."""
+    value = (value ^ value >> 30) * 0xBF58476D1CE4E5B9 & _MASK64
+    value = (value ^ value >> 27) * 0x94D049BB133111EB & _MASK64
+    return value ^ value >> 31
+
+
+@lru_cache(maxsize=8)
+def _round_keys(size: int, seed: int, epoch: int) -> tuple[int, ...]:
+    digest = hashlib.blake2b(f"{size} {seed} {epoch}".encode(), digest_size=8 * _ROUNDS).digest()
+    return tuple(int.from_bytes(digest[8 * number : 8 * number + 8], "big") for number in range(_ROUNDS))
+
+
+def _empty_split(infos: Sequence[EpisodeInfo], config: DataConfig, split: Split) -> InputError:
+    shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
+    fix = (
+        "Lower data.validation_share or data.test_share"
+        if split == "train"
+        else f"Raise data.{split}_share: a hash of its identity draws an episode, so few episodes need a large share"
+    )
+    return InputError(
+        where=f"data.path: {config.path}",
+        found=f"no {split} episodes among {len(infos)} ({shares})",
+        needed="one or more",
+        fix=fix,
+    )
+
+
+def _too_short(short: Sequence[EpisodeInfo], members: int, config: DataConfig, split: Split) -> InputError:
+    longest = max(short, key=lambda info: info.num_steps)
+    everyone = len(short) == members
+    fix = "Lower data.frames or data.stride" + ("" if everyone else ", or set data.short_episodes: skip")
+    return InputError(
+        where=f"data.path: {config.path}",
+        found=f"{len(short)} of {members} {split} episodes are shorter than a clip; the longest of these,"
+        f" {longest.id}, has {longest.num_steps} steps",
+        needed=f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}",
+        fix=fix,
+    )
