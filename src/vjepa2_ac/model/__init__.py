@@ -1,0 +1,1 @@
+"""What does the network compute? Frames become latents, and latents and actions the latents of the next step."""

@@ -1,0 +1,114 @@
+"""Who may look at whom? Block-causal attention: a token of step t sees every token of steps up to t.
+
+Three exact ways to compute it:
+    dense     one attention with a mask: the plain reference
+    per_step  one attention per step, on the keys up to it, without a mask: computes about half as much
+    flex      FlexAttention with a block mask, compiled: for training on CUDA
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, Literal, get_args
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import scaled_dot_product_attention
+
+AttentionKind = Literal["auto", "dense", "per_step", "flex"]
+ATTENTION_KINDS: tuple[str, ...] = get_args(AttentionKind)
+
+
+def block_causal_attention(
+    query: Float[Tensor, "batch heads sequence head_dim"],
+    key: Float[Tensor, "batch heads sequence head_dim"],
+    value: Float[Tensor, "batch heads sequence head_dim"],
+    tokens_per_step: int,
+    kind: AttentionKind = "auto",
+) -> Float[Tensor, "batch heads sequence head_dim"]:
+    """Return the attention in which a token of step t sees all tokens of steps <= t.
+
+    `auto` takes `flex` while training on CUDA where Triton is installed, and `per_step` everywhere else: lengths vary
+    in evaluation and planning, and each new one would be compiled anew.
+
+    Raises:
+        ValueError: The sequence is not a whole number of steps, or the kind is unknown.
+    """
+    if query.shape[2] % tokens_per_step:
+        raise ValueError(f"a sequence of {query.shape[2]} tokens is not a whole number of steps of {tokens_per_step}")
+    if kind == "auto":
+        kind = _best_kind(query)
+    if kind not in _IMPLEMENTATIONS:
+        raise ValueError(f"unknown attention {kind!r}; known: {', '.join(ATTENTION_KINDS)}")
+    return _IMPLEMENTATIONS[kind](query, key, value, tokens_per_step)
+
+
+def _dense(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
+    mask = _dense_mask(query.shape[2] // tokens_per_step, tokens_per_step, query.device)
+    return scaled_dot_product_attention(query, key, value, attn_mask=mask)
+
+
+def _per_step(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
+    # Slices of keys are views: nothing is copied, and nothing more is kept for the backward pass than key and value.
+    seen = [
+        scaled_dot_product_attention(part, key[:, :, :part_end], value[:, :, :part_end])
+        for part_end, part in _steps_with_end(query, tokens_per_step)
+    ]
+    return seen[0] if len(seen) == 1 else torch.cat(seen, dim=2)
+
+
+def _flex(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
+    mask = _flex_mask(query.shape[2], tokens_per_step, query.device)
+    attend = _flex_attention(query.device.type == "cuda")
+    return attend(query, key, value, block_mask=mask)  # type: ignore[no-any-return]  # torch.compile has no types
+
+
+_IMPLEMENTATIONS: dict[str, Callable[[Tensor, Tensor, Tensor, int], Tensor]] = {
+    "dense": _dense,
+    "per_step": _per_step,
+    "flex": _flex,
+}
+
+
+def _best_kind(query: Tensor) -> AttentionKind:
+    fits_flex = query.device.type == "cuda" and query.shape[-1] >= 16 and torch.is_grad_enabled()
+    return "flex" if fits_flex and _has_triton() else "per_step"
+
+
+def _steps_with_end(query: Tensor, tokens_per_step: int) -> list[tuple[int, Tensor]]:
+    parts = torch.split(query, tokens_per_step, dim=2)
+    return [((step + 1) * tokens_per_step, part) for step, part in enumerate(parts)]
+
+
+@lru_cache(maxsize=8)
+def _dense_mask(steps: int, tokens_per_step: int, device: torch.device) -> Bool[Tensor, "sequence sequence"]:
+    with torch.inference_mode(False):
+        step = torch.arange(steps, device=device).repeat_interleave(tokens_per_step)
+        return step[:, None] >= step[None, :]
+
+
+@lru_cache(maxsize=16)
+def _flex_mask(length: int, tokens_per_step: int, device: torch.device) -> Any:
+    from torch.nn.attention.flex_attention import create_block_mask
+
+    def visible(batch: Tensor, head: Tensor, query: Tensor, key: Tensor) -> Tensor:  # noqa: ARG001  # the API's order
+        return query // tokens_per_step >= key // tokens_per_step
+
+    with torch.inference_mode(False):
+        return create_block_mask(visible, None, None, length, length, device=device)
+
+
+@lru_cache(maxsize=2)
+def _flex_attention(compiled: bool) -> Callable[..., Any]:
+    from torch.nn.attention.flex_attention import flex_attention
+
+    attend: Callable[..., Any] = flex_attention
+    return torch.compile(attend, dynamic=False) if compiled else attend
+
+
+@lru_cache(maxsize=1)
+def _has_triton() -> bool:
+    return importlib.util.find_spec("triton") is not None

@@ -1,0 +1,110 @@
+"""What does a frame look like to the model? The frozen V-JEPA 2 encoder, one frame at a time."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+from transformers import VJEPA2Config
+from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
+
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.model.layers import NORM_EPSILON, initialise, output_std
+from vjepa2_ac.model.positions import TokenLayout, rotary_tables, rotate
+
+TUBELET = 2  # frames that the encoder sees at once: here the same one twice
+
+
+class Encoder(nn.Module):
+    """Turns frames into features, each frame by itself; frozen, and always in eval mode.
+
+    The network is the encoder of transformers' `VJEPA2Model` (its masked predictor is never built), with rotary
+    tables computed once and in float32: transformers makes angles in the type of the weights.
+    """
+
+    def __init__(self, sizes: ModelSizes) -> None:
+        super().__init__()
+        self.image_size = sizes.image_size
+        self.vit = VJEPA2Encoder(_config(sizes))
+        _share_exact_tables(self.vit, TokenLayout(1, sizes.image_size // sizes.patch_size))
+        self.requires_grad_(False)
+        self.eval()
+
+    @torch.no_grad()
+    def forward(
+        self, frames: Float[Tensor, "frames 3 height width"], chunk: int = 16
+    ) -> Float[Tensor, "frames tokens dim"]:
+        """Return the features of normalised frames, not yet layer-normalised, in the type the network computes in.
+
+        Args:
+            frames: Frames normalised as in training.
+            chunk: Frames that go through the network at once: bounds the memory.
+
+        Raises:
+            ValueError: The frames have another size than the model's: the positions would be wrong.
+        """
+        if frames.shape[-2:] != (self.image_size, self.image_size):
+            raise ValueError(
+                f"frames of {frames.shape[-2]} x {frames.shape[-1]} px; this encoder needs {self.image_size} x"
+                f" {self.image_size} px (model.sizes.image_size)"
+            )
+        return torch.cat([self._encode(part) for part in torch.split(frames, chunk)])
+
+    def train(self, mode: bool = True) -> Self:  # noqa: ARG002  # a frozen encoder has one mode
+        """Stay in eval mode, whatever the model around it does."""
+        return super().train(False)
+
+    def initialise(self, generator: Generator) -> None:
+        """Give every weight a fresh value, decided by the generator alone.
+
+        Source: facebookresearch/vjepa2 @ c2963a4, src/models/vision_transformer.py, _init_weights and _rescale_blocks.
+        """
+        for module in self.modules():
+            initialise(module, generator)
+        for index, block in enumerate(self.vit.layer):
+            for output in (block.attention.proj, block.mlp.fc2):
+                nn.init.trunc_normal_(output.weight, std=output_std(index + 1), generator=generator)
+
+    def _encode(self, frames: Tensor) -> Tensor:
+        tubelets = frames[:, None].expand(-1, TUBELET, -1, -1, -1)
+        features: Tensor = self.vit(tubelets).last_hidden_state
+        return features
+
+
+class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformers has no types
+    """transformers' attention, turned by tables that are computed once, in float32."""
+
+    def __init__(self, config: Any, layout: TokenLayout) -> None:
+        super().__init__(config, config.hidden_size, config.num_attention_heads)
+        self.layout = layout
+
+    def apply_rotary_embeddings(self, qk: Tensor, pos_ids: Any) -> Tensor:  # noqa: ARG002  # positions are the layout's
+        """Return queries or keys [batch heads sequence head_dim] turned by their position."""
+        tables = rotary_tables(self.layout, qk.shape[-1], qk.device)
+        return rotate(qk.transpose(1, 2), tables).transpose(1, 2)
+
+
+def _share_exact_tables(vit: Any, layout: TokenLayout) -> None:
+    """Give every layer an attention that uses our tables; the names of the weights stay."""
+    if not hasattr(VJEPA2RopeAttention, "apply_rotary_embeddings"):
+        raise RuntimeError("this version of transformers turns queries and keys elsewhere; 5.17 to 5.23 are tested")
+    for block in vit.layer:
+        block.attention = _ExactAttention(vit.config, layout)
+
+
+def _config(sizes: ModelSizes) -> Any:
+    config = VJEPA2Config(
+        patch_size=sizes.patch_size,
+        crop_size=sizes.image_size,
+        frames_per_clip=TUBELET,
+        tubelet_size=TUBELET,
+        hidden_size=sizes.encoder.width,
+        num_hidden_layers=sizes.encoder.depth,
+        num_attention_heads=sizes.encoder.heads,
+        mlp_ratio=sizes.encoder.mlp_ratio,
+        layer_norm_eps=NORM_EPSILON,
+    )
+    config._attn_implementation = "sdpa"
+    return config

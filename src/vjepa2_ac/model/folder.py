@@ -1,0 +1,129 @@
+"""How does a world model lie in a folder? config.json, encoder.safetensors and predictor/ as transformers writes it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import nn
+
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.errors import InputError
+
+FORMAT = "vjepa2-ac world model 1"
+CONFIG, ENCODER, PREDICTOR = "config.json", "encoder.safetensors", "predictor/model.safetensors"
+
+
+def write_folder(folder: Path, sizes: ModelSizes, encoder: nn.Module, predictor: Any, hashes: dict[str, str]) -> None:
+    """Write a model beside the folder, then put it in place: the folder is never half a model.
+
+    Args:
+        folder: Where the model goes; one that is there is replaced.
+        sizes: Sizes of the model.
+        encoder: The encoder.
+        predictor: The predictor: a transformers model.
+        hashes: More that config.json says of the model.
+    """
+    fresh = folder.with_name(f".{folder.name}.partial")
+    shutil.rmtree(fresh, ignore_errors=True)
+    (fresh / PREDICTOR).parent.mkdir(parents=True)
+    save_file(_whole(encoder), fresh / ENCODER, metadata={"format": "pt"})
+    save_file(_whole(predictor), fresh / PREDICTOR, metadata={"format": "pt"})
+    predictor.config.architectures = [type(predictor).__name__]
+    predictor.config.save_pretrained(fresh / "predictor")
+    card = {"format": FORMAT, "sizes": sizes.model_dump(mode="json"), **hashes}
+    (fresh / CONFIG).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+    _put_in_place(fresh, folder)
+
+
+def read_sizes(folder: Path) -> ModelSizes:
+    """Read the sizes of the model in a folder.
+
+    Raises:
+        InputError: The folder is not a world model.
+    """
+    where = str(folder / CONFIG)
+    needed = "a folder written by WorldModel.save_pretrained"
+    try:
+        card = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(where=where, found="no such file", needed=needed) from None
+    except (OSError, ValueError) as error:
+        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed) from None
+    if not isinstance(card, dict) or card.get("format") != FORMAT:
+        raise InputError(where=where, found="not the config of a world model", needed=needed)
+    try:
+        return ModelSizes.model_validate_json(json.dumps(card["sizes"]))
+    except (KeyError, ValidationError) as error:
+        raise InputError(where=where, found=f"sizes that cannot be used ({error})", needed=needed) from None
+
+
+def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -> None:
+    """Fill a module (which may be on the meta device) from a file, every name and shape matched.
+
+    Raises:
+        InputError: The file is missing or damaged, or its tensors are not those of the module.
+    """
+    needed = {name: tuple(value.shape) for name, value in module.state_dict().items()}
+    try:
+        with safe_open(path, framework="pt") as file:
+            found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
+            check_tensors(found, needed, where=str(path))
+            weights = {name: _cast(file.get_tensor(name), dtype) for name in needed}
+    except FileNotFoundError:
+        raise InputError(where=str(path), found="no such file", needed="the weights of a world model") from None
+    except (SafetensorError, OSError) as error:
+        raise InputError(
+            where=str(path), found=f"not a whole safetensors file ({error})", fix="Copy or write it again"
+        ) from None
+    frozen = {name: value.requires_grad for name, value in module.named_parameters()}
+    module.load_state_dict(weights, strict=True, assign=True)
+    for name, value in module.named_parameters():
+        value.requires_grad_(frozen[name])
+
+
+def check_tensors(found: dict[str, tuple[int, ...]], needed: dict[str, tuple[int, ...]], *, where: str) -> None:
+    """Refuse tensors that are missing, unknown or of another shape, and name some of them.
+
+    Raises:
+        InputError: Any of these.
+    """
+    problems = [f"missing: {name}" for name in needed.keys() - found.keys()]
+    problems += [f"unknown: {name}" for name in found.keys() - needed.keys()]
+    problems += [
+        f"{name} is {list(found[name])}, not {list(needed[name])}"
+        for name in needed.keys() & found.keys()
+        if found[name] != needed[name]
+    ]
+    if problems:
+        shown = "; ".join(sorted(problems)[:4]) + (f"; and {len(problems) - 4} more" if len(problems) > 4 else "")
+        raise InputError(
+            where=where,
+            found=f"{len(problems)} tensors do not fit ({shown})",
+            needed="every tensor of the model, and no other",
+            fix="Check model.base and model.sizes",
+        )
+
+
+def _whole(module: nn.Module) -> dict[str, torch.Tensor]:
+    return {name: value.detach().contiguous() for name, value in module.state_dict().items()}
+
+
+def _cast(tensor: torch.Tensor, dtype: torch.dtype | None) -> torch.Tensor:
+    # A copy in memory of our own: the file may be replaced while the model lives.
+    return tensor.to(dtype or tensor.dtype, copy=True)
+
+
+def _put_in_place(fresh: Path, folder: Path) -> None:
+    old = folder.with_name(f".{folder.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        folder.replace(old)
+    fresh.replace(folder)
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,122 @@
+"""What is a block of the predictor made of? Attention with rotary positions, MLP, pre-norm residuals."""
+
+from __future__ import annotations
+
+import math
+
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+
+from vjepa2_ac.model.attention import AttentionKind, block_causal_attention
+from vjepa2_ac.model.positions import RotaryTables, rotate
+
+NORM_EPSILON = 1e-6
+INIT_STD = 0.02
+
+
+class OutputLinear(nn.Linear):
+    """A linear layer whose output is added to the residual stream: starts smaller by sqrt(2 * layer), layer from 1."""
+
+    def __init__(self, inputs: int, outputs: int, layer: int) -> None:
+        super().__init__(inputs, outputs)
+        self.init_std = output_std(layer)
+
+
+class Attention(nn.Module):
+    """Multi-head block-causal attention; queries, keys and values keep one type (SDPA refuses a mixture)."""
+
+    def __init__(self, width: int, heads: int, layer: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.q = nn.Linear(width, width)
+        self.k = nn.Linear(width, width)
+        self.v = nn.Linear(width, width)
+        self.o = OutputLinear(width, width, layer)
+
+    def forward(
+        self,
+        tokens: Float[Tensor, "batch sequence width"],
+        tables: RotaryTables,
+        tokens_per_step: int,
+        kind: AttentionKind = "auto",
+    ) -> Float[Tensor, "batch sequence width"]:
+        """Return what each token gathers from the tokens of its own and earlier steps."""
+        query, key, value = (project(tokens).unflatten(-1, (self.heads, -1)) for project in (self.q, self.k, self.v))
+        query, key = rotate(query, tables), rotate(key, tables)
+        gathered = block_causal_attention(
+            query.transpose(1, 2), key.transpose(1, 2), value.transpose(1, 2), tokens_per_step, kind
+        )
+        return self.o(gathered.transpose(1, 2).flatten(2))  # type: ignore[no-any-return]  # nn.Module is untyped
+
+
+class Mlp(nn.Module):
+    """Two linear layers with the exact (erf) GELU between them."""
+
+    def __init__(self, width: int, hidden: int, layer: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(width, hidden)
+        self.activation = nn.GELU()
+        self.fc2 = OutputLinear(hidden, width, layer)
+
+    def forward(self, tokens: Float[Tensor, "*batch width"]) -> Float[Tensor, "*batch width"]:
+        """Return each token changed on its own."""
+        return self.fc2(self.activation(self.fc1(tokens)))  # type: ignore[no-any-return]  # nn.Module is untyped
+
+
+class Block(nn.Module):
+    """Attention and MLP, each on normalised tokens, each added to what came in.
+
+    Args:
+        layer: Which block this is, from 1.
+    """
+
+    def __init__(self, width: int, heads: int, hidden: int, layer: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width, eps=NORM_EPSILON)
+        self.attn = Attention(width, heads, layer)
+        self.norm2 = nn.LayerNorm(width, eps=NORM_EPSILON)
+        self.mlp = Mlp(width, hidden, layer)
+
+    def forward(
+        self,
+        tokens: Float[Tensor, "batch sequence width"],
+        tables: RotaryTables,
+        tokens_per_step: int,
+        kind: AttentionKind = "auto",
+    ) -> Float[Tensor, "batch sequence width"]:
+        """Return the tokens after this block."""
+        tokens = tokens + self.attn(self.norm1(tokens), tables, tokens_per_step, kind)
+        return tokens + self.mlp(self.norm2(tokens))  # type: ignore[no-any-return]  # nn.Module is untyped
+
+
+def initialise(module: nn.Module, generator: Generator | None = None) -> None:
+    """Give one module (not its children) fresh weights: truncated normal, std 0.02; biases 0; norms 1.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, src/models/ac_predictor.py, _init_weights and _rescale_blocks.
+    """
+    if isinstance(module, nn.Linear | nn.Conv3d):
+        std = module.init_std if isinstance(module, OutputLinear) else INIT_STD
+        nn.init.trunc_normal_(module.weight, std=std, generator=generator)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+    elif isinstance(module, nn.LayerNorm):
+        nn.init.ones_(module.weight)
+        nn.init.zeros_(module.bias)
+
+
+def output_std(layer: int) -> float:
+    """Return the standard deviation of a fresh output layer of a block, counted from 1."""
+    return INIT_STD / math.sqrt(2 * layer)
+
+
+def hidden_width(width: int, mlp_ratio: float) -> int:
+    """Return the hidden width of an MLP: rounded down, as upstream does."""
+    return int(width * mlp_ratio)
+
+
+def mlp_ratio_of(width: int, hidden: int, expected: float) -> float:
+    """Return a ratio from which `hidden_width` gives `hidden`: the expected one where it does."""
+    if hidden_width(width, expected) == hidden:
+        return expected
+    exact = hidden / width
+    return exact if hidden_width(width, exact) == hidden else (hidden + 0.5) / width

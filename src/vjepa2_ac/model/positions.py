@@ -1,0 +1,84 @@
+"""Where does a token stand? Rotary tables over time, height and width, computed once per shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+THETA = 10_000
+
+
+@dataclass(frozen=True)
+class TokenLayout:
+    """How a sequence is laid out: `steps` steps, each of `conditioning` tokens and then `grid` x `grid` patches."""
+
+    steps: int
+    grid: int
+    conditioning: int = 0
+
+    @property
+    def tokens_per_step(self) -> int:
+        """Conditioning tokens and patches of one step."""
+        return self.conditioning + self.grid**2
+
+    @property
+    def length(self) -> int:
+        """Tokens of the whole sequence."""
+        return self.steps * self.tokens_per_step
+
+
+class RotaryTables(NamedTuple):
+    """What every layer needs to rotate queries and keys; always float32, so positions stay exact in bfloat16."""
+
+    cosine: Float32[Tensor, "sequence 1 head_dim"]
+    signed_sine: Float32[Tensor, "sequence 1 head_dim"]  # minus for the first of a pair, plus for the second
+
+
+@lru_cache(maxsize=32)
+def rotary_tables(layout: TokenLayout, head_dim: int, device: torch.device) -> RotaryTables:
+    """Return the rotary tables of a sequence; the same tables for the same shape.
+
+    The head is cut into three equal parts of 2*((head_dim//3)//2) for time, height and width; the rest is not rotated.
+    Conditioning tokens are rotated in the time part only. Pairs are neighbours (2i, 2i+1), yet the frequencies are
+    tiled ([w0..w9, w0..w9]), not interleaved: so were the released weights trained.
+
+    Raises:
+        ValueError: The head has no pairs to rotate: its size is odd.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, src/models/utils/modules.py, rotate_queries_or_keys and ACRoPEAttention.
+    """
+    if head_dim % 2:
+        raise ValueError(f"a head of {head_dim} cannot be rotated in pairs: width / heads must be even")
+    part = 2 * ((head_dim // 3) // 2)
+    # Tables made in inference mode or under FakeTensor must not end up in the cache of a training run.
+    with torch.inference_mode(False), torch.no_grad():
+        places = _places(layout, device)
+        frequencies = 1.0 / THETA ** (torch.arange(part // 2, dtype=torch.float32, device=device) / (part / 2))
+        angles = (places[..., None] * frequencies).repeat(1, 1, 2).flatten(1)
+        angles = torch.nn.functional.pad(angles, (0, head_dim - 3 * part))
+        sign = torch.tensor([-1.0, 1.0], device=device).repeat((head_dim + 1) // 2)[:head_dim]
+        return RotaryTables(angles.cos()[:, None], (angles.sin() * sign)[:, None])
+
+
+def rotate(
+    tokens: Float[Tensor, "batch sequence heads head_dim"], tables: RotaryTables
+) -> Float[Tensor, "batch sequence heads head_dim"]:
+    """Return queries or keys turned by their position: computed in float32, returned in the type that came in."""
+    precise = tokens.float()
+    first, second = precise[..., 0::2], precise[..., 1::2]
+    swapped = torch.stack((second, first), dim=-1).flatten(-2)
+    return torch.addcmul(precise * tables.cosine, swapped, tables.signed_sine).to(tokens.dtype)
+
+
+def _places(layout: TokenLayout, device: torch.device) -> Float32[Tensor, "sequence 3"]:
+    """Return time, height and width of every token; conditioning tokens have only a time."""
+    grid = torch.arange(layout.grid, dtype=torch.float32, device=device)
+    patches = torch.cartesian_prod(grid, grid)
+    space = torch.cat([torch.zeros(layout.conditioning, 2, device=device), patches]).repeat(layout.steps, 1)
+    time = torch.arange(layout.steps, dtype=torch.float32, device=device).repeat_interleave(layout.tokens_per_step)
+    return torch.cat([time[:, None], space], dim=-1)

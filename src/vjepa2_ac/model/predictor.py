@@ -1,0 +1,145 @@
+"""Where will the scene be after this action? The action-conditioned predictor of V-JEPA 2-AC."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+from torch.utils.checkpoint import checkpoint
+from transformers import PreTrainedConfig, PreTrainedModel
+
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.episode import ACTION_DIM, EXTRINSICS_DIM, STATE_DIM
+from vjepa2_ac.model.attention import AttentionKind
+from vjepa2_ac.model.layers import NORM_EPSILON, Block, hidden_width, initialise
+from vjepa2_ac.model.positions import TokenLayout, rotary_tables
+
+
+class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
+    """Sizes of the predictor in the form transformers stores them; the defaults are the released ones."""
+
+    model_type = "vjepa2_ac_predictor"
+
+    image_size: int = 256
+    patch_size: int = 16
+    latent_dim: int = 1408
+    hidden_size: int = 1024
+    num_hidden_layers: int = 24
+    num_attention_heads: int = 16
+    mlp_ratio: float = 4.0
+    use_extrinsics: bool = False
+
+    @classmethod
+    def from_sizes(cls, sizes: ModelSizes) -> PredictorConfig:
+        """Return the sizes of the predictor of a world model."""
+        return cls(
+            image_size=sizes.image_size,
+            patch_size=sizes.patch_size,
+            latent_dim=sizes.encoder.width,
+            hidden_size=sizes.predictor.width,
+            num_hidden_layers=sizes.predictor.depth,
+            num_attention_heads=sizes.predictor.heads,
+            mlp_ratio=sizes.predictor.mlp_ratio,
+            use_extrinsics=sizes.predictor.use_extrinsics,
+        )
+
+
+class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # transformers has no types
+    """Predicts, for every step, the latents of the next one from the latents, states and actions up to it.
+
+    The tokens of a step, in order: action, state, (extrinsics), patches. Output: patches only, not normalised.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, src/models/ac_predictor.py, VisionTransformerPredictorAC.
+    """
+
+    config_class = PredictorConfig
+    base_model_prefix = "predictor"
+    main_input_name = "latents"
+    supports_gradient_checkpointing = True
+    _no_split_modules = ["Block"]  # noqa: RUF012  # transformers reads a list
+
+    def __init__(self, config: PredictorConfig) -> None:
+        super().__init__(config)
+        width = config.hidden_size
+        hidden = hidden_width(width, config.mlp_ratio)
+        self.predictor_embed = nn.Linear(config.latent_dim, width)
+        self.action_encoder = nn.Linear(ACTION_DIM, width)
+        self.state_encoder = nn.Linear(STATE_DIM, width)
+        self.extrinsics_encoder = nn.Linear(EXTRINSICS_DIM, width)  # always there, as in the official checkpoint
+        self.blocks = nn.ModuleList(
+            Block(width, config.num_attention_heads, hidden, layer=index + 1)
+            for index in range(config.num_hidden_layers)
+        )
+        self.predictor_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
+        self.predictor_proj = nn.Linear(width, config.latent_dim)
+        self.attention: AttentionKind = "auto"
+        self.gradient_checkpointing = False  # the name transformers switches
+        self.post_init()
+
+    @property
+    def grid(self) -> int:
+        """Patches along one side of a frame."""
+        return int(self.config.image_size // self.config.patch_size)
+
+    def forward(
+        self,
+        latents: Float[Tensor, "batch time tokens dim"],
+        actions: Float[Tensor, "batch time 7"],
+        states: Float[Tensor, "batch time 7"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return, at each step, the prediction of the next step's latents, not yet normalised.
+
+        Inputs of any float type are cast to the weights' type.
+
+        Raises:
+            ValueError: The tokens do not belong to the image size, or extrinsics are missing or unasked for.
+        """
+        tokens, layout = self._assemble(latents, actions, states, extrinsics)
+        tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
+        for block in self.blocks:
+            if self.gradient_checkpointing and torch.is_grad_enabled():
+                tokens = checkpoint(block, tokens, tables, layout.tokens_per_step, self.attention, use_reentrant=False)
+            else:
+                tokens = block(tokens, tables, layout.tokens_per_step, self.attention)
+        patches = rearrange(tokens, "batch (time token) width -> batch time token width", time=layout.steps)[
+            :, :, layout.conditioning :
+        ]
+        return self.predictor_proj(self.predictor_norm(patches))  # type: ignore[no-any-return]  # nn.Module is untyped
+
+    def initialise(self, generator: Generator) -> None:
+        """Give every weight a fresh value, decided by the generator alone."""
+        for module in self.modules():
+            initialise(module, generator)
+
+    def _assemble(
+        self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None
+    ) -> tuple[Tensor, TokenLayout]:
+        """Return the sequence of tokens, step by step, and how it is laid out."""
+        if latents.shape[2] != self.grid**2:
+            raise ValueError(
+                f"{latents.shape[2]} tokens a step do not make a frame of {self.config.image_size} px with patches of"
+                f" {self.config.patch_size} px ({self.grid} x {self.grid} = {self.grid**2} tokens)"
+            )
+        if self.config.use_extrinsics != (extrinsics is not None):
+            raise ValueError(
+                f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
+            )
+        dtype = self.predictor_embed.weight.dtype
+        conditions = [self.action_encoder(actions.to(dtype)), self.state_encoder(states.to(dtype))]
+        if extrinsics is not None:
+            conditions.append(self.extrinsics_encoder(extrinsics.to(dtype)))
+        patches = self.predictor_embed(latents.to(dtype))
+        tokens = torch.cat([torch.stack(conditions, dim=2), patches], dim=2)
+        return tokens.flatten(1, 2), TokenLayout(latents.shape[1], self.grid, conditioning=len(conditions))
+
+    def _init_weights(self, module: nn.Module) -> None:
+        """Initialise one module: what transformers calls for weights that a checkpoint lacks."""
+        initialise(module)
+
+    def get_input_embeddings(self) -> Any:
+        """Return the layer that reads latents: what PEFT looks for."""
+        return self.predictor_embed

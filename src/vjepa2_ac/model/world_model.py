@@ -1,0 +1,208 @@
+"""What will be seen after these actions? Encoder and predictor together: encode, predict, roll out, save and load."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import layer_norm
+
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.model.attention import AttentionKind
+from vjepa2_ac.model.encoder import Encoder
+from vjepa2_ac.model.folder import ENCODER, PREDICTOR, load_safetensors, read_sizes, write_folder
+from vjepa2_ac.model.predictor import ActionConditionedPredictor, PredictorConfig
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """What `model.lora` did to the predictor."""
+
+    kind: str  # as in config.AdapterConfig: lora, or none when every weight is trained
+    base: str  # fingerprint of the predictor it started from
+    start: dict[str, Tensor] | None = None  # kind none: the weights it started from
+
+
+class WorldModel(nn.Module):
+    """A frozen encoder and an action-conditioned predictor.
+
+    Latents and predictions are layer-normalised over `dim` without affine, and float32 whatever the weights' type:
+    inputs are cast inside. What trains is decided by `model.lora.add_adapter`; until then nothing does.
+
+    Build one with `random`, `from_pretrained` or `model.weights.load_official`.
+    """
+
+    def __init__(self, sizes: ModelSizes) -> None:
+        super().__init__()
+        self.sizes = sizes
+        self.encoder = Encoder(sizes)
+        self.predictor: nn.Module = ActionConditionedPredictor(PredictorConfig.from_sizes(sizes))
+        self.predictor.requires_grad_(False)
+        self.adaptation: Adaptation | None = None
+
+    @classmethod
+    def random(cls, sizes: ModelSizes, seed: int, dtype: torch.dtype = torch.float32) -> Self:
+        """Return a freshly initialised model: the same weights for the same sizes and seed."""
+        model = cls.empty(sizes).to_empty(device="cpu")
+        generator = torch.Generator().manual_seed(seed)
+        model.encoder.initialise(generator)
+        model.base_predictor.initialise(generator)
+        return model.to(dtype)
+
+    @classmethod
+    def empty(cls, sizes: ModelSizes) -> Self:
+        """Return a model without weights (on the meta device), for loaders to fill; in eval mode."""
+        with torch.device("meta"):
+            return cls(sizes).eval()
+
+    @classmethod
+    def from_pretrained(cls, folder: str | Path, dtype: torch.dtype | None = None) -> Self:
+        """Read a folder written by `save_pretrained`; `dtype` None keeps the type of each file.
+
+        Raises:
+            InputError: The folder is not a world model, is incomplete or damaged.
+        """
+        folder = Path(folder)
+        model = cls.empty(read_sizes(folder))
+        load_safetensors(model.encoder, folder / ENCODER, dtype)
+        load_safetensors(model.predictor, folder / PREDICTOR, dtype)
+        return model
+
+    def save_pretrained(self, folder: str | Path) -> None:
+        """Write config.json, encoder.safetensors and predictor/ (which transformers can load by itself).
+
+        Raises:
+            ValueError: An adapter is on: merge it first, or save it with `model.lora.save_adapter`.
+        """
+        if self.predictor is not self.base_predictor:
+            raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_adapter saves it alone")
+        hashes = {"encoder": self.encoder_fingerprint(), "predictor": self.predictor_fingerprint()}
+        write_folder(Path(folder), self.sizes, self.encoder, self.predictor, hashes)
+
+    @property
+    def image_size(self) -> int:
+        """Height and width of a frame in pixels."""
+        return self.sizes.image_size
+
+    @property
+    def num_tokens(self) -> int:
+        """Tokens of one frame."""
+        return (self.sizes.image_size // self.sizes.patch_size) ** 2
+
+    @property
+    def latent_dim(self) -> int:
+        """Width of a latent."""
+        return self.sizes.encoder.width
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return next(self.parameters()).device
+
+    @property
+    def base_predictor(self) -> Any:
+        """The predictor itself, out of whatever adapter is around it."""
+        wrapped = getattr(self.predictor, "get_base_model", None)  # PEFT's
+        return wrapped() if wrapped else self.predictor
+
+    @torch.no_grad()
+    def encode(
+        self, frames: Float[Tensor, "batch time 3 height width"], chunk: int = 16
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return the latents of normalised frames, each frame encoded by itself.
+
+        Args:
+            frames: Frames normalised as in training (ImageNet mean and std).
+            chunk: Frames that go through the encoder at once: bounds the memory.
+
+        Raises:
+            ValueError: The frames have another size than `image_size`.
+        """
+        features = _normalise(self.encoder(frames.flatten(0, 1), chunk))
+        return rearrange(features, "(batch time) tokens dim -> batch time tokens dim", batch=len(frames))
+
+    def predict(
+        self,
+        latents: Float[Tensor, "batch time tokens dim"],
+        actions: Float[Tensor, "batch time 7"],
+        states: Float[Tensor, "batch time 7"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return, at each step, the prediction of the next step's latents from the given ones (teacher forcing)."""
+        return _normalise(self.predictor(latents, actions, states, extrinsics))
+
+    def rollout(
+        self,
+        context: Float[Tensor, "batch context tokens dim"],
+        actions: Float[Tensor, "batch time 7"],
+        states: Float[Tensor, "batch time 7"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+    ) -> Float[Tensor, "batch steps tokens dim"]:
+        """Return predictions of the steps after the context, each fed back to make the next.
+
+        With frames counted from 0, the context holds frames 0 .. context-1 and the result frames context .. time: the
+        first is predicted from the context alone, so index h - 1 is horizon h, and there are time - context + 1 of
+        them. Actions and states are the true ones throughout. A context need not be true: to go on from a
+        prediction that is already known, append it to the context.
+
+        Raises:
+            ValueError: There are fewer actions than context latents.
+        """
+        first, last = context.shape[1], actions.shape[1]
+        if last < first:
+            raise ValueError(f"{last} actions do not reach the end of a context of {first} latents")
+        latents = context
+        for time in range(first, last + 1):
+            camera = None if extrinsics is None else extrinsics[:, :time]
+            following = self.predict(latents, actions[:, :time], states[:, :time], camera)[:, -1:]
+            latents = torch.cat([latents.to(following.dtype), following], dim=1)
+        return latents[:, first:]
+
+    def set_gradient_checkpointing(self, enabled: bool) -> None:
+        """Choose whether predictor blocks are computed again in the backward pass instead of being kept."""
+        self.base_predictor.gradient_checkpointing = enabled
+
+    def set_attention(self, kind: AttentionKind) -> None:
+        """Choose how the predictor computes block-causal attention (see `model.attention`)."""
+        self.base_predictor.attention = kind
+
+    def encoder_fingerprint(self) -> str:
+        """Return a hash that says which encoder made a latent: key cached latents by it."""
+        return fingerprint(self.encoder.state_dict())
+
+    def predictor_fingerprint(self) -> str:
+        """Return a hash of the predictor's own weights; an adapter on them does not change it."""
+        return fingerprint(base_weights(self.base_predictor))
+
+
+def fingerprint(weights: Mapping[str, Tensor]) -> str:
+    """Return the SHA-256 of names, shapes and values rounded to bfloat16.
+
+    Rounding makes it the same whether a checkpoint was loaded in float32 or in bfloat16.
+    """
+    digest = hashlib.sha256()
+    for name, value in sorted(weights.items()):
+        digest.update(f"{name} {tuple(value.shape)}\n".encode())
+        rounded = value.detach().to("cpu", torch.bfloat16).contiguous()
+        digest.update(rounded.view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def base_weights(predictor: nn.Module) -> dict[str, Tensor]:
+    """Return the weights of a predictor by their plain names, without those of an adapter."""
+    return {
+        name.replace(".base_layer.", "."): value
+        for name, value in predictor.state_dict().items()
+        if ".lora_" not in name
+    }
+
+
+def _normalise(features: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+    return layer_norm(features.float(), features.shape[-1:])
