@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from einops import rearrange
 from jaxtyping import Float
@@ -140,6 +138,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         """Initialise one module: what transformers calls for weights that a checkpoint lacks."""
         initialise(module)
 
-    def get_input_embeddings(self) -> Any:
-        """Return the layer that reads latents: what PEFT looks for."""
-        return self.predictor_embed
+    @property
+    def is_gradient_checkpointing(self) -> bool:
+        """Whether blocks are computed again in the backward pass; PEFT asks, and transformers' own answer warns."""
+        return self.gradient_checkpointing

@@ -1,0 +1,305 @@
+"""What is trained? A LoRA adapter on the predictor, or all of the predictor: add, save, load, switch off, merge."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
+from peft.tuners.lora import LoraLayer
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from vjepa2_ac.config import AdapterConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.folder import check_tensors
+from vjepa2_ac.model.world_model import Adaptation, WorldModel, base_weights
+
+CARD = "vjepa2_ac.json"
+LORA_WEIGHTS = "adapter_model.safetensors"  # PEFT's name
+FULL_WEIGHTS = "predictor.safetensors"
+_COMPARED = ("r", "lora_alpha", "use_rslora", "target_modules", "use_dora", "bias", "modules_to_save")
+
+
+class TrainableReport(NamedTuple):
+    """How many parameters there are; those of an adapter count as trained only."""
+
+    trained: int
+    predictor: int
+    total: int
+
+    @property
+    def share(self) -> float:
+        """Trained parameters over the predictor's own."""
+        return self.trained / self.predictor
+
+
+def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
+    """Make a model trainable: its predictor gets an adapter, or all of it is trained. What is trained is float32.
+
+    A fresh adapter changes nothing: its second matrix is zero; the first is decided by the seed.
+
+    Raises:
+        InputError: A target matches no layer.
+        ValueError: The model has been adapted already.
+    """
+    if model.adaptation is not None:
+        raise ValueError("this model has been adapted already: merge_adapter first, or load_adapter into it")
+    if config.kind == "none":
+        _train_everything(model)
+        return
+    _check_targets(model.predictor, config.targets)
+    lora = LoraConfig(
+        r=config.rank,
+        lora_alpha=config.alpha,
+        use_rslora=config.rslora,
+        lora_dropout=config.dropout,
+        target_modules=list(config.targets),
+        bias="none",
+    )
+    _wrap(model, lora)
+    generator = torch.Generator().manual_seed(seed)
+    for layer in _lora_layers(model):
+        first = layer.lora_A["default"].weight
+        fresh = torch.empty(first.shape)
+        nn.init.kaiming_uniform_(fresh, a=math.sqrt(5), generator=generator)
+        first.data.copy_(fresh)
+
+
+def trainable_report(model: WorldModel) -> TrainableReport:
+    """Return how many parameters are trained, the predictor's own, and the model's without an adapter."""
+    own = sum(value.numel() for value in base_weights(model.base_predictor).values())
+    encoder = sum(value.numel() for value in model.encoder.parameters())
+    return TrainableReport(sum(p.numel() for p in model.parameters() if p.requires_grad), own, own + encoder)
+
+
+def save_adapter(model: WorldModel, folder: str | Path) -> None:
+    """Write what was trained: an adapter in PEFT's own format, or all of the predictor; and which base it belongs to.
+
+    Raises:
+        ValueError: The model has not been adapted.
+    """
+    adaptation, folder = _adaptation(model), Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    if adaptation.kind == "lora":
+        weights = get_peft_model_state_dict(model.predictor, save_embedding_layers=False)
+        _lora_config(model).save_pretrained(str(folder))
+        name = LORA_WEIGHTS
+    else:
+        weights, name = model.predictor.state_dict(), FULL_WEIGHTS
+    whole = {key: value.detach().to("cpu").contiguous() for key, value in weights.items()}
+    save_file(whole, folder / name, metadata={"format": "pt"})
+    card = {"kind": adaptation.kind, "base_predictor": adaptation.base, "encoder": model.encoder_fingerprint()}
+    (folder / CARD).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+
+
+def load_adapter(model: WorldModel, folder: str | Path, trainable: bool) -> None:
+    """Put what `save_adapter` wrote on the base it was trained on, or into the adapter that is on already.
+
+    Raises:
+        InputError: The folder is not an adapter, is damaged, belongs to another base, or differs from the one that
+            is on.
+    """
+    folder = Path(folder)
+    card = _read_card(folder)
+    _check_base(model, card, where=str(folder / CARD))
+    if model.adaptation is not None and model.adaptation.kind != card["kind"]:
+        raise InputError(
+            where=str(folder),
+            found=f"an adapter of kind {card['kind']}",
+            needed=f"one of kind {model.adaptation.kind}, as the model has",
+            fix="Set adapter.kind to the one it was trained with",
+        )
+    if card["kind"] == "lora":
+        _load_lora(model, folder)
+    else:
+        _load_everything(model, folder)
+    _set_trainable(model, trainable)
+
+
+@contextmanager
+def base_only(model: WorldModel) -> Iterator[None]:
+    """Let the model predict as the base it was adapted from, for a while; a model that was not adapted is the base."""
+    if model.adaptation is None:
+        yield
+        return
+    trained = [(value, value.requires_grad) for value in model.predictor.parameters()]
+    switch = _lora_off(model) if model.adaptation.kind == "lora" else _start_weights(model, model.adaptation)
+    try:
+        with switch:
+            yield
+    finally:
+        for value, requires_grad in trained:  # PEFT turns gradients on when it turns an adapter on
+            value.requires_grad_(requires_grad)
+
+
+def merge_adapter(model: WorldModel) -> None:
+    """Make what was trained part of the predictor: added in float32, then cast to the base's type, frozen.
+
+    Raises:
+        ValueError: The model has not been adapted.
+    """
+    adaptation = _adaptation(model)
+    dtype = model.base_predictor.predictor_embed.weight.dtype
+    if adaptation.kind == "lora":
+        model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
+    elif adaptation.start is not None:
+        dtype = next(iter(adaptation.start.values())).dtype
+    model.predictor.to(dtype).requires_grad_(False)
+    model.adaptation = None
+
+
+def _train_everything(model: WorldModel) -> None:
+    start = {name: value.detach().to("cpu", copy=True) for name, value in model.predictor.state_dict().items()}
+    model.adaptation = Adaptation("none", model.predictor_fingerprint(), start)
+    model.predictor.float()
+    _set_trainable(model, trainable=True)
+
+
+def _check_targets(predictor: nn.Module, targets: tuple[str, ...]) -> None:
+    linear = {name.rsplit(".", 1)[-1] for name, layer in predictor.named_modules() if isinstance(layer, nn.Linear)}
+    unknown = [target for target in targets if target not in linear]
+    if unknown or not targets:
+        raise InputError(
+            where="adapter.targets",
+            found=", ".join(unknown) + " matches no layer of the predictor" if unknown else "no target",
+            needed=f"some of {', '.join(sorted(linear))}",
+        )
+
+
+def _wrap(model: WorldModel, config: LoraConfig) -> None:
+    base = model.predictor_fingerprint()
+    checkpointing = model.base_predictor.gradient_checkpointing
+    model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
+    model.predictor = get_peft_model(model.predictor, config)
+    model.set_gradient_checkpointing(checkpointing)
+    model.adaptation = Adaptation("lora", base)
+    for layer in _lora_layers(model):
+        layer.lora_A.float()
+        layer.lora_B.float()
+
+
+def _lora_layers(model: WorldModel) -> list[Any]:
+    return [layer for layer in model.predictor.modules() if isinstance(layer, LoraLayer)]
+
+
+def _lora_config(model: WorldModel) -> Any:
+    predictor: Any = model.predictor
+    config = LoraConfig(**{**predictor.peft_config["default"].to_dict(), "inference_mode": True})
+    config.target_modules = sorted(config.target_modules)
+    return config
+
+
+def _adaptation(model: WorldModel) -> Adaptation:
+    if model.adaptation is None:
+        raise ValueError("this model has not been adapted: add_adapter or load_adapter first")
+    return model.adaptation
+
+
+def _set_trainable(model: WorldModel, trainable: bool) -> None:
+    lora = isinstance(model.predictor, PeftModel)
+    unused = () if model.sizes.predictor.use_extrinsics else ("extrinsics_encoder.",)
+    for name, value in model.predictor.named_parameters():
+        chosen = ".lora_" in name if lora else not name.startswith(unused)
+        value.requires_grad_(trainable and chosen)
+
+
+def _read_card(folder: Path) -> dict[str, Any]:
+    needed = "a folder written by save_adapter"
+    try:
+        card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(where=str(folder / CARD), found="no such file", needed=needed) from None
+    except (OSError, ValueError) as error:
+        raise InputError(where=str(folder / CARD), found=f"cannot be read ({error})", needed=needed) from None
+    if not isinstance(card, dict) or card.get("kind") not in ("lora", "none"):
+        raise InputError(where=str(folder / CARD), found="not the card of an adapter", needed=needed)
+    return card
+
+
+def _check_base(model: WorldModel, card: dict[str, Any], *, where: str) -> None:
+    own = model.adaptation.base if model.adaptation else model.predictor_fingerprint()
+    encoder = model.encoder_fingerprint()
+    for part, found, needed in (
+        ("predictor", own, card.get("base_predictor")),
+        ("encoder", encoder, card.get("encoder")),
+    ):
+        if found != needed:
+            raise InputError(
+                where=where,
+                found=f"an adapter trained on another {part} ({str(needed)[:12]})",
+                needed=f"one trained on this model's {part} ({found[:12]})",
+                fix="Set model.base to the model it was trained on",
+            )
+
+
+def _load_lora(model: WorldModel, folder: Path) -> None:
+    config = _read_lora_config(folder)
+    if model.adaptation is None:
+        _wrap(model, config)
+    else:
+        _check_same_adapter(_lora_config(model), config, where=str(folder))
+    weights = _read_weights(folder / LORA_WEIGHTS)
+    _check_names(
+        weights, get_peft_model_state_dict(model.predictor, save_embedding_layers=False), folder / LORA_WEIGHTS
+    )
+    set_peft_model_state_dict(model.predictor, weights)
+
+
+def _read_lora_config(folder: Path) -> Any:
+    try:
+        return LoraConfig.from_pretrained(str(folder))
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(
+            where=str(folder / "adapter_config.json"), found=f"cannot be read ({error})", needed="a LoRA of PEFT"
+        ) from None
+
+
+def _check_same_adapter(own: Any, other: Any, *, where: str) -> None:
+    for key in _COMPARED:
+        found, needed = (sorted(v) if isinstance(v, set) else v for v in (getattr(other, key), getattr(own, key)))
+        if found != needed:
+            raise InputError(where=where, found=f"an adapter with {key} {found}", needed=f"{needed}, as the model has")
+
+
+def _load_everything(model: WorldModel, folder: Path) -> None:
+    weights = _read_weights(folder / FULL_WEIGHTS)
+    _check_names(weights, model.predictor.state_dict(), folder / FULL_WEIGHTS)
+    if model.adaptation is None:
+        _train_everything(model)
+    model.predictor.load_state_dict(weights)
+
+
+def _read_weights(path: Path) -> dict[str, Tensor]:
+    try:
+        return dict(load_file(path))
+    except FileNotFoundError:
+        raise InputError(where=str(path), found="no such file", needed="the weights of an adapter") from None
+    except (SafetensorError, OSError) as error:
+        raise InputError(where=str(path), found=f"not a whole safetensors file ({error})") from None
+
+
+def _check_names(found: dict[str, Tensor], needed: dict[str, Tensor], path: Path) -> None:
+    shapes = [{name: tuple(value.shape) for name, value in weights.items()} for weights in (found, needed)]
+    check_tensors(*shapes, where=str(path))
+
+
+def _lora_off(model: WorldModel) -> Any:
+    predictor: Any = model.predictor
+    return predictor.disable_adapter()
+
+
+@contextmanager
+def _start_weights(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
+    now = {name: value.detach().clone() for name, value in model.predictor.state_dict().items()}
+    model.predictor.load_state_dict(adaptation.start or {})
+    try:
+        yield
+    finally:
+        model.predictor.load_state_dict(now)
