@@ -1,0 +1,129 @@
+"""How does a large file get here over a line that breaks? Resumed where it stopped, its size checked, then renamed."""
+
+from __future__ import annotations
+
+import http.client
+import logging
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable
+from pathlib import Path
+
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+OFFICIAL_URL = "https://dl.fbaipublicfiles.com/vjepa2/vjepa2-ac-vitg.pt"
+CHUNK_BYTES = 2**20
+
+Progress = Callable[[int, int], None]
+"""Called with the bytes that are here and the bytes of the whole file."""
+
+
+def download(
+    url: str,
+    path: str | Path,
+    *,
+    progress: Progress | None = None,
+    attempts: int = 5,
+    wait_s: float = 2.0,
+    timeout_s: float = 30.0,
+) -> Path:
+    """Fetch a file to `path`; a part that an earlier call left in `path.part` is gone on with.
+
+    Args:
+        url: What to fetch.
+        path: Where the whole file goes; it appears there only when it is whole. One that is there is kept.
+        progress: Is told how far it is.
+        attempts: How often in a row the line may break without a byte having come.
+        wait_s: Seconds before the second attempt; doubled for each further one.
+        timeout_s: Seconds without an answer before the line counts as broken.
+
+    Raises:
+        InputError: The server refuses, cannot be reached, or sends a file of another size than it promised.
+    """
+    path = Path(path)
+    if path.exists():
+        return path
+    part = path.with_name(path.name + ".part")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    failures = 0
+    while True:
+        before = _size(part)
+        try:
+            whole = _fetch(url, part, progress, timeout_s)
+            break
+        except (OSError, http.client.HTTPException) as error:
+            if isinstance(error, urllib.error.HTTPError) and error.code < 500 and error.code not in (408, 429):
+                raise _refused(url, error) from None
+            failures = 0 if _size(part) > before else failures + 1
+            if failures >= attempts:
+                raise _unreachable(url, part, error, attempts) from None
+            logger.info("%s: %s; going on from %d bytes", url, error, _size(part))
+            time.sleep(wait_s * 2 ** max(failures - 1, 0))
+    _check_size(url, part, whole)
+    return part.replace(path)
+
+
+def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) -> int | None:
+    """Bring the rest of a file and return the size of the whole, None where the server does not say."""
+    start = _size(part)
+    request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user's
+    try:
+        answer = urllib.request.urlopen(request, timeout=timeout_s)  # noqa: S310  # a URL that the user gave
+    except urllib.error.HTTPError as error:
+        whole = _whole_of_range(error.headers.get("Content-Range"))
+        if error.code == 416 and whole == start:  # nothing is left to fetch
+            return whole
+        if error.code == 416:
+            part.unlink()  # the part is not of this file
+            raise http.client.HTTPException("the part that is here does not fit the file; starting again") from None
+        raise
+    with answer:
+        if start and answer.status != 206:
+            logger.info("%s: the server cannot resume; starting again", url)
+            start = 0
+        length = answer.headers.get("Content-Length")
+        whole = None if length is None else start + int(length)
+        with part.open("ab" if start else "wb") as file:
+            here = start
+            while block := answer.read(CHUNK_BYTES):
+                file.write(block)
+                here += len(block)
+                if progress and whole is not None:
+                    progress(here, whole)
+        if whole is not None and here < whole:
+            raise http.client.IncompleteRead(b"", whole - here)
+    return whole
+
+
+def _whole_of_range(header: str | None) -> int | None:
+    total = (header or "").rpartition("/")[2]
+    return int(total) if total.isdigit() else None
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
+
+
+def _check_size(url: str, part: Path, whole: int | None) -> None:
+    size = _size(part)
+    if whole is not None and size != whole:
+        part.unlink()
+        raise InputError(where=url, found=f"{size} bytes", needed=f"{whole} bytes", fix="Start the download again")
+
+
+def _refused(url: str, error: urllib.error.HTTPError) -> InputError:
+    return InputError(
+        where=url, found=f"the server answers {error.code} {error.reason}", needed="a file", fix="Check the URL"
+    )
+
+
+def _unreachable(url: str, part: Path, error: Exception, attempts: int) -> InputError:
+    reason = getattr(error, "reason", None) or error
+    return InputError(
+        where=url,
+        found=f"no answer after {attempts} attempts ({reason}); {_size(part)} bytes are in {part}",
+        fix="Check the network and start again: it goes on where it stopped",
+    )
