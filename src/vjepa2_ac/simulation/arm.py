@@ -9,10 +9,11 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.geometry import euler_from_matrices
-from vjepa2_ac.simulation.camera import FRAME_HEIGHT, FRAME_WIDTH, OpenGlCamera, RayCamera
+from vjepa2_ac.simulation.camera import FRAME_HEIGHT, FRAME_WIDTH, RayCamera
 from vjepa2_ac.simulation.domains import Domain
 from vjepa2_ac.simulation.kinematics import forward_kinematics, inverse_kinematics
 from vjepa2_ac.simulation.motion import GRIPPER_LAG_S, rest_joints, tracking_share
+from vjepa2_ac.simulation.opengl import OpenGlCamera
 from vjepa2_ac.simulation.scene import FINGER_TRAVEL_M, compile_scene, load_mujoco
 
 Renderer = Literal["rays", "opengl"]

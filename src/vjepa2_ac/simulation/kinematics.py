@@ -83,8 +83,25 @@ def inverse_kinematics(
             error = _pose_error(pose[:3], rotation, frames[-1])
             if np.abs(error[:3]).max() < _TOLERANCE_M and np.abs(error[3:]).max() < _TOLERANCE_RAD:
                 return joints
-            joints = np.clip(joints + _step(_jacobian(frames), error, rest - joints), LOW, HIGH)
+            joints = _limited_step(_jacobian(frames), error, joints, rest)
     raise UnreachableError(f"no joint angles within the limits bring the flange to {np.round(pose, 3).tolist()}")
+
+
+def _limited_step(
+    jacobian: Float[np.ndarray, "6 7"],
+    error: Float[np.ndarray, " 6"],
+    joints: Float[np.ndarray, " 7"],
+    rest: Float[np.ndarray, " 7"],
+) -> Float[np.ndarray, " 7"]:
+    """Return the joints one step further; one at its limit that pushes on stays, and the others make up for it."""
+    free = np.ones(7)
+    for _ in range(3):
+        step = _step(jacobian * free, error, (rest - joints) * free)
+        pushing = ((joints + step < LOW) & (joints <= LOW)) | ((joints + step > HIGH) & (joints >= HIGH))
+        if not pushing.any():
+            break
+        free[pushing] = 0.0
+    return np.clip(joints + step * free, LOW, HIGH)
 
 
 def _step(

@@ -105,12 +105,10 @@ def record_episode(
     motion_rng, world_rng = (np.random.default_rng([seed, index, purpose]) for purpose in range(2))
     world = domain or sample_domain(world_rng)
     motion = random_reaching(world, steps, motion_rng, recipe)
-    outcome = "success" if motion_rng.uniform() < SUCCESS_SHARE else "failure"
-    minute, hour, day = index % 60, index // 60 % 24, 1 + index // 1440
-    place = f"SIM/{outcome}/2026-01-{day:02d}/{world.name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"
+    folder = episode_folder(index, seed, world.name)
     return DroidEpisode(
-        file_path=f"/simulated/{place}/trajectory.h5",
-        recording_folderpath=f"/simulated/{place}/recordings/MP4",
+        file_path=f"{folder}/trajectory.h5",
+        recording_folderpath=f"{folder}/recordings/MP4",
         action=np.concatenate([motion.commanded_poses, motion.commanded_gripper[:, None]], axis=1),
         action_dict=_commands(motion),
         observation=DroidMeasurements(
@@ -119,6 +117,14 @@ def record_episode(
         images=_film(world, motion, cameras, renderer),
         language_instruction=INSTRUCTION,
     )
+
+
+def episode_folder(index: int, seed: int, domain_name: str) -> str:
+    """Return the folder that an episode pretends to come from; as in DROID, only it says success or failure."""
+    succeeded = np.random.default_rng([seed, index, 2]).uniform() < SUCCESS_SHARE
+    minute, hour, day = index % 60, index // 60 % 24, 1 + index // 1440 % 28
+    place = f"{domain_name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"
+    return f"/simulated/SIM/{'success' if succeeded else 'failure'}/2026-01-{day:02d}/{place}"
 
 
 def _film(world: Domain, motion: Motion, cameras: int, renderer: Renderer) -> dict[str, list[bytes]]:

@@ -17,7 +17,8 @@ STATIC_GROUP, ARM_GROUP = 0, 1
 """Geom groups: what never moves, and what does."""
 FINGER_TRAVEL_M = 0.04
 
-Point = tuple[float, float, float]
+Coordinate = float | int
+Point = tuple[Coordinate, Coordinate, Coordinate]
 
 
 @dataclass(frozen=True)
