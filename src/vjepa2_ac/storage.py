@@ -8,11 +8,28 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any, BinaryIO, cast
+from typing import Any, BinaryIO, Protocol, cast, runtime_checkable
 
 _HASH_CHUNK_BYTES = 1 << 20
+
+
+@runtime_checkable
+class ByteReader(Protocol):
+    """What a file that is open to read can do, wherever it is."""
+
+    def read(self, size: int = -1, /) -> bytes:
+        """Return the next bytes, all that are left with -1."""
+        ...
+
+    def seek(self, offset: int, /) -> int:
+        """Go to an offset from the start."""
+        ...
+
+    def close(self) -> None:
+        """Give the file back."""
+        ...
 
 
 def is_url(path: str | Path) -> bool:
@@ -50,13 +67,13 @@ def list_names(folder: str | Path) -> list[str]:
     return sorted(str(path).rstrip("/").rsplit("/", 1)[-1] for path in found)
 
 
-def open_to_read(path: str | Path) -> BinaryIO:
+def open_to_read(path: str | Path) -> ByteReader:
     """Open a file to read and seek in; the caller closes it.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
     """
-    return cast("BinaryIO", _filesystem(path).open(str(path), "rb") if is_url(path) else Path(path).open("rb"))
+    return cast("ByteReader", _filesystem(path).open(str(path), "rb") if is_url(path) else Path(path).open("rb"))
 
 
 def read_bytes(path: str | Path) -> bytes:
@@ -65,7 +82,7 @@ def read_bytes(path: str | Path) -> bytes:
     Raises:
         OSError: There is no such file, or it cannot be read.
     """
-    with open_to_read(path) as file:
+    with closing(open_to_read(path)) as file:
         return file.read()
 
 
@@ -75,7 +92,7 @@ def read_range(path: str | Path, start: int, length: int) -> bytes:
     Raises:
         OSError: There is no such file, or it cannot be read.
     """
-    with open_to_read(path) as file:
+    with closing(open_to_read(path)) as file:
         file.seek(start)
         return file.read(length)
 
@@ -124,7 +141,7 @@ def sha256_of_file(path: str | Path) -> str:
         OSError: There is no such file, or it cannot be read.
     """
     digest = hashlib.sha256()
-    with open_to_read(path) as file:
+    with closing(open_to_read(path)) as file:
         while chunk := file.read(_HASH_CHUNK_BYTES):
             digest.update(chunk)
     return digest.hexdigest()

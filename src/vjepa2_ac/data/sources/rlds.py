@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import difflib
 import io
+import itertools
 import logging
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -78,14 +80,10 @@ class RldsSource:
 
     @cached_property
     def _infos(self) -> list[EpisodeInfo]:
-        infos = []
-        path, file = "", io.BytesIO()
-        for span in self._spans:
-            if span.path != path:
-                file.close()
-                path, file = span.path, storage.open_to_read(span.path)  # type: ignore[assignment]
-            infos.append(self._scan(file, span))
-        file.close()
+        infos: list[EpisodeInfo] = []
+        for path, spans in itertools.groupby(self._spans, key=lambda span: span.path):
+            with closing(storage.open_to_read(path)) as file:
+                infos += [self._scan(file, span) for span in spans]
         self._require_distinct(infos)
         logger.info("%s: %d episodes, %d steps", self._config.path, len(infos), sum(info.num_steps for info in infos))
         return infos
@@ -96,7 +94,7 @@ class RldsSource:
         language = [fields.language] if fields.language else []
         return [*fields.identity, *fields.state, fields.cameras[self._config.camera], *language]
 
-    def _scan(self, file: Any, span: RecordSpan) -> EpisodeInfo:
+    def _scan(self, file: storage.ByteReader, span: RecordSpan) -> EpisodeInfo:
         try:
             record = _Record(file, span, span.data_offset)
             record.require(self._needed)
@@ -183,25 +181,23 @@ class JpegReader:
 class _Record:
     """The features of one Example, read from a file or from memory when asked for."""
 
-    def __init__(self, file: Any, span: RecordSpan, start: int) -> None:
+    def __init__(self, file: storage.ByteReader, span: RecordSpan, start: int) -> None:
         self._file, self._start, self._span = file, start, span
-        self._located: dict[str, tuple[int, int]] = {}
 
-    def locate(self, wanted: Sequence[str] | None = None) -> dict[str, tuple[int, int]]:
-        """Return where features lie: at least the wanted ones that there are."""
-        if wanted is None or not self._located.keys() >= set(wanted):
-            try:
-                self._located = locate_features(self._file, self._start, self._span.length, wanted=wanted)
-            except NotAnExampleError as error:
-                raise InputError(
-                    where=str(self._span), found=f"not a tf.train.Example ({error})", needed="an RLDS data set"
-                ) from None
-        return self._located
+    @cached_property
+    def located(self) -> dict[str, tuple[int, int]]:
+        """Where each feature lies: offset and length."""
+        try:
+            return locate_features(self._file, self._start, self._span.length)
+        except NotAnExampleError as error:
+            raise InputError(
+                where=str(self._span), found=f"not a tf.train.Example ({error})", needed="an RLDS data set"
+            ) from None
 
     def require(self, names: Iterable[str]) -> None:
         """Refuse a record that lacks a feature."""
         for name in names:
-            if name not in self.locate():
+            if name not in self.located:
                 raise self._missing(name)
 
     def values(self, name: str, *kinds: Kind) -> Sequence[Any]:
@@ -210,9 +206,9 @@ class _Record:
         Raises:
             InputError: There is no such feature, or it holds values of another kind.
         """
-        if name not in self.locate([name]):
+        if name not in self.located:
             raise self._missing(name)
-        offset, length = self._located[name]
+        offset, length = self.located[name]
         self._file.seek(offset)
         where = f"{self._span}: {name}"
         found, values = decode_feature(self._file.read(length), where=where)
@@ -221,7 +217,7 @@ class _Record:
         return values
 
     def _missing(self, name: str) -> InputError:
-        names = sorted(self.locate())
+        names = sorted(self.located)
         close = difflib.get_close_matches(name, names, n=1)
         hint = f"Did you mean {close[0]}? " if close else ""
         return InputError(
@@ -244,7 +240,7 @@ def _info_of(record: _Record, fields: RldsFields) -> EpisodeInfo:
 
 def _num_steps(record: _Record, fields: RldsFields) -> int:
     """Count the steps by their first flag; a data set without it by its states."""
-    if _STEP_FLAG in record.locate([_STEP_FLAG]):
+    if _STEP_FLAG in record.located:
         return len(record.values(_STEP_FLAG, "int64_list"))
     return sum(len(record.values(name, "float_list")) for name in fields.state) // STATE_DIM
 
@@ -287,7 +283,7 @@ def _require_plausible(states: Float[np.ndarray, "steps 7"], where: str) -> None
             step = int(wrong.argmax())
             raise InputError(
                 where=f"{where}: step {step}",
-                found=f"the state {np.array2string(states[step], precision=4)}",
+                found=f"the state {np.array2string(states[step], precision=4, max_line_width=200)}",
                 needed=needed,
                 fix="Check data.fields.state",
             )

@@ -150,10 +150,11 @@ def _check(episode: DroidEpisode, sizes: dict[str, tuple[int, int]]) -> None:
         raise ValueError(f"{episode.file_path}: {steps} steps, cameras {sorted(episode.images)}; needed: {CAMERAS}")
     for camera, pictures in episode.images.items():
         height, width, _, _ = simplejpeg.decode_jpeg_header(pictures[0])
-        if len(pictures) != steps or sizes.setdefault(camera, (height, width)) != (height, width):
+        expected = sizes.setdefault(camera, (height, width))
+        if len(pictures) != steps or expected != (height, width):
             raise ValueError(
                 f"{episode.file_path}: {camera} has {len(pictures)} pictures of {height}x{width};"
-                f" needed: {steps} of {'x'.join(map(str, sizes[camera]))}"
+                f" needed: {steps} of {'x'.join(map(str, expected))}"
             )
 
 

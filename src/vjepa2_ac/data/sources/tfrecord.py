@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
@@ -61,7 +62,7 @@ def index_records(path: str | Path) -> list[RecordSpan]:
     """
     try:
         size = storage.file_size(path)
-        with storage.open_to_read(path) as file:
+        with closing(storage.open_to_read(path)) as file:
             return _hop_headers(file, str(path), size)
     except OSError as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a TFRecord file") from None
@@ -132,7 +133,7 @@ def decode_feature(data: bytes, *, where: str) -> tuple[Kind | None, Sequence[An
         raise InputError(where=where, found="not a tf.train.Feature", needed="an RLDS data set") from None
 
 
-def _hop_headers(file: BinaryIO, path: str, size: int) -> list[RecordSpan]:
+def _hop_headers(file: storage.ByteReader, path: str, size: int) -> list[RecordSpan]:
     spans: list[RecordSpan] = []
     offset = 0
     while offset < size:

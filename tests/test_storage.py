@@ -1,0 +1,72 @@
+"""Files are whole or absent, and URLs read like local paths."""
+
+import hashlib
+from pathlib import Path
+
+import fsspec
+import pytest
+
+from vjepa2_ac import storage
+
+
+def test_a_file_that_fails_while_being_written_leaves_the_old_one(tmp_path: Path) -> None:
+    target = tmp_path / "inner" / "file"
+    storage.write_atomically(target, b"old")
+
+    def write_half() -> None:
+        with storage.atomic_writer(target) as file:
+            file.write(b"new, but not ")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        write_half()
+    assert target.read_bytes() == b"old"
+    assert list(target.parent.iterdir()) == [target]
+
+
+def test_a_file_does_not_have_its_name_before_it_is_whole(tmp_path: Path) -> None:
+    target = tmp_path / "file"
+    with storage.atomic_writer(target) as file:
+        file.write(b"half")
+        file.flush()
+        assert not target.exists()
+    assert target.read_bytes() == b"half"
+
+
+def test_text_is_written_as_utf8(tmp_path: Path) -> None:
+    storage.write_atomically(tmp_path / "file", "Grüße")
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "Grüße"
+
+
+def test_a_hash_is_that_of_the_whole_file(tmp_path: Path) -> None:
+    data = bytes(range(256)) * 10_000
+    (tmp_path / "file").write_bytes(data)
+    assert storage.sha256_of_file(tmp_path / "file") == hashlib.sha256(data).hexdigest()
+
+
+@pytest.fixture(params=["local", "memory"])
+def folder(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """A folder with two files, on this machine and behind a URL."""
+    place = str(tmp_path) if request.param == "local" else f"memory://{tmp_path.name}"
+    filesystem = fsspec.filesystem("file" if request.param == "local" else "memory")
+    for name, data in (("b", b"0123456789"), ("a", b"")):
+        filesystem.pipe_file(storage.join(place, name), data)
+    return place
+
+
+def test_a_url_is_read_like_a_local_folder(folder: str) -> None:
+    assert storage.list_names(folder) == ["a", "b"]
+    file = storage.join(folder, "b")
+    assert storage.exists(file)
+    assert not storage.exists(storage.join(folder, "c"))
+    assert storage.file_size(file) == 10
+    assert storage.read_bytes(file) == b"0123456789"
+    assert storage.read_range(file, 3, 4) == b"3456"
+    assert storage.read_range(file, 8, 4) == b"89"
+    with pytest.raises(FileNotFoundError):
+        storage.read_bytes(storage.join(folder, "c"))
+
+
+def test_a_folder_that_is_not_there_has_no_files(tmp_path: Path) -> None:
+    assert storage.list_names(tmp_path / "none") == []
+    assert storage.list_names("memory://none-at-all") == []
