@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,18 +11,13 @@ from typing import Any, NamedTuple
 import torch
 from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
 from peft.tuners.lora import LoraLayer
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.folder import check_tensors
+from vjepa2_ac.model.trained_folder import FULL_WEIGHTS, LORA_WEIGHTS, read_kind, read_weights, write_trained
 from vjepa2_ac.model.world_model import Adaptation, WorldModel, base_weights
 
-CARD = "vjepa2_ac.json"
-LORA_WEIGHTS = "adapter_model.safetensors"  # PEFT's name
-FULL_WEIGHTS = "predictor.safetensors"
 _COMPARED = ("r", "lora_alpha", "use_rslora", "target_modules", "use_dora", "bias", "modules_to_save")
 
 
@@ -39,6 +33,12 @@ class TrainableReport(NamedTuple):
         """Trained parameters over the predictor's own."""
         return self.trained / self.predictor
 
+    def __str__(self) -> str:
+        return (
+            f"{self.trained:,} parameters are trained: {self.share:.2%} of the predictor's {self.predictor:,};"
+            f" the model has {self.total:,}"
+        )
+
 
 def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     """Make a model trainable: its predictor gets an adapter, or all of it is trained. What is trained is float32.
@@ -50,7 +50,7 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
         ValueError: The model has been adapted already.
     """
     if model.adaptation is not None:
-        raise ValueError("this model has been adapted already: merge_adapter first, or load_adapter into it")
+        raise ValueError("this model has been adapted already: merge_adapter first, or load_trained into it")
     if config.kind == "none":
         _train_everything(model)
         return
@@ -79,48 +79,45 @@ def trainable_report(model: WorldModel) -> TrainableReport:
     return TrainableReport(sum(p.numel() for p in model.parameters() if p.requires_grad), own, own + encoder)
 
 
-def save_adapter(model: WorldModel, folder: str | Path) -> None:
+def has_adapter(model: WorldModel) -> bool:
+    """Return whether the model differs from the base it started from: `base_only` brings that back for a while."""
+    return model.adaptation is not None
+
+
+def save_trained(model: WorldModel, folder: str | Path) -> None:
     """Write what was trained: an adapter in PEFT's own format, or all of the predictor; and which base it belongs to.
 
     Raises:
         ValueError: The model has not been adapted.
     """
     adaptation, folder = _adaptation(model), Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     if adaptation.kind == "lora":
-        weights = get_peft_model_state_dict(model.predictor, save_embedding_layers=False)
+        write_trained(folder, adaptation, _lora_weights(model))
         _lora_config(model).save_pretrained(str(folder))
-        name = LORA_WEIGHTS
     else:
-        weights, name = model.predictor.state_dict(), FULL_WEIGHTS
-    whole = {key: value.detach().to("cpu").contiguous() for key, value in weights.items()}
-    save_file(whole, folder / name, metadata={"format": "pt"})
-    card = {"kind": adaptation.kind, "base_predictor": adaptation.base, "encoder": model.encoder_fingerprint()}
-    (folder / CARD).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+        write_trained(folder, adaptation, model.predictor.state_dict())
 
 
-def load_adapter(model: WorldModel, folder: str | Path, trainable: bool) -> None:
-    """Put what `save_adapter` wrote on the base it was trained on, or into the adapter that is on already.
+def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
+    """Put what `save_trained` wrote on the base it was trained on, or into the adapter that is on already.
+
+    Args:
+        model: The base, or a model adapted in the same way; it is never wrapped twice.
+        folder: The folder.
+        trainable: Whether to train on; None leaves an adapter that is on as it is, and freezes a new one.
 
     Raises:
         InputError: The folder is not an adapter, is damaged, belongs to another base, or differs from the one that
             is on.
     """
     folder = Path(folder)
-    card = _read_card(folder)
-    _check_base(model, card, where=str(folder / CARD))
-    if model.adaptation is not None and model.adaptation.kind != card["kind"]:
-        raise InputError(
-            where=str(folder),
-            found=f"an adapter of kind {card['kind']}",
-            needed=f"one of kind {model.adaptation.kind}, as the model has",
-            fix="Set adapter.kind to the one it was trained with",
-        )
-    if card["kind"] == "lora":
+    fresh = model.adaptation is None
+    if read_kind(folder, model) == "lora":
         _load_lora(model, folder)
     else:
         _load_everything(model, folder)
-    _set_trainable(model, trainable)
+    if fresh or trainable is not None:
+        _set_trainable(model, bool(trainable))
 
 
 @contextmanager
@@ -157,7 +154,7 @@ def merge_adapter(model: WorldModel) -> None:
 
 def _train_everything(model: WorldModel) -> None:
     start = {name: value.detach().to("cpu", copy=True) for name, value in model.predictor.state_dict().items()}
-    model.adaptation = Adaptation("none", model.predictor_fingerprint(), start)
+    model.adaptation = Adaptation("none", model.predictor_fingerprint(), model.encoder_fingerprint(), start)
     model.predictor.float()
     _set_trainable(model, trainable=True)
 
@@ -179,7 +176,7 @@ def _wrap(model: WorldModel, config: LoraConfig) -> None:
     model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
     model.predictor = get_peft_model(model.predictor, config)
     model.set_gradient_checkpointing(checkpointing)
-    model.adaptation = Adaptation("lora", base)
+    model.adaptation = Adaptation("lora", base, model.encoder_fingerprint())
     for layer in _lora_layers(model):
         layer.lora_A.float()
         layer.lora_B.float()
@@ -187,6 +184,10 @@ def _wrap(model: WorldModel, config: LoraConfig) -> None:
 
 def _lora_layers(model: WorldModel) -> list[Any]:
     return [layer for layer in model.predictor.modules() if isinstance(layer, LoraLayer)]
+
+
+def _lora_weights(model: WorldModel) -> dict[str, Tensor]:
+    return dict(get_peft_model_state_dict(model.predictor, save_embedding_layers=False))
 
 
 def _lora_config(model: WorldModel) -> Any:
@@ -198,7 +199,7 @@ def _lora_config(model: WorldModel) -> Any:
 
 def _adaptation(model: WorldModel) -> Adaptation:
     if model.adaptation is None:
-        raise ValueError("this model has not been adapted: add_adapter or load_adapter first")
+        raise ValueError("this model has not been adapted: add_adapter or load_trained first")
     return model.adaptation
 
 
@@ -210,46 +211,13 @@ def _set_trainable(model: WorldModel, trainable: bool) -> None:
         value.requires_grad_(trainable and chosen)
 
 
-def _read_card(folder: Path) -> dict[str, Any]:
-    needed = "a folder written by save_adapter"
-    try:
-        card = json.loads((folder / CARD).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(where=str(folder / CARD), found="no such file", needed=needed) from None
-    except (OSError, ValueError) as error:
-        raise InputError(where=str(folder / CARD), found=f"cannot be read ({error})", needed=needed) from None
-    if not isinstance(card, dict) or card.get("kind") not in ("lora", "none"):
-        raise InputError(where=str(folder / CARD), found="not the card of an adapter", needed=needed)
-    return card
-
-
-def _check_base(model: WorldModel, card: dict[str, Any], *, where: str) -> None:
-    own = model.adaptation.base if model.adaptation else model.predictor_fingerprint()
-    encoder = model.encoder_fingerprint()
-    for part, found, needed in (
-        ("predictor", own, card.get("base_predictor")),
-        ("encoder", encoder, card.get("encoder")),
-    ):
-        if found != needed:
-            raise InputError(
-                where=where,
-                found=f"an adapter trained on another {part} ({str(needed)[:12]})",
-                needed=f"one trained on this model's {part} ({found[:12]})",
-                fix="Set model.base to the model it was trained on",
-            )
-
-
 def _load_lora(model: WorldModel, folder: Path) -> None:
     config = _read_lora_config(folder)
     if model.adaptation is None:
         _wrap(model, config)
     else:
         _check_same_adapter(_lora_config(model), config, where=str(folder))
-    weights = _read_weights(folder / LORA_WEIGHTS)
-    _check_names(
-        weights, get_peft_model_state_dict(model.predictor, save_embedding_layers=False), folder / LORA_WEIGHTS
-    )
-    set_peft_model_state_dict(model.predictor, weights)
+    set_peft_model_state_dict(model.predictor, read_weights(folder / LORA_WEIGHTS, _lora_weights(model)))
 
 
 def _read_lora_config(folder: Path) -> Any:
@@ -269,25 +237,10 @@ def _check_same_adapter(own: Any, other: Any, *, where: str) -> None:
 
 
 def _load_everything(model: WorldModel, folder: Path) -> None:
-    weights = _read_weights(folder / FULL_WEIGHTS)
-    _check_names(weights, model.predictor.state_dict(), folder / FULL_WEIGHTS)
+    weights = read_weights(folder / FULL_WEIGHTS, model.predictor.state_dict())
     if model.adaptation is None:
         _train_everything(model)
     model.predictor.load_state_dict(weights)
-
-
-def _read_weights(path: Path) -> dict[str, Tensor]:
-    try:
-        return dict(load_file(path))
-    except FileNotFoundError:
-        raise InputError(where=str(path), found="no such file", needed="the weights of an adapter") from None
-    except (SafetensorError, OSError) as error:
-        raise InputError(where=str(path), found=f"not a whole safetensors file ({error})") from None
-
-
-def _check_names(found: dict[str, Tensor], needed: dict[str, Tensor], path: Path) -> None:
-    shapes = [{name: tuple(value.shape) for name, value in weights.items()} for weights in (found, needed)]
-    check_tensors(*shapes, where=str(path))
 
 
 def _lora_off(model: WorldModel) -> Any:

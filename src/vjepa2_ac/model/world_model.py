@@ -27,6 +27,7 @@ class Adaptation:
 
     kind: str  # as in config.AdapterConfig: lora, or none when every weight is trained
     base: str  # fingerprint of the predictor it started from
+    encoder: str  # fingerprint of the encoder whose latents it learns from
     start: dict[str, Tensor] | None = None  # kind none: the weights it started from
 
 
@@ -79,10 +80,10 @@ class WorldModel(nn.Module):
         """Write config.json, encoder.safetensors and predictor/ (which transformers can load by itself).
 
         Raises:
-            ValueError: An adapter is on: merge it first, or save it with `model.lora.save_adapter`.
+            ValueError: An adapter is on: merge it first, or save it with `model.lora.save_trained`.
         """
         if self.predictor is not self.base_predictor:
-            raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_adapter saves it alone")
+            raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_trained saves it alone")
         hashes = {"encoder": self.encoder_fingerprint(), "predictor": self.predictor_fingerprint()}
         write_folder(Path(folder), self.sizes, self.encoder, self.predictor, hashes)
 
