@@ -11,7 +11,7 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -25,7 +25,9 @@ Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 class Section(BaseModel):
     """A group of knobs: frozen, and unknown keys are errors."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 class RldsFields(Section):
@@ -79,7 +81,7 @@ class DataConfig(Section):
     """Loader processes; 0 loads in the training process. The data does not depend on it."""
 
     @model_validator(mode="after")
-    def _camera_is_mapped(self) -> Self:
+    def _camera_is_mapped(self) -> DataConfig:
         if self.camera not in self.fields.cameras:
             raise ValueError(f"camera {self.camera!r} is not one of fields.cameras: {', '.join(self.fields.cameras)}")
         if self.validation_share + self.test_share >= 1.0:
@@ -133,7 +135,7 @@ class ModelSizes(Section):
     """The predictor."""
 
     @model_validator(mode="after")
-    def _sizes_divide(self) -> Self:
+    def _sizes_divide(self) -> ModelSizes:
         if self.image_size % self.patch_size:
             raise ValueError(f"image_size {self.image_size} is not a multiple of patch_size {self.patch_size}")
         for name, part in (("encoder", self.encoder), ("predictor", self.predictor)):
@@ -160,7 +162,7 @@ class ModelConfig(Section):
     """Frames that go through the encoder at once: bounds its memory."""
 
     @model_validator(mode="after")
-    def _one_start(self) -> Self:
+    def _one_start(self) -> ModelConfig:
         if (self.base is None) == (self.random is None):
             raise ValueError("give either base (a model to adapt) or random (sizes of a fresh one)")
         return self
@@ -225,7 +227,7 @@ class TrainingConfig(Section):
     """Optimizer steps between lines in metrics.jsonl."""
 
     @model_validator(mode="after")
-    def _schedule_fits(self) -> Self:
+    def _schedule_fits(self) -> TrainingConfig:
         if self.warmup_steps + self.decay_steps > self.steps:
             raise ValueError(
                 f"warmup_steps {self.warmup_steps} and decay_steps {self.decay_steps} exceed steps {self.steps}"
@@ -242,7 +244,7 @@ class ValidationConfig(Section):
     """Optimizer steps between validations."""
     clips: PositiveInt = 64
     """Clips of held-out episodes, always the same ones."""
-    batch_size: PositiveInt = 4
+    batch_size: Annotated[int, Field(ge=2)] = 4
     """Clips that are evaluated at once."""
 
 
@@ -285,7 +287,7 @@ class Config(Section):
     """Where figures go."""
 
     @model_validator(mode="after")
-    def _parts_fit(self) -> Self:
+    def _parts_fit(self) -> Config:
         if self.training.rollout_steps >= self.data.frames:
             raise ValueError(
                 f"training.rollout_steps {self.training.rollout_steps} needs data.frames of at least"
@@ -310,7 +312,9 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> Config:
     for override in overrides:
         key, separator, text = override.partition("=")
         if not separator or not key:
-            raise InputError(where="command line", found=f"{override!r}", needed="an override such as training.steps=100")
+            raise InputError(
+                where="command line", found=f"{override!r}", needed="an override such as training.steps=100"
+            )
         _set(values, key.split("."), _parse_yaml(text, where=f"command line: {key}"), override)
     return parse_config(values, where=where)
 
@@ -327,8 +331,10 @@ def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
         lines = [_explain(detail) for detail in error.errors()]
         raise InputError(
             where=where,
-            found=f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n" + "\n".join(f"  {line}" for line in lines),
-            fix="\n`vjepa2-ac config schema` lists every key with its range",
+            found=f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n"
+            + "\n".join(f"  {line}" for line in lines)
+            + "\n",
+            fix="`vjepa2-ac config schema` lists every key with its range",
         ) from None
     except (TypeError, ValueError) as error:  # a YAML date, NaN, ...
         raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
@@ -376,18 +382,17 @@ class _StrictLoader(yaml.SafeLoader):
         return float(str(self.construct_scalar(node)))
 
 
-
 _StrictLoader.add_constructor("!scientific", _StrictLoader.construct_scientific)
-_StrictLoader.add_implicit_resolver(
-    "!scientific", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
-)
+_StrictLoader.add_implicit_resolver("!scientific", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789"))
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise InputError(where=str(path), found="no such file", needed="a config", fix="See configs/ for examples") from None
+        raise InputError(
+            where=str(path), found="no such file", needed="a config", fix="See configs/ for examples"
+        ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
     values = _parse_yaml(text, where=str(path))
@@ -422,7 +427,13 @@ def _explain(detail: Any) -> str:
         known = _keys_at(detail["loc"][:-1])
         close = difflib.get_close_matches(str(detail["loc"][-1]), known, n=1)
         elsewhere = [key for key in _all_keys() if key.split(".")[-1] == str(detail["loc"][-1])]
-        hint = f"did you mean {close[0]}?" if close else f"did you mean {elsewhere[0]}?" if elsewhere else f"known here: {', '.join(known)}"
+        hint = (
+            f"did you mean {close[0]}?"
+            if close
+            else f"did you mean {elsewhere[0]}?"
+            if elsewhere
+            else f"known here: {', '.join(known)}"
+        )
         return f"{path}: unknown key; {hint}"
     if detail["type"] == "missing":
         return f"{path}: missing; it has no default"

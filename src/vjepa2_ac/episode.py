@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -36,6 +36,7 @@ ACTION_DIM = 7
 EXTRINSICS_DIM = 6
 
 
+@runtime_checkable
 class FrameReader(Protocol):
     """Reads pictures of one camera of one episode, and only those that are asked for."""
 
@@ -102,6 +103,7 @@ class LatentBatch:
     starts: tuple[int, ...]
 
 
+@runtime_checkable
 class EpisodeSource(Protocol):
     """A set of episodes in a fixed order. It knows nothing of clips, crops or batches."""
 

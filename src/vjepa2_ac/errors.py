@@ -15,12 +15,8 @@ class InputError(Exception):
 
     def __init__(self, *, where: str, found: str, needed: str = "", fix: str = "") -> None:
         self.where, self.found, self.needed, self.fix = where, found, needed, fix
-        parts = [found]
-        if needed:
-            parts.append(f"needed: {needed}")
-        if fix:
-            parts.append(fix if fix.endswith((".", "?", "`")) else f"{fix}.")
-        super().__init__(f"{where}: " + ". ".join(part.rstrip(".") if i < len(parts) - 1 else part for i, part in enumerate(parts)))
+        sentences = [found, f"needed: {needed}" if needed else "", fix]
+        super().__init__(f"{where}: " + "".join(_sentence(text) for text in sentences if text).rstrip())
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
         """Survive the trip from a loader worker to the main process."""
@@ -29,3 +25,8 @@ class InputError(Exception):
 
 def _rebuild(kind: type[InputError], where: str, found: str, needed: str, fix: str) -> InputError:
     return kind(where=where, found=found, needed=needed, fix=fix)
+
+
+def _sentence(text: str) -> str:
+    """End a part of the message; a part that begins on a new line brings its own layout."""
+    return text + (" " if text.endswith((".", "?", "!", "\n")) else ". ")

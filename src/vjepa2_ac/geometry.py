@@ -40,7 +40,9 @@ def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray
     return np.concatenate([np.diff(states[:, :3], axis=0), delta, np.diff(states[:, 6:], axis=0)], axis=-1)
 
 
-def apply_action(state: Float[np.ndarray, "*batch 7"], action: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarray, "*batch 7"]:
+def apply_action(
+    state: Float[np.ndarray, "*batch 7"], action: Float[np.ndarray, "*batch 7"]
+) -> Float[np.ndarray, "*batch 7"]:
     """Return the state that an action leads to: xyz and gripper add, R' = R_delta @ R.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.

@@ -1,0 +1,206 @@
+"""What can be asked for on the command line? Parse, call one function, print."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from vjepa2_ac import __version__
+from vjepa2_ac.errors import InputError
+
+Handler = Callable[[argparse.Namespace], None]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; return the exit status: 0 done, 2 something given cannot be used, 130 interrupted."""
+    parser = _parser()
+    options, rest = parser.parse_known_args(arguments)
+    if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:  # argparse gives up on `key=value` behind an option
+        options.overrides += rest
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    handler: Handler = options.handler
+    try:
+        handler(options)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped."
+    )
+    parser.add_argument("--version", action="version", version=__version__)
+    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_train(commands)
+    _add_evaluate(commands)
+    _add_export(commands)
+    _add_config(commands)
+    _add_download(commands)
+    _add_simulate(commands)
+    return parser
+
+
+_Commands = argparse._SubParsersAction  # noqa: SLF001 - argparse has no public name for it
+
+
+def _command(
+    commands: _Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=text, description=text)
+    parser.set_defaults(handler=handler)
+    return parser
+
+
+def _add_train(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(commands, "train", _train, "Train an adapter (or the whole predictor) as a config says.")
+    parser.add_argument("config", metavar="CONFIG", help="a YAML config, or with --resume the folder of a run")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as training.learning_rate=3e-4")
+    parser.add_argument("--resume", action="store_true", help="go on with the run in the folder CONFIG")
+    parser.add_argument(
+        "--check", action="store_true", help="do everything that can fail and stop before the first step"
+    )
+
+
+def _train(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config import load_config
+    from vjepa2_ac.console import ConsoleReporter, console
+    from vjepa2_ac.training.loop import train
+    from vjepa2_ac.training.run_folder import read_run_config
+
+    path = Path(options.config)
+    if options.resume and options.overrides:
+        raise InputError(
+            where="command line", found="--resume with overrides", needed="the run's own config, unchanged"
+        )
+    if path.is_dir() and not options.resume:
+        raise InputError(
+            where=options.config, found="a folder", needed="a config file", fix="To go on with a run, add --resume"
+        )
+    config = read_run_config(path) if options.resume else load_config(path, options.overrides)
+    reporter = ConsoleReporter()
+    try:
+        folder = train(config, reporter, check_only=options.check)
+    finally:
+        reporter.close()
+    if not options.check:
+        console.print(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
+
+
+def _add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "evaluate", _evaluate, "Measure a run on held-out episodes, beside its base and persistence."
+    )
+    parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a run")
+    parser.add_argument("--split", choices=["test", "validation"], default="test", help="which held-out episodes")
+    parser.add_argument("--clips", type=int, default=256, help="at most this many clips, spread over the episodes")
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    from vjepa2_ac.console import console, evaluation_table
+    from vjepa2_ac.evaluation.evaluate import verdict
+    from vjepa2_ac.training.runs import evaluate_run
+
+    evaluation, written = evaluate_run(options.run, split=options.split, clips=options.clips)
+    console.print(evaluation_table(evaluation.models, evaluation.seconds_per_step))
+    console.print(verdict(evaluation))
+    for path in written:
+        console.print(f"  {path}")
+
+
+def _add_export(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(commands, "export", _export, "Write a run's model, adapter merged in, as one folder.")
+    parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a run")
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="where to; `model.base` takes it")
+
+
+def _export(options: argparse.Namespace) -> None:
+    from vjepa2_ac.console import console
+    from vjepa2_ac.training.runs import export_run
+
+    export_run(options.run, options.folder)
+    console.print(f"The merged model is in {options.folder}")
+
+
+def _add_config(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "config", _config, "Print the JSON schema of configs, or one config with every default."
+    )
+    parser.add_argument("what", choices=["schema", "show"])
+    parser.add_argument("config", metavar="CONFIG", nargs="?", help="for show: a YAML config")
+    parser.add_argument("overrides", nargs="*", metavar="key=value")
+
+
+def _config(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config import config_as_yaml, config_schema, load_config
+
+    if options.what == "schema":
+        print(json.dumps(config_schema(), indent=2))
+    elif options.config is None:
+        raise InputError(
+            where="command line", found="config show without a file", needed="vjepa2-ac config show CONFIG"
+        )
+    else:
+        print(config_as_yaml(load_config(options.config, options.overrides)), end="")
+
+
+def _add_download(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "download", _download, "Fetch the official checkpoint (11.7 GB); goes on where it stopped."
+    )
+    parser.add_argument("path", metavar="PATH", type=Path, nargs="?", default=Path("checkpoints/vjepa2-ac-vitg.pt"))
+    parser.add_argument("--url", default=None, help="another address than Meta's")
+
+
+def _download(options: argparse.Namespace) -> None:
+    from vjepa2_ac.console import DownloadProgress, console
+    from vjepa2_ac.model.download import OFFICIAL_URL, download
+
+    progress = DownloadProgress(options.path.name)
+    download(options.url or OFFICIAL_URL, options.path, progress=progress)
+    console.print(f"The checkpoint is in {options.path}")
+
+
+def _add_simulate(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(commands, "simulate", _simulate, "Record demonstrations of a simulated arm as a DROID data set.")
+    parser.add_argument("what", choices=["record"])
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="where the data set goes")
+    parser.add_argument(
+        "--domain", default="A", help="A, B, or random: another camera, light and look in every episode"
+    )
+    parser.add_argument("--episodes", type=int, default=40)
+    parser.add_argument("--steps", type=int, default=41, help="control steps of an episode, 15 per second")
+    parser.add_argument("--seed", type=int, default=0)
+
+
+def _simulate(options: argparse.Namespace) -> None:
+    from vjepa2_ac.console import ProgressBar, console
+    from vjepa2_ac.simulation.record import record_dataset
+
+    bar = ProgressBar("recording", options.episodes)
+    try:
+        folder = record_dataset(
+            options.folder,
+            domain=options.domain,
+            episodes=options.episodes,
+            steps=options.steps,
+            seed=options.seed,
+            progress=lambda done, _: bar.advance_to(done),
+        )
+    finally:
+        bar.close()
+    console.print(f"{options.episodes} episodes are in {folder}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

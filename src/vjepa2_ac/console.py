@@ -1,0 +1,122 @@
+"""How does a run look in a terminal? Progress, tables, numbers; plain lines where there is no terminal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, ratios_by_horizon
+
+console = Console(highlight=False, soft_wrap=True)
+
+
+class ProgressBar:
+    """A bar with a few words behind it in a terminal; a line every few seconds elsewhere."""
+
+    def __init__(self, title: str, total: int, done: int = 0, line_every_s: float = 10.0) -> None:
+        self._title, self._total, self._done, self._line_every_s = title, total, done, line_every_s
+        self._last_line = time.monotonic()
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+        if console.is_terminal:
+            self._bar = Progress(
+                TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+                TextColumn("{task.fields[words]}"), console=console,
+            )  # fmt: skip
+            self._task = self._bar.add_task(title, total=total, completed=done, words="")
+            self._bar.start()
+
+    def advance_to(self, done: int, words: str = "") -> None:
+        """Show that `done` of the total are done."""
+        self._done = done
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done, words=words)
+        elif done == self._total or time.monotonic() - self._last_line >= self._line_every_s:
+            self._last_line = time.monotonic()
+            console.print(f"{self._title} {done}/{self._total}  {words}")
+        if done >= self._total:
+            self.close()
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+class DownloadProgress:
+    """Shows a download as it grows."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._bar: ProgressBar | None = None
+
+    def __call__(self, done: int, whole: int | None) -> None:
+        """Show that `done` of `whole` bytes are here; in megabytes."""
+        if self._bar is None:
+            self._bar = ProgressBar(f"{self._name} (MB)", (whole or 0) // 10**6)
+        self._bar.advance_to(done // 10**6)
+
+
+class ConsoleReporter:
+    """Shows a training run."""
+
+    def __init__(self) -> None:
+        self._bar: ProgressBar | None = None
+        self._total = 0
+        self._validation = ""
+
+    def note(self, text: str) -> None:
+        """Say something once."""
+        console.print(text)
+
+    def started(self, done: int, total: int) -> None:
+        """Begin the bar."""
+        self._total = total
+        self._bar = ProgressBar("training", total, done)
+
+    def stepped(self, step: int, figures: Mapping[str, float]) -> None:
+        """Move the bar."""
+        if self._bar is not None:
+            words = f"loss {figures['loss']:.4f}  {figures['samples_per_second']:.1f} clips/s  {self._validation}"
+            self._bar.advance_to(step, words)
+
+    def validated(self, step: int, errors: PredictionErrors) -> None:
+        """Print a line of the validation's figures."""
+        one_step = one_step_ratios(errors)
+        self._validation = f"error/persistence {one_step['true'].value:.3f}"
+        horizons = "  ".join(f"{h}: {r.value:.3f}" for h, r in enumerate(ratios_by_horizon(errors), start=1))
+        console.print(
+            f"validation at step {step}: one-step error/persistence {one_step['true'].value:.3f}"
+            f" (zero actions {one_step['zero'].value:.3f}, shuffled {one_step['shuffled'].value:.3f});"
+            f" rollout by horizon  {horizons}"
+        )
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+def evaluation_table(models: Mapping[str, PredictionErrors], seconds_per_step: float) -> Table:
+    """Return the table of `evaluate`: error over persistence by horizon, then the use of the actions."""
+    horizons = next(iter(models.values())).rollout.shape[1]
+    table = Table(
+        title="Latent error / persistence on held-out episodes (95 % interval over episodes)", title_justify="left"
+    )
+    table.add_column("open loop")
+    for name in ("persistence", *models):
+        table.add_column(name, justify="right")
+    columns = {name: ratios_by_horizon(errors) for name, errors in models.items()}
+    for horizon in range(horizons):
+        seconds = (horizon + 1) * seconds_per_step
+        table.add_row(f"{seconds:.2f} s ahead", "1.000", *(str(ratios[horizon]) for ratios in columns.values()))
+    table.add_section()
+    used = {name: one_step_ratios(errors) for name, errors in models.items()}
+    for actions in ("true", "zero", "shuffled"):
+        table.add_row(f"one step, {actions} actions", "1.000", *(str(ratios[actions]) for ratios in used.values()))
+    return table

@@ -1,0 +1,33 @@
+"""Pixels to latents: where is the frozen encoder run?
+
+Training, evaluation and planning see only what comes out of here.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from vjepa2_ac.data.transforms import pixels_to_input
+from vjepa2_ac.episode import Batch, LatentBatch
+from vjepa2_ac.model.world_model import WorldModel
+
+
+@torch.no_grad()
+def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int) -> LatentBatch:
+    """Encode the frames of a batch, each by itself, on the device.
+
+    Args:
+        world_model: The model whose frozen encoder is used.
+        batch: Clips as the loader gives them: uint8 pixels, cropped, of any size.
+        device: Where the model is.
+        chunk: Frames that go through the encoder at once.
+    """
+    inputs = pixels_to_input(batch.frames.to(device, non_blocking=True), world_model.image_size)
+    return LatentBatch(
+        latents=world_model.encode(inputs, chunk=chunk),
+        states=batch.states.to(device, non_blocking=True),
+        actions=batch.actions.to(device, non_blocking=True),
+        extrinsics=None if batch.extrinsics is None else batch.extrinsics.to(device, non_blocking=True),
+        episode_ids=batch.episode_ids,
+        starts=batch.starts,
+    )

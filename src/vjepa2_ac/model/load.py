@@ -1,0 +1,52 @@
+"""Which world model does `model.base` name? The official checkpoint, a folder, one that ships with the package."""
+
+from __future__ import annotations
+
+import importlib.resources
+from pathlib import Path
+
+import torch
+
+from vjepa2_ac.config import ModelConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.weights import load_official
+from vjepa2_ac.model.world_model import WorldModel
+
+_BUILTIN = "builtin:"
+
+
+def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
+    """Return the world model to start from, on the CPU: `model.base`, or a fresh one of the sizes `model.random`.
+
+    Raises:
+        InputError: There is no such model, or it cannot be read.
+    """
+    dtype = torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
+    if config.random is not None:
+        return WorldModel.random(config.random, seed=seed, dtype=dtype)
+    if config.base is None:
+        raise ValueError("a ModelConfig has a base or random sizes")
+    path = _builtin(config.base) if config.base.startswith(_BUILTIN) else Path(config.base)
+    if path.is_dir():
+        return WorldModel.from_pretrained(path, dtype=dtype)
+    if not path.exists():
+        raise InputError(
+            where=f"model.base: {config.base}",
+            found="no such file or folder",
+            needed="the official .pt, a folder written by `vjepa2-ac export`, or builtin:sim-tiny",
+            fix="`vjepa2-ac download` fetches the official checkpoint to checkpoints/vjepa2-ac-vitg.pt",
+        )
+    return load_official(path, config.sizes, dtype=dtype)
+
+
+def _builtin(name: str) -> Path:
+    assets = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets"
+    path = assets / name.removeprefix(_BUILTIN)
+    if not (path / "config.json").is_file():
+        known = sorted(f"{_BUILTIN}{entry.name}" for entry in assets.iterdir() if (entry / "config.json").is_file())
+        raise InputError(
+            where=f"model.base: {name}",
+            found="no model of that name in the package",
+            needed=f"one of {', '.join(known)}",
+        )
+    return path

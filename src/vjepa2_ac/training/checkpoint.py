@@ -1,0 +1,136 @@
+"""What is kept of a run, so that it can go on exactly? Adapter, optimizer and step; never the frozen base.
+
+A checkpoint is a folder `step-00001000` with `manifest.json`, which holds the SHA-256 of every other file. It is
+written under a temporary name and renamed, so a folder that carries the final name is whole or was damaged later;
+the manifest tells.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import sha256_of_file
+
+logger = logging.getLogger(__name__)
+
+MANIFEST = "manifest.json"
+STATE = "state.json"
+_NAME = re.compile(r"step-(\d{8})$")
+
+
+@dataclass(frozen=True)
+class RunState:
+    """Where a run stands. Data order, learning rate and random numbers are functions of the step."""
+
+    step: int  # optimizer steps done
+    best_step: int | None = None
+    best_error: float | None = None  # validation error over persistence, the lower the better
+
+
+def checkpoint_name(step: int) -> str:
+    """Return the folder name of a step's checkpoint."""
+    return f"step-{step:08d}"
+
+
+def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path], None], *, keep: int) -> Path:
+    """Write a checkpoint whole or not at all, then remove all but the newest `keep`.
+
+    Args:
+        folder: The run's checkpoint folder.
+        state: Where the run stands.
+        write_files: Writes weights and optimizer state into the folder it is given.
+        keep: How many checkpoints stay.
+
+    Raises:
+        InputError: The folder cannot be written (full disk, no permission). Older checkpoints stay as they are.
+    """
+    final = folder / checkpoint_name(state.step)
+    temporary = folder / f".writing-{checkpoint_name(state.step)}"
+    try:
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        write_files(temporary)
+        (temporary / STATE).write_text(json.dumps(asdict(state)))
+        _seal(temporary)
+        if final.exists():  # a damaged one: whole ones are resumed from, not written again
+            shutil.rmtree(final)
+        temporary.rename(final)
+        _sync(folder)
+    except OSError as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise InputError(
+            where=str(final),
+            found=f"the checkpoint cannot be written ({error.strerror or error})",
+            fix="Older checkpoints are untouched: make room or pass another run_dir, then resume",
+        ) from error
+    _prune(folder, keep)
+    return final
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """Return the newest checkpoint that is whole; damaged ones are passed over with a warning that names them."""
+    for path in reversed(_listed(folder)):
+        problem = damage(path)
+        if problem is None:
+            return path
+        logger.warning("%s: %s; using an older checkpoint", path, problem)
+    return None
+
+
+def damage(checkpoint: Path) -> str | None:
+    """Return what is wrong with a checkpoint, or None when every file is what the manifest says."""
+    try:
+        files = json.loads((checkpoint / MANIFEST).read_text())["files"]
+        for name, digest in files.items():
+            if not (checkpoint / name).is_file():
+                return f"{name} is missing"
+            if sha256_of_file(checkpoint / name) != digest:
+                return f"{name} is damaged (its SHA-256 is not the manifest's)"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return f"no readable {MANIFEST} ({error})"
+    return None
+
+
+def read_state(checkpoint: Path) -> RunState:
+    """Return where the run stood when the checkpoint was written."""
+    return RunState(**json.loads((checkpoint / STATE).read_text()))
+
+
+def _listed(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.glob("step-*") if path.is_dir() and _NAME.search(path.name))
+
+
+def _seal(folder: Path) -> None:
+    """Flush every file to the disk, then write the manifest."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    digests = {}
+    for path in files:
+        _sync(path)
+        digests[str(path.relative_to(folder))] = sha256_of_file(path)
+    manifest = folder / MANIFEST
+    manifest.write_text(json.dumps({"files": digests}, indent=1))
+    _sync(manifest)
+    _sync(folder)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _prune(folder: Path, keep: int) -> None:
+    for path in folder.glob(".writing-*"):
+        shutil.rmtree(path, ignore_errors=True)
+    for path in _listed(folder)[:-keep]:
+        shutil.rmtree(path)

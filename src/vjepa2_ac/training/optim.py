@@ -1,0 +1,63 @@
+"""Which parameters move, by which rule, and how fast at which step?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import torch
+from torch import nn
+
+from vjepa2_ac.config import TrainingConfig
+
+
+def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, object]]:
+    """Split what is trained into matrices, which decay, and biases and norms, which do not.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/utils.py, init_opt.
+    """
+    trained = [(name, parameter) for name, parameter in module.named_parameters() if parameter.requires_grad]
+    decayed = [parameter for name, parameter in trained if parameter.ndim > 1 and not name.endswith("bias")]
+    exempt = [parameter for name, parameter in trained if parameter.ndim <= 1 or name.endswith("bias")]
+    groups = [{"params": decayed, "weight_decay": weight_decay}, {"params": exempt, "weight_decay": 0.0}]
+    return [group for group in groups if group["params"]]
+
+
+def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.AdamW:
+    """Return AdamW over what is trained. The learning rate is set anew before every step."""
+    return torch.optim.AdamW(
+        parameter_groups(module, training.weight_decay), lr=training.learning_rate, betas=training.betas
+    )
+
+
+def learning_rate_at(step: int, training: TrainingConfig) -> float:
+    """Return the learning rate of optimizer step 1..steps: a pure function, so there is no scheduler to save.
+
+    Raises:
+        ValueError: A step before 1.
+
+    Source: warmup_stable_decay is facebookresearch/vjepa2 @ c2963a4, src/utils/schedulers.py, WSDSchedule.
+    """
+    if step < 1:
+        raise ValueError(f"optimizer steps count from 1, got {step}")
+    start, peak, final = training.start_learning_rate, training.learning_rate, training.final_learning_rate
+    if step <= training.warmup_steps:
+        return start + (peak - start) * step / training.warmup_steps
+    if training.schedule == "cosine":
+        done = (step - training.warmup_steps) / max(1, training.steps - training.warmup_steps)
+        return final + (peak - final) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
+    first_decay = training.steps - training.decay_steps
+    if step <= first_decay:
+        return peak
+    return peak + (final - peak) * min(1.0, (step - first_decay) / training.decay_steps)
+
+
+def set_learning_rate(optimizer: torch.optim.Optimizer, learning_rate: float) -> None:
+    """Give every group this learning rate."""
+    for group in optimizer.param_groups:
+        group["lr"] = learning_rate
+
+
+def trained_parameters(module: nn.Module) -> Iterable[nn.Parameter]:
+    """Return the parameters that the optimizer moves."""
+    return (parameter for parameter in module.parameters() if parameter.requires_grad)

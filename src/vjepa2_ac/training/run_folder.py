@@ -1,0 +1,123 @@
+"""What does a run's folder hold, and whose is it?
+
+RUN/config.yaml         the resolved config, defaults included
+RUN/environment.json    versions, machine and command of every start
+RUN/metrics.jsonl       figures, a row per line
+RUN/checkpoints/        step-XXXXXXXX folders
+RUN/tensorboard/        event files
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from vjepa2_ac.config import Config, changed_keys, config_as_yaml, load_config
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import write_atomically
+
+CONFIG = "config.yaml"
+ENVIRONMENT = "environment.json"
+CHECKPOINTS = "checkpoints"
+
+# Settings that may change between two starts of one run: they do not change what is computed.
+_FREE_TO_CHANGE = (
+    "run_dir",
+    "data.workers",
+    "checkpoint.",
+    "tracking.",
+    "training.log_every",
+    "training.allow_weak_base",
+)
+
+
+def check_run_folder(config: Config) -> None:
+    """See that the run's folder is free, or belongs to this very config, and can be written. Changes nothing.
+
+    Raises:
+        InputError: The folder is a file, somebody else's, of another config, or not writable.
+    """
+    folder = Path(config.run_dir)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(where=str(folder), found="a file", needed="a folder for the run", fix="Set another run_dir")
+    if (folder / CONFIG).exists():
+        _refuse_another_config(folder, config)
+    elif folder.exists() and any(folder.iterdir()):
+        raise InputError(
+            where=str(folder),
+            found="a folder with other things in it, and no config.yaml",
+            needed="an empty or new folder, or one of a run",
+            fix="Set another run_dir",
+        )
+    _check_writable(folder)
+
+
+def open_run_folder(config: Config) -> Path:
+    """Create the run's folder, or go on in it, and note this start's versions.
+
+    Raises:
+        InputError: As `check_run_folder`.
+    """
+    check_run_folder(config)
+    folder = Path(config.run_dir)
+    (folder / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
+    if not (folder / CONFIG).exists():
+        write_atomically(folder / CONFIG, config_as_yaml(config).encode())
+    path = folder / ENVIRONMENT
+    starts = json.loads(path.read_text()) if path.exists() else []
+    write_atomically(path, json.dumps([*starts, {"seed": config.seed, **environment()}], indent=1).encode())
+    return folder
+
+
+def read_run_config(folder: Path) -> Config:
+    """Return the config of a run.
+
+    Raises:
+        InputError: Not the folder of a run.
+    """
+    if not (folder / CONFIG).is_file():
+        raise InputError(
+            where=str(folder),
+            found="no config.yaml" if folder.is_dir() else "no such folder",
+            needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
+        )
+    return load_config(folder / CONFIG, [f"run_dir={json.dumps(str(folder))}"])
+
+
+def environment() -> dict[str, object]:
+    """Return what a figure should be read with: versions, machine, command, time."""
+    packages = ("vjepa2-ac", "torch", "transformers", "peft", "accelerate", "numpy", "scipy", "simplejpeg", "protobuf")
+    return {
+        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "command": sys.argv,
+        "python": platform.python_version(),
+        "machine": platform.platform(),
+        "packages": {name: importlib.metadata.version(name) for name in packages},
+    }
+
+
+def _refuse_another_config(folder: Path, config: Config) -> None:
+    differing = [key for key in changed_keys(read_run_config(folder), config) if not key.startswith(_FREE_TO_CHANGE)]
+    if differing:
+        raise InputError(
+            where=str(folder),
+            found=f"a run of another config; it differs in {', '.join(differing)}",
+            needed="the same config, to go on with it",
+            fix=f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`",
+        )
+
+
+def _check_writable(folder: Path) -> None:
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    try:
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise InputError(
+            where=str(folder), found=f"cannot be written ({error.strerror})", fix="Set run_dir to a folder of yours"
+        ) from None

@@ -1,0 +1,93 @@
+"""What can be done with a run that was trained? Load its model, evaluate it, export it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.loader import open_source, validation_batches
+from vjepa2_ac.data.windows import Split
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate import Evaluation, evaluate, evaluation_as_dict
+from vjepa2_ac.evaluation.plots import plot_evaluation
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.lora import load_trained, merge_adapter
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.training.checkpoint import newest_checkpoint
+from vjepa2_ac.training.loop import ADAPTER, make_accelerator
+from vjepa2_ac.training.run_folder import CHECKPOINTS, read_run_config
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A run's config and the model of its newest checkpoint, on the CPU."""
+
+    config: Config
+    world_model: WorldModel
+    checkpoint: Path
+
+
+def load_run(folder: Path) -> TrainedRun:
+    """Load the model of a run: its base with the trained weights of the newest whole checkpoint.
+
+    Raises:
+        InputError: Not the folder of a run, no checkpoint yet, or its base cannot be loaded.
+    """
+    config = read_run_config(folder)
+    checkpoint = newest_checkpoint(folder / CHECKPOINTS)
+    if checkpoint is None:
+        raise InputError(
+            where=str(folder),
+            found="a run without a whole checkpoint",
+            needed="at least one",
+            fix=f"Train on with `vjepa2-ac train {folder} --resume`",
+        )
+    world_model = load_base(config.model, seed=config.seed)
+    load_trained(world_model, checkpoint / ADAPTER, trainable=False)
+    return TrainedRun(config, world_model, checkpoint)
+
+
+def evaluate_run(folder: Path, *, split: Split, clips: int) -> tuple[Evaluation, list[Path]]:
+    """Measure a run on held-out episodes; write `evaluation.json` and `evaluation.png` into its folder.
+
+    Returns:
+        What was measured, and the files that were written.
+
+    Raises:
+        InputError: As `load_run`; or the split has no episodes.
+    """
+    run = load_run(folder)
+    config = run.config
+    source = open_source(config.data)
+    batches = validation_batches(source, config.data, split, clips=clips, batch_size=config.validation.batch_size)
+    accelerator = make_accelerator(config)
+    run.world_model.to(accelerator.device)
+    with accelerator.autocast():
+        evaluation = evaluate(
+            run.world_model,
+            batches,
+            has_base=config.model.base is not None,
+            device=accelerator.device,
+            encode_chunk=config.model.encode_chunk,
+            seconds_per_step=config.data.stride / config.data.fields.control_rate_hz,
+        )
+    figures = folder / "evaluation.json"
+    about = {"checkpoint": str(run.checkpoint), "split": split, **evaluation_as_dict(evaluation)}
+    write_atomically(figures, json.dumps(about, indent=1).encode())
+    return evaluation, [plot_evaluation(evaluation, folder / "evaluation.png"), figures]
+
+
+def export_run(folder: Path, destination: Path) -> None:
+    """Merge a run's adapter into its base, in float32, and write the model as one folder.
+
+    Raises:
+        InputError: As `load_run`; or the destination exists.
+    """
+    if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
+        raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
+    run = load_run(folder)
+    merge_adapter(run.world_model)
+    run.world_model.save_pretrained(destination)

@@ -1,0 +1,33 @@
+"""What every test can use: checked shapes, the shared reference data, tiny settings."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from jaxtyping import install_import_hook
+
+
+_hook = install_import_hook("vjepa2_ac", "beartype.beartype")  # shapes and types of public functions, while testing
+
+import pytest  # noqa: E402 - the hook comes first
+
+from paths import ROOT  # noqa: E402
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The larger reference data, which stands beside the project's own checkout only."""
+    folder = ROOT.parent / "shared"
+    if not folder.is_dir():
+        pytest.skip("the larger reference data is not beside this checkout")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    """Tiny tensors are slower on many threads, and bits depend on their number."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

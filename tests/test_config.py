@@ -1,0 +1,151 @@
+"""Every knob once; everything that is wrong at once."""
+
+from pathlib import Path
+
+import pytest
+import yaml
+from paths import ROOT
+
+from vjepa2_ac.config import (
+    Config,
+    _all_keys,
+    changed_keys,
+    config_as_dict,
+    config_as_yaml,
+    config_schema,
+    load_config,
+    parse_config,
+)
+from vjepa2_ac.errors import InputError
+
+MINIMAL = {"run_dir": "runs/x", "data": {"path": "d"}, "model": {"base": "b.pt"}}
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "config.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.name)
+def test_every_config_of_the_project_loads(path: Path) -> None:
+    load_config(path)
+
+
+def test_default_config_holds_the_mission() -> None:
+    config = load_config(ROOT / "configs/default.yaml")
+    assert (config.adapter.rank, config.adapter.alpha, config.adapter.rslora) == (16, 32, True)
+    assert (config.training.batch_size, config.training.accumulation, config.training.steps) == (2, 16, 100_000)
+    assert (config.training.learning_rate, config.training.precision) == (1e-4, "bf16")
+    assert (config.data.frames, config.model.sizes.image_size) == (16, 256)
+    assert (config.checkpoint.every, config.checkpoint.keep) == (1_000, 5)
+
+
+def test_a_resolved_config_reads_back_equal(tmp_path: Path) -> None:
+    config = parse_config(MINIMAL, where="here")
+    assert load_config(write(tmp_path, config_as_yaml(config))) == config
+
+
+def test_all_errors_are_reported_at_once_with_their_paths() -> None:
+    wrong = {
+        "data": {"path": "d", "strid": 4, "frames": 1},
+        "model": {"base": "b"},
+        "training": {"learning_rate": "fast", "rank": 8},
+    }
+    with pytest.raises(InputError) as caught:
+        parse_config(wrong, where="my.yaml")
+    message = str(caught.value)
+    assert "my.yaml" in message
+    assert "5 values are wrong" in message
+    assert "run_dir: missing" in message
+    assert "data.strid: unknown key; did you mean stride?" in message
+    assert "data.frames" in message
+    assert "greater than or equal to 2" in message
+    assert "training.learning_rate" in message
+    assert "training.rank: unknown key; did you mean adapter.rank?" in message
+
+
+@pytest.mark.parametrize(
+    ("override", "complaint"),
+    [
+        ("training.steps=0", "greater than or equal to 1"),
+        ("training.steps=many", "valid integer"),
+        ("training.steps=1.5", "valid integer"),
+        ("adapter.dropout=1.0", "less than 1"),
+        ("data.camera=third_eye", "exterior_1_left"),
+        ("training.rollout_steps=16", "data.frames of at least 17"),
+        ("training.warmup_steps=200000", "exceed steps"),
+        ("training.decay_steps=5", "warmup_stable_decay"),
+        ("model.base=null", "either base"),
+        ("model.sizes.patch_size=15", "multiple of patch_size"),
+        ("data.validation_share=0.97", "nothing to train on"),
+        ("training.learning_rate=.nan", "finite"),
+        ("steps=3", "did you mean training.steps?"),
+        ("seed.x=3", "valid integer"),
+        ("training", "an override such as"),
+    ],
+)
+def test_a_wrong_override_is_explained(tmp_path: Path, override: str, complaint: str) -> None:
+    path = write(tmp_path, yaml.safe_dump(MINIMAL))
+    with pytest.raises(InputError, match=complaint):
+        load_config(path, [override])
+
+
+def test_overrides_reach_nested_keys_and_read_numbers_as_people_write_them(tmp_path: Path) -> None:
+    path = write(tmp_path, yaml.safe_dump(MINIMAL))
+    config = load_config(
+        path, ["training.learning_rate=3e-4", "adapter.targets=[q, v]", "data.fields.gripper=openness"]
+    )
+    assert config.training.learning_rate == 3e-4
+    assert config.adapter.targets == ("q", "v")
+    assert config.data.fields.gripper == "openness"
+
+
+def test_a_key_given_twice_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="given twice"):
+        load_config(write(tmp_path, "run_dir: a\nrun_dir: b\n"))
+
+
+@pytest.mark.parametrize("text", ["", "- a list", "{unclosed", "run_dir: !!python/object:os.system x"])
+def test_what_is_not_a_config_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError):
+        load_config(write(tmp_path, text))
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="nowhere.yaml"):
+        load_config(tmp_path / "nowhere.yaml")
+
+
+def test_changed_keys_names_the_dotted_keys() -> None:
+    old = parse_config(MINIMAL, where="")
+    new = parse_config({**MINIMAL, "seed": 3, "training": {"steps": 5000}}, where="")
+    assert changed_keys(old, new) == ["seed", "training.steps"]
+
+
+def test_config_is_frozen() -> None:
+    config = parse_config(MINIMAL, where="")
+    with pytest.raises(ValueError, match="frozen"):
+        config.seed = 3  # type: ignore[misc]
+
+
+def test_schema_documents_every_knob() -> None:
+    definitions = config_schema()["$defs"]
+    for name, section in {**definitions, "Config": config_schema()}.items():
+        for key, knob in section.get("properties", {}).items():
+            documented = knob.get("description") or "$ref" in knob  # a section is documented by its class
+            assert documented, f"{name}.{key} is not documented"
+
+
+def test_every_knob_is_read_somewhere() -> None:
+    source = (
+        "\n".join(path.read_text() for path in (ROOT / "src").rglob("*.py") if path.name != "config.py")
+        + (ROOT / "src/vjepa2_ac/config.py").read_text().split("class Config(")[1]
+    )
+    unread = [key for key in _all_keys() if f".{key.split('.')[-1]}" not in source]
+    assert unread == []
+
+
+def test_plain_values_are_plain() -> None:
+    assert isinstance(config_as_dict(parse_config(MINIMAL, where=""))["adapter"]["targets"], list)
+    assert Config.model_config["extra"] == "forbid"
