@@ -25,6 +25,7 @@ logger = logging.getLogger(__name__)
 Split = Literal["train", "validation", "test"]
 
 _ROUNDS = 8
+_HALF_BITS = 3  # at least: narrower halves favour some orders of a handful of windows
 _MASK64 = (1 << 64) - 1
 _NAMED = 5
 
@@ -107,11 +108,11 @@ def spread(size: int, count: int) -> list[int]:
 def permuted(index: int, *, size: int, seed: int, epoch: int) -> int:
     """Return where a keyed permutation of `range(size)` sends an index; nothing of that size is ever in memory.
 
-    A Feistel network permutes the next larger power of four; what falls outside is sent on until it falls inside.
+    A Feistel network permutes a power of four that is as large; what falls outside is sent on until it falls inside.
     """
     if not 0 <= index < size:
         raise ValueError(f"index {index} of {size}")
-    half = max(1, ((size - 1).bit_length() + 1) // 2)
+    half = max(_HALF_BITS, ((size - 1).bit_length() + 1) // 2)
     keys = _round_keys(size, seed, epoch)
     index = _feistel(index, half, keys)
     while index >= size:
