@@ -6,8 +6,8 @@ import numpy as np
 
 from vjepa2_ac.geometry import matrices_from_euler
 from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B
-from vjepa2_ac.simulation.kinematics import HIGH, LOW, forward_kinematics
-from vjepa2_ac.simulation.motion import MotionRecipe, follow, random_reaching, tracking_share
+from vjepa2_ac.simulation.kinematics import HIGH, HOME, LOW, forward_kinematics
+from vjepa2_ac.simulation.motion import MotionRecipe, follow, random_reaching, rest_joints, tracking_share
 
 RECIPE = MotionRecipe()
 
@@ -62,6 +62,11 @@ def test_another_look_leaves_the_motion_as_it_was() -> None:
     other = replace(DOMAIN_A, look=DOMAIN_B.look, camera=DOMAIN_B.camera)
     first, second = (random_reaching(domain, 9, np.random.default_rng(3)) for domain in (DOMAIN_A, other))
     np.testing.assert_array_equal(first.joints, second.joints)
+
+
+def test_a_turned_arm_rests_over_the_same_spot() -> None:
+    resting = forward_kinematics(rest_joints(DOMAIN_B))[:3]
+    np.testing.assert_allclose(DOMAIN_B.base_pose()[:3, :3] @ resting, forward_kinematics(HOME)[:3], atol=1e-9)
 
 
 def test_a_turned_base_reports_the_same_motion_turned() -> None:

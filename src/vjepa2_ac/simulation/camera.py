@@ -102,7 +102,8 @@ class RayCamera:
         to_lamp = self._lamp - spots
         to_lamp /= np.maximum(np.linalg.norm(to_lamp, axis=1, keepdims=True), 1e-9)
         shine = np.einsum("ij,ij->i", hits.normals, to_lamp).clip(0.0, 1.0)
-        shine[self._caster.shaded(data, self._lamp, spots, group)] *= _SHADOW
+        facing = np.flatnonzero(shine > 0.0)
+        shine[facing[self._caster.shaded(data, self._lamp, spots[facing], group)]] *= _SHADOW
         sky = 0.8 + 0.2 * hits.normals[:, 2:]
         return colour * (self._ambient * sky), colour * ((1.15 - self._ambient) * shine[:, None])
 

@@ -144,12 +144,11 @@ def named_domain(name: str) -> Domain:
     return DOMAINS[name]
 
 
-def sample_domain(rng: np.random.Generator, ranges: DomainRanges | None = None) -> Domain:
+def sample_domain(rng: np.random.Generator, ranges: DomainRanges = DomainRanges()) -> Domain:
     """Return a random world: camera, light, colours and mounting, for training a base over many of them.
 
     The arm is always light before dark or dark before light, so that it can be seen.
     """
-    ranges = ranges or DomainRanges()
 
     def draw(bounds: Range) -> float:
         return float(rng.uniform(*bounds))

@@ -23,7 +23,7 @@ from vjepa2_ac.data.sources.rlds_writer import (
 )
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.simulation.arm import Renderer, SimulatedArm
-from vjepa2_ac.simulation.domains import Domain, named_domain, sample_domain
+from vjepa2_ac.simulation.domains import Domain, DomainRanges, named_domain, sample_domain
 from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
 from vjepa2_ac.simulation.scene import load_mujoco
 
@@ -36,7 +36,7 @@ _SIMULATED_CAMERAS = dict(zip(CAMERAS, ("exterior_1", "exterior_2", "wrist"), st
 def record_dataset(
     folder: str | Path,
     *,
-    domain: str | Domain,
+    domain: str | Domain | DomainRanges,
     episodes: int,
     steps: int = 41,
     seed: int = 0,
@@ -51,7 +51,8 @@ def record_dataset(
 
     Args:
         folder: Where the data set shall stand; must not hold anything yet.
-        domain: A `Domain`, the name of one, or `random`: another world for every episode.
+        domain: A `Domain`, or the name of one. For another world in every episode, `DomainRanges` to draw it from, or
+            `random`.
         episodes: How many.
         steps: Control steps of each (15 per second).
         seed: Decides motion, outcome and, for `random`, the worlds.
@@ -72,11 +73,11 @@ def record_dataset(
             found=f"episodes {episodes}, steps {steps}, shards {shards}, workers {workers}",
             needed="at least 1 episode, 2 steps, 1 shard, 1 worker",
         )
-    if isinstance(domain, str) and domain != "random":
-        domain = named_domain(domain)
+    if isinstance(domain, str):
+        domain = DomainRanges() if domain == "random" else named_domain(domain)
     record = partial(
         record_episode,
-        domain=None if isinstance(domain, str) else domain,
+        domain=domain,
         steps=steps,
         seed=seed,
         cameras=cameras,
@@ -90,20 +91,20 @@ def record_dataset(
 def record_episode(
     index: int,
     *,
-    domain: Domain | None,
+    domain: Domain | DomainRanges,
     steps: int,
     seed: int,
     cameras: Literal[1, 3] = 1,
     renderer: Renderer = "rays",
     recipe: MotionRecipe | None = None,
 ) -> DroidEpisode:
-    """Return one episode: a pure function of its arguments. Without a domain, in a world of its own.
+    """Return one episode, in a domain or in a world drawn from ranges: a pure function of its arguments.
 
     Raises:
         InputError: MuJoCo or OpenGL is missing.
     """
     motion_rng, world_rng = (np.random.default_rng([seed, index, purpose]) for purpose in range(2))
-    world = domain or sample_domain(world_rng)
+    world = domain if isinstance(domain, Domain) else sample_domain(world_rng, domain)
     motion = random_reaching(world, steps, motion_rng, recipe)
     folder = episode_folder(index, seed, world.name)
     return DroidEpisode(
