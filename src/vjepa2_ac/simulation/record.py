@@ -47,7 +47,8 @@ def record_dataset(
     recipe: MotionRecipe | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Record episodes and write them as a data set; the same arguments give the same bytes, whatever `workers`.
+    """Record episodes and write them as a data set; the same arguments give the same bytes, whatever `workers`
+    (with other versions of the libraries, the same episodes with other last digits).
 
     Args:
         folder: Where the data set shall stand; must not hold anything yet.
