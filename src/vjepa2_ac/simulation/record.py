@@ -47,8 +47,9 @@ def record_dataset(
     recipe: MotionRecipe | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Record episodes and write them as a data set; the same arguments give the same bytes, whatever `workers`
-    (with other versions of the libraries, the same episodes with other last digits).
+    """Record episodes and write them as a data set; the same arguments give the same bytes, whatever `workers`.
+
+    Other versions of MuJoCo, NumPy or the JPEG library may change last digits and bytes, not the episodes.
 
     Args:
         folder: Where the data set shall stand; must not hold anything yet.
