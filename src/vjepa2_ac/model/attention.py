@@ -94,11 +94,15 @@ def _dense_mask(steps: int, tokens_per_step: int, device: torch.device) -> Bool[
 def _flex_mask(length: int, tokens_per_step: int, device: torch.device) -> Any:
     from torch.nn.attention.flex_attention import create_block_mask
 
-    def visible(batch: Tensor, head: Tensor, query: Tensor, key: Tensor) -> Tensor:  # noqa: ARG001  # the API's order
-        return query // tokens_per_step >= key // tokens_per_step
-
     with torch.inference_mode(False):
-        return create_block_mask(visible, None, None, length, length, device=device)
+        return create_block_mask(
+            lambda _batch, _head, query, key: query // tokens_per_step >= key // tokens_per_step,
+            None,
+            None,
+            length,
+            length,
+            device=device,
+        )
 
 
 @lru_cache(maxsize=2)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -52,7 +52,7 @@ class Encoder(nn.Module):
             )
         return torch.cat([self._encode(part) for part in torch.split(frames, chunk)])
 
-    def train(self, mode: bool = True) -> Self:  # noqa: ARG002  # a frozen encoder has one mode
+    def train(self, mode: bool = True) -> Encoder:  # noqa: ARG002  # a frozen encoder has one mode
         """Stay in eval mode, whatever the model around it does."""
         return super().train(False)
 

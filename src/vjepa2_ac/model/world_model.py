@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import torch
 from einops import rearrange
@@ -49,7 +49,7 @@ class WorldModel(nn.Module):
         self.adaptation: Adaptation | None = None
 
     @classmethod
-    def random(cls, sizes: ModelSizes, seed: int, dtype: torch.dtype = torch.float32) -> Self:
+    def random(cls, sizes: ModelSizes, seed: int, dtype: torch.dtype = torch.float32) -> WorldModel:
         """Return a freshly initialised model: the same weights for the same sizes and seed."""
         model = cls.empty(sizes).to_empty(device="cpu")
         generator = torch.Generator().manual_seed(seed)
@@ -58,13 +58,13 @@ class WorldModel(nn.Module):
         return model.to(dtype)
 
     @classmethod
-    def empty(cls, sizes: ModelSizes) -> Self:
+    def empty(cls, sizes: ModelSizes) -> WorldModel:
         """Return a model without weights (on the meta device), for loaders to fill; in eval mode."""
         with torch.device("meta"):
             return cls(sizes).eval()
 
     @classmethod
-    def from_pretrained(cls, folder: str | Path, dtype: torch.dtype | None = None) -> Self:
+    def from_pretrained(cls, folder: str | Path, dtype: torch.dtype | None = None) -> WorldModel:
         """Read a folder written by `save_pretrained`; `dtype` None keeps the type of each file.
 
         Raises:

@@ -1,0 +1,69 @@
+import pytest
+import torch
+from torch import Tensor
+
+from vjepa2_ac.model.attention import AttentionKind, block_causal_attention
+
+PER_STEP = 5
+
+
+def drawn(dtype: torch.dtype = torch.float32, steps: int = 4, device: str = "cpu") -> list[Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    shape = (2, 2, steps * PER_STEP, 16)
+    return [torch.randn(shape, generator=generator).to(device, dtype).requires_grad_() for _ in range(3)]
+
+
+def output_and_gradients(kind: AttentionKind, inputs: list[Tensor]) -> list[Tensor]:
+    output = block_causal_attention(*inputs, PER_STEP, kind)
+    weights = torch.randn(output.shape, generator=torch.Generator().manual_seed(1)).to(output)
+    return [output, *torch.autograd.grad((output * weights).sum(), inputs)]
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+@pytest.mark.parametrize("kind", ["per_step", "auto"])
+def test_every_way_gives_the_output_and_gradients_of_the_dense_mask(kind: AttentionKind, steps: int) -> None:
+    inputs = drawn(steps=steps)
+    for found, expected in zip(output_and_gradients(kind, inputs), output_and_gradients("dense", inputs), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_ways_agree_in_bfloat16_to_its_rounding() -> None:
+    inputs = drawn(torch.bfloat16)
+    for found, expected in zip(
+        output_and_gradients("per_step", inputs), output_and_gradients("dense", inputs), strict=True
+    ):
+        assert found.dtype == torch.bfloat16
+        torch.testing.assert_close(found, expected, rtol=2e-2, atol=4e-2)
+
+
+@pytest.mark.filterwarnings("ignore:flex_attention called without torch.compile")  # eager on purpose: no compiler here
+def test_flex_gives_the_output_of_the_dense_mask() -> None:
+    inputs = [value.detach() for value in drawn()]
+    found = block_causal_attention(*inputs, PER_STEP, "flex")
+    torch.testing.assert_close(found, block_causal_attention(*inputs, PER_STEP, "dense"), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="FlexAttention has gradients on CUDA only")
+@pytest.mark.parametrize("kind", ["flex", "per_step", "auto"])
+def test_every_way_agrees_on_cuda(kind: AttentionKind) -> None:
+    inputs = drawn(device="cuda")
+    for found, expected in zip(output_and_gradients(kind, inputs), output_and_gradients("dense", inputs), strict=True):
+        torch.testing.assert_close(found, expected, rtol=2e-3, atol=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["dense", "per_step"])
+def test_a_step_sees_itself_and_the_past_but_not_the_future(kind: AttentionKind) -> None:
+    query, key, value = (x.detach() for x in drawn())
+    before = block_causal_attention(query, key, value, PER_STEP, kind)
+    changed = value.clone()
+    changed[:, :, 2 * PER_STEP + 4] += 1.0  # the last token of step 2
+    after = block_causal_attention(query, key, changed, PER_STEP, kind)
+    same = (before == after).all(dim=-1).all(dim=1).all(dim=0)
+    assert same[: 2 * PER_STEP].all()
+    assert not same[2 * PER_STEP :].any()
+
+
+def test_a_sequence_of_broken_steps_is_refused() -> None:
+    query = torch.zeros(1, 1, 11, 16)
+    with pytest.raises(ValueError, match="not a whole number of steps"):
+        block_causal_attention(query, query, query, PER_STEP)
