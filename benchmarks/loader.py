@@ -139,7 +139,7 @@ def run_tfds(python: str, config: DataConfig, clips: int, mode: str, longest: in
 def draw_episodes(count: int = 12, steps: int = 290) -> Iterator[DroidEpisode]:
     """Yield episodes as long as DROID's, of noise as smooth as a camera's picture: 180x320 JPEGs of 10 to 25 KB."""
     generator = np.random.default_rng(0)
-    pictures = [encode_jpeg(draw_picture(generator), quality=quality) for quality in range(80, 96) for _ in range(4)]
+    pictures = [encode_jpeg(draw_picture(generator), quality=quality) for quality in range(78, 94) for _ in range(4)]
     sizes = sorted(len(picture) for picture in pictures)
     print(f"JPEGs of {sizes[0] / 1e3:.0f} to {sizes[-1] / 1e3:.0f} KB, {count} episodes of {steps} steps, 3 cameras")
     pose, gripper, joints = np.zeros((steps, 6)), np.zeros((steps, 1)), np.zeros((steps, 7))

@@ -31,6 +31,7 @@ def test_a_file_does_not_have_its_name_before_it_is_whole(tmp_path: Path) -> Non
         file.flush()
         assert not target.exists()
     assert target.read_bytes() == b"half"
+    assert list(tmp_path.iterdir()) == [target]
 
 
 def test_text_is_written_as_utf8(tmp_path: Path) -> None:

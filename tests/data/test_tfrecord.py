@@ -59,7 +59,7 @@ def test_a_file_that_ends_within_a_record_is_truncated_wherever_it_ends(file: Pa
         if size in boundaries:
             continue
         with pytest.raises(InputError, match=r"record \d at byte \d+.*truncated"):
-            read_all(file)
+            index_records(file)
 
 
 def test_a_file_that_shrinks_after_it_was_indexed_is_truncated(file: Path) -> None:

@@ -57,6 +57,12 @@ def test_frames_of_a_batch_do_not_touch() -> None:
     assert torch.equal(together[1:, 2:], alone)
 
 
+def test_shrinking_samples_pixels_and_does_not_average_them() -> None:
+    """At a third of the size, an output pixel has the middle of one input pixel: no antialias."""
+    frames = torch.randint(0, 256, (1, 1, 24, 24, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(pixels_to_input(frames, 8), pixels_to_input(frames[:, :, 1::3, 1::3], 8))
+
+
 def test_a_picture_of_the_mean_colour_becomes_zero() -> None:
     frames = torch.tensor([124, 116, 104], dtype=torch.uint8).expand(1, 1, 8, 8, 3)
     assert pixels_to_input(frames, 8).abs().max() < 0.02
