@@ -81,7 +81,8 @@ def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) ->
             raise http.client.HTTPException("the part that is here does not fit the file; starting again") from None
         raise
     with answer:
-        if start and answer.status != 206:
+        resumes = answer.headers.get("Content-Range", "").startswith(f"bytes {start}-")
+        if start and not (answer.status == 206 and resumes):
             logger.info("%s: the server cannot resume; starting again", url)
             start = 0
         length = answer.headers.get("Content-Length")
