@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import difflib
 import io
 import itertools
 import logging
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-import simplejpeg
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, RldsFields
 from vjepa2_ac.data.sources.dataset_info import find_shards, index_shards
-from vjepa2_ac.data.sources.example_index import NotAnExampleError, locate_features
-from vjepa2_ac.data.sources.tfrecord import Kind, RecordSpan, decode_feature, read_record
+from vjepa2_ac.data.sources.jpeg import JpegReader
+from vjepa2_ac.data.sources.record import Record
+from vjepa2_ac.data.sources.tfrecord import RecordSpan, read_record
 from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo
 from vjepa2_ac.errors import InputError
 
@@ -96,7 +94,7 @@ class RldsSource:
 
     def _scan(self, file: storage.ByteReader, span: RecordSpan) -> EpisodeInfo:
         try:
-            record = _Record(file, span, span.data_offset)
+            record = Record(file, span, span.data_offset)
             record.require(self._needed)
             return _info_of(record, self._config.fields)
         except InputError:
@@ -105,7 +103,7 @@ class RldsSource:
 
     def _read(self, span: RecordSpan) -> Episode:
         data = read_record(span, check_crc=self._config.check_crc)
-        record = _Record(io.BytesIO(data), span, 0)
+        record = Record(io.BytesIO(data), span, 0)
         fields = self._config.fields
         info = _info_of(record, fields)
         where = f"{span} ({info.id})"
@@ -140,95 +138,7 @@ class RldsSource:
             seen[info.id] = number
 
 
-@dataclass(frozen=True)
-class JpegReader:
-    """Decodes the JPEGs of one camera, those that are asked for; equal to TensorFlow's decoder bit for bit."""
-
-    pictures: Sequence[bytes]
-    where: str
-
-    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order.
-
-        Raises:
-            InputError: A picture is not a JPEG, or differs in size from the first one.
-            ValueError: No steps, or a step outside the episode.
-        """
-        if not steps or min(steps) < 0 or max(steps) >= len(self.pictures):
-            raise ValueError(f"{self.where}: steps {list(steps)} of {len(self.pictures)}")
-        frames = [self._decode(step) for step in steps]
-        for step, frame in zip(steps, frames, strict=True):
-            if frame.shape != frames[0].shape:
-                raise InputError(
-                    where=f"{self.where}: step {step}",
-                    found=f"a picture of {frame.shape[0]}x{frame.shape[1]}",
-                    needed=f"{frames[0].shape[0]}x{frames[0].shape[1]} as at step {steps[0]}",
-                )
-        return np.stack(frames)
-
-    def _decode(self, step: int) -> UInt8[np.ndarray, "height width 3"]:
-        picture = self.pictures[step]
-        try:
-            return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB", fastdct=True))
-        except ValueError as error:
-            raise InputError(
-                where=f"{self.where}: step {step}",
-                found=f"{len(picture)} bytes that are not a JPEG, starting with {bytes(picture[:4])!r} ({error})",
-                needed="a JPEG picture",
-            ) from None
-
-
-class _Record:
-    """The features of one Example, read from a file or from memory when asked for."""
-
-    def __init__(self, file: storage.ByteReader, span: RecordSpan, start: int) -> None:
-        self._file, self._start, self._span = file, start, span
-
-    @cached_property
-    def located(self) -> dict[str, tuple[int, int]]:
-        """Where each feature lies: offset and length."""
-        try:
-            return locate_features(self._file, self._start, self._span.length)
-        except NotAnExampleError as error:
-            raise InputError(
-                where=str(self._span), found=f"not a tf.train.Example ({error})", needed="an RLDS data set"
-            ) from None
-
-    def require(self, names: Iterable[str]) -> None:
-        """Refuse a record that lacks a feature."""
-        for name in names:
-            if name not in self.located:
-                raise self._missing(name)
-
-    def values(self, name: str, *kinds: Kind) -> Sequence[Any]:
-        """Return a feature's values.
-
-        Raises:
-            InputError: There is no such feature, or it holds values of another kind.
-        """
-        if name not in self.located:
-            raise self._missing(name)
-        offset, length = self.located[name]
-        self._file.seek(offset)
-        where = f"{self._span}: {name}"
-        found, values = decode_feature(self._file.read(length), where=where)
-        if found is not None and found not in kinds:
-            raise InputError(where=where, found=f"a {found}", needed=f"a {' or '.join(kinds)}", fix="Check data.fields")
-        return values
-
-    def _missing(self, name: str) -> InputError:
-        names = sorted(self.located)
-        close = difflib.get_close_matches(name, names, n=1)
-        hint = f"Did you mean {close[0]}? " if close else ""
-        return InputError(
-            where=str(self._span),
-            found=f"no feature {name}; the record has {', '.join(names) or 'none'}",
-            needed="the features that data.fields names",
-            fix=f"{hint}Set data.fields",
-        )
-
-
-def _info_of(record: _Record, fields: RldsFields) -> EpisodeInfo:
+def _info_of(record: Record, fields: RldsFields) -> EpisodeInfo:
     parts = []
     for name in fields.identity:
         values = record.values(name, "bytes_list", "int64_list")
@@ -238,14 +148,14 @@ def _info_of(record: _Record, fields: RldsFields) -> EpisodeInfo:
     return EpisodeInfo(id=identity, num_steps=_num_steps(record, fields), success=success)
 
 
-def _num_steps(record: _Record, fields: RldsFields) -> int:
+def _num_steps(record: Record, fields: RldsFields) -> int:
     """Count the steps by their first flag; a data set without it by its states."""
     if _STEP_FLAG in record.located:
         return len(record.values(_STEP_FLAG, "int64_list"))
     return sum(len(record.values(name, "float_list")) for name in fields.state) // STATE_DIM
 
 
-def _states_of(record: _Record, fields: RldsFields, steps: int, where: str) -> Float[np.ndarray, "steps 7"]:
+def _states_of(record: Record, fields: RldsFields, steps: int, where: str) -> Float[np.ndarray, "steps 7"]:
     columns = []
     for name in fields.state:
         values = np.asarray(record.values(name, "float_list"), dtype=np.float64)

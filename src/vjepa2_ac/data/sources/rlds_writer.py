@@ -16,11 +16,15 @@ from typing import Any
 
 import numpy as np
 import simplejpeg
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from vjepa2_ac import storage
+from vjepa2_ac.data.sources.jpeg import encode_jpeg
+from vjepa2_ac.data.sources.rlds_schema import dataset_info, droid_features
 from vjepa2_ac.data.sources.tfrecord import Kind, encode_example, write_record
 from vjepa2_ac.errors import InputError
+
+__all__ = ["CAMERAS", "DroidCommands", "DroidEpisode", "DroidMeasurements", "encode_jpeg", "write_droid_rlds"]
 
 CAMERAS = ("exterior_image_1_left", "exterior_image_2_left", "wrist_image_left")
 
@@ -67,13 +71,6 @@ class DroidEpisode:
         return len(self.action)
 
 
-def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95) -> bytes:
-    """Return an RGB picture as JPEG; the default quality is TFDS's."""
-    return bytes(
-        simplejpeg.encode_jpeg(np.ascontiguousarray(frame), quality=quality, colorspace="RGB", colorsubsampling="420")
-    )
-
-
 def write_droid_rlds(
     folder: str | Path,
     episodes: Iterable[DroidEpisode],
@@ -101,8 +98,8 @@ def write_droid_rlds(
             raise InputError(
                 where=str(folder), found=f"{sum(counts)} episodes", needed=f"at least one for each of {shards} shards"
             )
-        _write_json(partial / "features.json", _droid_features(sizes), indent=4)
-        _write_json(partial / "dataset_info.json", _dataset_info(name, version, counts, num_bytes), indent=2)
+        _write_json(partial / "features.json", droid_features(sizes), indent=4)
+        _write_json(partial / "dataset_info.json", dataset_info(name, version, counts, num_bytes), indent=2)
     return folder
 
 
@@ -184,64 +181,6 @@ def _features_of(episode: DroidEpisode) -> dict[str, tuple[Kind, Sequence[Any] |
     for camera, pictures in episode.images.items():
         features[f"steps/observation/{camera}"] = ("bytes_list", pictures)
     return features
-
-
-_TFDS = "tensorflow_datasets.core.features"
-
-
-def _tensor(dtype: str, *shape: int) -> dict[str, Any]:
-    kind = "tensor_feature.Tensor" if shape else "scalar.Scalar"
-    dimensions = {"dimensions": [str(size) for size in shape]} if shape else {}
-    return {"pythonClassName": f"{_TFDS}.{kind}", "tensor": {"dtype": dtype, "encoding": "none", "shape": dimensions}}
-
-
-def _text() -> dict[str, Any]:
-    return {"pythonClassName": f"{_TFDS}.text_feature.Text", "text": {}}
-
-
-def _image(height: int, width: int) -> dict[str, Any]:
-    shape = {"dimensions": [str(height), str(width), "3"]}
-    image = {"dtype": "uint8", "encodingFormat": "jpeg", "shape": shape}
-    return {"pythonClassName": f"{_TFDS}.image_feature.Image", "image": image}
-
-
-def _group(features: Mapping[str, Any]) -> dict[str, Any]:
-    return {"pythonClassName": f"{_TFDS}.features_dict.FeaturesDict", "featuresDict": {"features": dict(features)}}
-
-
-def _droid_features(sizes: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    position = {
-        "cartesian_position": _tensor("float64", 6),
-        "gripper_position": _tensor("float64", 1),
-        "joint_position": _tensor("float64", 7),
-    }
-    velocity = {name.replace("position", "velocity"): value for name, value in position.items()}
-    steps = {
-        "action": _tensor("float64", 7),
-        "action_dict": _group(position | velocity),
-        "discount": _tensor("float32"),
-        "reward": _tensor("float32"),
-        **{f"is_{name}": _tensor("bool") for name in ("first", "last", "terminal")},
-        **{f"language_instruction{suffix}": _text() for suffix in ("", "_2", "_3")},
-        "observation": _group(position | {camera: _image(*size) for camera, size in sizes.items()}),
-    }
-    sequence = {
-        "pythonClassName": f"{_TFDS}.dataset_feature.Dataset",
-        "sequence": {"feature": _group(steps), "length": "-1"},
-    }
-    return _group(
-        {"episode_metadata": _group({"file_path": _text(), "recording_folderpath": _text()}), "steps": sequence}
-    )
-
-
-def _dataset_info(name: str, version: str, counts: Sequence[int], num_bytes: int) -> dict[str, Any]:
-    split = {
-        "filepathTemplate": "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}",
-        "name": "train",
-        "numBytes": str(num_bytes),
-        "shardLengths": [str(count) for count in counts],
-    }
-    return {"fileFormat": "tfrecord", "moduleName": "__main__", "name": name, "splits": [split], "version": version}
 
 
 def _write_json(path: Path, value: Mapping[str, Any], *, indent: int) -> None:
