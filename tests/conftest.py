@@ -5,7 +5,6 @@ from pathlib import Path
 
 from jaxtyping import install_import_hook
 
-
 _hook = install_import_hook("vjepa2_ac", "beartype.beartype")  # shapes and types of public functions, while testing
 
 import pytest  # noqa: E402 - the hook comes first

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from paths import ROOT
 
+from paths import ROOT
 from vjepa2_ac.config import (
     Config,
     _all_keys,
@@ -113,7 +113,7 @@ def test_what_is_not_a_config_is_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="nowhere.yaml"):
+    with pytest.raises(InputError, match=r"nowhere\.yaml"):
         load_config(tmp_path / "nowhere.yaml")
 
 

@@ -72,7 +72,7 @@ class DataConfig(Section):
     validation_share: Share = 0.05
     """Share of the episodes held out for validation, chosen by a hash of the episode's identity."""
     test_share: Share = 0.05
-    """Share of the episodes held out for `evaluate`, likewise; never seen in training, nor when choosing a checkpoint."""
+    """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
     short_episodes: Literal["skip", "error"] = "skip"
     """What to do with episodes shorter than a clip: leave them out and say how many, or stop."""
     check_crc: bool = True
@@ -153,7 +153,7 @@ class ModelConfig(Section):
     """The model to adapt: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny
     model of the demo, which comes with the package)."""
     random: ModelSizes | None = None
-    """Instead of `base`: a freshly initialised model of these sizes (with `adapter.kind: none`: training from scratch)."""
+    """Instead of `base`: a fresh model of these sizes; with `adapter.kind: none` that is training from scratch."""
     sizes: ModelSizes = ModelSizes()
     """What an official `.pt` cannot say of itself: image size and heads. Everything else is read from its tensors."""
     dtype: Literal["float32", "bfloat16"] = "bfloat16"
@@ -372,7 +372,7 @@ class _StrictLoader(yaml.SafeLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[Any] = set()
         for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)  # type: ignore[no-untyped-call]
+            key = self.construct_object(key_node, deep=True)
             if key in seen:
                 raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
             seen.add(key)

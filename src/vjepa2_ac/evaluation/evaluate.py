@@ -28,7 +28,6 @@ from vjepa2_ac.latents import encode_batch
 from vjepa2_ac.model.lora import base_only
 from vjepa2_ac.model.world_model import WorldModel
 
-
 Variant = Callable[[WorldModel], contextlib.AbstractContextManager[object]]
 
 
@@ -89,8 +88,9 @@ def evaluate(
         if motion.max().item() > most_motion:
             most_motion = motion.max().item()
             example = _example(world_model, batch, latents, int(motion.argmax()), variants)
+    if example is None:
+        raise ValueError("no clips to evaluate on")
     models = {name: meter.result() for name, meter in meters.items()}
-    assert example is not None  # result() has raised if there was no clip
     return Evaluation(models=models, seconds_per_step=seconds_per_step, example=example)
 
 
@@ -137,30 +137,29 @@ def improvement(evaluation: Evaluation, horizon: int) -> Ratio | None:
 
 
 def verdict(evaluation: Evaluation) -> str:
-    """Say in words whether the adapter helped."""
-    name = "adapter" if "adapter" in evaluation.models else "model"
-    by_horizon = ratios_by_horizon(evaluation.models[name])
-    last = len(by_horizon)
-    ahead = f"{last * evaluation.seconds_per_step:.1f} s ahead"
-    against_nothing = (
-        f"Its error {ahead} is {by_horizon[-1].value:.2f} of doing nothing"
-        f" (95 % interval {by_horizon[-1].low:.2f} to {by_horizon[-1].high:.2f})"
-        + (
-            ": better."
-            if by_horizon[-1].high < 1
-            else ": NOT better."
-            if by_horizon[-1].low > 1
-            else ": no clear difference."
-        )
-    )
-    gain = improvement(evaluation, last)
+    """Say in words whether the adapter helped, at the farthest horizon."""
     where = f"on {evaluation.clips} clips of {evaluation.episodes} held-out episodes"
+    models = evaluation.models
+    error = ratios_by_horizon(models["adapter" if "adapter" in models else "model"])
+    horizon = len(error)
+    ahead = f"{horizon * evaluation.seconds_per_step:.1f} s ahead"
+    absolute = f"Its error {ahead} is {error[-1].value:.2f} of doing nothing ({_interval(error[-1], '.2f')})"
+    absolute += (
+        ": better." if error[-1].high < 1 else ": NOT better." if error[-1].low > 1 else ": no clear difference."
+    )
+    gain = improvement(evaluation, horizon)
     if gain is None:
-        return f"The model {where}: {against_nothing}"
-    words = f"{abs(gain.value):.0%} {'better' if gain.value > 0 else 'WORSE'} than the base (95 % interval {gain.low:.0%} to {gain.high:.0%})"
+        return f"The model was measured {where}. {absolute}"
+    compared = (
+        f"{abs(gain.value):.0%} {'better' if gain.value > 0 else 'WORSE'} than the base ({_interval(gain, '.0%')})"
+    )
     if gain.low <= 0 <= gain.high:
-        return f"The adapter did not clearly help {where}: it predicts {ahead} {words}. {against_nothing}"
-    return f"The adapter predicts {ahead} {words}, {where}. {against_nothing}"
+        return f"The adapter did not clearly help: it predicts {ahead} {compared}, {where}. {absolute}"
+    return f"The adapter predicts {ahead} {compared}, {where}. {absolute}"
+
+
+def _interval(value: Ratio, form: str) -> str:
+    return f"95 % interval {value.low:{form}} to {value.high:{form}}"
 
 
 def evaluation_as_dict(evaluation: Evaluation) -> dict[str, Any]:

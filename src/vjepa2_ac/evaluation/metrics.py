@@ -112,7 +112,8 @@ def _batch_errors(model: Predictor, batch: LatentBatch, other_actions: Tensor) -
     truth = latents[:, 1:]
 
     def one_step_error(tried: Tensor) -> np.ndarray:
-        return _error(model.predict(latents[:, :-1], tried, states, extrinsics), truth).mean(axis=1)
+        error = _error(model.predict(latents[:, :-1], tried, states, extrinsics), truth)
+        return np.asarray(error.mean(axis=1))
 
     return {
         "rollout": _error(model.rollout(latents[:, :1], actions, states, extrinsics), truth),

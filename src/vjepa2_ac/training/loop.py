@@ -18,8 +18,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import torch
 from accelerate import Accelerator
-from jaxtyping import Float
-from torch import Tensor
+from accelerate.state import AcceleratorState
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.loader import open_source, training_loader, validation_batches
@@ -144,6 +143,7 @@ def make_accelerator(config: Config) -> Accelerator:
             fix="Set training.device=cpu, or install a CUDA build of PyTorch and a driver",
         )
     precision = "bf16" if config.training.precision == "bf16" else "no"
+    AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
     return Accelerator(mixed_precision=precision, cpu=config.training.device == "cpu")
 
 
@@ -267,7 +267,7 @@ def _refuse_not_finite(step: int, value: float, seen: list[Batch]) -> None:
     raise InputError(
         where=f"optimizer step {step}",
         found=f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}",
-        fix="The weights have not moved. Look at these clips, lower training.learning_rate, or set training.precision=fp32",
+        fix="The weights have not moved. Look at these clips, or lower training.learning_rate",
     )
 
 

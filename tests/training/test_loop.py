@@ -1,0 +1,243 @@
+"""Laws of the loop: exact, resumable, and nothing but the adapter moves."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from vjepa2_ac.config import Config, config_as_yaml
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.training.checkpoint import newest_checkpoint
+from vjepa2_ac.training.journal import read_journal
+from vjepa2_ac.training.loop import assemble, step_seed, train, training_step
+from vjepa2_ac.training.runs import load_run
+
+TIMINGS = {"samples_per_second"}
+
+
+def trained_weights(run: Path) -> dict[str, torch.Tensor]:
+    return load_file(newest_checkpoint(run / "checkpoints") / "adapter" / "adapter_model.safetensors")
+
+
+def optimizer_state(run: Path) -> dict:
+    return torch.load(newest_checkpoint(run / "checkpoints") / "optimizer.pt", weights_only=True)["state"]
+
+
+def figures(run: Path) -> list[dict]:
+    return [{k: v for k, v in row.items() if k not in TIMINGS} for row in read_journal(run / "metrics.jsonl")]
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    first, second = trained_weights(one), trained_weights(other)
+    assert first.keys() == second.keys()
+    assert all(torch.equal(first[key], second[key]) for key in first)
+    for key, moments in optimizer_state(one).items():
+        for name, value in moments.items():
+            assert torch.equal(value, optimizer_state(other)[key][name]), (key, name)
+    assert figures(one) == figures(other)
+
+
+class KilledError(Exception):
+    """Stands for the end of the process."""
+
+
+def dying_reporter(reporter, last_step: int):
+    stepped = reporter.stepped
+
+    def die(step: int, seen: dict) -> None:
+        stepped(step, seen)
+        if step == last_step:
+            raise KilledError
+
+    reporter.stepped = die
+    return reporter
+
+
+@pytest.mark.parametrize("died_at", [1, 3, 4])
+def test_a_run_that_died_and_went_on_equals_the_one_that_did_not(make_config, reporter, tmp_path, died_at) -> None:
+    train(make_config(run_dir=str(tmp_path / "whole")), reporter)
+    config = make_config(run_dir=str(tmp_path / "broken"))
+    with pytest.raises(KilledError):
+        train(config, dying_reporter(type(reporter)(), died_at))
+    train(config, reporter)
+    assert_same_run(tmp_path / "whole", tmp_path / "broken")
+
+
+def test_the_number_of_loader_workers_changes_nothing(make_config, reporter, tmp_path) -> None:
+    train(make_config(run_dir=str(tmp_path / "none"), training__steps=2), reporter)
+    train(make_config(run_dir=str(tmp_path / "two"), training__steps=2, data__workers=2), reporter)
+    assert_same_run(tmp_path / "none", tmp_path / "two")
+
+
+def test_another_seed_is_another_run(make_config, reporter, tmp_path) -> None:
+    train(make_config(run_dir=str(tmp_path / "a"), training__steps=2), reporter)
+    train(make_config(run_dir=str(tmp_path / "b"), training__steps=2, seed=1), reporter)
+    assert figures(tmp_path / "a") != figures(tmp_path / "b")
+
+
+def test_a_process_killed_with_sigkill_goes_on_from_its_checkpoint(make_config, reporter, tmp_path) -> None:
+    config = make_config(run_dir=str(tmp_path / "killed"), training__steps=20, validation__every=20)
+    path = tmp_path / "config.yaml"
+    path.write_text(config_as_yaml(config))
+    code = "import sys, torch; torch.set_num_threads(1); from vjepa2_ac.cli import main; sys.exit(main(sys.argv[1:]))"
+    process = subprocess.Popen([sys.executable, "-c", code, "train", str(path)], stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list((tmp_path / "killed").glob("checkpoints/step-*")):
+        assert process.poll() is None, "it ended before it could be killed"
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    train(config, reporter)
+    assert reporter.steps[0] > 1, "it began anew"
+    assert reporter.steps[-1] == 20
+    train(make_config(run_dir=str(tmp_path / "whole"), training__steps=20, validation__every=20), reporter)
+    assert_same_run(tmp_path / "whole", tmp_path / "killed")
+
+
+def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporter) -> None:
+    def gradients(batch_size: int, accumulation: int) -> dict[str, torch.Tensor]:
+        config = make_config(
+            training__batch_size=batch_size, training__accumulation=accumulation, adapter__dropout=0.0,
+            training__max_grad_norm=None,
+        )  # fmt: skip
+        run = assemble(config, reporter)
+        run.optimizer.step = lambda: None
+        run.optimizer.zero_grad = lambda **_: None
+        training_step(run, batches_from(run), 1)
+        return {name: p.grad for name, p in run.world_model.named_parameters() if p.grad is not None}
+
+    big, small = gradients(4, 1), gradients(1, 4)
+    assert big
+    for name, gradient in big.items():
+        torch.testing.assert_close(small[name], gradient, rtol=1e-4, atol=1e-7)
+
+
+def batches_from(run):
+    from vjepa2_ac.training.loop import _batches_from
+
+    return _batches_from(run, 0)
+
+
+def test_checkpointing_of_activations_changes_no_gradient(make_config, reporter) -> None:
+    def one_step(checkpointing: bool) -> list[float]:
+        run = assemble(make_config(training__gradient_checkpointing=checkpointing), reporter)
+        figures_of_step = training_step(run, batches_from(run), 1)
+        return [figures_of_step["loss"], figures_of_step["grad_norm"]]
+
+    assert one_step(checkpointing=False) == one_step(checkpointing=True)
+
+
+def test_only_the_adapter_moves(make_config, reporter) -> None:
+    config = make_config()
+    before = load_base(config.model, seed=config.seed)
+    train(config, reporter)
+    after = load_run(Path(config.run_dir)).world_model
+    assert after.encoder_fingerprint() == before.encoder_fingerprint()
+    assert after.predictor_fingerprint() == before.predictor_fingerprint()
+    assert any(value.abs().max() > 0 for key, value in trained_weights(Path(config.run_dir)).items() if "lora_B" in key)
+
+
+def test_the_base_is_not_written(make_config, reporter) -> None:
+    config = make_config()
+    train(config, reporter)
+    checkpoint = newest_checkpoint(Path(config.run_dir) / "checkpoints")
+    names = {path.name for path in checkpoint.rglob("*") if path.is_file()}
+    assert "adapter_model.safetensors" in names
+    assert all("lora_" in key for key in trained_weights(Path(config.run_dir)))
+
+
+def test_training_lowers_the_loss(make_config, reporter) -> None:
+    config = make_config(
+        training__steps=60, training__accumulation=1, training__learning_rate=5e-3, adapter__rank=16,
+        adapter__targets=["q", "k", "v", "o", "fc1", "fc2", "predictor_embed", "predictor_proj"],
+        validation__every=60, checkpoint__every=60,
+    )  # fmt: skip
+    train(config, reporter)
+    validations = [row for row in figures(Path(config.run_dir)) if row["kind"] == "validation"]
+    assert [row["step"] for row in validations] == [0, 60]
+    assert validations[-1]["error_over_persistence"] < 0.8 * validations[0]["error_over_persistence"]
+
+
+def test_a_base_no_better_than_persistence_is_refused(make_config, reporter) -> None:
+    config = make_config(training__allow_weak_base=False)
+    with pytest.raises(InputError, match="copying the last frame"):
+        train(config, reporter)
+    assert reporter.steps == []
+
+
+def test_check_does_everything_but_writes_nothing(make_config, reporter) -> None:
+    config = make_config()
+    train(config, reporter, check_only=True)
+    assert "Everything is in place" in reporter.notes[-1]
+    assert not Path(config.run_dir).exists()
+    with pytest.raises(InputError, match="copying the last frame"):
+        train(make_config(training__allow_weak_base=False), reporter, check_only=True)
+
+
+def test_a_loss_that_is_not_finite_stops_before_the_weights_move(make_config, reporter) -> None:
+    run = assemble(make_config(), reporter)
+    poisoned = next(p for p in run.world_model.parameters() if p.requires_grad)
+    with torch.no_grad():
+        poisoned[0, 0] = float("nan")
+    before = [p.detach().clone() for p in run.world_model.parameters()]
+    with pytest.raises(InputError, match="not finite") as caught:
+        training_step(run, batches_from(run), 1)
+    assert "episode" in str(caught.value)
+    for old, new in zip(before, run.world_model.parameters(), strict=True):
+        assert torch.equal(old.nan_to_num(), new.detach().nan_to_num())
+
+
+def test_a_folder_of_another_config_is_refused_and_names_the_key(make_config, reporter) -> None:
+    train(make_config(), reporter)
+    with pytest.raises(InputError, match=r"training\.learning_rate"):
+        train(make_config(training__learning_rate=2e-3), reporter)
+
+
+def test_workers_and_logging_may_change_within_a_run(make_config, reporter) -> None:
+    train(make_config(), reporter)
+    train(make_config(data__workers=1, checkpoint__keep=2, training__log_every=5), reporter)
+    assert "Going on from" in reporter.notes[-1]
+
+
+def test_a_folder_with_other_things_in_it_is_left_alone(make_config, reporter, tmp_path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "thesis.tex").write_text("years of work")
+    with pytest.raises(InputError, match="other things"):
+        train(make_config(), reporter)
+    assert [path.name for path in (tmp_path / "run").iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_cuda_that_is_asked_for_and_absent_is_an_error(make_config, reporter) -> None:
+    with pytest.raises(InputError, match="no CUDA device"):
+        train(make_config(training__device="cuda"), reporter)
+
+
+def test_a_run_notes_its_config_and_versions(make_config, reporter) -> None:
+    config = make_config()
+    folder = train(config, reporter)
+    assert (folder / "config.yaml").read_text() == config_as_yaml(config)
+    start = json.loads((folder / "environment.json").read_text())[0]
+    assert start["seed"] == config.seed
+    assert start["packages"]["torch"] == torch.__version__
+
+
+def test_random_numbers_differ_between_steps_ranks_and_seeds() -> None:
+    seeds = {step_seed(seed, step, rank) for seed in range(3) for step in range(50) for rank in range(4)}
+    assert len(seeds) == 600
+    assert all(0 <= seed < 2**63 for seed in seeds)
+
+
+def test_bf16_runs_and_keeps_what_is_trained_in_float32(make_config: object, reporter) -> None:
+    config: Config = make_config(training__precision="bf16", model__dtype="bfloat16", training__steps=2)
+    train(config, reporter)
+    assert all(value.dtype == torch.float32 for value in trained_weights(Path(config.run_dir)).values())
