@@ -88,7 +88,7 @@ def measure(config: DataConfig, clips: int, tfds_python: str | None) -> None:
     order = ClipOrder(windows_of(infos, config, "train"), seed=0)
     taken = time.perf_counter() - start
     print(f"{config.path}: {len(infos)} episodes, {len(order.windows)} clips, indexed in {taken:.3f} s")
-    print(f"{config.frames} frames at stride {config.stride}, {clips} random clips, medians:\n")
+    print(f"{config.frames} frames at stride {config.stride}, {clips} random clips, medians (TFDS: mean):\n")
 
     def ours(position: int) -> None:
         forget_episodes(source)
