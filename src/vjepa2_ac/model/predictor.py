@@ -129,6 +129,16 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         for module in self.modules():
             initialise(module, generator)
 
+    def start_at_persistence(self, generator: Generator) -> None:
+        """Make a fresh predictor begin close to copying: read latents through a rotation, write through its inverse.
+
+        The network has no path from its input to its output but these two layers; a tiny one that starts at random
+        spends most of its training on learning to copy. Exact where the predictor is as wide as a latent.
+        """
+        nn.init.orthogonal_(self.predictor_embed.weight, generator=generator)
+        with torch.no_grad():
+            self.predictor_proj.weight.copy_(self.predictor_embed.weight.T)
+
     def _assemble(
         self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None
     ) -> tuple[Tensor, TokenLayout]:
