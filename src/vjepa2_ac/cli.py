@@ -181,6 +181,7 @@ def _add_simulate(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--episodes", type=int, default=40)
     parser.add_argument("--steps", type=int, default=41, help="control steps of an episode, 15 per second")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=1, help="processes; the data are the same whatever their number")
 
 
 def _simulate(options: argparse.Namespace) -> None:
@@ -195,6 +196,7 @@ def _simulate(options: argparse.Namespace) -> None:
             episodes=options.episodes,
             steps=options.steps,
             seed=options.seed,
+            workers=options.workers,
             progress=lambda done, _: bar.advance_to(done),
         )
     finally:

@@ -154,6 +154,8 @@ class ModelConfig(Section):
     model of the demo, which comes with the package)."""
     random: ModelSizes | None = None
     """Instead of `base`: a fresh model of these sizes; with `adapter.kind: none` that is training from scratch."""
+    random_start: Literal["persistence", "released"] = "persistence"
+    """How a `random` model begins: close to copying the last frame, or as the released recipe drew its weights."""
     sizes: ModelSizes = ModelSizes()
     """What an official `.pt` cannot say of itself: image size and heads. Everything else is read from its tensors."""
     dtype: Literal["float32", "bfloat16"] = "bfloat16"

@@ -23,7 +23,8 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     """
     dtype = torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
     if config.random is not None:
-        return WorldModel.random(config.random, seed=seed, dtype=dtype)
+        at_persistence = config.random_start == "persistence"
+        return WorldModel.random(config.random, seed, dtype, at_persistence=at_persistence)
     if config.base is None:
         raise ValueError("a ModelConfig has a base or random sizes")
     path = _builtin(config.base) if config.base.startswith(_BUILTIN) else Path(config.base)

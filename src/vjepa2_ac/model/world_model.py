@@ -49,12 +49,19 @@ class WorldModel(nn.Module):
         self.adaptation: Adaptation | None = None
 
     @classmethod
-    def random(cls, sizes: ModelSizes, seed: int, dtype: torch.dtype = torch.float32) -> WorldModel:
-        """Return a freshly initialised model: the same weights for the same sizes and seed."""
+    def random(
+        cls, sizes: ModelSizes, seed: int, dtype: torch.dtype = torch.float32, *, at_persistence: bool = False
+    ) -> WorldModel:
+        """Return a freshly initialised model: the same weights for the same sizes and seed.
+
+        Weights are drawn as in the released recipe; `at_persistence` lets the predictor begin close to copying.
+        """
         model = cls.empty(sizes).to_empty(device="cpu")
         generator = torch.Generator().manual_seed(seed)
         model.encoder.initialise(generator)
         model.base_predictor.initialise(generator)
+        if at_persistence:
+            model.base_predictor.start_at_persistence(generator)
         return model.to(dtype)
 
     @classmethod
