@@ -1,14 +1,30 @@
-# make demo · make test · make lint · make bench: each creates the environment it needs and does its job.
+# make demo · make test · make lint · make bench · make base: each creates the environment it needs and does its job.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: demo test lint format bench clean
+.PHONY: demo demo-seeds base test lint format bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet -c constraints.txt -e ".[sim,dev]"
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[sim,dev]"
 	touch $(INSTALLED)
+
+demo: $(INSTALLED)  ## a simulated arm, a tiny world model, a LoRA adapter, and whether it helped
+	test -e demo/data || $(BIN)/vjepa2-ac simulate record demo/data --domain B --episodes 60 --seed 5
+	$(BIN)/vjepa2-ac train configs/demo.yaml
+	$(BIN)/vjepa2-ac evaluate demo/run
+
+demo-seeds: demo  ## the spread of the demo's result over three seeds
+	for seed in 1 2; do $(BIN)/vjepa2-ac train configs/demo.yaml seed=$$seed run_dir=demo/run-$$seed || exit 1; done
+	$(BIN)/vjepa2-ac evaluate demo/run demo/run-1 demo/run-2
+
+base:  $(INSTALLED)  ## make the demo's base model again (about an hour); replaces the one in the package
+	test -e base/data || $(BIN)/vjepa2-ac simulate record base/data --domain random --episodes 800 --seed 3 --workers 2
+	$(BIN)/vjepa2-ac train configs/demo_base.yaml
+	rm -rf base/model && $(BIN)/vjepa2-ac export base/run base/model
+	rm -rf src/vjepa2_ac/assets/sim-tiny && cp -r base/model src/vjepa2_ac/assets/sim-tiny
 
 test: $(INSTALLED)  ## the whole test suite
 	$(BIN)/pytest -q
@@ -21,6 +37,10 @@ lint: $(INSTALLED)  ## style and types
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+bench: $(INSTALLED)  ## figures of this machine; each prints a ratio against a named baseline of the same run
+	$(BIN)/python benchmarks/loader.py
+	$(BIN)/python benchmarks/train_step.py
 
 clean:
 	rm -rf .venv demo runs

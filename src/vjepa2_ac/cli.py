@@ -101,21 +101,26 @@ def _add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser = _command(
         commands, "evaluate", _evaluate, "Measure a run on held-out episodes, beside its base and persistence."
     )
-    parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a run")
+    parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="folder of a run; several: their spread too")
     parser.add_argument("--split", choices=["test", "validation"], default="test", help="which held-out episodes")
     parser.add_argument("--clips", type=int, default=256, help="at most this many clips, spread over the episodes")
 
 
 def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.console import console, evaluation_table
-    from vjepa2_ac.evaluation.evaluate import verdict
+    from vjepa2_ac.evaluation.evaluate import spread, verdict
     from vjepa2_ac.training.runs import evaluate_run
 
-    evaluation, written = evaluate_run(options.run, split=options.split, clips=options.clips)
-    console.print(evaluation_table(evaluation.models, evaluation.seconds_per_step))
-    console.print(verdict(evaluation))
-    for path in written:
-        console.print(f"  {path}")
+    evaluations = []
+    for run in options.runs:
+        evaluation, written = evaluate_run(run, split=options.split, clips=options.clips)
+        evaluations.append(evaluation)
+        console.print(evaluation_table(evaluation.models, evaluation.seconds_per_step))
+        console.print(verdict(evaluation))
+        for path in written:
+            console.print(f"  {path}")
+    if len(evaluations) > 1:
+        console.print(spread(evaluations))
 
 
 def _add_export(commands: _Commands[argparse.ArgumentParser]) -> None:

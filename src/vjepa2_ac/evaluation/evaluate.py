@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -160,6 +160,22 @@ def verdict(evaluation: Evaluation) -> str:
 
 def _interval(value: Ratio, form: str) -> str:
     return f"95 % interval {value.low:{form}} to {value.high:{form}}"
+
+
+def spread(evaluations: Sequence[Evaluation]) -> str:
+    """Say how much runs that differ in their seed differ in their result, at the farthest horizon."""
+    errors, gains = [], []
+    for evaluation in evaluations:
+        name = "adapter" if "adapter" in evaluation.models else "model"
+        errors.append(ratios_by_horizon(evaluation.models[name])[-1].value)
+        gain = improvement(evaluation, evaluation.models[name].rollout.shape[1])
+        gains += [] if gain is None else [gain.value]
+    words = f"{len(evaluations)} runs: error over persistence {_mean_and_range(errors, '.3f')}"
+    return words + (f"; better than the base by {_mean_and_range(gains, '.1%')}" if gains else "")
+
+
+def _mean_and_range(values: list[float], form: str) -> str:
+    return f"{np.mean(values):{form}} ({min(values):{form}} to {max(values):{form}})"
 
 
 def evaluation_as_dict(evaluation: Evaluation) -> dict[str, Any]:

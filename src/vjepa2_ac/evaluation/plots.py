@@ -24,7 +24,8 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
         figure = Figure(figsize=(max(9.0, 1.25 * columns + 2), 3.6 + 1.2 * rows), layout="constrained")
         FigureCanvasAgg(figure)
         figure.suptitle(_wrapped(verdict(evaluation)), fontsize=10, x=0.01, ha="left")
-        top, bottom = figure.subfigures(2, 1, height_ratios=[3.0, 1.15 * rows])
+        halves: Any = figure.subfigures(2, 1, height_ratios=[3.0, 1.15 * rows])
+        top, bottom = halves
         left, right = top.subplots(1, 2, width_ratios=[3, 2])
         _curves(left, evaluation)
         _use_of_actions(right, evaluation)
