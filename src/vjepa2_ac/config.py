@@ -141,8 +141,10 @@ class ModelSizes(Section):
         for name, part in (("encoder", self.encoder), ("predictor", self.predictor)):
             if part.width % part.heads:
                 raise ValueError(f"{name}.width {part.width} is not a multiple of {name}.heads {part.heads}")
-            if part.width // part.heads < 6:
-                raise ValueError(f"{name}: a head of {part.width // part.heads} is too narrow for 3D RoPE (needs 6)")
+            if part.width // part.heads < 6 or (part.width // part.heads) % 2:
+                raise ValueError(
+                    f"{name}: a head of {part.width // part.heads} does not fit 3D RoPE (even, at least 6)"
+                )
         return self
 
 
@@ -297,6 +299,8 @@ class Config(Section):
             )
         if self.model.random is not None and self.adapter.kind == "lora":
             raise ValueError("model.random with adapter.kind lora would adapt noise; set adapter.kind: none")
+        if self.training.precision == "fp32" and self.model.dtype != "float32":
+            raise ValueError("training.precision fp32 needs model.dtype float32: bfloat16 weights compute in bfloat16")
         sizes = self.model.random or self.model.sizes
         if sizes.predictor.use_extrinsics:
             raise ValueError("predictor.use_extrinsics needs camera poses, which a data.source of rlds does not have")

@@ -15,10 +15,12 @@ from safetensors.torch import load_file
 from vjepa2_ac.config import Config, config_as_yaml
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.load import load_base
+from vjepa2_ac.training.assembly import assemble, batches_from
 from vjepa2_ac.training.checkpoint import newest_checkpoint
 from vjepa2_ac.training.journal import read_journal
-from vjepa2_ac.training.loop import assemble, step_seed, train, training_step
+from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.runs import load_run
+from vjepa2_ac.training.step import step_seed, training_step
 
 TIMINGS = {"samples_per_second"}
 
@@ -109,10 +111,10 @@ def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporte
             training__batch_size=batch_size, training__accumulation=accumulation, adapter__dropout=0.0,
             training__max_grad_norm=None,
         )  # fmt: skip
-        run = assemble(config, reporter)
+        run = assemble(config, reporter.note)
         run.optimizer.step = lambda: None
         run.optimizer.zero_grad = lambda **_: None
-        training_step(run, batches_from(run), 1)
+        training_step(run, batches_from(run, 0), 1)
         return {name: p.grad for name, p in run.world_model.named_parameters() if p.grad is not None}
 
     big, small = gradients(4, 1), gradients(1, 4)
@@ -121,16 +123,10 @@ def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporte
         torch.testing.assert_close(small[name], gradient, rtol=1e-4, atol=1e-7)
 
 
-def batches_from(run):
-    from vjepa2_ac.training.loop import _batches_from
-
-    return _batches_from(run, 0)
-
-
 def test_checkpointing_of_activations_changes_no_gradient(make_config, reporter) -> None:
     def one_step(checkpointing: bool) -> list[float]:
-        run = assemble(make_config(training__gradient_checkpointing=checkpointing), reporter)
-        figures_of_step = training_step(run, batches_from(run), 1)
+        run = assemble(make_config(training__gradient_checkpointing=checkpointing), reporter.note)
+        figures_of_step = training_step(run, batches_from(run, 0), 1)
         return [figures_of_step["loss"], figures_of_step["grad_norm"]]
 
     assert one_step(checkpointing=False) == one_step(checkpointing=True)
@@ -172,6 +168,7 @@ def test_a_base_no_better_than_persistence_is_refused(make_config, reporter) -> 
     with pytest.raises(InputError, match="copying the last frame"):
         train(config, reporter)
     assert reporter.steps == []
+    assert not Path(config.run_dir).exists(), "the config can be mended and tried again"
 
 
 def test_check_does_everything_but_writes_nothing(make_config, reporter) -> None:
@@ -184,13 +181,13 @@ def test_check_does_everything_but_writes_nothing(make_config, reporter) -> None
 
 
 def test_a_loss_that_is_not_finite_stops_before_the_weights_move(make_config, reporter) -> None:
-    run = assemble(make_config(), reporter)
+    run = assemble(make_config(), reporter.note)
     poisoned = next(p for p in run.world_model.parameters() if p.requires_grad)
     with torch.no_grad():
         poisoned[0, 0] = float("nan")
     before = [p.detach().clone() for p in run.world_model.parameters()]
     with pytest.raises(InputError, match="not finite") as caught:
-        training_step(run, batches_from(run), 1)
+        training_step(run, batches_from(run, 0), 1)
     assert "episode" in str(caught.value)
     for old, new in zip(before, run.world_model.parameters(), strict=True):
         assert torch.equal(old.nan_to_num(), new.detach().nan_to_num())

@@ -16,8 +16,8 @@ from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import load_trained, merge_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.training.assembly import ADAPTER, make_accelerator
 from vjepa2_ac.training.checkpoint import newest_checkpoint
-from vjepa2_ac.training.loop import ADAPTER, make_accelerator
 from vjepa2_ac.training.run_folder import CHECKPOINTS, read_run_config
 
 

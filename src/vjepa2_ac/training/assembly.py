@@ -1,0 +1,127 @@
+"""What must stand before the first step? Device, data, model, adapter, optimizer and the newest checkpoint, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from accelerate import Accelerator
+from accelerate.state import AcceleratorState
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.loader import open_source, training_loader, validation_batches
+from vjepa2_ac.episode import Batch, EpisodeSource, LatentBatch
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.latents import encode_batch
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.lora import add_adapter, load_trained, save_trained, trainable_report
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.checkpoint import RunState, newest_checkpoint, read_state, write_checkpoint
+from vjepa2_ac.training.loss import Objective
+from vjepa2_ac.training.optim import make_optimizer
+from vjepa2_ac.training.run_folder import CHECKPOINTS
+
+ADAPTER = "adapter"
+OPTIMIZER = "optimizer.pt"
+
+
+@dataclass
+class Run:
+    """Everything the loop needs, assembled and checked."""
+
+    config: Config
+    accelerator: Accelerator
+    world_model: WorldModel
+    objective: torch.nn.Module
+    optimizer: torch.optim.Optimizer
+    source: EpisodeSource
+    state: RunState
+
+
+def assemble(config: Config, note: Callable[[str], None]) -> Run:
+    """Open the data, load the model, attach the adapter, and take up the newest checkpoint. Cheap failures first.
+
+    Raises:
+        InputError: Something cannot be used.
+    """
+    accelerator = make_accelerator(config)
+    source = open_source(config.data)
+    _read_one_clip_of_each_split(source, config)
+    world_model = load_base(config.model, seed=config.seed)
+    add_adapter(world_model, config.adapter, seed=config.seed)
+    note(str(trainable_report(world_model)))
+    world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
+    world_model.to(accelerator.device)
+    optimizer = make_optimizer(world_model, config.training)
+    state = _take_up(config, world_model, optimizer, note)
+    objective, optimizer = accelerator.prepare(Objective(world_model, config.training.rollout_steps), optimizer)
+    return Run(config, accelerator, world_model, objective, optimizer, source, state)
+
+
+def make_accelerator(config: Config) -> Accelerator:
+    """Return the device and precision of a run.
+
+    Raises:
+        InputError: CUDA was asked for and there is none.
+    """
+    if config.training.device == "cuda" and not torch.cuda.is_available():
+        raise InputError(
+            where="training.device",
+            found="cuda, but this PyTorch sees no CUDA device",
+            fix="Set training.device=cpu, or install a CUDA build of PyTorch and a driver",
+        )
+    precision = "bf16" if config.training.precision == "bf16" else "no"
+    AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
+    return Accelerator(mixed_precision=precision, cpu=config.training.device == "cpu")
+
+
+def batches_from(run: Run, step: int) -> Iterator[Batch]:
+    """Yield the micro-batches of this process that come after `step` optimizer steps."""
+    training = run.config.training
+    micro_batches_done = step * training.accumulation
+    return training_loader(
+        run.source,
+        run.config.data,
+        seed=run.config.seed,
+        batch_size=training.batch_size,
+        start_position=micro_batches_done * run.accelerator.num_processes * training.batch_size,
+        rank=run.accelerator.process_index,
+        world_size=run.accelerator.num_processes,
+    )
+
+
+def encode(run: Run, batch: Batch) -> LatentBatch:
+    """Return the latents of a batch on the run's device, in its precision."""
+    with run.accelerator.autocast():
+        return encode_batch(run.world_model, batch, device=run.accelerator.device, chunk=run.config.model.encode_chunk)
+
+
+def save_checkpoint(run: Run, folder: Path) -> Path:
+    """Write where the run stands into its folder; see `training.checkpoint`."""
+
+    def write(inner: Path) -> None:
+        save_trained(run.world_model, inner / ADAPTER)
+        torch.save(run.optimizer.state_dict(), inner / OPTIMIZER)
+
+    return write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
+
+
+def _read_one_clip_of_each_split(source: EpisodeSource, config: Config) -> None:
+    """Fail early: an empty split, a broken first clip."""
+    for split in ("train", "validation"):
+        next(validation_batches(source, config.data, split, clips=1, batch_size=1))
+
+
+def _take_up(
+    config: Config, world_model: WorldModel, optimizer: torch.optim.Optimizer, note: Callable[[str], None]
+) -> RunState:
+    checkpoint = newest_checkpoint(Path(config.run_dir) / CHECKPOINTS)
+    if checkpoint is None:
+        return RunState(step=0)
+    load_trained(world_model, checkpoint / ADAPTER, trainable=True)
+    optimizer.load_state_dict(torch.load(checkpoint / OPTIMIZER, weights_only=True, map_location="cpu"))
+    state = read_state(checkpoint)
+    note(f"Going on from {checkpoint} ({state.step} of {config.training.steps} steps are done).")
+    return state
