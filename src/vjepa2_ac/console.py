@@ -12,6 +12,8 @@ from rich.table import Table
 from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, ratios_by_horizon
 
 console = Console(highlight=False, soft_wrap=True)
+if not console.is_terminal:
+    console.width = 120  # a log file has room
 
 
 class ProgressBar:
@@ -108,9 +110,9 @@ def evaluation_table(models: Mapping[str, PredictionErrors], seconds_per_step: f
     table = Table(
         title="Latent error / persistence on held-out episodes (95 % interval over episodes)", title_justify="left"
     )
-    table.add_column("open loop")
+    table.add_column("open loop", no_wrap=True)
     for name in ("persistence", *models):
-        table.add_column(name, justify="right")
+        table.add_column(name, justify="right", no_wrap=True)
     columns = {name: ratios_by_horizon(errors) for name, errors in models.items()}
     for horizon in range(horizons):
         seconds = (horizon + 1) * seconds_per_step

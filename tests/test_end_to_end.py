@@ -1,0 +1,143 @@
+"""The whole way on the command line: record, train from scratch, export, adapt with LoRA, evaluate."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from vjepa2_ac.cli import main
+
+TINY = {
+    "image_size": 48,
+    "patch_size": 16,
+    "encoder": {"width": 24, "depth": 1, "heads": 2, "mlp_ratio": 2.0},
+    "predictor": {"width": 24, "depth": 1, "heads": 2},
+}
+
+
+def write_config(folder: Path, name: str, **sections: object) -> str:
+    values = {
+        "run_dir": str(folder / name),
+        "data": {
+            "path": str(folder / "data"), "frames": 3, "stride": 4, "validation_share": 0.3, "test_share": 0.3,
+            "workers": 0,
+        },
+        "training": {
+            "steps": 3, "batch_size": 2, "accumulation": 1, "warmup_steps": 0, "precision": "fp32", "device": "cpu",
+            "allow_weak_base": True,
+        },
+        "validation": {"every": 3, "clips": 4, "batch_size": 2},
+        "checkpoint": {"every": 3},
+        **sections,
+    }  # fmt: skip
+    path = folder / f"{name}.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data set, a base made from scratch, and an adapter on it, all made by commands."""
+    folder = tmp_path_factory.mktemp("workshop")
+    data = str(folder / "data")
+    assert main(["simulate", "record", data, "--domain", "B", "--episodes", "10", "--steps", "14"]) == 0
+    scratch = write_config(folder, "scratch", model={"random": TINY, "dtype": "float32"}, adapter={"kind": "none"})
+    assert main(["train", scratch]) == 0
+    assert main(["export", str(folder / "scratch"), str(folder / "base")]) == 0
+    lora = write_config(folder, "lora", model={"base": str(folder / "base"), "dtype": "float32"})
+    assert main(["train", lora, "--check", "seed=3"]) == 0
+    assert not (folder / "lora").exists()
+    assert main(["train", lora]) == 0
+    return folder
+
+
+def test_evaluate_ends_with_the_result_in_words_a_picture_and_paths(
+    workshop: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["evaluate", str(workshop / "lora"), "--clips", "8"]) == 0
+    printed = capsys.readouterr().out
+    result = json.loads((workshop / "lora" / "evaluation.json").read_text())
+    assert result["verdict"] in printed
+    assert str(workshop / "lora" / "evaluation.png") in printed
+    assert (workshop / "lora" / "evaluation.png").read_bytes().startswith(b"\x89PNG")
+    assert list(result["models"]) == ["base", "adapter"]
+    assert len(result["models"]["adapter"]["rollout_over_persistence"]) == 2
+    for word in ("persistence", "base", "adapter", "0.27 s ahead", "zero actions", "shuffled actions"):
+        assert word in printed
+
+
+def test_evaluate_of_several_runs_tells_their_spread(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", str(workshop / "lora"), str(workshop / "scratch"), "--clips", "4"]) == 0
+    assert "2 runs: error over persistence" in capsys.readouterr().out
+
+
+def test_a_finished_run_has_nothing_left_to_do(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = sorted(path.name for path in (workshop / "lora" / "checkpoints").iterdir())
+    assert main(["train", str(workshop / "lora"), "--resume"]) == 0
+    assert "3 of 3 steps are done" in capsys.readouterr().out
+    assert sorted(path.name for path in (workshop / "lora" / "checkpoints").iterdir()) == before
+
+
+def test_an_exported_adapter_predicts_as_the_run_does(workshop: Path, tmp_path: Path) -> None:
+    assert main(["export", str(workshop / "lora"), str(tmp_path / "merged")]) == 0
+    assert main(["evaluate", str(workshop / "lora"), "--clips", "4"]) == 0
+    with_adapter = json.loads((workshop / "lora" / "evaluation.json").read_text())["models"]["adapter"]
+    config = write_config(workshop, "again", model={"base": str(tmp_path / "merged"), "dtype": "float32"})
+    assert main(["train", config, f"run_dir={tmp_path / 'again'}", "training.steps=1"]) == 0
+    assert main(["evaluate", str(tmp_path / "again"), "--clips", "4"]) == 0
+    merged = json.loads((tmp_path / "again" / "evaluation.json").read_text())["models"]["base"]
+    assert merged["rollout_error"] == pytest.approx(with_adapter["rollout_error"], rel=1e-4)
+
+
+WRONG = {
+    "no such config": (["train", "nowhere.yaml"], "nowhere.yaml"),
+    "a folder without --resume": (["train", "{here}"], "--resume"),
+    "resume of no run": (["train", "{here}", "--resume"], "no config.yaml"),
+    "resume with overrides": (["train", "{here}/lora", "--resume", "seed=3"], "unchanged"),
+    "evaluate no run": (["evaluate", "{here}"], "no config.yaml"),
+    "evaluate nothing": (["evaluate", "{here}/nowhere"], "no such folder"),
+    "export over something": (["export", "{here}/lora", "{here}/base"], "something is there already"),
+    "another config": (["train", "{here}/lora.yaml", "adapter.rank=3"], "adapter.rank"),
+    "no data": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.path={here}/nowhere"], "nowhere"),
+    "no model": (["train", "{here}/lora.yaml", "run_dir={here}/x", "model.base={here}/no.pt"], "vjepa2-ac download"),
+    "no such builtin": (
+        ["train", "{here}/lora.yaml", "run_dir={here}/x", "model.base=builtin:big"],
+        "builtin:sim-tiny",
+    ),
+    "a file that is no checkpoint": (
+        ["train", "{here}/lora.yaml", "run_dir={here}/x", "model.base={here}/lora.yaml"],
+        "lora.yaml",
+    ),
+    "clips longer than episodes": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.frames=16"], "61"),
+    "no test episodes": (["train", "{here}/lora.yaml", "run_dir={here}/x", "data.validation_share=0.0"], "validation"),
+    "a target that is not there": (["train", "{here}/lora.yaml", "run_dir={here}/x", "adapter.targets=[qkv]"], "qkv"),
+    "an unknown domain": (["simulate", "record", "{here}/y", "--domain", "C"], "'C'"),
+    "a data set over another": (["simulate", "record", "{here}/data"], "data"),
+    "config show without a file": (["config", "show"], "CONFIG"),
+    "a broken override": (["train", "{here}/lora.yaml", "seed"], "override"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "complaint"), WRONG.values(), ids=WRONG.keys())
+def test_wrong_input_is_one_clear_error(
+    workshop: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], complaint: str
+) -> None:
+    assert main([word.format(here=workshop) for word in arguments]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert complaint in error
+    assert "Traceback" not in error
+    assert not (workshop / "x").exists()
+
+
+def test_config_show_prints_every_default(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "show", str(workshop / "lora.yaml"), "seed=7"]) == 0
+    shown = yaml.safe_load(capsys.readouterr().out)
+    assert shown["seed"] == 7
+    assert shown["training"]["betas"] == [0.9, 0.999]
+
+
+def test_config_schema_is_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["config", "schema"]) == 0
+    assert json.loads(capsys.readouterr().out)["additionalProperties"] is False
