@@ -367,11 +367,6 @@ def changed_keys(old: Config, new: Config) -> list[str]:
     return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
 
 
-def flatten_config(config: Config) -> dict[str, Any]:
-    """Return dotted key -> value, for trackers that refuse nested settings."""
-    return _flatten(config_as_dict(config))
-
-
 class _StrictLoader(yaml.SafeLoader):
     """Safe YAML that refuses a key given twice, and reads 1e-4 as the number it is (YAML 1.1 says text)."""
 
