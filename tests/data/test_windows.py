@@ -1,5 +1,6 @@
 """Splits, windows and order are pure functions: nothing but identities, lengths, seed and position counts."""
 
+import itertools
 from collections import Counter
 from typing import Any
 
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.windows import ClipOrder, permuted, split_of, spread, windows_of
+from vjepa2_ac.data.windows import ClipOrder, far_neighbours, permuted, split_of, spread, windows_of
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
 
@@ -188,3 +189,11 @@ def test_what_is_spread_is_distinct_and_even(size: int, count: int) -> None:
     gaps = np.diff([-size / len(chosen) / 2, *chosen])
     assert 0 <= min(chosen) <= max(chosen) < size
     assert abs(gaps - size / len(chosen)).max() <= 1
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 31])
+def test_far_neighbours_are_all_there_and_lie_half_the_list_apart(count: int) -> None:
+    order = far_neighbours(list(range(count)))
+    assert sorted(order) == list(range(count))
+    for one, other in itertools.pairwise(order):
+        assert abs(one - other) >= count // 2 - 1

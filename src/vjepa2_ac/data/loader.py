@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.data.transforms import crop
-from vjepa2_ac.data.windows import ClipOrder, Split, spread, windows_of
+from vjepa2_ac.data.windows import ClipOrder, Split, far_neighbours, spread, windows_of
 from vjepa2_ac.episode import Batch, Clip, EpisodeSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
@@ -109,13 +109,14 @@ def validation_batches(
 ) -> Iterator[Batch]:
     """Yield a fixed set of at most `clips` clips of a split, evenly spread over its windows, in this process.
 
-    The set follows from the data alone: neither the seed nor the number of shards changes it.
+    The set follows from the data alone: neither the seed nor the number of shards changes it. Neighbours in it are
+    from far apart, so that the actions of one are no stand-in for those of the next.
 
     Raises:
         InputError: The split is empty, or a clip cannot be read.
     """
     windows = windows_of(source.infos(), config, split)
-    chosen = [windows[index] for index in spread(len(windows), clips)]
+    chosen = [windows[index] for index in far_neighbours(spread(len(windows), clips))]
 
     def batches() -> Iterator[Batch]:
         for first in range(0, len(chosen), batch_size):

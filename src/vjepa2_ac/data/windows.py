@@ -7,6 +7,7 @@ the number of shards, workers or ranks, and nothing needs to be saved to go on w
 from __future__ import annotations
 
 import hashlib
+import itertools
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -103,6 +104,13 @@ def spread(size: int, count: int) -> list[int]:
     """Return at most `count` of `range(size)`, evenly spread, each once."""
     count = min(size, count)
     return [(2 * number + 1) * size // (2 * count) for number in range(count)]
+
+
+def far_neighbours(items: list[int]) -> list[int]:
+    """Return sorted items in an order in which neighbours lie about half the list apart."""
+    half = (len(items) + 1) // 2
+    pairs = itertools.zip_longest(items[:half], items[half:])
+    return [item for pair in pairs for item in pair if item is not None]
 
 
 def permuted(index: int, *, size: int, seed: int, epoch: int) -> int:
