@@ -75,6 +75,8 @@ class DataConfig(Section):
     """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
     short_episodes: Literal["skip", "error"] = "skip"
     """What to do with episodes shorter than a clip: leave them out and say how many, or stop."""
+    exclude: tuple[str, ...] = ()
+    """Identities of episodes to leave out, as errors name them."""
     check_crc: bool = True
     """Check the masked CRC-32C of every record that is read."""
     workers: Annotated[int, Field(ge=0, le=256)] = 4
