@@ -108,7 +108,7 @@ def _add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
 
 def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.console import console, evaluation_table
-    from vjepa2_ac.evaluation.evaluate import spread, verdict
+    from vjepa2_ac.evaluation.report import spread, verdict
     from vjepa2_ac.training.runs import evaluate_run
 
     evaluations = []

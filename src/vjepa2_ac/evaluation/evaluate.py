@@ -1,12 +1,11 @@
-"""Did the adapter help? Base and adapter side by side on held-out episodes, and the answer in words."""
+"""Did training help? The base and what was trained, side by side on held-out episodes."""
 
 from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,10 +18,6 @@ from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.evaluation.metrics import (
     ErrorMeter,
     PredictionErrors,
-    Ratio,
-    one_step_ratios,
-    ratio,
-    ratios_by_horizon,
 )
 from vjepa2_ac.latents import encode_batch
 from vjepa2_ac.model.lora import base_only
@@ -49,14 +44,24 @@ class Evaluation:
     example: Example
 
     @property
+    def trained(self) -> str:
+        """The name of what was trained: adapter, or model."""
+        return list(self.models)[-1]
+
+    @property
+    def horizon(self) -> int:
+        """How many model steps ahead was measured."""
+        return int(self.models[self.trained].rollout.shape[1])
+
+    @property
     def episodes(self) -> int:
         """How many episodes the clips come from."""
-        return len(set(next(iter(self.models.values())).episode_ids))
+        return len(set(self.models[self.trained].episode_ids))
 
     @property
     def clips(self) -> int:
         """How many clips were measured."""
-        return len(next(iter(self.models.values())).episode_ids)
+        return len(self.models[self.trained].episode_ids)
 
 
 def evaluate(
@@ -75,7 +80,7 @@ def evaluate(
     """
     world_model.eval()
     variants: dict[str, Variant] = {"base": base_only} if has_base else {}
-    variants["adapter" if has_base else "model"] = contextlib.nullcontext
+    variants["adapter" if _has_lora(world_model) else "model"] = contextlib.nullcontext
     meters = {name: ErrorMeter() for name in variants}
     example: Example | None = None
     most_motion = -1.0
@@ -124,79 +129,5 @@ def _seen_by_the_encoder(frames: Tensor, size: int) -> UInt8[np.ndarray, "time s
     return np.asarray(rearrange(shown, "time c h w -> time h w c").round().to(torch.uint8).cpu().numpy())
 
 
-def improvement(evaluation: Evaluation, horizon: int) -> Ratio | None:
-    """Return by which share of the base's error the adapter's is smaller at a horizon (1 = first step), paired by clip.
-
-    None if there is no base to compare with.
-    """
-    if "adapter" not in evaluation.models:
-        return None
-    base, adapter = evaluation.models["base"], evaluation.models["adapter"]
-    kept = ratio(adapter.rollout[:, horizon - 1], base.rollout[:, horizon - 1], base.episode_ids)
-    return Ratio(1 - kept.value, 1 - kept.high, 1 - kept.low)
-
-
-def verdict(evaluation: Evaluation) -> str:
-    """Say in words whether the adapter helped, at the farthest horizon."""
-    where = f"on {evaluation.clips} clips of {evaluation.episodes} held-out episodes"
-    models = evaluation.models
-    error = ratios_by_horizon(models["adapter" if "adapter" in models else "model"])
-    horizon = len(error)
-    ahead = f"{horizon * evaluation.seconds_per_step:.1f} s ahead"
-    absolute = f"Its error {ahead} is {error[-1].value:.2f} of doing nothing ({_interval(error[-1], '.2f')})"
-    absolute += (
-        ": better." if error[-1].high < 1 else ": NOT better." if error[-1].low > 1 else ": no clear difference."
-    )
-    gain = improvement(evaluation, horizon)
-    if gain is None:
-        return f"The model was measured {where}. {absolute}"
-    compared = (
-        f"{abs(gain.value):.0%} {'better' if gain.value > 0 else 'WORSE'} than the base ({_interval(gain, '.0%')})"
-    )
-    if gain.low <= 0 <= gain.high:
-        return f"The adapter did not clearly help: it predicts {ahead} {compared}, {where}. {absolute}"
-    return f"The adapter predicts {ahead} {compared}, {where}. {absolute}"
-
-
-def _interval(value: Ratio, form: str) -> str:
-    return f"95 % interval {value.low:{form}} to {value.high:{form}}"
-
-
-def spread(evaluations: Sequence[Evaluation]) -> str:
-    """Say how much runs that differ in their seed differ in their result, at the farthest horizon."""
-    errors, gains = [], []
-    for evaluation in evaluations:
-        name = "adapter" if "adapter" in evaluation.models else "model"
-        errors.append(ratios_by_horizon(evaluation.models[name])[-1].value)
-        gain = improvement(evaluation, evaluation.models[name].rollout.shape[1])
-        gains += [] if gain is None else [gain.value]
-    words = f"{len(evaluations)} runs: error over persistence {_mean_and_range(errors, '.3f')}"
-    return words + (f"; better than the base by {_mean_and_range(gains, '.1%')}" if gains else "")
-
-
-def _mean_and_range(values: list[float], form: str) -> str:
-    return f"{np.mean(values):{form}} ({min(values):{form}} to {max(values):{form}})"
-
-
-def evaluation_as_dict(evaluation: Evaluation) -> dict[str, Any]:
-    """Return every figure as plain values, for `evaluation.json`."""
-    models = {
-        name: {
-            "rollout_over_persistence": [asdict(r) for r in ratios_by_horizon(errors)],
-            "one_step_over_persistence": {k: asdict(r) for k, r in one_step_ratios(errors).items()},
-            "rollout_error": errors.rollout.mean(axis=0).tolist(),
-        }
-        for name, errors in evaluation.models.items()
-    }
-    any_model = next(iter(evaluation.models.values()))
-    horizons = any_model.rollout.shape[1]
-    gains = [improvement(evaluation, h + 1) for h in range(horizons)]
-    return {
-        "verdict": verdict(evaluation),
-        "clips": evaluation.clips,
-        "episodes": evaluation.episodes,
-        "seconds_per_step": evaluation.seconds_per_step,
-        "persistence_error": any_model.persistence.mean(axis=0).tolist(),
-        "models": models,
-        "improvement_over_base": [asdict(g) for g in gains if g is not None],
-    }
+def _has_lora(world_model: WorldModel) -> bool:
+    return world_model.adaptation is not None and world_model.adaptation.kind == "lora"

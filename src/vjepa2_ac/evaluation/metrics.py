@@ -6,6 +6,7 @@ error of copying the last frame that was seen. A ratio of 1 means: as good as do
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -50,14 +51,19 @@ class PredictionErrors:
 
 @dataclass(frozen=True)
 class Ratio:
-    """An error over persistence, with a 95 % bootstrap interval over episodes."""
+    """An error over another, with a 95 % bootstrap interval over episodes; NaN where there is one episode only."""
 
     value: float
     low: float
     high: float
 
+    @property
+    def has_interval(self) -> bool:
+        """Whether there were episodes enough to say how sure the value is."""
+        return not math.isnan(self.low)
+
     def __str__(self) -> str:
-        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]"
+        return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]" if self.has_interval else f"{self.value:.3f}"
 
 
 class ErrorMeter:
@@ -143,12 +149,15 @@ def ratio(
 
     Clips of one episode resemble each other; drawing clips would make the interval too narrow.
     """
-    _, episode_of = np.unique(np.array(episode_ids), return_inverse=True)
+    value = float(errors.sum() / persistence.sum())
+    names, episode_of = np.unique(np.array(episode_ids), return_inverse=True)
+    if len(names) < 2:
+        return Ratio(value, math.nan, math.nan)
     sums = np.stack([np.bincount(episode_of, weights=values) for values in (errors, persistence)])
     drawn = np.random.default_rng(seed).integers(sums.shape[1], size=(resamples, sums.shape[1]))
     resampled = sums[:, drawn].sum(axis=2)
     low, high = np.percentile(resampled[0] / resampled[1], [2.5, 97.5])
-    return Ratio(float(errors.sum() / persistence.sum()), float(low), float(high))
+    return Ratio(value, float(low), float(high))
 
 
 def ratios_by_horizon(errors: PredictionErrors) -> list[Ratio]:

@@ -10,14 +10,16 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from vjepa2_ac.evaluation.evaluate import Evaluation, Example, verdict
-from vjepa2_ac.evaluation.metrics import one_step_ratios, ratios_by_horizon
+from vjepa2_ac.evaluation.evaluate import Evaluation, Example
+from vjepa2_ac.evaluation.metrics import Ratio, one_step_ratios, ratios_by_horizon
+from vjepa2_ac.evaluation.report import verdict
+from vjepa2_ac.storage import atomic_writer
 
 _COLOURS = {"persistence": "#8a8a8a", "base": "#d1762a", "adapter": "#1f6fb4", "model": "#1f6fb4"}
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
-    """Write the picture of an evaluation as PNG."""
+    """Write the picture of an evaluation as PNG; it appears whole or not at all."""
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
         rows = 1 + len(evaluation.example.errors)
         columns = len(evaluation.example.frames)
@@ -30,7 +32,8 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
         _curves(left, evaluation)
         _use_of_actions(right, evaluation)
         _filmstrip(bottom, evaluation.example, evaluation.seconds_per_step)
-        figure.savefig(path, dpi=130)
+        with atomic_writer(path) as file:
+            figure.savefig(file, format="png", dpi=130)
     return path
 
 
@@ -54,12 +57,19 @@ def _use_of_actions(axes: Any, evaluation: Evaluation) -> None:
         ratios = one_step_ratios(errors)
         places = np.arange(len(ratios)) + (i - (len(evaluation.models) - 1) / 2) * width
         values = [r.value for r in ratios.values()]
-        spread = [[r.value - r.low for r in ratios.values()], [r.high - r.value for r in ratios.values()]]
+        spread = np.array([_reach(r) for r in ratios.values()]).T
         axes.bar(places, values, width, color=_COLOURS[name], yerr=spread, error_kw={"elinewidth": 1}, label=name)
     axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--")
     axes.set_xticks(range(3), ["true", "zero", "shuffled"])
     axes.set(xlabel="actions given", ylabel="one-step error / persistence")
     axes.set_title("Does it use the actions?", loc="left", fontsize=9)
+
+
+def _reach(value: Ratio) -> tuple[float, float]:
+    """How far an error bar reaches down and up; never negative, which rounding could make it."""
+    if not value.has_interval:
+        return 0.0, 0.0
+    return max(0.0, value.value - value.low), max(0.0, value.high - value.value)
 
 
 def _filmstrip(figure: Any, example: Example, seconds_per_step: float) -> None:

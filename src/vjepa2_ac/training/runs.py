@@ -10,8 +10,9 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.loader import open_source, validation_batches
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import Evaluation, evaluate, evaluation_as_dict
+from vjepa2_ac.evaluation.evaluate import Evaluation, evaluate
 from vjepa2_ac.evaluation.plots import plot_evaluation
+from vjepa2_ac.evaluation.report import evaluation_as_dict
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import load_trained, merge_adapter
 from vjepa2_ac.model.world_model import WorldModel
