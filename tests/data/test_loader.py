@@ -1,6 +1,8 @@
 """Batches follow from seed and position alone; what goes wrong in a worker is what the user reads."""
 
 import itertools
+import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +15,7 @@ import torch
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.loader import clip_at, collate, open_source, training_loader, validation_batches
+from vjepa2_ac.data.sources.tfrecord import index_records
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import apply_action, matrices_from_euler
@@ -152,6 +155,22 @@ def test_an_error_in_a_worker_is_the_error_the_user_reads(spoiled: Callable[...,
     assert type(caught.value) is InputError
     assert "tfrecord-00000-of-00002: record 0 at byte 0" in caught.value.where
     assert caught.value.needed == "a JPEG picture"
+    exclude = tuple(json.loads(caught.value.fix.split("data.exclude: ")[1]))
+    assert len(exclude) == 1
+    assert exclude[0] not in {name for name, _ in names(take(60, config.model_copy(update={"exclude": exclude})))}
+
+
+def test_a_clip_of_a_damaged_record_says_how_to_leave_it_out(droid: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(droid, tmp_path / "set")
+    shard = sorted(folder.glob("*.tfrecord-*"))[0]
+    config = config_of(folder)
+    source = open_source(config)
+    source.infos()
+    whole = bytearray(shard.read_bytes())
+    whole[index_records(shard)[0].end - 10] ^= 1
+    shard.write_bytes(whole)
+    with pytest.raises(InputError, match=r"CRC of the data.*add to data\.exclude: .*episode_0000"):
+        clip_at(source, 0, 0, config)
 
 
 def test_pictures_of_two_sizes_do_not_stack(droid: Path) -> None:

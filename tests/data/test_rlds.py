@@ -1,5 +1,6 @@
 """RLDS episodes are read exactly, and whatever is wrong with them is named."""
 
+import dataclasses
 import json
 import pickle
 import shutil
@@ -149,7 +150,6 @@ def test_length_is_that_of_the_states_where_no_step_is_flagged(spoiled: Spoil) -
             lambda f: f.pop("steps/observation/exterior_image_1_left"),
             "Did you mean steps/observation/exterior_image_2_left",
         ),
-        (lambda f: f.pop("steps/language_instruction"), "no feature steps/language_instruction"),
         (
             lambda f: f.pop("episode_metadata/file_path"),
             "no feature episode_metadata/file_path; the record has .*steps/action",
@@ -180,8 +180,38 @@ def test_a_state_that_cannot_be_one_is_named(spoiled: Spoil, name: str, value: f
         else:
             values[2 * len(values) // 12] = value
 
-    with pytest.raises(InputError, match=message):
-        open_droid(spoiled(spoil)).read(0)
+    source = open_droid(spoiled(spoil))
+    for meet in (source.infos, lambda: source.read(0)):  # at the start, and under a CRC that is checked
+        with pytest.raises(InputError, match=message):
+            meet()
+
+
+def test_an_episode_that_cannot_be_used_says_how_to_leave_it_out(spoiled: Spoil) -> None:
+    folder = spoiled(lambda features: features["steps/observation/gripper_position"][1].pop() and None)
+    with pytest.raises(InputError, match=r"To leave out, add to data\.exclude: \[\S+\]") as caught:
+        open_droid(folder).infos()
+    exclude = tuple(json.loads(caught.value.fix.split("data.exclude: ")[1]))
+    infos = open_droid(folder, exclude=exclude).infos()
+    assert [info.id for info in infos if info.num_steps == 0] == list(exclude) == [infos[0].id]
+
+
+def test_episodes_that_cannot_be_used_are_named_together(tmp_path: Path) -> None:
+    far = dataclasses.replace(synthetic_episode(0).observation, cartesian_position=np.full((40, 6), 7.0))
+    drawn = [synthetic_episode(number, steps=40, size=(16, 32)) for number in range(4)]
+    bad = [dataclasses.replace(episode, observation=far) for episode in drawn]
+    folder = write_droid_rlds(tmp_path / "set", [drawn[0], *bad[1:3], drawn[3]], shards=1)
+    with pytest.raises(InputError, match=r"within 5 m.*1 more cannot be used either.*episode_0001.*episode_0002"):
+        open_droid(folder).infos()
+    every_one = write_droid_rlds(tmp_path / "every", bad, shards=1)
+    with pytest.raises(InputError, match=r"within 5 m.*Check data\.fields\.state\.$"):
+        open_droid(every_one).infos()
+
+
+def test_a_data_set_without_language_is_read(spoiled: Spoil) -> None:
+    source = open_droid(spoiled(lambda features: features.pop("steps/language_instruction") and None))
+    assert source.infos()[0].num_steps == 12
+    assert source.read(0).metadata == {}
+    assert source.read(1).metadata["language"]
 
 
 def test_degrees_are_not_taken_for_radians(spoiled: Spoil) -> None:
@@ -208,8 +238,12 @@ def test_a_picture_too_few_is_named(spoiled: Spoil) -> None:
 def test_two_episodes_of_one_identity_are_refused(tmp_path: Path) -> None:
     episode = synthetic_episode(0, steps=3, size=(16, 32))
     folder = write_droid_rlds(tmp_path / "set", [episode, episode], shards=2)
-    with pytest.raises(InputError, match=r"00001-of-00002: record 0.*same identity as .*00000-of-00002: record 0"):
+    with pytest.raises(
+        InputError, match=r"00001-of-00002: record 0.*same identity as .*00000-of-00002: record 0"
+    ) as caught:
         open_droid(folder).infos()
+    exclude = tuple(json.loads(caught.value.fix.split("data.exclude: ")[1]))
+    assert len(open_droid(folder, exclude=exclude).infos()) == 2  # of which none takes part
 
 
 def test_every_flipped_bit_is_noticed(droid: Path, tmp_path: Path) -> None:

@@ -154,14 +154,50 @@ def test_short_episodes_are_left_out_counted_and_named(caplog: pytest.LogCapture
     windows = windows_of(episodes(9, 10, 3), settings_of(**ALL_TRAIN), "train")
     assert windows.short == ("episode 0", "episode 2")
     assert windows.episodes.tolist() == [1]
-    assert "2 of 3 episodes are shorter than a clip of 10 control steps" in caplog.text
+    assert "2 of 3 train episodes are shorter than a clip of 10 control steps" in caplog.text
     assert "episode 2" in caplog.text
+
+
+def test_short_episodes_are_spoken_of_once_for_each_set_of_data(caplog: pytest.LogCaptureFixture) -> None:
+    for path in ("this set", "this set", "another set"):
+        windows_of(episodes(9, 10), settings_of(**ALL_TRAIN).model_copy(update={"path": path}), "train")
+    assert [record.getMessage().split(":")[0] for record in caplog.records] == ["this set", "another set"]
 
 
 def test_short_episodes_stop_the_run_when_told_to() -> None:
     config = settings_of(short_episodes="error", **ALL_TRAIN)
     with pytest.raises(InputError, match=r"2 of 3 train episodes.*episode 0, has 9 steps.*needed: 10 steps.*skip"):
         windows_of(episodes(9, 10, 3), config, "train")
+
+
+def test_short_episodes_that_stop_the_run_are_named_ten_at_most() -> None:
+    config = settings_of(short_episodes="error", **ALL_TRAIN)
+    with pytest.raises(InputError, match=r"Too short: episode 1, episode 2\."):
+        windows_of(episodes(10, 3, 3), config, "train")
+    with pytest.raises(InputError, match=r"Too short: episode 0, (episode \d+, ){8}episode \d+ and 2 more\."):
+        windows_of(episodes(*[3] * 12, 10), config, "train")
+
+
+def test_an_excluded_episode_is_in_no_split_and_the_others_stay_where_they_were() -> None:
+    infos = episodes(*[20] * 60)
+    shares = {"validation_share": 0.3, "test_share": 0.2}
+    without = settings_of(exclude=("episode 7", "episode 11", "episode 0"), **shares)
+    for split in ("train", "validation", "test"):
+        everyone, fewer = (set(windows_of(infos, c, split).episodes.tolist()) for c in (settings_of(**shares), without))
+        assert fewer == everyone - {7, 11, 0}
+
+
+def test_an_excluded_episode_may_be_short() -> None:
+    config = settings_of(short_episodes="error", exclude=("episode 1",), **ALL_TRAIN)
+    assert windows_of(episodes(10, 0), config, "train").episodes.tolist() == [0]
+
+
+def test_excluding_an_episode_that_there_is_not_is_refused() -> None:
+    config = settings_of(exclude=("episode 1", "episode 9", "elsewhere"), **ALL_TRAIN)
+    with pytest.raises(
+        InputError, match=r"data\.exclude: not the identity.*: elsewhere, episode 9\. .*such as episode 0"
+    ):
+        windows_of(episodes(10, 10), config, "train")
 
 
 def test_nothing_but_short_episodes_stops_the_run() -> None:

@@ -16,6 +16,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.exclusion import with_way_out
 from vjepa2_ac.data.sources.rlds import RldsSource
 from vjepa2_ac.data.transforms import crop
 from vjepa2_ac.data.windows import ClipOrder, Split, far_neighbours, spread, windows_of
@@ -35,14 +36,18 @@ def clip_at(source: EpisodeSource, episode: int, start: int, config: DataConfig)
     """Return the clip that starts at a control step of an episode; decodes its frames only.
 
     Raises:
-        InputError: The episode or one of the pictures cannot be read.
+        InputError: The episode or one of the pictures cannot be read; says how to leave the episode out.
     """
-    recording = source.read(episode)
     steps = range(start, start + config.clip_steps, config.stride)
+    try:
+        recording = source.read(episode)
+        frames = recording.read_frames(steps)
+    except InputError as error:
+        raise with_way_out(error, [source.infos()[episode].id]) from None
     states = recording.states[steps.start : steps.stop : steps.step]
     extrinsics = recording.extrinsics
     return Clip(
-        frames=crop(recording.read_frames(steps)),
+        frames=crop(frames),
         states=states.astype(np.float32),
         actions=actions_from_states(states).astype(np.float32),
         extrinsics=None if extrinsics is None else extrinsics[list(steps)].astype(np.float32),
@@ -61,12 +66,13 @@ def collate(clips: Sequence[Clip]) -> Batch:
     first = clips[0]
     for clip in clips:
         if clip.frames.shape != first.frames.shape:
-            raise InputError(
+            error = InputError(
                 where=f"episode {clip.episode_id}",
                 found=f"pictures of {'x'.join(map(str, clip.frames.shape[1:3]))} after the crop",
                 needed=f"{'x'.join(map(str, first.frames.shape[1:3]))}, as in episode {first.episode_id}",
                 fix="Train on episodes of one size, or set training.batch_size: 1",
             )
+            raise with_way_out(error, [clip.episode_id])
     extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
     return Batch(
         frames=torch.from_numpy(np.stack([clip.frames for clip in clips])),

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Int
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.exclusion import included, named
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
 
@@ -28,7 +29,6 @@ Split = Literal["train", "validation", "test"]
 _ROUNDS = 8
 _HALF_BITS = 3  # at least: narrower halves favour some orders of a handful of windows
 _MASK64 = (1 << 64) - 1
-_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -76,27 +76,26 @@ def windows_of(infos: Sequence[EpisodeInfo], config: DataConfig, split: Split) -
     """Return the windows of a split: every start from which a clip fits into its episode.
 
     Raises:
-        InputError: The split has no episodes, or only short ones, or `data.short_episodes` forbids short ones.
+        InputError: The split has no episodes, or only short ones, or `data.short_episodes` forbids short ones; or
+            `data.exclude` names an episode that there is not.
     """
-    members = [number for number, info in enumerate(infos) if split_of(info.id, config) == split]
+    taking_part = included(infos, config)
+    members = [number for number in taking_part if split_of(infos[number].id, config) == split]
     if not members:
-        raise _empty_split(infos, config, split)
+        raise _empty_split(len(taking_part), config, split)
     members.sort(key=lambda number: infos[number].id)
     counts = [infos[number].num_steps - config.clip_steps + 1 for number in members]
     short = [infos[number] for number, count in zip(members, counts, strict=True) if count < 1]
     if short and (config.short_episodes == "error" or len(short) == len(members)):
         raise _too_short(short, len(members), config, split)
+    names = tuple(info.id for info in short)
     if short:
-        names = ", ".join(info.id for info in short[:_NAMED]) + (", …" if len(short) > _NAMED else "")
-        logger.warning(
-            "%s: %d of %d episodes are shorter than a clip of %d control steps and left out: %s",
-            split, len(short), len(members), config.clip_steps, names,
-        )  # fmt: skip
+        _warn_of_short(config.path, split, config.clip_steps, len(members), names)
     kept = [(number, count) for number, count in zip(members, counts, strict=True) if count >= 1]
     return Windows(
         episodes=np.array([number for number, _ in kept], dtype=np.int64),
         ends=np.cumsum([count for _, count in kept], dtype=np.int64),
-        short=tuple(info.id for info in short),
+        short=names,
     )
 
 
@@ -149,7 +148,15 @@ def _round_keys(size: int, seed: int, epoch: int) -> tuple[int, ...]:
     return tuple(int.from_bytes(digest[8 * number : 8 * number + 8], "big") for number in range(_ROUNDS))
 
 
-def _empty_split(infos: Sequence[EpisodeInfo], config: DataConfig, split: Split) -> InputError:
+@lru_cache(maxsize=64)  # said once: every validation asks for the same windows
+def _warn_of_short(path: str, split: Split, clip_steps: int, members: int, short: tuple[str, ...]) -> None:
+    logger.warning(
+        "%s: %d of %d %s episodes are shorter than a clip of %d control steps and left out: %s",
+        path, len(short), members, split, clip_steps, named(short),
+    )  # fmt: skip
+
+
+def _empty_split(episodes: int, config: DataConfig, split: Split) -> InputError:
     shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
     fix = (
         "Lower data.validation_share or data.test_share"
@@ -158,7 +165,7 @@ def _empty_split(infos: Sequence[EpisodeInfo], config: DataConfig, split: Split)
     )
     return InputError(
         where=f"data.path: {config.path}",
-        found=f"no {split} episodes among {len(infos)} ({shares})",
+        found=f"no {split} episodes among {episodes} ({shares})",
         needed="one or more",
         fix=fix,
     )
@@ -171,7 +178,7 @@ def _too_short(short: Sequence[EpisodeInfo], members: int, config: DataConfig, s
     return InputError(
         where=f"data.path: {config.path}",
         found=f"{len(short)} of {members} {split} episodes are shorter than a clip; the longest of these,"
-        f" {longest.id}, has {longest.num_steps} steps",
+        f" {longest.id}, has {longest.num_steps} steps. Too short: {named([info.id for info in short])}",
         needed=f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}",
         fix=fix,
     )

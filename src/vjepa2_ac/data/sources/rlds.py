@@ -6,7 +6,7 @@ import io
 import itertools
 import logging
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from functools import cached_property
 from typing import Any
@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, RldsFields
+from vjepa2_ac.data.exclusion import NAMED, with_way_out
 from vjepa2_ac.data.sources.dataset_info import find_shards, index_shards
 from vjepa2_ac.data.sources.jpeg import JpegReader
 from vjepa2_ac.data.sources.record import Record
@@ -37,8 +38,9 @@ _GRIPPER_TOLERANCE = 0.05
 class RldsSource:
     """The episodes of an RLDS data set, in the order of its shards.
 
-    Nothing is read before the first call. `infos` reads a few hundred bytes of each episode; `read` reads the whole
-    record and checks its CRC, and its pictures are decoded when asked for. The last few episodes are kept per process.
+    Nothing is read before the first call. `infos` reads a few kilobytes of each episode and checks its states; `read`
+    reads the whole record and checks its CRC, and its pictures are decoded when asked for. The last few episodes are
+    kept per process. Of episodes in `data.exclude` nothing but the identity is read; their length is given as 0.
     """
 
     def __init__(self, config: DataConfig) -> None:
@@ -53,7 +55,8 @@ class RldsSource:
         """Return identity, length and outcome of every episode.
 
         Raises:
-            InputError: No data set, a damaged one, a missing field, or two episodes of the same identity.
+            InputError: No data set, a damaged one, a missing field, what cannot be a robot's states, or two episodes
+                of the same identity.
         """
         return self._infos
 
@@ -79,27 +82,47 @@ class RldsSource:
     @cached_property
     def _infos(self) -> list[EpisodeInfo]:
         infos: list[EpisodeInfo] = []
-        for path, spans in itertools.groupby(self._spans, key=lambda span: span.path):
-            with closing(storage.open_to_read(path)) as file:
-                infos += [self._scan(file, span) for span in spans]
+        unusable: dict[str, InputError] = {}
+        for info, error in self._scan():
+            infos.append(info)
+            if error is not None:
+                unusable[info.id] = error
+            if len(unusable) == NAMED:
+                break
+        if unusable:
+            first = next(iter(unusable.values()))
+            settings_at_fault = len(unusable) == len(infos) > 1
+            raise first if settings_at_fault else with_way_out(first, list(unusable))
         self._require_distinct(infos)
         logger.info("%s: %d episodes, %d steps", self._config.path, len(infos), sum(info.num_steps for info in infos))
         return infos
 
-    @property
-    def _needed(self) -> list[str]:
-        fields = self._config.fields
-        language = [fields.language] if fields.language else []
-        return [*fields.identity, *fields.state, fields.cameras[self._config.camera], *language]
+    def _scan(self) -> Iterator[tuple[EpisodeInfo, InputError | None]]:
+        """Yield what is known of every episode, and why it cannot be used, if so.
 
-    def _scan(self, file: storage.ByteReader, span: RecordSpan) -> EpisodeInfo:
+        Raises:
+            InputError: An episode cannot even be named.
+        """
+        for path, spans in itertools.groupby(self._spans, key=lambda span: span.path):
+            with closing(storage.open_to_read(path)) as file:
+                for span in spans:
+                    yield self._scan_episode(Record(file, span, span.data_offset), span)
+
+    def _scan_episode(self, record: Record, span: RecordSpan) -> tuple[EpisodeInfo, InputError | None]:
+        fields = self._config.fields
         try:
-            record = Record(file, span, span.data_offset)
-            record.require(self._needed)
-            return _info_of(record, self._config.fields)
-        except InputError:
-            read_record(span)  # if the CRC says that the record is damaged, that is the error to show
-            raise
+            info = EpisodeInfo(id=_identity_of(record, fields), num_steps=0)
+        except InputError as error:
+            raise _damage_or(error, span) from None
+        if info.id in self._config.exclude:
+            return info, None
+        try:
+            record.require([*fields.state, fields.cameras[self._config.camera]])
+            info = _info_of(record, fields)
+            _states_of(record, fields, info.num_steps, f"{span} ({info.id})")
+        except InputError as error:
+            return info, _damage_or(error, span)
+        return info, None
 
     def _read(self, span: RecordSpan) -> Episode:
         data = read_record(span, check_crc=self._config.check_crc)
@@ -115,7 +138,7 @@ class RldsSource:
                 needed=f"one for each of the {info.num_steps} steps",
             )
         metadata = {}
-        if fields.language:
+        if fields.language in record.located:
             metadata["language"] = b"".join(record.values(fields.language, "bytes_list")[:1]).decode(errors="replace")
         return Episode(
             info=info,
@@ -128,22 +151,36 @@ class RldsSource:
     def _require_distinct(self, infos: list[EpisodeInfo]) -> None:
         seen: dict[str, int] = {}
         for number, info in enumerate(infos):
-            if info.id in seen:
-                raise InputError(
+            if info.id in seen and info.id not in self._config.exclude:
+                error = InputError(
                     where=str(self._spans[number]),
                     found=f"the same identity as {self._spans[seen[info.id]]}: {info.id}",
                     needed="episodes that can be told apart: the split is a hash of the identity",
                     fix="Add a feature to data.fields.identity that differs between them",
                 )
+                raise with_way_out(error, [info.id])
             seen[info.id] = number
 
 
-def _info_of(record: Record, fields: RldsFields) -> EpisodeInfo:
+def _damage_or(error: InputError, span: RecordSpan) -> InputError:
+    """Return what the CRC says, if it says that the record is damaged: then that is the error to show."""
+    try:
+        read_record(span)
+    except InputError as damage:
+        return damage
+    return error
+
+
+def _identity_of(record: Record, fields: RldsFields) -> str:
     parts = []
     for name in fields.identity:
         values = record.values(name, "bytes_list", "int64_list")
         parts += [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
-    identity = IDENTITY_SEPARATOR.join(parts)
+    return IDENTITY_SEPARATOR.join(parts)
+
+
+def _info_of(record: Record, fields: RldsFields) -> EpisodeInfo:
+    identity = _identity_of(record, fields)
     success = True if "/success/" in identity else False if "/failure/" in identity else None
     return EpisodeInfo(id=identity, num_steps=_num_steps(record, fields), success=success)
 
