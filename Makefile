@@ -43,4 +43,4 @@ bench: $(INSTALLED)  ## figures of this machine; each prints a ratio against a n
 	$(BIN)/python benchmarks/train_step.py
 
 clean:
-	rm -rf .venv demo runs
+	rm -rf .venv demo

@@ -13,8 +13,9 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 
 # A room imports only rooms of a lower rank; rooms of one rank do not know each other.
 RANK = {
-    "__init__": 0, "errors": 0, "config": 1, "episode": 1, "geometry": 1, "storage": 1, "data": 2, "model": 2,
-    "latents": 3, "planning": 4, "evaluation": 5, "training": 6, "simulation": 7, "console": 8, "cli": 9,
+    "__init__": 0, "errors": 0, "config": 1, "config_file": 1.5, "episode": 1, "geometry": 1, "storage": 1,
+    "data": 2, "model": 2, "latents": 3, "planning": 4, "evaluation": 5, "training": 6, "simulation": 7,
+    "console": 8, "cli": 9,
 }  # fmt: skip
 
 HOMES = {

@@ -23,17 +23,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"unrecognized arguments: {' '.join(rest)}")
     if rest:  # argparse gives up on `key=value` behind an option
         options.overrides += rest
-    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    _show_our_warnings()
     handler: Handler = options.handler
     try:
         handler(options)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except OSError as error:  # a full disk, a path that is no path: the message names it
+        print(f"error: {error}", file=sys.stderr)
+        return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
     return 0
+
+
+def _show_our_warnings() -> None:
+    """Print warnings of this program; those of libraries are theirs to show."""
+    ours = logging.getLogger("vjepa2_ac")
+    if not ours.handlers:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("warning: %(message)s"))
+        ours.addHandler(handler)
+    logging.getLogger("bitsandbytes").setLevel(logging.ERROR)
+
+
+def _count(text: str) -> int:
+    """Read a number of things: a whole number from 1."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 1")
+    return number
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -73,7 +94,7 @@ def _add_train(commands: _Commands[argparse.ArgumentParser]) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    from vjepa2_ac.config import load_config
+    from vjepa2_ac.config_file import load_config
     from vjepa2_ac.console import ConsoleReporter, console
     from vjepa2_ac.training.loop import train
     from vjepa2_ac.training.run_folder import read_run_config
@@ -103,7 +124,7 @@ def _add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="folder of a run; several: their spread too")
     parser.add_argument("--split", choices=["test", "validation"], default="test", help="which held-out episodes")
-    parser.add_argument("--clips", type=int, default=256, help="at most this many clips, spread over the episodes")
+    parser.add_argument("--clips", type=_count, default=256, help="at most this many clips, spread over the episodes")
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -147,7 +168,7 @@ def _add_config(commands: _Commands[argparse.ArgumentParser]) -> None:
 
 
 def _config(options: argparse.Namespace) -> None:
-    from vjepa2_ac.config import config_as_yaml, config_schema, load_config
+    from vjepa2_ac.config_file import config_as_yaml, config_schema, load_config
 
     if options.what == "schema":
         print(json.dumps(config_schema(), indent=2))
@@ -183,10 +204,16 @@ def _add_simulate(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--domain", default="A", help="A, B, or random: another camera, light and look in every episode"
     )
-    parser.add_argument("--episodes", type=int, default=40)
-    parser.add_argument("--steps", type=int, default=41, help="control steps of an episode, 15 per second")
+    parser.add_argument("--episodes", type=_count, default=40)
+    parser.add_argument("--steps", type=_count, default=41, help="control steps of an episode, 15 per second")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--workers", type=int, default=1, help="processes; the data are the same whatever their number")
+    parser.add_argument("--cameras", type=int, choices=[1, 3], default=1, help="1: all three pictures are the same one")
+    parser.add_argument(
+        "--renderer", choices=["rays", "opengl"], default="rays", help="opengl needs a working MUJOCO_GL"
+    )
+    parser.add_argument(
+        "--workers", type=_count, default=1, help="processes; the data are the same whatever their number"
+    )
 
 
 def _simulate(options: argparse.Namespace) -> None:
@@ -202,6 +229,8 @@ def _simulate(options: argparse.Namespace) -> None:
             steps=options.steps,
             seed=options.seed,
             workers=options.workers,
+            cameras=options.cameras,
+            renderer=options.renderer,
             progress=lambda done, _: bar.advance_to(done),
         )
     finally:

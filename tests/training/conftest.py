@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from synthetic import write_synthetic_droid
-from vjepa2_ac.config import Config, config_as_dict, parse_config
+from vjepa2_ac.config import Config
+from vjepa2_ac.config_file import config_as_dict, parse_config
 from vjepa2_ac.model.world_model import WorldModel
 
 TINY = {

@@ -24,13 +24,13 @@ def write_weights(folder: Path) -> None:
 
 
 def write(folder: Path, step: int, keep: int = 5) -> Path:
-    return write_checkpoint(folder, RunState(step=step, best_step=1, best_error=0.5), write_weights, keep=keep)
+    return write_checkpoint(folder, RunState(step), write_weights, keep=keep)
 
 
 def test_what_is_written_is_found_again(tmp_path: Path) -> None:
     path = write(tmp_path, 20)
     assert newest_checkpoint(tmp_path) == path
-    assert read_state(path) == RunState(step=20, best_step=1, best_error=0.5)
+    assert read_state(path) == RunState(20)
     assert damage(path) is None
 
 
@@ -85,3 +85,20 @@ def test_what_a_killed_writer_left_behind_is_never_resumed_from_and_is_cleaned_u
     assert newest_checkpoint(tmp_path) is None
     path = write(tmp_path, 40)
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_when_every_checkpoint_is_damaged_the_run_stops_and_leaves_them(tmp_path: Path) -> None:
+    for step in (10, 20):
+        (write(tmp_path, step) / "optimizer.pt").write_bytes(b"")
+    with pytest.raises(InputError, match="none of 2 checkpoints is whole"):
+        newest_checkpoint(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_new_checkpoint_replaces_the_damaged_ones_after_it(tmp_path: Path) -> None:
+    older = write(tmp_path, 10, keep=1)
+    for step in (20, 30, 40):
+        (write(tmp_path, step, keep=9) / "optimizer.pt").write_bytes(b"")
+    path = write(tmp_path, 20, keep=2)
+    assert sorted(tmp_path.iterdir()) == [older, path]
+    assert newest_checkpoint(tmp_path) == path

@@ -12,7 +12,8 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from vjepa2_ac.config import Config, config_as_yaml
+from vjepa2_ac.config import Config
+from vjepa2_ac.config_file import config_as_yaml
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.training.assembly import assemble, batches_from

@@ -135,8 +135,12 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         The network has no path from its input to its output but these two layers; a tiny one that starts at random
         spends most of its training on learning to copy. Exact where the predictor is as wide as a latent.
         """
-        nn.init.orthogonal_(self.predictor_embed.weight, generator=generator)
+        shape = self.predictor_embed.weight.shape
+        drawn = torch.randn(max(shape), min(shape), generator=generator).double()  # or threads would change last bits
+        rotation, triangle = torch.linalg.qr(drawn)
+        rotation = rotation * triangle.diagonal().sign()
         with torch.no_grad():
+            self.predictor_embed.weight.copy_(rotation if shape[0] >= shape[1] else rotation.T)
             self.predictor_proj.weight.copy_(self.predictor_embed.weight.T)
 
     def _assemble(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +14,7 @@ from accelerate.state import AcceleratorState
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.loader import open_source, training_loader, validation_batches
+from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, EpisodeSource, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.latents import encode_batch
@@ -72,6 +75,13 @@ def make_accelerator(config: Config) -> Accelerator:
             found="cuda, but this PyTorch sees no CUDA device",
             fix="Set training.device=cpu, or install a CUDA build of PyTorch and a driver",
         )
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise InputError(
+            where="WORLD_SIZE",
+            found=f"{os.environ['WORLD_SIZE']} processes",
+            needed="one: training on several GPUs is not supported yet",
+            fix="Start without torchrun or accelerate launch",
+        )
     precision = "bf16" if config.training.precision == "bf16" else "no"
     AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
     return Accelerator(mixed_precision=precision, cpu=config.training.device == "cpu")
@@ -109,8 +119,9 @@ def save_checkpoint(run: Run, folder: Path) -> Path:
 
 
 def _read_one_clip_of_each_split(source: EpisodeSource, config: Config) -> None:
-    """Fail early: an empty split, a broken first clip."""
-    for split in ("train", "validation"):
+    """Fail early: an empty split, a broken first clip. A test split of share 0 is nobody's mistake."""
+    splits: tuple[Split, ...] = ("train", "validation", "test") if config.data.test_share else ("train", "validation")
+    for split in splits:
         next(validation_batches(source, config.data, split, clips=1, batch_size=1))
 
 
@@ -121,7 +132,12 @@ def _take_up(
     if checkpoint is None:
         return RunState(step=0)
     load_trained(world_model, checkpoint / ADAPTER, trainable=True)
-    optimizer.load_state_dict(torch.load(checkpoint / OPTIMIZER, weights_only=True, map_location="cpu"))
-    state = read_state(checkpoint)
+    try:
+        optimizer.load_state_dict(torch.load(checkpoint / OPTIMIZER, weights_only=True, map_location="cpu"))
+        state = read_state(checkpoint)
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, pickle.UnpicklingError) as error:
+        raise InputError(
+            where=str(checkpoint), found=f"not the state of this run ({error})", fix="Delete it to use an older one"
+        ) from None
     note(f"Going on from {checkpoint} ({state.step} of {config.training.steps} steps are done).")
     return state

@@ -31,8 +31,6 @@ class RunState:
     """Where a run stands. Data order, learning rate and random numbers are functions of the step."""
 
     step: int  # optimizer steps done
-    best_step: int | None = None
-    best_error: float | None = None  # validation error over persistence, the lower the better
 
 
 def checkpoint_name(step: int) -> str:
@@ -60,8 +58,9 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
         write_files(temporary)
         (temporary / STATE).write_text(json.dumps(asdict(state)))
         _seal(temporary)
-        if final.exists():  # a damaged one: whole ones are resumed from, not written again
-            shutil.rmtree(final)
+        for stale in _listed(folder):  # damaged ones that were passed over; those steps are being done again
+            if stale.name >= final.name:
+                shutil.rmtree(stale)
         temporary.rename(final)
         _sync(folder)
     except OSError as error:
@@ -76,12 +75,23 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """Return the newest checkpoint that is whole; damaged ones are passed over with a warning that names them."""
-    for path in reversed(_listed(folder)):
+    """Return the newest checkpoint that is whole, None where there are none; damaged ones are named in a warning.
+
+    Raises:
+        InputError: There are checkpoints, and every one is damaged.
+    """
+    found = _listed(folder)
+    for path in reversed(found):
         problem = damage(path)
         if problem is None:
             return path
-        logger.warning("%s: %s; using an older checkpoint", path, problem)
+        logger.warning("%s: %s; passed over", path, problem)
+    if found:
+        raise InputError(
+            where=str(folder),
+            found=f"none of {len(found)} checkpoints is whole",
+            fix="To start the run anew, delete this folder",
+        )
     return None
 
 

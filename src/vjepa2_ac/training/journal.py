@@ -65,9 +65,13 @@ def read_journal(path: Path) -> Iterator[dict[str, Any]]:
         return
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
-            yield json.loads(line)
+            row = json.loads(line)
         except ValueError:
-            logger.warning("%s: a line was left by halves; it is dropped", path)
+            row = None
+        if isinstance(row, dict) and isinstance(row.get("step"), int):
+            yield row
+        else:
+            logger.warning("%s: a line is not a row of figures, or was left by halves; it is dropped", path)
 
 
 def _plain(value: Any) -> Any:

@@ -6,10 +6,13 @@ step). A run that was killed continues from its newest checkpoint as if nothing 
 
 from __future__ import annotations
 
+import contextlib
 import time
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
+
+import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.loader import validation_batches
@@ -19,7 +22,7 @@ from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, sav
 from vjepa2_ac.training.checkpoint import RunState
 from vjepa2_ac.training.journal import Journal
 from vjepa2_ac.training.run_folder import check_run_folder, open_run_folder
-from vjepa2_ac.training.step import training_step
+from vjepa2_ac.training.step import gradients, training_step
 
 
 @runtime_checkable
@@ -58,12 +61,18 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False) -> Pa
         InputError: Something the user gave cannot be used; raised before the first step wherever that can be known.
     """
     check_run_folder(config)
+    with _out_of_memory_explained():
+        return _train(config, reporter, check_only=check_only)
+
+
+def _train(config: Config, reporter: Reporter, *, check_only: bool) -> Path:
     run = assemble(config, reporter.note)
-    first = _validate(run, reporter) if run.state.step == 0 or check_only else None
+    first = _validate(run, reporter) if run.state.step == 0 else None
     if first is not None:
         _refuse_weak_base(config, first)
     if check_only:
-        reporter.note("Everything is in place: data, model and validation were tried. Nothing was written.")
+        gradients(run, batches_from(run, run.state.step))
+        reporter.note("Everything is in place: data, model, validation and gradients were tried; nothing was written.")
         return Path(config.run_dir)
     folder = open_run_folder(config)
     with Journal(folder, first_step=run.state.step, tensorboard=config.tracking.tensorboard) as journal:
@@ -85,11 +94,10 @@ def _loop(run: Run, folder: Path, journal: Journal, reporter: Reporter) -> None:
         last = step == training.steps
         if step % training.log_every == 0 or last:
             journal.write("train", step, figures)
-        run.state = replace(run.state, step=step)
+        run.state = RunState(step)
         if step % config.validation.every == 0 or last:
             errors = _validate(run, reporter)
             journal.write("validation", step, validation_figures(errors))
-            run.state = _with_best(run.state, errors)
         if step % config.checkpoint.every == 0 or last:
             save_checkpoint(run, folder)
 
@@ -122,6 +130,19 @@ def _validate(run: Run, reporter: Reporter) -> PredictionErrors:
     return errors
 
 
+@contextlib.contextmanager
+def _out_of_memory_explained() -> Iterator[None]:
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        raise InputError(
+            where="training",
+            found=f"the GPU's memory is not enough ({str(error).splitlines()[0]})",
+            fix="Set training.gradient_checkpointing=true, or lower training.batch_size (and raise"
+            " training.accumulation), model.encode_chunk or validation.batch_size",
+        ) from error
+
+
 def _refuse_weak_base(config: Config, errors: PredictionErrors) -> None:
     error = one_step_ratios(errors)["true"].value
     if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:
@@ -133,10 +154,3 @@ def _refuse_weak_base(config: Config, errors: PredictionErrors) -> None:
         fix="Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction;"
         " to adapt it all the same, set training.allow_weak_base=true",
     )
-
-
-def _with_best(state: RunState, errors: PredictionErrors) -> RunState:
-    error = one_step_ratios(errors)["true"].value
-    if state.best_error is None or error < state.best_error:
-        return replace(state, best_step=state.step, best_error=error)
-    return state

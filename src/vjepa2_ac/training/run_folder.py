@@ -17,7 +17,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from vjepa2_ac.config import Config, changed_keys, config_as_yaml, load_config
+from vjepa2_ac.config import Config
+from vjepa2_ac.config_file import changed_keys, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import write_atomically
 
@@ -69,7 +70,7 @@ def open_run_folder(config: Config) -> Path:
     if not (folder / CONFIG).exists():
         write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     path = folder / ENVIRONMENT
-    starts = json.loads(path.read_text()) if path.exists() else []
+    starts = _earlier_starts(path)
     write_atomically(path, json.dumps([*starts, {"seed": config.seed, **environment()}], indent=1).encode())
     return folder
 
@@ -99,6 +100,14 @@ def environment() -> dict[str, object]:
         "machine": platform.platform(),
         "packages": {name: importlib.metadata.version(name) for name in packages},
     }
+
+
+def _earlier_starts(path: Path) -> list[object]:
+    try:
+        starts = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return []
+    return starts if isinstance(starts, list) else []
 
 
 def _refuse_another_config(folder: Path, config: Config) -> None:

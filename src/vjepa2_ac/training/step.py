@@ -21,25 +21,10 @@ def training_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, fl
     Raises:
         InputError: The loss or a gradient is not finite; names the clips. The weights have not moved.
     """
-    training = run.config.training
     torch.manual_seed(step_seed(run.config.seed, step, run.accelerator.process_index))
-    learning_rate = learning_rate_at(step, training)
+    learning_rate = learning_rate_at(step, run.config.training)
     set_learning_rate(run.optimizer, learning_rate)
-    run.world_model.train()
-    sums = torch.zeros(2, device=run.accelerator.device)
-    seen: list[Batch] = []
-    for micro in range(training.accumulation):
-        batch = next(batches)
-        seen.append(batch)
-        latents = encode(run, batch)
-        last = micro == training.accumulation - 1
-        with contextlib.nullcontext() if last else run.accelerator.no_sync(run.objective):
-            forced, rollout = run.objective(latents)
-            run.accelerator.backward((forced + rollout) / training.accumulation)
-        sums += torch.stack([forced.detach(), rollout.detach()]) / training.accumulation
-    grad_norm = _clip(run)
-    forced_loss, rollout_loss = sums.tolist()
-    _refuse_not_finite(step, forced_loss + rollout_loss + grad_norm, seen)
+    forced_loss, rollout_loss, grad_norm = gradients(run, batches)
     run.optimizer.step()
     run.optimizer.zero_grad(set_to_none=True)
     return {
@@ -49,6 +34,33 @@ def training_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, fl
         "grad_norm": grad_norm,
         "learning_rate": learning_rate,
     }
+
+
+def gradients(run: Run, batches: Iterator[Batch]) -> tuple[float, float, float]:
+    """Accumulate and clip the gradients of the next micro-batches; the weights do not move.
+
+    Returns:
+        Both losses, averaged over the micro-batches, and the norm of the gradients before clipping.
+
+    Raises:
+        InputError: A loss or gradient is not finite; names the clips.
+    """
+    accumulation = run.config.training.accumulation
+    run.world_model.train()
+    sums = torch.zeros(2, device=run.accelerator.device)
+    seen: list[Batch] = []  # on the CPU: only named if something goes wrong
+    for micro in range(accumulation):
+        batch = next(batches)
+        seen.append(batch)
+        last = micro == accumulation - 1
+        with contextlib.nullcontext() if last else run.accelerator.no_sync(run.objective):
+            forced, rollout = run.objective(encode(run, batch))
+            run.accelerator.backward((forced + rollout) / accumulation)
+        sums += torch.stack([forced.detach(), rollout.detach()]) / accumulation
+    grad_norm = _clip(run)
+    forced_loss, rollout_loss = sums.tolist()
+    _refuse_not_finite(forced_loss + rollout_loss + grad_norm, seen)
+    return forced_loss, rollout_loss, grad_norm
 
 
 def step_seed(seed: int, step: int, rank: int) -> int:
@@ -65,7 +77,7 @@ def _clip(run: Run) -> float:
     return float(norm)
 
 
-def _refuse_not_finite(step: int, value: float, seen: list[Batch]) -> None:
+def _refuse_not_finite(value: float, seen: list[Batch]) -> None:
     if math.isfinite(value):
         return
     clips = [
@@ -74,7 +86,7 @@ def _refuse_not_finite(step: int, value: float, seen: list[Batch]) -> None:
         for name, start in zip(batch.episode_ids, batch.starts, strict=True)
     ]
     raise InputError(
-        where=f"optimizer step {step}",
+        where="training",
         found=f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}",
         fix="The weights have not moved. Look at these clips, or lower training.learning_rate",
     )

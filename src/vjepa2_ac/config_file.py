@@ -1,0 +1,193 @@
+"""How is a config read? Strict YAML with dotted overrides; all that is wrong is reported at once, with its path."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.errors import InputError
+
+
+def load_config(path: str | Path, overrides: Iterable[str] = ()) -> Config:
+    """Read a config file and apply `key.sub=value` overrides.
+
+    Raises:
+        InputError: The file cannot be read or is not a valid config; names every key that is wrong.
+    """
+    where = str(path)
+    values = _read_yaml(Path(path))
+    for override in overrides:
+        key, separator, text = override.partition("=")
+        if not separator or not key:
+            raise InputError(
+                where="command line", found=f"{override!r}", needed="an override such as training.steps=100"
+            )
+        _set(values, key.split("."), _parse_yaml(text, where=f"command line: {key}"), override)
+    return parse_config(values, where=where)
+
+
+def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
+    """Validate plain values, as YAML or JSON gives them.
+
+    Raises:
+        InputError: Names every key that is wrong, all at once.
+    """
+    try:
+        return Config.model_validate_json(json.dumps(values))
+    except ValidationError as error:
+        lines = [_explain(detail) for detail in error.errors()]
+        raise InputError(
+            where=where,
+            found=f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n"
+            + "\n".join(f"  {line}" for line in lines)
+            + "\n",
+            fix="`vjepa2-ac config schema` lists every key with its range",
+        ) from None
+    except (TypeError, ValueError) as error:  # a YAML date, NaN, ...
+        raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
+
+
+def config_as_dict(config: Config) -> dict[str, Any]:
+    """Return the resolved config as plain values, defaults included."""
+    return dict(config.model_dump(mode="json"))
+
+
+def config_as_yaml(config: Config) -> str:
+    """Return the resolved config as YAML that `load_config` reads back to an equal config."""
+    return str(yaml.safe_dump(config_as_dict(config), sort_keys=False))
+
+
+def config_schema() -> dict[str, Any]:
+    """Return the JSON schema of a config file, for editors."""
+    return Config.model_json_schema()
+
+
+def changed_keys(old: Config, new: Config) -> list[str]:
+    """Return the dotted keys in which two configs differ."""
+    flat_old, flat_new = _flatten(config_as_dict(old)), _flatten(config_as_dict(new))
+    return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Safe YAML that refuses a key given twice, and reads 1e-4 as the number it is (YAML 1.1 says text)."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if key in seen:
+                raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
+            seen.add(key)
+        return dict(super().construct_mapping(node, deep))
+
+    def construct_scientific(self, node: yaml.ScalarNode) -> float:
+        return float(str(self.construct_scalar(node)))
+
+
+_StrictLoader.add_constructor("!scientific", _StrictLoader.construct_scientific)
+_StrictLoader.add_implicit_resolver("!scientific", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789"))
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(
+            where=str(path), found="no such file", needed="a config", fix="See configs/ for examples"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
+    values = _parse_yaml(text, where=str(path))
+    if not isinstance(values, dict):
+        raise InputError(where=str(path), found=f"a {type(values).__name__}", needed="a mapping of keys to values")
+    return values
+
+
+def _parse_yaml(text: str, *, where: str) -> Any:
+    try:
+        return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - a SafeLoader
+    except yaml.YAMLError as error:
+        raise InputError(where=where, found=f"not YAML: {error}") from None
+
+
+def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> None:
+    for depth, key in enumerate(keys[:-1]):
+        inner = values.setdefault(key, {})
+        if inner is None:
+            inner = values[key] = {}
+        if not isinstance(inner, dict):
+            raise InputError(
+                where=f"command line: {override}", found=f"{'.'.join(keys[: depth + 1])} is a value", needed="a section"
+            )
+        values = inner
+    values[keys[-1]] = value
+
+
+def _explain(detail: Any) -> str:
+    path = ".".join(str(part) for part in detail["loc"])
+    if detail["type"] == "extra_forbidden":
+        known = _keys_at(detail["loc"][:-1])
+        close = difflib.get_close_matches(str(detail["loc"][-1]), known, n=1)
+        elsewhere = [key for key in _all_keys() if key.split(".")[-1] == str(detail["loc"][-1])]
+        hint = (
+            f"did you mean {close[0]}?"
+            if close
+            else f"did you mean {elsewhere[0]}?"
+            if elsewhere
+            else f"known here: {', '.join(known)}"
+        )
+        return f"{path}: unknown key; {hint}"
+    if detail["type"] == "missing":
+        return f"{path}: missing; it has no default"
+    message = str(detail["msg"]).removeprefix("Value error, ")
+    found = detail.get("input")
+    shown = "" if isinstance(found, dict) else f" (found {found!r})"
+    return f"{path}: {message}{shown}" if path else message
+
+
+def _section_at(location: Iterable[Any]) -> type[BaseModel] | None:
+    section: type[BaseModel] | None = Config
+    for part in location:
+        if section is None or part not in section.model_fields:
+            return None
+        section = _section_of(section.model_fields[part].annotation)
+    return section
+
+
+def _section_of(annotation: Any) -> type[BaseModel] | None:
+    for candidate in (annotation, *getattr(annotation, "__args__", ())):
+        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
+            return candidate
+    return None
+
+
+def _keys_at(location: Iterable[Any]) -> list[str]:
+    section = _section_at(location)
+    return list(section.model_fields) if section else []
+
+
+def _all_keys(section: type[BaseModel] = Config, prefix: str = "") -> list[str]:
+    keys = []
+    for name, info in section.model_fields.items():
+        keys.append(prefix + name)
+        if inner := _section_of(info.annotation):
+            keys += _all_keys(inner, f"{prefix}{name}.")
+    return keys
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            flat |= _flatten(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
