@@ -1,5 +1,6 @@
 """Files are whole or absent, and URLs read like local paths."""
 
+import errno
 import hashlib
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import fsspec
 import pytest
 
 from vjepa2_ac import storage
+from vjepa2_ac.errors import InputError
 
 
 def test_a_file_that_fails_while_being_written_leaves_the_old_one(tmp_path: Path) -> None:
@@ -32,6 +34,65 @@ def test_a_file_does_not_have_its_name_before_it_is_whole(tmp_path: Path) -> Non
         assert not target.exists()
     assert target.read_bytes() == b"half"
     assert list(tmp_path.iterdir()) == [target]
+
+
+def fill(folder: Path, *names: str) -> None:
+    with storage.folder_writer(folder, "manifest") as partial:
+        for name in names:
+            storage.write_atomically(partial / name, name)
+
+
+def test_a_folder_is_filled_whole_and_nothing_is_left_where_that_fails(tmp_path: Path) -> None:
+    def fail() -> None:
+        with storage.folder_writer(tmp_path / "new", "manifest") as partial:
+            (partial / "a").touch()
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail()
+    assert list(tmp_path.iterdir()) == []
+    fill(tmp_path / "deep" / "new", "a", "inner/b", "manifest")
+    assert storage.list_names(tmp_path / "deep" / "new") == ["a", "inner", "manifest"]
+
+
+def test_a_folder_that_is_there_stays_itself_and_keeps_its_other_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine").write_text("precious")
+    (tmp_path / "manifest").write_text("old")
+    before = tmp_path.stat().st_ino
+    monkeypatch.chdir(tmp_path)
+    fill(Path(), "inner/b", "manifest")
+    assert tmp_path.stat().st_ino == before
+    assert storage.list_names(tmp_path) == ["inner", "manifest", "mine"]
+    assert (tmp_path / "manifest").read_text() == "manifest"
+
+
+def test_a_folder_in_which_moving_fails_has_no_manifest(tmp_path: Path) -> None:
+    (tmp_path / "manifest").write_text("old")
+    (tmp_path / "a").mkdir()  # where a file is to go
+    (tmp_path / "a" / "mine").write_text("precious")
+    with pytest.raises(InputError, match=r"cannot be written: .*directory"):
+        fill(tmp_path, "a", "manifest")
+    assert storage.list_names(tmp_path) == ["a"]
+
+
+@pytest.mark.parametrize("place", ["file", "file/inner", "/proc/inner"])
+def test_a_place_that_cannot_be_a_folder_is_named(tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=rf"{place}: cannot be written: .*Name a place") as caught:
+        fill(tmp_path / place, "manifest")
+    assert caught.value.where == str(tmp_path / place)
+
+
+def test_a_full_disk_is_called_one() -> None:
+    with (
+        pytest.raises(InputError, match=r"^a: cannot be written: No space left.*Free some space"),
+        storage.user_can_write("a"),
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(ConnectionResetError), storage.user_can_write("a"):
+        raise ConnectionResetError(errno.ECONNRESET, "not about writing")
 
 
 def test_text_is_written_as_utf8(tmp_path: Path) -> None:

@@ -5,14 +5,23 @@ A path is local, or an fsspec URL such as `gs://bucket/folder`; fsspec is import
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterator, Set
 from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, cast, runtime_checkable
 
+from vjepa2_ac.errors import InputError
+
 _HASH_CHUNK_BYTES = 1 << 20
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+_UNWRITABLE = _FULL | {
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG,
+    errno.EINVAL, errno.ELOOP,
+}  # fmt: skip
 
 
 @runtime_checkable
@@ -123,6 +132,68 @@ def write_atomically(path: str | Path, data: bytes | str) -> None:
     """Write a local file so that it is never seen in part; text is written as UTF-8."""
     with atomic_writer(path) as file:
         file.write(data.encode() if isinstance(data, str) else data)
+
+
+@contextmanager
+def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
+    """Give an empty local folder to fill, whose files go to `folder` when the block ends, and nowhere when it fails.
+
+    A new folder appears whole. One that is there stays itself (it may be the working directory, or mounted) and keeps
+    its other files: the old manifest goes first and the new one comes last, so with a manifest the folder is whole.
+
+    Args:
+        folder: Where the files go; missing folders are made.
+        manifest: Name of the file without which the folder does not count.
+
+    Raises:
+        InputError: The folder cannot be made or written, or the disk is full.
+    """
+    with user_can_write(folder):
+        target = Path(folder).resolve()
+        there = target.is_dir()
+        partial = (target if there else target.parent) / f".{target.name}.{os.getpid()}.partial"
+        if target.exists() and not there:
+            raise NotADirectoryError(errno.ENOTDIR, "it is a file")
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+    try:
+        with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's own
+            yield partial
+        with user_can_write(folder):
+            if there:
+                _move_into(target, partial, manifest)
+            else:
+                partial.replace(target)
+            sync_folder(target if there else target.parent)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+@contextmanager
+def user_can_write(path: str | Path, errors: Set[int] = _UNWRITABLE) -> Iterator[None]:
+    """Say in the user's words that a local path cannot be written, or that the disk is full.
+
+    Raises:
+        InputError: In place of an OSError of one of these numbers; other errors pass.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in errors:
+            raise
+        full = error.errno in _FULL
+        fix = "Free some space, or name a place on another disk" if full else "Name a place that can be written"
+        raise InputError(where=str(path), found=f"cannot be written: {error.strerror}", fix=fix) from None
+
+
+def _move_into(target: Path, partial: Path, manifest: str) -> None:
+    (target / manifest).unlink(missing_ok=True)
+    files = [path.relative_to(partial) for path in partial.rglob("*") if path.is_file()]
+    for file in sorted(files, key=lambda file: file == Path(manifest)):
+        (target / file).parent.mkdir(parents=True, exist_ok=True)
+        (partial / file).replace(target / file)
+    shutil.rmtree(partial)
 
 
 def sync_folder(folder: str | Path) -> None:

@@ -1,7 +1,9 @@
 """What we write is DROID's schema as TFDS writes it (golden/DATA_ORIGIN.md), and appears whole or not at all."""
 
 import dataclasses
+import errno
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -101,11 +103,40 @@ def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_full_disk_is_the_users_error_and_an_episodes_own_error_is_not(tmp_path: Path) -> None:
+    def episodes(number: int) -> Iterator[DroidEpisode]:
+        yield synthetic_episode(0, steps=2, size=(16, 32))
+        raise OSError(number, os.strerror(number))
+
+    with pytest.raises(InputError, match="/set: cannot be written: No space left"):
+        write_droid_rlds(tmp_path / "set", episodes(errno.ENOSPC), shards=1)
+    with pytest.raises(FileNotFoundError):
+        write_droid_rlds(tmp_path / "set", episodes(errno.ENOENT), shards=1)
+
+
 def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("precious")
     with pytest.raises(InputError, match="not empty"):
         write_synthetic_droid(tmp_path, episodes=1, steps=2, shards=1)
     assert (tmp_path / "mine").read_text() == "precious"
+
+
+@pytest.mark.parametrize("place", ["file", "file/inner", "/proc/inner"])
+def test_a_place_that_cannot_be_a_data_set_is_refused_before_an_episode_is_made(tmp_path: Path, place: str) -> None:
+    def episodes() -> Iterator[DroidEpisode]:
+        pytest.fail("an episode was made")
+        yield
+
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=rf"{place}: cannot be written"):
+        write_droid_rlds(tmp_path / place, episodes(), shards=1)
+
+
+def test_an_empty_folder_is_used_also_where_one_stands_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_synthetic_droid(".", episodes=1, steps=2, shards=1, size=(16, 32))
+    assert (Path() / "dataset_info.json").exists()
+    assert len(list(tmp_path.iterdir())) == 3
 
 
 def test_an_empty_folder_is_used(tmp_path: Path) -> None:

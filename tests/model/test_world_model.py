@@ -91,6 +91,30 @@ def test_saving_again_replaces_the_folder_and_leaves_nothing_else(fresh: Fresh, 
     assert [path.name for path in tmp_path.iterdir()] == ["model"]
 
 
+def test_a_model_is_saved_where_one_stands_and_beside_what_is_there(
+    fresh: Fresh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "README.md").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    for seed in (0, 1):
+        fresh(seed).save_pretrained(".")
+    assert WorldModel.from_pretrained(".").encoder_fingerprint() == fresh(1).encoder_fingerprint()
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["README.md", "config.json", "encoder.safetensors", "predictor"]
+
+
+@pytest.mark.parametrize("place", ["file", "file/inner", "/proc/inner"])
+def test_a_place_that_cannot_hold_a_model_is_named(model: WorldModel, tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=rf"{place}: cannot be written"):
+        model.save_pretrained(tmp_path / place)
+
+
+def test_the_config_of_a_saved_model_promises_nothing_that_is_not_checked(model: WorldModel, tmp_path: Path) -> None:
+    model.save_pretrained(tmp_path / "model")
+    assert json.loads((tmp_path / "model" / "config.json").read_text()).keys() == {"format", "sizes"}
+
+
 def break_config(folder: Path) -> None:
     (folder / "config.json").write_text("{")
 

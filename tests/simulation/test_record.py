@@ -121,6 +121,10 @@ def test_progress_is_told_after_every_episode(tmp_path: Path) -> None:
 def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least 1 episode"):
         record_dataset(tmp_path / "x", domain="A", episodes=0)
+    with pytest.raises(InputError, match="seed -1"):
+        record_dataset(tmp_path / "x", domain="A", episodes=1, seed=-1)
+    with pytest.raises(InputError, match="shards 0"):
+        record_dataset(tmp_path / "x", domain="A", episodes=1, shards=0)
     with pytest.raises(InputError, match="one of A, B, or random"):
         record_dataset(tmp_path / "x", domain="Z", episodes=1)
     assert not (tmp_path / "x").exists()

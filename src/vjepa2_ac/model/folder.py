@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
 
@@ -20,26 +20,29 @@ FORMAT = "vjepa2-ac world model 1"
 CONFIG, ENCODER, PREDICTOR = "config.json", "encoder.safetensors", "predictor/model.safetensors"
 
 
-def write_folder(folder: Path, sizes: ModelSizes, encoder: nn.Module, predictor: Any, hashes: dict[str, str]) -> None:
-    """Write a model beside the folder, then put it in place: the folder is never half a model.
+def write_folder(folder: Path, sizes: ModelSizes, encoder: nn.Module, predictor: Any) -> None:
+    """Write a model aside, then put it in place, config.json last: what has one is a whole model.
 
     Args:
         folder: Where the model goes; one that is there is replaced.
         sizes: Sizes of the model.
         encoder: The encoder.
         predictor: The predictor: a transformers model.
-        hashes: More that config.json says of the model.
+
+    Raises:
+        InputError: The folder cannot be made or written, or the disk is full.
     """
-    fresh = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(fresh, ignore_errors=True)
-    (fresh / PREDICTOR).parent.mkdir(parents=True)
-    save_file(_whole(encoder), fresh / ENCODER, metadata={"format": "pt"})
-    save_file(_whole(predictor), fresh / PREDICTOR, metadata={"format": "pt"})
-    predictor.config.architectures = [type(predictor).__name__]
-    predictor.config.save_pretrained(fresh / "predictor")
-    card = {"format": FORMAT, "sizes": sizes.model_dump(mode="json"), **hashes}
-    (fresh / CONFIG).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-    _put_in_place(fresh, folder)
+    with storage.folder_writer(folder, CONFIG) as fresh:
+        (fresh / PREDICTOR).parent.mkdir()
+        try:
+            save_file(_whole(encoder), fresh / ENCODER, metadata={"format": "pt"})
+            save_file(_whole(predictor), fresh / PREDICTOR, metadata={"format": "pt"})
+        except SafetensorError as error:  # which is no OSError, also where the disk is full
+            raise InputError(where=str(folder), found=f"cannot be written: {error}") from None
+        predictor.config.architectures = [type(predictor).__name__]
+        predictor.config.save_pretrained(fresh / "predictor")
+        card = {"format": FORMAT, "sizes": sizes.model_dump(mode="json")}
+        (fresh / CONFIG).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
 
 def read_sizes(folder: Path) -> ModelSizes:
@@ -118,12 +121,3 @@ def _whole(module: nn.Module) -> dict[str, torch.Tensor]:
 def _cast(tensor: torch.Tensor, dtype: torch.dtype | None) -> torch.Tensor:
     # A copy in memory of our own: the file may be replaced while the model lives.
     return tensor.to(dtype or tensor.dtype, copy=True)
-
-
-def _put_in_place(fresh: Path, folder: Path) -> None:
-    old = folder.with_name(f".{folder.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.replace(old)
-    fresh.replace(folder)
-    shutil.rmtree(old, ignore_errors=True)

@@ -87,12 +87,12 @@ class WorldModel(nn.Module):
         """Write config.json, encoder.safetensors and predictor/ (which transformers can load by itself).
 
         Raises:
+            InputError: The folder cannot be written.
             ValueError: An adapter is on: merge it first, or save it with `model.lora.save_trained`.
         """
         if self.predictor is not self.base_predictor:
             raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_trained saves it alone")
-        hashes = {"encoder": self.encoder_fingerprint(), "predictor": self.predictor_fingerprint()}
-        write_folder(Path(folder), self.sizes, self.encoder, self.predictor, hashes)
+        write_folder(Path(folder), self.sizes, self.encoder, self.predictor)
 
     @property
     def image_size(self) -> int:

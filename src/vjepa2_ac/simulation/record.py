@@ -66,14 +66,15 @@ def record_dataset(
         progress: Called with (episodes done, episodes in all).
 
     Raises:
-        InputError: MuJoCo or OpenGL is missing, an unknown domain, a number out of range, or a folder that is in use.
+        InputError: MuJoCo or OpenGL is missing, an unknown domain, a number out of range, or a folder that is in use or
+            cannot be written.
     """
     load_mujoco()
-    if min(episodes, steps - 1, workers, shards or 1) < 1:
+    if min(episodes, steps - 1, workers, 1 if shards is None else shards, seed + 1) < 1:
         raise InputError(
             where="simulate record",
-            found=f"episodes {episodes}, steps {steps}, shards {shards}, workers {workers}",
-            needed="at least 1 episode, 2 steps, 1 shard, 1 worker",
+            found=f"episodes {episodes}, steps {steps}, shards {shards}, workers {workers}, seed {seed}",
+            needed="at least 1 episode, 2 steps, 1 shard, 1 worker, seed 0",
         )
     if isinstance(domain, str):
         domain = DomainRanges() if domain == "random" else named_domain(domain)

@@ -6,10 +6,8 @@ Source: measured on files that TFDS wrote in DROID's schema (layout, kinds of li
 from __future__ import annotations
 
 import json
-import os
-import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -27,6 +25,8 @@ from vjepa2_ac.errors import InputError
 __all__ = ["CAMERAS", "DroidCommands", "DroidEpisode", "DroidMeasurements", "encode_jpeg", "write_droid_rlds"]
 
 CAMERAS = ("exterior_image_1_left", "exterior_image_2_left", "wrist_image_left")
+
+_INFO = "dataset_info.json"
 
 
 @dataclass(frozen=True)
@@ -81,39 +81,28 @@ def write_droid_rlds(
 ) -> Path:
     """Write episodes as a data set in DROID's RLDS schema and return its folder; one episode is in memory at a time.
 
-    Episodes are dealt to the shards in turn. The folder appears under its name when it is whole.
+    Episodes are dealt to the shards in turn. The folder is a data set when it is whole.
 
     Raises:
-        InputError: The folder exists and is not empty, or there are fewer episodes than shards.
+        InputError: The folder exists and is not empty, or cannot be written, or there are fewer episodes than shards.
         ValueError: An episode's arrays and pictures do not fit together.
     """
     folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    with storage.user_can_write(folder):
+        in_use = folder.is_dir() and any(folder.iterdir())
+    if in_use:
         raise InputError(
             where=str(folder), found="already there and not empty", fix="Delete it, or name another folder"
         )
-    with _whole_folder(folder) as partial:
+    with storage.folder_writer(folder, _INFO) as partial:
         counts, num_bytes, sizes = _write_shards(partial, episodes, shards, name)
         if min(counts) == 0:
             raise InputError(
                 where=str(folder), found=f"{sum(counts)} episodes", needed=f"at least one for each of {shards} shards"
             )
         _write_json(partial / "features.json", droid_features(sizes), indent=4)
-        _write_json(partial / "dataset_info.json", dataset_info(name, version, counts, num_bytes), indent=2)
+        _write_json(partial / _INFO, dataset_info(name, version, counts, num_bytes), indent=2)
     return folder
-
-
-@contextmanager
-def _whole_folder(folder: Path) -> Iterator[Path]:
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        partial.replace(folder)
-    except BaseException:
-        shutil.rmtree(partial)
-        raise
-    storage.sync_folder(folder.parent)
 
 
 def _write_shards(
