@@ -2,7 +2,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from vjepa2_ac.model.attention import AttentionKind, block_causal_attention
+from vjepa2_ac.model import attention
+from vjepa2_ac.model.attention import AttentionKind, best_kind, block_causal_attention
 
 PER_STEP = 5
 
@@ -61,6 +62,32 @@ def test_a_step_sees_itself_and_the_past_but_not_the_future(kind: AttentionKind)
     same = (before == after).all(dim=-1).all(dim=1).all(dim=0)
     assert same[: 2 * PER_STEP].all()
     assert not same[2 * PER_STEP :].any()
+
+
+def test_auto_compiles_only_for_long_sequences_with_gradients_on_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    cpu, cuda = torch.device("cpu"), torch.device("cuda")
+    monkeypatch.setattr(attention, "_has_triton", lambda: True)
+    assert best_kind(cuda, 64, 4, gradients=True) == "flex"
+    assert best_kind(cuda, 64, 3, gradients=True) == "per_step"
+    assert best_kind(cuda, 64, 15, gradients=False) == "per_step"
+    assert best_kind(cuda, 12, 15, gradients=True) == "per_step"
+    assert best_kind(cpu, 64, 15, gradients=True) == "per_step"
+    monkeypatch.setattr(attention, "_has_triton", lambda: False)
+    assert best_kind(cuda, 64, 15, gradients=True) == "per_step"
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+def test_auto_is_asked_with_the_steps_and_gradients_at_hand(monkeypatch: pytest.MonkeyPatch, gradients: bool) -> None:
+    asked = []
+
+    def best(device: torch.device, head_dim: int, steps: int, *, gradients: bool) -> AttentionKind:
+        asked.append((device.type, head_dim, steps, gradients))
+        return "dense"
+
+    monkeypatch.setattr(attention, "best_kind", best)
+    with torch.set_grad_enabled(gradients):
+        block_causal_attention(*drawn(steps=3), PER_STEP)
+    assert asked == [("cpu", 16, 3, gradients)]
 
 
 def test_a_sequence_of_broken_steps_is_refused() -> None:

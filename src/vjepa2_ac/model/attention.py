@@ -21,6 +21,9 @@ from torch.nn.functional import scaled_dot_product_attention
 AttentionKind = Literal["auto", "dense", "per_step", "flex"]
 ATTENTION_KINDS: tuple[str, ...] = get_args(AttentionKind)
 
+_FLEX_HEAD_DIM = 16  # at least: what its kernels take
+_FLEX_STEPS = 4  # at least: what is worth a compilation
+
 
 def block_causal_attention(
     query: Float[Tensor, "batch heads sequence head_dim"],
@@ -31,8 +34,9 @@ def block_causal_attention(
 ) -> Float[Tensor, "batch heads sequence head_dim"]:
     """Return the attention in which a token of step t sees all tokens of steps <= t.
 
-    `auto` takes `flex` while training on CUDA where Triton is installed, and `per_step` everywhere else: lengths vary
-    in evaluation and planning, and each new one would be compiled anew.
+    `auto` takes `flex` on CUDA where Triton is installed, with gradients on and at least four steps; `per_step`
+    everywhere else. Each length is compiled anew and PyTorch compiles eight at most: lengths vary in evaluation and
+    planning, and the short ones at the start of a rollout are not worth it.
 
     Raises:
         ValueError: The sequence is not a whole number of steps, or the kind is unknown.
@@ -40,10 +44,17 @@ def block_causal_attention(
     if query.shape[2] % tokens_per_step:
         raise ValueError(f"a sequence of {query.shape[2]} tokens is not a whole number of steps of {tokens_per_step}")
     if kind == "auto":
-        kind = _best_kind(query)
+        steps = query.shape[2] // tokens_per_step
+        kind = best_kind(query.device, query.shape[-1], steps, gradients=torch.is_grad_enabled())
     if kind not in _IMPLEMENTATIONS:
         raise ValueError(f"unknown attention {kind!r}; known: {', '.join(ATTENTION_KINDS)}")
     return _IMPLEMENTATIONS[kind](query, key, value, tokens_per_step)
+
+
+def best_kind(device: torch.device, head_dim: int, steps: int, *, gradients: bool) -> AttentionKind:
+    """Return what `auto` takes: see `block_causal_attention`."""
+    fits_flex = device.type == "cuda" and head_dim >= _FLEX_HEAD_DIM and steps >= _FLEX_STEPS and gradients
+    return "flex" if fits_flex and _has_triton() else "per_step"
 
 
 def _dense(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
@@ -71,11 +82,6 @@ _IMPLEMENTATIONS: dict[str, Callable[[Tensor, Tensor, Tensor, int], Tensor]] = {
     "per_step": _per_step,
     "flex": _flex,
 }
-
-
-def _best_kind(query: Tensor) -> AttentionKind:
-    fits_flex = query.device.type == "cuda" and query.shape[-1] >= 16 and torch.is_grad_enabled()
-    return "flex" if fits_flex and _has_triton() else "per_step"
 
 
 def _steps_with_end(query: Tensor, tokens_per_step: int) -> list[tuple[int, Tensor]]:

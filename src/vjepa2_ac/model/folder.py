@@ -114,6 +114,31 @@ def check_tensors(found: dict[str, tuple[int, ...]], needed: dict[str, tuple[int
         )
 
 
+def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
+    """Refuse sizes that were given, and are not those of the model.
+
+    Only those other than the default count as given: a run's own config spells out every default.
+
+    Raises:
+        InputError: Names what differs.
+    """
+    actual, wanted, standard = _flat(found), _flat(given), _flat(ModelSizes())
+    wrong = [key for key in actual if wanted[key] not in (actual[key], standard[key])]
+    if wrong:
+        raise InputError(
+            where=where,
+            found=", ".join(f"{key} {actual[key]}" for key in wrong),
+            needed=", ".join(f"{key} {wanted[key]}" for key in wrong) + ", as model.sizes says",
+            fix="Leave them out of model.sizes: the model tells",
+        )
+
+
+def _flat(sizes: ModelSizes) -> dict[str, Any]:
+    nested = sizes.model_dump()
+    flat = {f"{part}.{key}": value for part in ("encoder", "predictor") for key, value in nested.pop(part).items()}
+    return nested | flat
+
+
 def _whole(module: nn.Module) -> dict[str, torch.Tensor]:
     return {name: value.detach().contiguous() for name, value in module.state_dict().items()}
 

@@ -9,17 +9,21 @@ import torch
 
 from vjepa2_ac.config import ModelConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.folder import CONFIG, check_sizes, read_sizes
 from vjepa2_ac.model.weights import load_official
 from vjepa2_ac.model.world_model import WorldModel
 
+ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets"
+
 _BUILTIN = "builtin:"
+_TINY = f"{_BUILTIN}sim-tiny"
 
 
 def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     """Return the world model to start from, on the CPU: `model.base`, or a fresh one of the sizes `model.random`.
 
     Raises:
-        InputError: There is no such model, or it cannot be read.
+        InputError: There is no such model, it cannot be read, or `model.sizes` says otherwise.
     """
     dtype = torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
     if config.random is not None:
@@ -29,25 +33,26 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
         raise ValueError("a ModelConfig has a base or random sizes")
     path = _builtin(config.base) if config.base.startswith(_BUILTIN) else Path(config.base)
     if path.is_dir():
+        check_sizes(read_sizes(path), config.sizes, where=f"model.base: {config.base}")
         return WorldModel.from_pretrained(path, dtype=dtype)
     if not path.exists():
         raise InputError(
             where=f"model.base: {config.base}",
             found="no such file or folder",
-            needed="the official .pt, a folder written by `vjepa2-ac export`, or builtin:sim-tiny",
+            needed=f"the official .pt, a folder written by `vjepa2-ac export`, or {_TINY}",
             fix="`vjepa2-ac download` fetches the official checkpoint to checkpoints/vjepa2-ac-vitg.pt",
         )
     return load_official(path, config.sizes, dtype=dtype)
 
 
 def _builtin(name: str) -> Path:
-    assets = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets"
-    path = assets / name.removeprefix(_BUILTIN)
-    if not (path / "config.json").is_file():
-        known = sorted(f"{_BUILTIN}{entry.name}" for entry in assets.iterdir() if (entry / "config.json").is_file())
+    path = ASSETS / name.removeprefix(_BUILTIN)
+    if not (path / CONFIG).is_file():
+        there = sorted(f"{_BUILTIN}{config.parent.name}" for config in ASSETS.glob(f"*/{CONFIG}"))
         raise InputError(
             where=f"model.base: {name}",
-            found="no model of that name in the package",
-            needed=f"one of {', '.join(known)}",
+            found=f"no model of that name in the package; it has {', '.join(there) or 'none'}",
+            needed=_TINY,
+            fix="" if _TINY in there else f"Install the package again, or make {_TINY} with `make base`",
         )
     return path

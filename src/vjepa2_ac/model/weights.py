@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.episode import ACTION_DIM
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.folder import check_tensors
+from vjepa2_ac.model.folder import check_sizes, check_tensors
 from vjepa2_ac.model.layers import mlp_ratio_of
 from vjepa2_ac.model.world_model import WorldModel
 
@@ -143,16 +143,7 @@ def _sizes(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes, *, w
             needed="image size and heads of the checkpoint",
             fix="Set them in model.sizes: the tensors cannot tell",
         ) from None
-    standard = _flat(ModelSizes())
-    actual, wanted = _flat(found), _flat(given)
-    wrong = [key for key in actual if wanted[key] not in (actual[key], standard[key])]
-    if wrong:
-        raise InputError(
-            where=where,
-            found=", ".join(f"{key} {actual[key]}" for key in wrong),
-            needed=", ".join(f"{key} {wanted[key]}" for key in wrong) + ", as model.sizes says",
-            fix="Leave them out of model.sizes: the tensors tell",
-        )
+    check_sizes(found, given, where=where)
     return found
 
 
@@ -185,12 +176,6 @@ def _sizes_of_tensors(parts: dict[str, dict[str, tuple[int, ...]]], given: Model
 
 def _depth(names: Mapping[str, object], blocks: str) -> int:
     return 1 + max(int(name.split(".")[1]) for name in names if name.startswith(f"{blocks}."))
-
-
-def _flat(sizes: ModelSizes) -> dict[str, Any]:
-    nested = sizes.model_dump()
-    flat = {f"{part}.{key}": value for part in ("encoder", "predictor") for key, value in nested.pop(part).items()}
-    return nested | flat
 
 
 def _fill(network: nn.Module, path: Path, part: str, dtype: torch.dtype) -> None:
