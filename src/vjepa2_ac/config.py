@@ -56,7 +56,7 @@ class DataConfig(Section):
     frames: Annotated[int, Field(ge=2, le=256)] = 16
     """Frames of a clip, one per model step."""
     stride: PositiveInt = 4
-    """Control steps per model step. Unsettled for the released weights: 4, 8 and 15 are candidates (docs/IMPLEMENTATION_NOTES.md)."""
+    """Control steps per model step. Unsettled for the released weights: 4, 8 and 15 are candidates."""
     validation_share: Share = 0.05
     """Share of the episodes held out for validation, chosen by a hash of the episode's identity."""
     test_share: Share = 0.05
