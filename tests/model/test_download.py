@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model import download as module
 from vjepa2_ac.model.download import download
 
 CONTENT = bytes(range(256)) * 400
@@ -23,6 +24,7 @@ class Behaviour:
     cut_after: list[int] = field(default_factory=list)
     answers: list[int] = field(default_factory=list)
     resumes: bool = True
+    says_size: bool = True
     seen: list[int] = field(default_factory=list)  # where each request started
 
 
@@ -60,7 +62,8 @@ def handler_for(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
             self.send_response(206 if start else 200)
             if start:
                 self.send_header("Content-Range", f"bytes {start}-{size - 1}/{size}")
-            self.send_header("Content-Length", str(size - start))
+            if behaviour.says_size:
+                self.send_header("Content-Length", str(size - start))
             self.end_headers()
             end = start + behaviour.cut_after.pop(0) if behaviour.cut_after else size
             self.wfile.write(behaviour.content[start:end])
@@ -138,3 +141,68 @@ def test_a_file_that_is_here_is_not_fetched_again(serve, tmp_path: Path) -> None
     behaviour = Behaviour()
     assert download(serve(behaviour), tmp_path / "model.pt").read_bytes() == b"mine"
     assert behaviour.seen == []
+
+
+def test_a_file_whose_size_is_not_said_is_refused(serve, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"does not say how large.*needed: its size \(Content-Length\)"):
+        download(serve(Behaviour(says_size=False)), tmp_path / "model.pt")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def official(serve, monkeypatch: pytest.MonkeyPatch) -> Callable[[Behaviour], str]:
+    """Serve the official checkpoint, which is a little smaller than it ought to be."""
+
+    def start(behaviour: Behaviour) -> str:
+        url = serve(behaviour)
+        monkeypatch.setattr(module, "OFFICIAL_URL", url)
+        monkeypatch.setattr(module, "OFFICIAL_LEAST_BYTES", len(CONTENT))
+        return url
+
+    return start
+
+
+def test_less_than_the_official_checkpoint_is_not_taken_for_it(official, tmp_path: Path) -> None:
+    part = tmp_path / "model.pt.part"
+    part.write_bytes(CONTENT[:1000])
+    with pytest.raises(
+        InputError, match=r"a file of 11 bytes\. needed: the official checkpoint, of more than 102,400.*proxy"
+    ):
+        download(official(Behaviour(content=b"please wait", resumes=False)), tmp_path / "model.pt")
+    assert part.read_bytes() == CONTENT[:1000]  # hours of a good line are not thrown away
+    assert download(official(Behaviour()), tmp_path / "model.pt").read_bytes() == CONTENT
+
+
+def test_a_file_that_is_here_and_cannot_be_the_official_checkpoint_is_named(official, tmp_path: Path) -> None:
+    (tmp_path / "model.pt").write_bytes(b"<html>")
+    with pytest.raises(InputError, match=r"model\.pt: a file of 6 bytes.*Delete it"):
+        download(official(Behaviour()), tmp_path / "model.pt")
+    with pytest.raises(InputError, match=r"a folder\. needed: the name of a file"):
+        download(official(Behaviour()), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "url", ["foo", "foo.pt", "file:///etc/passwd", "https://", "http://[", "http://a:b/", "http://a b/"]
+)
+def test_what_is_no_address_is_told_at_once(tmp_path: Path, url: str) -> None:
+    with pytest.raises(InputError, match=r"not an address.*https://"):
+        download(url, tmp_path / "model.pt")
+
+
+@pytest.mark.parametrize("place", ["file/model.pt", "/proc/none/model.pt", "folder.part"])
+def test_a_path_that_cannot_be_written_is_told_at_once(serve, tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.part").mkdir()
+    behaviour = Behaviour()
+    with pytest.raises(InputError, match=rf"{place}: cannot be written"):
+        download(serve(behaviour), tmp_path / place.removesuffix(".part"))
+    assert len(behaviour.seen) <= 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+def test_a_full_disk_is_told_and_not_tried_again(serve, tmp_path: Path) -> None:
+    (tmp_path / "model.pt.part").symlink_to("/dev/full")
+    behaviour = Behaviour()
+    with pytest.raises(InputError, match=r"model\.pt\.part: cannot be written: No space left.*Free some space"):
+        download(serve(behaviour), tmp_path / "model.pt")
+    assert behaviour.seen == [0]

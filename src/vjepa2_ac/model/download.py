@@ -6,15 +6,18 @@ import http.client
 import logging
 import time
 import urllib.error
+import urllib.parse
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
 
+from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)
 
 OFFICIAL_URL = "https://dl.fbaipublicfiles.com/vjepa2/vjepa2-ac-vitg.pt"
+OFFICIAL_LEAST_BYTES = 10 * 10**9  # it has 11.7 GB; what a proxy answers in its place has not
 CHUNK_BYTES = 2**20
 
 Progress = Callable[[int, int], None]
@@ -34,26 +37,33 @@ def download(
 
     Args:
         url: What to fetch.
-        path: Where the whole file goes; it appears there only when it is whole. One that is there is kept.
+        path: Where the whole file goes; it appears there only when it is whole. One that is there is kept, if it can
+            be the file.
         progress: Is told how far it is.
         attempts: How often in a row the line may break without a byte having come.
         wait_s: Seconds before the second attempt; doubled for each further one.
         timeout_s: Seconds without an answer before the line counts as broken.
 
     Raises:
-        InputError: The server refuses, cannot be reached, or sends a file of another size than it promised.
+        InputError: The server refuses, cannot be reached, does not say how large the file is, or sends another size
+            than that or than the official file can have; the address is none; the path cannot be written.
     """
     path = Path(path)
-    if path.exists():
-        return path
+    _require_address(url)
+    with storage.user_can_write(path):
+        if path.exists():
+            _require_file(url, path)
+            return path
+        path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
-    path.parent.mkdir(parents=True, exist_ok=True)
     failures = 0
     while True:
         before = _size(part)
         try:
             whole = _fetch(url, part, progress, timeout_s)
             break
+        except (http.client.InvalidURL, UnicodeError):
+            raise _no_address(url) from None
         except (OSError, http.client.HTTPException) as error:
             if isinstance(error, urllib.error.HTTPError) and error.code < 500 and error.code not in (408, 429):
                 raise _refused(url, error) from None
@@ -66,8 +76,8 @@ def download(
     return part.replace(path)
 
 
-def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) -> int | None:
-    """Bring the rest of a file and return the size of the whole, None where the server does not say."""
+def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) -> int:
+    """Bring the rest of a file and return the size of the whole."""
     start = _size(part)
     request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user's
     try:
@@ -85,18 +95,56 @@ def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) ->
         if start and not (answer.status == 206 and resumes):
             logger.info("%s: the server cannot resume; starting again", url)
             start = 0
-        length = answer.headers.get("Content-Length")
-        whole = None if length is None else start + int(length)
-        with part.open("ab" if start else "wb") as file:
+        whole = start + _promised_bytes(url, answer.headers.get("Content-Length"))
+        _require_size(url, whole, where=url)
+        with storage.user_can_write(part), part.open("ab" if start else "wb") as file:
             here = start
             while block := answer.read(CHUNK_BYTES):
                 file.write(block)
                 here += len(block)
-                if progress and whole is not None:
+                if progress:
                     progress(here, whole)
-        if whole is not None and here < whole:
+        if here < whole:
             raise http.client.IncompleteRead(b"", whole - here)
     return whole
+
+
+def _promised_bytes(url: str, header: str | None) -> int:
+    if header is None or not header.isdigit():
+        raise InputError(
+            where=url,
+            found="a server that does not say how large the file is",
+            needed="its size (Content-Length): without it, half a file looks like a whole one",
+            fix="Check the URL, and whether a proxy answers in its place",
+        )
+    return int(header)
+
+
+def _require_address(url: str) -> None:
+    try:
+        parts = urllib.parse.urlsplit(url)
+    except ValueError:
+        raise _no_address(url) from None
+    if parts.scheme not in {"http", "https"} or not parts.netloc:
+        raise _no_address(url)
+
+
+def _require_file(url: str, path: Path) -> None:
+    if not path.is_file():
+        raise InputError(where=str(path), found="a folder", needed="the name of a file", fix="Name a file in it")
+    _require_size(url, path.stat().st_size, where=str(path))
+
+
+def _require_size(url: str, size: int, *, where: str) -> None:
+    if url == OFFICIAL_URL and size < OFFICIAL_LEAST_BYTES:
+        raise InputError(
+            where=where,
+            found=f"a file of {size:,} bytes",
+            needed=f"the official checkpoint, of more than {OFFICIAL_LEAST_BYTES:,}",
+            fix="Check whether a proxy answers in the server's place"
+            if where == url
+            else "Delete it, or name another file",
+        )
 
 
 def _whole_of_range(header: str | None) -> int | None:
@@ -108,11 +156,15 @@ def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
-def _check_size(url: str, part: Path, whole: int | None) -> None:
+def _check_size(url: str, part: Path, whole: int) -> None:
     size = _size(part)
-    if whole is not None and size != whole:
+    if size != whole:
         part.unlink()
         raise InputError(where=url, found=f"{size} bytes", needed=f"{whole} bytes", fix="Start the download again")
+
+
+def _no_address(url: str) -> InputError:
+    return InputError(where=f"URL {url!r}", found="not an address", needed="one such as https://host/model.pt")
 
 
 def _refused(url: str, error: urllib.error.HTTPError) -> InputError:
