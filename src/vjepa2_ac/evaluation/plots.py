@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from jaxtyping import UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -21,19 +23,16 @@ _COLOURS = {"persistence": "#8a8a8a", "base": "#d1762a", "adapter": "#1f6fb4", "
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
     """Write the picture of an evaluation as PNG; it appears whole or not at all."""
     with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        rows = 1 + len(evaluation.example.errors)
-        columns = len(evaluation.example.frames)
-        figure = Figure(figsize=(max(9.0, 1.25 * columns + 2), 3.6 + 1.2 * rows), layout="constrained")
+        figure = Figure(figsize=(13, 6.2), layout="constrained")
         FigureCanvasAgg(figure)
-        figure.suptitle(_wrapped(verdict(evaluation)), fontsize=10, x=0.01, ha="left")
-        halves: Any = figure.subfigures(2, 1, height_ratios=[3.0, 1.15 * rows])
-        top, bottom = halves
-        left, right = top.subplots(1, 2, width_ratios=[3, 2])
-        _curves(left, evaluation)
-        _use_of_actions(right, evaluation)
-        _filmstrip(bottom, evaluation.example, evaluation.seconds_per_step)
+        figure.suptitle("\n".join(textwrap.wrap(verdict(evaluation), 150)), fontsize=10.5, x=0.01, ha="left")
+        halves: Any = figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
+        upper, lower = halves[0].subplots(2, 1, height_ratios=[3, 2])
+        _curves(upper, evaluation)
+        _use_of_actions(lower, evaluation)
+        _filmstrip(halves[1], evaluation.example, evaluation.seconds_per_step)
         with atomic_writer(path) as file:
-            figure.savefig(file, format="png", dpi=130)
+            figure.savefig(file, format="png", dpi=110)
     return path
 
 
@@ -47,6 +46,7 @@ def _curves(axes: Any, evaluation: Evaluation) -> None:
             seconds, [r.low for r in ratios], [r.high for r in ratios], color=_COLOURS[name], alpha=0.2, linewidth=0
         )
     axes.set(xlabel="seconds ahead (open loop)", ylabel="latent error / persistence", ylim=(0, None))
+    axes.set_xticks(seconds, [f"{value:.2f}" for value in seconds])
     axes.legend(frameon=False, loc="lower right")
     axes.set_title("Prediction error by horizon (band: 95 % over episodes)", loc="left", fontsize=9)
 
@@ -73,32 +73,24 @@ def _reach(value: Ratio) -> tuple[float, float]:
 
 
 def _filmstrip(figure: Any, example: Example, seconds_per_step: float) -> None:
-    columns = len(example.frames)
-    grid = figure.subplots(1 + len(example.errors), columns, squeeze=False)
+    """Show one clip: the first frame and some later ones, and under each where a prediction of it is wrong."""
+    horizons = np.unique(np.linspace(1, len(example.frames) - 1, num=4).round().astype(int))
+    grid = figure.subplots(1 + len(example.errors), 1 + len(horizons), squeeze=False)
+    figure.suptitle("One held-out clip, and the error of each patch (brighter is worse)", x=0.02, ha="left", fontsize=9)
     largest = max(float(errors.max()) for errors in example.errors.values())
-    size = example.frames.shape[1]
-    for column in range(columns):
-        grid[0][column].imshow(example.frames[column])
-        grid[0][column].set_title("now" if column == 0 else f"+{column * seconds_per_step:.1f} s", fontsize=8)
-        for row, (name, errors) in enumerate(example.errors.items(), start=1):
-            axes = grid[row][column]
-            if column == 0:
-                axes.text(0.95, 0.5, f"{name}\nerror", ha="right", va="center", transform=axes.transAxes, fontsize=9)
-                axes.set_axis_off()
-                continue
-            grey = example.frames[column].mean(axis=-1)
-            axes.imshow(grey, cmap="gray", vmin=-100, vmax=255)
-            axes.imshow(errors[column - 1], cmap="inferno", vmin=0, vmax=largest, alpha=0.65, extent=(0, size, size, 0))
-            axes.set_xlim(0, size)
-            axes.set_ylim(size, 0)
     for axes in grid.ravel():
-        axes.set_xticks([])
-        axes.set_yticks([])
-        for spine in axes.spines.values():
-            spine.set_visible(False)
+        axes.set_axis_off()
+    for column, time in enumerate([0, *horizons]):
+        grid[0][column].imshow(example.frames[time])
+        grid[0][column].set_title("now" if time == 0 else f"+{time * seconds_per_step:.2f} s", fontsize=8)
+    for row, (name, errors) in enumerate(example.errors.items(), start=1):
+        grid[row][0].text(0.5, 0.5, f"{name}\nerror", ha="center", va="center", transform=grid[row][0].transAxes)
+        for column, time in enumerate(horizons, start=1):
+            _overlay(grid[row][column], example.frames[time], errors[time - 1], largest)
 
 
-def _wrapped(text: str, width: int = 110) -> str:
-    import textwrap
-
-    return "\n".join(textwrap.wrap(text, width))
+def _overlay(axes: Any, frame: UInt8[np.ndarray, "size size 3"], errors: Any, largest: float) -> None:
+    size = len(frame)
+    axes.imshow(frame.mean(axis=-1), cmap="gray", vmin=-100, vmax=255)
+    axes.imshow(errors, cmap="inferno", vmin=0, vmax=largest, alpha=0.65, extent=(0, size, size, 0))
+    axes.set(xlim=(0, size), ylim=(size, 0))
