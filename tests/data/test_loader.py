@@ -2,7 +2,11 @@
 
 import itertools
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -171,6 +175,41 @@ def test_a_clip_of_a_damaged_record_says_how_to_leave_it_out(droid: Path, tmp_pa
     shard.write_bytes(whole)
     with pytest.raises(InputError, match=r"CRC of the data.*add to data\.exclude: .*episode_0000"):
         clip_at(source, 0, 0, config)
+
+
+RUN_THAT_DIES = """
+import os, signal, sys
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.loader import open_source, training_loader
+if __name__ == "__main__":
+    config = DataConfig(path=sys.argv[1], frames=3, stride=2, workers=1, validation_share=0.0, test_share=0.0)
+    batches = training_loader(open_source(config), config, seed=0, batch_size=1)
+    next(batches)
+    if sys.argv[2] == "error":
+        raise RuntimeError("boom")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize("death", ["error", "kill"])
+def test_workers_end_with_the_run_however_it_ends(droid: Path, tmp_path: Path, death: str) -> None:
+    script = tmp_path / "run.py"
+    script.write_text(RUN_THAT_DIES)
+    with subprocess.Popen(
+        [sys.executable, "-W", "always", str(script), str(droid), death],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as run:
+        try:
+            _, said = run.communicate(timeout=60)  # waits until no process holds the pipe any more
+        except subprocess.TimeoutExpired:
+            os.killpg(run.pid, signal.SIGKILL)
+            pytest.fail("a worker outlives the run")
+    assert said.count("Traceback") == (death == "error")
+    if death == "error":
+        assert said.endswith("RuntimeError: boom\n")
+        assert "Warning" not in said
 
 
 def test_pictures_of_two_sizes_do_not_stack(droid: Path) -> None:

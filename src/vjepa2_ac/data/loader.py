@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import itertools
 import multiprocessing
+import os
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -165,12 +167,29 @@ def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int) -> Ite
         generator=torch.Generator(),  # else the loader draws from the generator that dropout draws from
         num_workers=workers,
         multiprocessing_context=context,
+        worker_init_fn=_end_with_the_run if workers else None,
         prefetch_factor=_PREFETCHED_BATCHES if workers else None,
     )
     for batch in loader:
         if isinstance(batch, InputError):
             raise batch
         yield batch
+
+
+def _end_with_the_run(_worker: int) -> None:
+    """End this worker when the process that reads from it is gone, however it went.
+
+    PyTorch's own watch looks at the fork server, which lives as long as its workers: both would stay for ever.
+    """
+    run = multiprocessing.parent_process()
+    if run is None:
+        raise ValueError("not in a worker")
+
+    def watch() -> None:
+        run.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def _as_it_is(batch: Any) -> Any:
