@@ -6,7 +6,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from paths import ROOT
 from vjepa2_ac.cli import main
+from vjepa2_ac.training.journal import read_journal
 
 TINY = {
     "image_size": 48,
@@ -141,3 +143,15 @@ def test_config_show_prints_every_default(workshop: Path, capsys: pytest.Capture
 def test_config_schema_is_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["config", "schema"]) == 0
     assert json.loads(capsys.readouterr().out)["additionalProperties"] is False
+
+
+def test_real_robot_pictures_go_the_whole_way_and_the_error_falls(shared: Path, tmp_path: Path) -> None:
+    data = shared / "data/bridge_rlds/bridge_dataset/1.0.0"
+    config = str(ROOT / "configs/bridge.yaml")
+    overrides = [f"data.path={data}", f"run_dir={tmp_path / 'run'}", "training.steps=20", "validation.every=20"]
+    assert main(["train", config, *overrides]) == 0
+    rows = list(read_journal(tmp_path / "run" / "metrics.jsonl"))
+    losses = [row["loss"] for row in rows if row["kind"] == "train"]
+    errors = [row["error_over_persistence"] for row in rows if row["kind"] == "validation"]
+    assert losses[-1] < 0.95 * losses[0]
+    assert errors[-1] < 0.9 * errors[0]

@@ -38,15 +38,16 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
 
 def _curves(axes: Any, evaluation: Evaluation) -> None:
     axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--", label="persistence (doing nothing)")
+    seconds = evaluation.seconds_per_step * np.arange(1, evaluation.horizon + 1)
+    shown = seconds[:: -(-len(seconds) // 8)]
     for name, errors in evaluation.models.items():
         ratios = ratios_by_horizon(errors)
-        seconds = evaluation.seconds_per_step * np.arange(1, len(ratios) + 1)
         axes.plot(seconds, [r.value for r in ratios], "o-", color=_COLOURS[name], label=name)
         axes.fill_between(
             seconds, [r.low for r in ratios], [r.high for r in ratios], color=_COLOURS[name], alpha=0.2, linewidth=0
         )
     axes.set(xlabel="seconds ahead (open loop)", ylabel="latent error / persistence", ylim=(0, None))
-    axes.set_xticks(seconds, [f"{value:.2f}" for value in seconds])
+    axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
     axes.legend(frameon=False, loc="lower right")
     axes.set_title("Prediction error by horizon (band: 95 % over episodes)", loc="left", fontsize=9)
 
