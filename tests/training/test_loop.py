@@ -239,3 +239,11 @@ def test_bf16_runs_and_keeps_what_is_trained_in_float32(make_config: object, rep
     config: Config = make_config(training__precision="bf16", model__dtype="bfloat16", training__steps=2)
     train(config, reporter)
     assert all(value.dtype == torch.float32 for value in trained_weights(Path(config.run_dir)).values())
+
+
+def test_an_episode_may_be_left_out_within_a_run(make_config, reporter) -> None:
+    config = make_config(training__steps=2)
+    train(config, reporter)
+    broken = next(batches_from(assemble(config, reporter.note), 0)).episode_ids[0]
+    train(make_config(training__steps=2, data__exclude=[broken]), reporter)
+    assert "Going on from" in reporter.notes[-1]

@@ -26,10 +26,12 @@ CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
 CHECKPOINTS = "checkpoints"
 
-# Settings that may change between two starts of one run: they do not change what is computed.
+# Settings that may change between two starts of one run. They do not change what is computed, but for data.exclude:
+# leaving a broken episode out changes the order of the clips that are still to come.
 _FREE_TO_CHANGE = (
     "run_dir",
     "data.workers",
+    "data.exclude",
     "checkpoint.",
     "tracking.",
     "training.log_every",
