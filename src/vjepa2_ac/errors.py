@@ -29,4 +29,6 @@ def _rebuild(kind: type[InputError], where: str, found: str, needed: str, fix: s
 
 def _sentence(text: str) -> str:
     """End a part of the message; a part that begins on a new line brings its own layout."""
-    return text + (" " if text.endswith((".", "?", "!", "\n")) else ". ")
+    if text.endswith("\n"):
+        return text
+    return text + (" " if text.endswith((".", "?", "!")) else ". ")

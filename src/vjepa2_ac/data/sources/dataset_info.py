@@ -71,7 +71,12 @@ def _read_info(folder: str, where: str) -> dict[str, Any]:
     try:
         info = json.loads(storage.read_bytes(where))
     except FileNotFoundError:
-        raise InputError(where="data.path", found=_nothing_in(folder), needed=f"a folder with {_INFO}") from None
+        raise InputError(
+            where="data.path",
+            found=_nothing_in(folder),
+            needed=f"a folder with {_INFO}",
+            fix="Set data.path to the data set; docs/QUICKSTART.md says how to get DROID",
+        ) from None
     except (OSError, ValueError) as error:
         raise InputError(where=where, found=f"cannot be read ({error})", needed="JSON as TFDS writes it") from None
     if not isinstance(info, dict):
