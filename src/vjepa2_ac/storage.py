@@ -125,7 +125,7 @@ def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
         with suppress(FileNotFoundError):
             temporary.unlink()
         raise
-    sync_folder(target.parent)
+    sync(target.parent)
 
 
 def write_atomically(path: str | Path, data: bytes | str) -> None:
@@ -164,7 +164,7 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
                 _move_into(target, partial, manifest)
             else:
                 partial.replace(target)
-            sync_folder(target if there else target.parent)
+            sync(target if there else target.parent)
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
@@ -196,9 +196,9 @@ def _move_into(target: Path, partial: Path, manifest: str) -> None:
     shutil.rmtree(partial)
 
 
-def sync_folder(folder: str | Path) -> None:
-    """Make the names in a local folder survive a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
+def sync(path: str | Path) -> None:
+    """Make the bytes of a local file, or the names in a local folder, survive a power cut."""
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

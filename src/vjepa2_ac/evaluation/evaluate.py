@@ -15,10 +15,7 @@ from torch import Tensor
 
 from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.evaluation.metrics import (
-    ErrorMeter,
-    PredictionErrors,
-)
+from vjepa2_ac.evaluation.metrics import ErrorMeter, PredictionErrors
 from vjepa2_ac.latents import encode_batch
 from vjepa2_ac.model.lora import base_only
 from vjepa2_ac.model.world_model import WorldModel
@@ -82,7 +79,7 @@ def evaluate(
     variants: dict[str, Variant] = {"base": base_only} if has_base else {}
     variants["adapter" if _has_lora(world_model) else "model"] = contextlib.nullcontext
     meters = {name: ErrorMeter() for name in variants}
-    example: Example | None = None
+    chosen: tuple[Batch, LatentBatch, int] | None = None
     most_motion = -1.0
     for batch in batches:
         latents = encode_batch(world_model, batch, device=device, chunk=encode_chunk)
@@ -92,11 +89,11 @@ def evaluate(
         motion = (latents.latents[:, -1] - latents.latents[:, 0]).abs().mean(dim=(1, 2))
         if motion.max().item() > most_motion:
             most_motion = motion.max().item()
-            example = _example(world_model, batch, latents, int(motion.argmax()), variants)
-    if example is None:
+            chosen = batch, latents, int(motion.argmax())
+    if chosen is None:
         raise ValueError("no clips to evaluate on")
     models = {name: meter.result() for name, meter in meters.items()}
-    return Evaluation(models=models, seconds_per_step=seconds_per_step, example=example)
+    return Evaluation(models, seconds_per_step, _example(world_model, *chosen, variants))
 
 
 @torch.no_grad()

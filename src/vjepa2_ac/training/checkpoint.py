@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import re
 import shutil
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import sha256_of_file
+from vjepa2_ac.storage import sha256_of_file, sync
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +61,7 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
             if stale.name >= final.name:
                 shutil.rmtree(stale)
         temporary.rename(final)
-        _sync(folder)
+        sync(folder)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise InputError(
@@ -123,20 +122,12 @@ def _seal(folder: Path) -> None:
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     digests = {}
     for path in files:
-        _sync(path)
+        sync(path)
         digests[str(path.relative_to(folder))] = sha256_of_file(path)
     manifest = folder / MANIFEST
     manifest.write_text(json.dumps({"files": digests}, indent=1))
-    _sync(manifest)
-    _sync(folder)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    sync(manifest)
+    sync(folder)
 
 
 def _prune(folder: Path, keep: int) -> None:

@@ -55,19 +55,18 @@ def prediction_losses(world_model: WorldModel, batch: LatentBatch, rollout_steps
     latents, actions, states, extrinsics = batch.latents, batch.actions, batch.states, batch.extrinsics
     if rollout_steps >= latents.shape[1]:
         raise ValueError(f"a rollout of {rollout_steps} steps needs {rollout_steps + 1} frames, got {latents.shape[1]}")
-    steps = actions.shape[1]
-    forced = world_model.predict(
-        latents[:, :-1], actions, states[:, :steps], None if extrinsics is None else extrinsics[:, :steps]
-    )
-    known = torch.cat([latents[:, :1], forced[:, :1]], dim=1)
-    for step in range(2, rollout_steps + 1):
-        predicted = world_model.predict(
-            known, actions[:, :step], states[:, :step], None if extrinsics is None else extrinsics[:, :step]
-        )
-        known = torch.cat([known, predicted[:, -1:]], dim=1)
+    states = states[:, :-1]
+    extrinsics = None if extrinsics is None else extrinsics[:, :-1]
+    forced = world_model.predict(latents[:, :-1], actions, states, extrinsics)
+    rolled = forced[:, :1]
+    if rollout_steps > 1:
+        context = torch.cat([latents[:, :1], rolled], dim=1)
+        camera = None if extrinsics is None else extrinsics[:, :rollout_steps]
+        further = world_model.rollout(context, actions[:, :rollout_steps], states[:, :rollout_steps], camera)
+        rolled = torch.cat([rolled, further], dim=1)
     return Losses(
         teacher_forcing=mean_absolute_difference(forced, latents[:, 1:]),
-        rollout=mean_absolute_difference(known[:, 1:], latents[:, 1 : rollout_steps + 1]),
+        rollout=mean_absolute_difference(rolled, latents[:, 1 : rollout_steps + 1]),
     )
 
 

@@ -48,10 +48,10 @@ def gradients(run: Run, batches: Iterator[Batch]) -> tuple[float, float, float]:
     accumulation = run.config.training.accumulation
     run.world_model.train()
     sums = torch.zeros(2, device=run.accelerator.device)
-    seen: list[Batch] = []  # on the CPU: only named if something goes wrong
+    seen: list[str] = []
     for micro in range(accumulation):
         batch = next(batches)
-        seen.append(batch)
+        seen += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
         last = micro == accumulation - 1
         with contextlib.nullcontext() if last else run.accelerator.no_sync(run.objective):
             forced, rollout = run.objective(encode(run, batch))
@@ -77,14 +77,9 @@ def _clip(run: Run) -> float:
     return float(norm)
 
 
-def _refuse_not_finite(value: float, seen: list[Batch]) -> None:
+def _refuse_not_finite(value: float, clips: list[str]) -> None:
     if math.isfinite(value):
         return
-    clips = [
-        f"{name} from step {start}"
-        for batch in seen
-        for name, start in zip(batch.episode_ids, batch.starts, strict=True)
-    ]
     raise InputError(
         where="training",
         found=f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}",
