@@ -21,6 +21,14 @@ def shared() -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Nothing of a test stays in the user's cache folder, and nothing in there helps a test."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VJEPA2_AC_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
     """Tiny tensors are slower on many threads, and bits depend on their number."""

@@ -13,7 +13,7 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 
 # A room imports only rooms of a lower rank; rooms of one rank do not know each other.
 RANK = {
-    "__init__": 0, "errors": 0, "config": 1, "config_file": 1.5, "episode": 1, "geometry": 1, "storage": 1,
+    "__init__": 0, "errors": 0, "config": 1, "config_file": 1.5, "episode": 1, "geometry": 1, "remote": 0.5, "storage": 1,
     "data": 2, "model": 2, "latents": 3, "planning": 4, "evaluation": 5, "training": 6, "simulation": 7,
     "console": 8, "cli": 9,
 }  # fmt: skip
@@ -26,8 +26,11 @@ HOMES = {
     "google_crc32c": {"data/sources/tfrecord.py"},
     "simplejpeg": {"data/"},
     "mujoco": {"simulation/"},
-    "matplotlib": {"evaluation/plots.py"},
-    "fsspec": {"storage.py"},
+    "matplotlib": {"evaluation/plots.py", "evaluation/contact_sheet.py"},
+    "fsspec": {"remote.py"},
+    "av": {"data/video.py"},
+    "h5py": {"data/sources/droid_raw.py"},
+    "pyarrow": {"data/sources/lerobot"},
     "rich": {"console.py"},
     "tensorflow": set(),
     "torchvision": set(),

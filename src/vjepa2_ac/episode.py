@@ -21,7 +21,7 @@ A clip of T frames has T states and T - 1 actions.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -30,6 +30,8 @@ from jaxtyping import Float, Float32, UInt8
 
 if TYPE_CHECKING:
     from torch import Tensor
+
+Progress = Callable[[int, int], None]  # done, total
 
 STATE_DIM = 7
 ACTION_DIM = 7
@@ -45,7 +47,7 @@ class FrameReader(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class EpisodeInfo:
     """What is known of an episode without reading its pictures: enough to choose clips from it."""
 
@@ -56,14 +58,33 @@ class EpisodeInfo:
 
 @dataclass(frozen=True)
 class Episode:
-    """One demonstration: states of every control step, and pictures that are read when asked for."""
+    """One demonstration: states of every control step, and pictures of one camera that are read when asked for."""
 
     info: EpisodeInfo
     states: Float[np.ndarray, "steps 7"]
     read_frames: FrameReader
     control_rate_hz: float
-    extrinsics: Float[np.ndarray, "steps 6"] | None = None
+    extrinsics: Float[np.ndarray, "steps 6"] | None = None  # of the camera
+    joint_velocities: Float[np.ndarray, "steps joints"] | None = None  # *commanded*, radians per second
     metadata: Mapping[str, str] = field(default_factory=dict)  # language instruction and the like; never interpreted
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What is changed in a training clip, the same for all its frames; done on the device."""
+
+    box: tuple[int, int, int, int]  # top, left, height, width within the clip's frames, in pixels
+    brightness: float = 1.0  # factors; 1: unchanged
+    contrast: float = 1.0
+    saturation: float = 1.0
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A clip that was to be in a batch and could not be read (`data.broken_episodes: skip`)."""
+
+    episode_id: str
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -77,6 +98,7 @@ class Clip:
     episode_id: str
     start: int  # first control step
     stride: int  # control steps per model step
+    augmentation: Augmentation | None = None
 
 
 @dataclass(frozen=True)
@@ -89,6 +111,8 @@ class Batch:
     extrinsics: Float32[Tensor, "batch time 6"] | None
     episode_ids: tuple[str, ...]
     starts: tuple[int, ...]
+    augmentations: tuple[Augmentation, ...] = ()  # one per clip, or none at all
+    bytes_fetched: int = 0  # over the network, for these clips
 
 
 @dataclass(frozen=True)
@@ -103,16 +127,33 @@ class LatentBatch:
     starts: tuple[int, ...]
 
 
+StepRanges = Sequence[tuple[int, int]]  # [start, end) of control steps, ascending and apart
+
+
 @runtime_checkable
 class EpisodeSource(Protocol):
-    """A set of episodes in a fixed order. It knows nothing of clips, crops or batches."""
+    """A set of episodes in a fixed order. It knows nothing of clips, crops or batches.
 
-    def infos(self) -> Sequence[EpisodeInfo]:
-        """Return what is known of every episode, in the order of `read`."""
+    It can be pickled to a loader worker, and read from several threads at once.
+    """
+
+    def infos(self, progress: Progress | None = None) -> Sequence[EpisodeInfo]:
+        """Return what is known of every episode that can be used, in the order of `read`.
+
+        Long work the first time (`progress` is told), at once afterwards: what was found out is kept on disk.
+
+        Raises:
+            InputError: There is no such data set, or it is damaged beyond what `data.broken_episodes` allows.
+        """
         ...
 
-    def read(self, index: int) -> Episode:
-        """Return one episode.
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
+        """Return one episode; no picture is read or decoded before `Episode.read_frames` asks for it.
+
+        Args:
+            index: Place in `infos`.
+            camera: Whose pictures; None: the config's (first) camera.
+            needed: Steps that clips may come from, None: all. A source that fetches from afar keeps no others.
 
         Raises:
             InputError: The episode cannot be read, or is not what the data set promises.

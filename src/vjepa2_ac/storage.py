@@ -9,8 +9,9 @@ import errno
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Set
+from collections.abc import Iterator, Sequence, Set
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, cast, runtime_checkable
 
@@ -22,6 +23,10 @@ _UNWRITABLE = _FULL | {
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG,
     errno.EINVAL, errno.ELOOP,
 }  # fmt: skip
+
+
+class ShortReadError(OSError):
+    """A file ends before the bytes that were asked for."""
 
 
 @runtime_checkable
@@ -104,6 +109,46 @@ def read_range(path: str | Path, start: int, length: int) -> bytes:
     with closing(open_to_read(path)) as file:
         file.seek(start)
         return file.read(length)
+
+
+def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+    """Return several (start, length) pieces of a file, each whole; those of a URL are fetched at the same time.
+
+    Raises:
+        OSError: There is no such file, it cannot be read, or it ends within a piece.
+    """
+    pieces = [read_range(path, start, length) for start, length in ranges]
+    for (start, length), piece in zip(ranges, pieces, strict=True):
+        if len(piece) < length:
+            raise ShortReadError(f"{path}: {len(piece)} of {length} bytes at {start}")
+    return pieces
+
+
+@dataclass(frozen=True)
+class FileInfo:
+    """What a listing says of a file."""
+
+    name: str
+    size: int
+    version: str  # differs when the content does, as far as can be known without reading it
+
+
+def list_files(folder: str | Path) -> list[FileInfo]:
+    """Return the files of a folder, sorted by name; none where there is no such folder.
+
+    Raises:
+        OSError: The folder cannot be listed.
+    """
+    if not is_url(folder):
+        files = [path for path in Path(folder).iterdir() if path.is_file()] if Path(folder).is_dir() else []
+        stats = {path.name: path.stat() for path in files}
+        return [FileInfo(name, stat.st_size, str(stat.st_mtime_ns)) for name, stat in sorted(stats.items())]
+    raise NotImplementedError
+
+
+def bytes_fetched() -> int:
+    """Return how many bytes this process has read over the network so far."""
+    return 0
 
 
 @contextmanager

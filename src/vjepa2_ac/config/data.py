@@ -1,0 +1,266 @@
+"""Which knobs has the data? The form it is in, and which clips are made of it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from vjepa2_ac.config.section import PositiveInt, Section, Share
+
+RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
+
+_STRIDES_AT_15_HZ = (4, 8, 15)
+
+
+class RldsFields(Section):
+    """Where an RLDS data set keeps what the model needs; the defaults are DROID's."""
+
+    state: tuple[str, ...] = (
+        "steps/observation/cartesian_position",
+        "steps/observation/gripper_position",
+    )
+    """Features that give, joined, the 7 numbers of the *measured* state (legend: episode.py)."""
+    gripper: Literal["closedness", "openness"] = "closedness"
+    """What the last number of the state is: 0 open .. 1 closed (DROID), or 0 closed .. 1 open (BridgeData)."""
+    identity: tuple[str, ...] = ("episode_metadata/recording_folderpath", "episode_metadata/file_path")
+    """Features that name an episode; the split into train, validation and test is a hash of them."""
+    cameras: dict[str, str] = {
+        "exterior_1_left": "steps/observation/exterior_image_1_left",
+        "exterior_2_left": "steps/observation/exterior_image_2_left",
+        "wrist_left": "steps/observation/wrist_image_left",
+    }
+    """Camera name -> feature with its pictures."""
+    language: str | None = "steps/language_instruction"
+    """Feature kept in the episode's metadata; the model does not use it."""
+    joint_velocity: str | None = "steps/action_dict/joint_velocity"
+    """Feature with the *commanded* joint velocities, read by the idle filter; null: there is none."""
+    control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 15.0
+    """Control steps per second (RLDS does not say)."""
+
+
+class RawDroidOptions(Section):
+    """How raw DROID (trajectory.h5, metadata_*.json, recordings/MP4) is read."""
+
+    skip_action: Literal["drop", "keep"] = "drop"
+    """Steps at which the operator was not in control: drop them, as DROID's own loader does, or keep them."""
+    control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 15.0
+    """Control steps per second; the MP4 holds one frame for each, whatever its header says."""
+
+
+class LeRobotFields(Section):
+    """Where a LeRobot data set keeps what the model needs; the defaults are those of DROID's ports."""
+
+    state: tuple[str, ...] = ("observation.state.cartesian_position", "observation.state.gripper_position")
+    """Columns whose values, joined, hold position, rotation and gripper of the *measured* state."""
+    select: tuple[Annotated[int, Field(ge=0)], ...] | None = None
+    """Which of the joined numbers, in this order, are x, y, z, the rotation's 3 or 4, the gripper; null: all."""
+    rotation: Literal["euler_xyz", "quaternion_wxyz", "quaternion_xyzw"] = "euler_xyz"
+    """How the rotation is written: extrinsic xyz Euler angles in radians, or a unit quaternion, w first or last."""
+    gripper_open: float = 0.0
+    """What the gripper's number is when it is open."""
+    gripper_closed: float = 1.0
+    """What the gripper's number is when it is closed; smaller than gripper_open where the sign is turned."""
+    cameras: dict[str, str] = {
+        "exterior_1_left": "observation.images.exterior_1_left",
+        "exterior_2_left": "observation.images.exterior_2_left",
+        "wrist_left": "observation.images.wrist_left",
+    }
+    """Camera name -> video feature."""
+    joint_velocity: str | None = "action.joint_velocity"
+    """Column with the *commanded* joint velocities, read by the idle filter where there is one."""
+    success: str | None = "is_episode_successful"
+    """Column that says whether the episode succeeded, used where there is one."""
+    fps: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
+    """Control steps per second; null: what meta/info.json says."""
+
+    @model_validator(mode="after")
+    def _gripper_moves(self) -> LeRobotFields:
+        if self.gripper_open == self.gripper_closed:
+            raise ValueError("gripper_open and gripper_closed are the same number")
+        return self
+
+
+class IdleConfig(Section):
+    """Which control steps are left out because the robot stands still."""
+
+    rule: Literal["none", "published", "commands", "motion"] = "none"
+    """none: keep all. published: ranges from a file. commands: openpi's rule on commanded joint velocities. motion: the
+    same runs, found in the measured poses, for data sets without joint velocities."""
+    ranges: str | None = None
+    """For published: a JSON file, local or a URL, of {"recording_folderpath--file_path": [[start, end), ...]}."""
+    keep_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """Share of the idle windows that stay all the same: a world model should see stillness too."""
+    velocity_change_rad_s: Annotated[float, Field(gt=0.0)] = 1e-3
+    """For commands: a step is idle if no commanded joint velocity changes by as much."""
+    translation_m: Annotated[float, Field(gt=0.0)] = 1e-3
+    """For motion: a step is idle if it moves less, turns less and closes less than these three."""
+    rotation_rad: Annotated[float, Field(gt=0.0)] = 5e-3
+    """See translation_m."""
+    gripper: Annotated[float, Field(gt=0.0)] = 1e-2
+    """See translation_m."""
+    shortest_idle_steps: PositiveInt = 7
+    """Shorter idle runs stay."""
+    shortest_kept_steps: PositiveInt = 16
+    """What is left between idle runs goes, too, if it is shorter."""
+    cut_last_steps: Annotated[int, Field(ge=0)] = 10
+    """Steps cut from the end of each range that is left."""
+
+    @model_validator(mode="after")
+    def _published_ranges_are_named(self) -> IdleConfig:
+        if (self.rule == "published") != (self.ranges is not None):
+            raise ValueError("rule published and ranges (a file or URL) belong together")
+        return self
+
+
+class AugmentConfig(Section):
+    """Random changes of training clips, the same for all frames of a clip. The released recipe has none."""
+
+    crop_scale: tuple[Annotated[float, Field(gt=0.0, le=1.0)], Annotated[float, Field(gt=0.0, le=1.0)]] | None = None
+    """Random resized crop: least and greatest share of the picture's area; null: no random crop."""
+    crop_aspect: tuple[Annotated[float, Field(gt=0.0)], Annotated[float, Field(gt=0.0)]] = (0.75, 1.35)
+    """Random resized crop: narrowest and widest width over height."""
+    brightness: Share = 0.0
+    """Colour jitter: brightness is multiplied by 1 - this .. 1 + this."""
+    contrast: Share = 0.0
+    """Colour jitter: contrast likewise."""
+    saturation: Share = 0.0
+    """Colour jitter: saturation likewise."""
+
+    @property
+    def is_on(self) -> bool:
+        """Whether anything is changed."""
+        return self.crop_scale is not None or max(self.brightness, self.contrast, self.saturation) > 0
+
+    @model_validator(mode="after")
+    def _pairs_are_ordered(self) -> AugmentConfig:
+        for name, pair in (("crop_scale", self.crop_scale), ("crop_aspect", self.crop_aspect)):
+            if pair is not None and pair[0] > pair[1]:
+                raise ValueError(f"{name}: {pair[0]} is more than {pair[1]}")
+        return self
+
+
+class DiskCacheConfig(Section):
+    """What is kept on this machine of data that lies elsewhere, and of what was found out about it."""
+
+    dir: str | None = None
+    """Folder; null: $VJEPA2_AC_CACHE, or vjepa2-ac in the user's cache folder."""
+    limit_gb: Annotated[float, Field(ge=0.0)] = 50.0
+    """Pictures beyond this size go, least recently used first; 0: none are kept. Indexes do not count."""
+
+
+class DataConfig(Section):
+    """Which clips, from where."""
+
+    source: Literal["rlds", "droid_raw", "lerobot", "npz"] = "rlds"
+    """Form of the data set. rlds: TFRecord shards with a dataset_info.json, as TFDS writes them. droid_raw: DROID's
+    folders with trajectory.h5 and MP4. lerobot: LeRobotDataset v2.1 or v3.0. npz: a folder of .npz episodes."""
+    path: str
+    """Folder of the data set: on this machine, or a URL such as gs://bucket/folder or hf://datasets/owner/name."""
+    fields: RldsFields = RldsFields()
+    """For rlds: names of the features."""
+    droid_raw: RawDroidOptions = RawDroidOptions()
+    """For droid_raw: what is kept."""
+    lerobot: LeRobotFields = LeRobotFields()
+    """For lerobot: names and conventions of the columns."""
+    camera: str | tuple[str, ...] | None = None
+    """Which camera the model sees; of several, one is drawn for each clip. null: the source's first, for DROID the left
+    exterior camera, which the released weights saw. rlds, lerobot: a name in `cameras`. droid_raw: left, right, wrist,
+    ext1, ext2 or a serial number. npz: the name of an array of pictures."""
+    frames: Annotated[int, Field(ge=2, le=256)] = 16
+    """Frames of a clip, one per model step."""
+    stride: PositiveInt | Literal["auto"] = 4
+    """Control steps per model step. Unsettled for the released weights: 4, 8 and 15 are candidates. auto: before the
+    first step the model chooses among `stride_candidates` by its prediction error over persistence."""
+    stride_candidates: tuple[PositiveInt, ...] | None = None
+    """Strides that `auto` and `data calibrate` try; null: 4, 8 and 15 at 15 control steps per second, scaled to others."""
+    validation_share: Share = 0.05
+    """Share of the episodes held out for validation, chosen by a hash of the episode's identity."""
+    test_share: Share = 0.05
+    """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
+    outcome: Literal["all", "success", "failure"] = "all"
+    """Which demonstrations take part, where the data set tells success from failure."""
+    idle: IdleConfig = IdleConfig()
+    """Which steps are left out because the robot stands still."""
+    short_episodes: Literal["skip", "error"] = "skip"
+    """What to do with episodes shorter than a clip: leave them out and say how many, or stop."""
+    broken_episodes: Literal["error", "skip"] = "error"
+    """What to do with an episode that cannot be read: stop and name it, or leave its clips out, name and count it, and
+    stop when more than 1 % of the episodes are broken."""
+    exclude: tuple[str, ...] = ()
+    """Identities of episodes to leave out, as errors name them."""
+    pose_frame: Literal["base", "camera"] = "base"
+    """Frame of the poses: the robot's base (the released recipe), or the camera, where its extrinsics are known."""
+    crop: Literal["released", "square", "letterbox"] = "released"
+    """What becomes of a picture that is not square. released: its centre at an aspect of 1.35 at most, squashed. square:
+    its central square (upstream's evaluation). letterbox: all of it, with black bars."""
+    augment: AugmentConfig = AugmentConfig()
+    """Random changes of training clips."""
+    check_crc: Literal["once", "always", "never"] = "once"
+    """When the CRC-32C of a local TFRecord's data is checked: the first time that it is read on this machine, every
+    time, or never. The CRC of a record's length is always checked."""
+    disk_cache: DiskCacheConfig = DiskCacheConfig()
+    """What is kept on this machine."""
+    workers: Annotated[int, Field(ge=0, le=256)] = 4
+    """Loader processes; 0 loads in the training process. The data does not depend on it."""
+    prefetch: PositiveInt = 2
+    """Batches that each loader process prepares ahead."""
+    connections: Annotated[int, Field(ge=1, le=256)] = 16
+    """Reads in flight at once per process, for data that lies elsewhere."""
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> DataConfig:
+        known = self.known_cameras
+        if not self.cameras:
+            raise ValueError("camera: an empty list; name one or more, or null for the source's first")
+        for camera in self.cameras:
+            if known is not None and camera not in known:
+                raise ValueError(f"camera {camera!r} is not one of {', '.join(known)}")
+        if self.validation_share + self.test_share >= 1.0:
+            raise ValueError("validation_share and test_share leave nothing to train on")
+        if self.pose_frame == "camera" and self.source in {"rlds", "lerobot"}:
+            raise ValueError(f"pose_frame camera needs camera poses, which a source of {self.source} does not have")
+        return self
+
+    @property
+    def known_cameras(self) -> tuple[str, ...] | None:
+        """The cameras that the config can know of, or None where only the data set does."""
+        return {"rlds": tuple(self.fields.cameras), "lerobot": tuple(self.lerobot.cameras)}.get(self.source)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that clips are drawn from, one or more."""
+        if self.camera is None:
+            first = {"droid_raw": RAW_CAMERAS[0], "npz": "frames"}
+            return (first[self.source],) if self.known_cameras is None else self.known_cameras[:1]
+        return (self.camera,) if isinstance(self.camera, str) else self.camera
+
+    @property
+    def clip_steps(self) -> int:
+        """Control steps that a clip spans, first and last frame included.
+
+        Raises:
+            ValueError: The stride is still to be found out.
+        """
+        return (self.frames - 1) * self.model_stride + 1
+
+    @property
+    def model_stride(self) -> int:
+        """The stride as a number.
+
+        Raises:
+            ValueError: It is still to be found out.
+        """
+        if self.stride == "auto":
+            raise ValueError("data.stride is auto: calibrate first")
+        return self.stride
+
+    def strides_to_try(self, control_rate_hz: float) -> tuple[int, ...]:
+        """Return the strides among which a model may choose, at a control rate."""
+        if self.stride_candidates is not None:
+            return self.stride_candidates
+        return tuple(sorted({max(1, round(stride * control_rate_hz / 15)) for stride in _STRIDES_AT_15_HZ}))
+
+    def with_stride(self, stride: int) -> DataConfig:
+        """Return the same with a stride that was found out."""
+        return self.model_copy(update={"stride": stride})

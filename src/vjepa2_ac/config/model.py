@@ -1,0 +1,105 @@
+"""Which knobs has the model, and what is trained of it?"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from vjepa2_ac.config.section import PositiveInt, Section, Share
+
+
+class EncoderSizes(Section):
+    """Sizes of the frozen video encoder; the defaults are ViT-g/16's."""
+
+    width: PositiveInt = 1408
+    """Width of a latent."""
+    depth: PositiveInt = 40
+    """Transformer blocks."""
+    heads: PositiveInt = 22
+    """Attention heads; width / heads is the size of a head."""
+    mlp_ratio: Annotated[float, Field(gt=0.0)] = 48 / 11
+    """Hidden width of the MLP over the width."""
+
+
+class PredictorSizes(Section):
+    """Sizes of the action-conditioned predictor; the defaults are the released ones."""
+
+    width: PositiveInt = 1024
+    """Width of a token."""
+    depth: PositiveInt = 24
+    """Transformer blocks."""
+    heads: PositiveInt = 16
+    """Attention heads."""
+    mlp_ratio: Annotated[float, Field(gt=0.0)] = 4.0
+    """Hidden width of the MLP over the width."""
+    use_extrinsics: bool = False
+    """Whether the camera pose is one more input token per time step."""
+
+
+class ModelSizes(Section):
+    """Sizes of a world model. The defaults are V-JEPA 2-AC ViT-g/16 at 256 px."""
+
+    image_size: PositiveInt = 256
+    """Height and width of a frame in pixels; a multiple of patch_size."""
+    patch_size: PositiveInt = 16
+    """Height and width of a patch in pixels."""
+    encoder: EncoderSizes = EncoderSizes()
+    """The frozen encoder."""
+    predictor: PredictorSizes = PredictorSizes()
+    """The predictor."""
+
+    @model_validator(mode="after")
+    def _sizes_divide(self) -> ModelSizes:
+        if self.image_size % self.patch_size:
+            raise ValueError(f"image_size {self.image_size} is not a multiple of patch_size {self.patch_size}")
+        for name, part in (("encoder", self.encoder), ("predictor", self.predictor)):
+            if part.width % part.heads:
+                raise ValueError(f"{name}.width {part.width} is not a multiple of {name}.heads {part.heads}")
+            if part.width // part.heads < 6 or (part.width // part.heads) % 2:
+                raise ValueError(
+                    f"{name}: a head of {part.width // part.heads} does not fit 3D RoPE (even, at least 6)"
+                )
+        return self
+
+
+class ModelConfig(Section):
+    """Which world model to start from."""
+
+    base: str | None = None
+    """The model to adapt: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny
+    model of the demo, which comes with the package)."""
+    random: ModelSizes | None = None
+    """Instead of `base`: a fresh model of these sizes; with `adapter.kind: none` that is training from scratch."""
+    random_start: Literal["persistence", "released"] = "persistence"
+    """How a `random` model begins: close to copying the last frame, or as the released recipe drew its weights."""
+    sizes: ModelSizes = ModelSizes()
+    """What an official `.pt` cannot say of itself: image size and heads. Everything else is read from its tensors."""
+    dtype: Literal["float32", "bfloat16"] = "bfloat16"
+    """Type of the frozen weights; what is trained is always float32."""
+    encode_chunk: PositiveInt = 16
+    """Frames that go through the encoder at once: bounds its memory."""
+
+    @model_validator(mode="after")
+    def _one_start(self) -> ModelConfig:
+        if (self.base is None) == (self.random is None):
+            raise ValueError("give either base (a model to adapt) or random (sizes of a fresh one)")
+        return self
+
+
+class AdapterConfig(Section):
+    """What is trained: a LoRA adapter on the predictor, or the whole predictor."""
+
+    kind: Literal["lora", "none"] = "lora"
+    """lora: low-rank adapter (PEFT). none: every weight of the predictor is trained."""
+    rank: Annotated[int, Field(ge=1, le=1024)] = 16
+    """Rank of the update of each target."""
+    alpha: Annotated[float, Field(gt=0.0)] = 32.0
+    """Scale of the update: alpha / sqrt(rank) with rsLoRA, alpha / rank without."""
+    rslora: bool = True
+    """Rank-stabilised scale (arXiv 2312.03732)."""
+    dropout: Share = 0.05
+    """Dropout before the adapter's first matrix, in training only."""
+    targets: tuple[str, ...] = ("q", "k", "v", "o", "fc1", "fc2")
+    """Linear layers of the predictor that get an adapter, by the last part of their name; besides the defaults:
+    predictor_embed, predictor_proj, action_encoder, state_encoder."""

@@ -1,0 +1,53 @@
+"""Which knobs make a complete run?"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from vjepa2_ac.config.data import DataConfig
+from vjepa2_ac.config.model import AdapterConfig, ModelConfig
+from vjepa2_ac.config.section import Section
+from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
+
+
+class Config(Section):
+    """A complete run."""
+
+    run_dir: str
+    """Folder of the run: resolved config, checkpoints, metrics."""
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    """Decides the order of clips, fresh weights and dropout."""
+    data: DataConfig
+    """Which clips, from where."""
+    model: ModelConfig
+    """Which world model to start from."""
+    adapter: AdapterConfig = AdapterConfig()
+    """What is trained."""
+    training: TrainingConfig = TrainingConfig()
+    """How the weights change."""
+    validation: ValidationConfig = ValidationConfig()
+    """The measurement before the first step and on the way."""
+    checkpoint: CheckpointConfig = CheckpointConfig()
+    """What is kept of a run."""
+    tracking: TrackingConfig = TrackingConfig()
+    """Where figures go."""
+
+    @model_validator(mode="after")
+    def _parts_fit(self) -> Config:
+        if self.training.rollout_steps >= self.data.frames:
+            raise ValueError(
+                f"training.rollout_steps {self.training.rollout_steps} needs data.frames of at least"
+                f" {self.training.rollout_steps + 1}, not {self.data.frames}"
+            )
+        if self.model.random is not None and self.adapter.kind == "lora":
+            raise ValueError("model.random with adapter.kind lora would adapt noise; set adapter.kind: none")
+        if self.training.precision == "fp32" and self.model.dtype != "float32":
+            raise ValueError("training.precision fp32 needs model.dtype float32: bfloat16 weights compute in bfloat16")
+        sizes = self.model.random or self.model.sizes
+        if sizes.predictor.use_extrinsics and self.data.source in {"rlds", "lerobot"}:
+            raise ValueError(
+                f"predictor.use_extrinsics needs camera poses, which a data.source of {self.data.source} does not have"
+            )
+        return self

@@ -1,0 +1,156 @@
+"""What is known of every episode of a data set, in a few bytes each?
+
+DROID has 95,658 episodes: a list of as many objects is slow to load and to send to workers. Here are columns instead.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import overload
+
+import numpy as np
+from jaxtyping import Int8, Int32, Int64, UInt8, UInt64
+
+from vjepa2_ac.episode import EpisodeInfo
+
+_UNKNOWN = -1
+
+
+class NotATableError(ValueError):
+    """The bytes are not a table that `to_bytes` wrote."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """An episode that cannot be used, and why."""
+
+    name: str  # its identity; where even that cannot be read, its place
+    where: str
+    found: str
+    needed: str = ""
+    fix: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeTable(Sequence[EpisodeInfo]):
+    """The usable episodes of a data set, in the source's order, as columns.
+
+    `locators` are columns of the source's own (where an episode lies); `texts` are small values of the whole set.
+    """
+
+    num_steps: Int32[np.ndarray, " episodes"]
+    success: Int8[np.ndarray, " episodes"]  # 1, 0, or -1: the data set does not say
+    id_ends: Int64[np.ndarray, " episodes"]
+    id_bytes: UInt8[np.ndarray, " bytes"]
+    id_hash: UInt64[np.ndarray, " episodes"]  # the first 8 bytes of the identity's SHA-256
+    id_rank: Int32[np.ndarray, " episodes"]  # place of the identity in alphabetical order
+    problems: tuple[Problem, ...] = ()
+    locators: Mapping[str, np.ndarray] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        infos: Sequence[EpisodeInfo],
+        *,
+        problems: Sequence[Problem] = (),
+        locators: Mapping[str, np.ndarray] | None = None,
+        texts: Mapping[str, str] | None = None,
+    ) -> EpisodeTable:
+        """Make a table; one that is given is returned as it is."""
+        if isinstance(infos, EpisodeTable):
+            return infos
+        ids = [info.id.encode() for info in infos]
+        rank = np.empty(len(ids), np.int32)
+        rank[sorted(range(len(ids)), key=lambda number: infos[number].id)] = np.arange(len(ids), dtype=np.int32)
+        return cls(
+            num_steps=np.array([info.num_steps for info in infos], np.int32),
+            success=np.array([_UNKNOWN if info.success is None else info.success for info in infos], np.int8),
+            id_ends=np.cumsum([len(name) for name in ids], dtype=np.int64),
+            id_bytes=np.frombuffer(b"".join(ids), np.uint8),
+            id_hash=np.array([identity_hash(info.id) for info in infos], np.uint64),
+            id_rank=rank,
+            problems=tuple(problems),
+            locators=dict(locators or {}),
+            texts=dict(texts or {}),
+        )
+
+    def __len__(self) -> int:
+        return len(self.num_steps)
+
+    @overload
+    def __getitem__(self, index: int) -> EpisodeInfo: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[EpisodeInfo]: ...
+
+    def __getitem__(self, index: int | slice) -> EpisodeInfo | Sequence[EpisodeInfo]:
+        """Return what is known of one episode, or of several."""
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"episode {index} of {len(self)}")
+        index %= len(self)
+        success = int(self.success[index])
+        return EpisodeInfo(
+            id=self.identity(index),
+            num_steps=int(self.num_steps[index]),
+            success=None if success == _UNKNOWN else bool(success),
+        )
+
+    def __iter__(self) -> Iterator[EpisodeInfo]:
+        return (self[number] for number in range(len(self)))
+
+    def identity(self, index: int) -> str:
+        """Return the identity of one episode."""
+        start = int(self.id_ends[index - 1]) if index else 0
+        return self.id_bytes[start : int(self.id_ends[index])].tobytes().decode()
+
+    def find(self, identity: str) -> int | None:
+        """Return the place of an episode, or None where no episode is called so."""
+        for index in np.flatnonzero(self.id_hash == np.uint64(identity_hash(identity))):
+            if self.identity(int(index)) == identity:
+                return int(index)
+        return None
+
+    def to_bytes(self) -> bytes:
+        """Return the table as a file's content, with checksums."""
+        text = json.dumps({"problems": [vars(problem) for problem in self.problems], "texts": dict(self.texts)})
+        file = io.BytesIO()
+        columns = {name: getattr(self, name) for name in _COLUMNS}
+        named = {f"locator.{name}": column for name, column in self.locators.items()}
+        np.savez(file, text=np.frombuffer(text.encode(), np.uint8), **columns, **named)
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> EpisodeTable:
+        """Read what `to_bytes` returned.
+
+        Raises:
+            NotATableError: It is something else, or damaged.
+        """
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as file:
+                arrays = {name: file[name] for name in file.files}
+            text = json.loads(arrays.pop("text").tobytes())
+            return cls(
+                **{name: arrays[name] for name in _COLUMNS},
+                problems=tuple(Problem(**problem) for problem in text["problems"]),
+                locators={name.removeprefix("locator."): a for name, a in arrays.items() if name not in _COLUMNS},
+                texts=text["texts"],
+            )
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise NotATableError(str(error)) from None
+
+
+_COLUMNS = ("num_steps", "success", "id_ends", "id_bytes", "id_hash", "id_rank")
+
+
+def identity_hash(identity: str) -> int:
+    """Return 64 bits of the identity's SHA-256: as a share of 2**64 it decides the episode's split."""
+    return int.from_bytes(hashlib.sha256(identity.encode()).digest()[:8], "big")
