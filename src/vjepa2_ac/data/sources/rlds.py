@@ -20,6 +20,7 @@ from vjepa2_ac.data.exclusion import NAMED, with_way_out
 from vjepa2_ac.data.sources.dataset_info import find_shards, index_shards
 from vjepa2_ac.data.sources.jpeg import JpegReader
 from vjepa2_ac.data.sources.record import Record
+from vjepa2_ac.data.sources.states import require_plausible
 from vjepa2_ac.data.sources.tfrecord import RecordSpan, read_record
 from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo
 from vjepa2_ac.errors import InputError
@@ -30,9 +31,6 @@ IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
 
 _STEP_FLAG = "steps/is_first"
 _CACHED_EPISODES = 4
-_REACH_LIMIT_M = 5.0
-_ANGLE_LIMIT_RAD = 2 * np.pi + 0.1
-_GRIPPER_TOLERANCE = 0.05
 
 
 class RldsSource:
@@ -207,30 +205,7 @@ def _states_of(record: Record, fields: RldsFields, steps: int, where: str) -> Fl
         raise InputError(
             where=f"{where}: data.fields.state", found=found, needed=f"{STATE_DIM} numbers a step: xyz, Euler, gripper"
         )
-    _require_plausible(states, where)
+    require_plausible(states, where, fix="Check data.fields.state")
     if fields.gripper == "openness":
         states[:, 6] = 1.0 - states[:, 6]
     return states
-
-
-def _require_plausible(states: Float[np.ndarray, "steps 7"], where: str) -> None:
-    """Refuse what cannot be metres, radians and closedness."""
-    gripper = (states[:, 6] < -_GRIPPER_TOLERANCE) | (states[:, 6] > 1 + _GRIPPER_TOLERANCE)
-    checks = (
-        (~np.isfinite(states).all(axis=1), "finite numbers"),
-        (
-            abs(states[:, :3]).max(axis=1) > _REACH_LIMIT_M,
-            f"a position within {_REACH_LIMIT_M:g} m of the base, in metres",
-        ),
-        (abs(states[:, 3:6]).max(axis=1) > _ANGLE_LIMIT_RAD, "Euler angles in radians"),
-        (gripper, "a gripper between 0 and 1"),
-    )
-    for wrong, needed in checks:
-        if wrong.any():
-            step = int(wrong.argmax())
-            raise InputError(
-                where=f"{where}: step {step}",
-                found=f"the state {np.array2string(states[step], precision=4, max_line_width=200)}",
-                needed=needed,
-                fix="Check data.fields.state",
-            )
