@@ -14,7 +14,7 @@ from vjepa2_ac.model.world_model import WorldModel
 
 @torch.no_grad()
 def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int) -> LatentBatch:
-    """Encode the frames of a batch, each by itself, on the device.
+    """Encode the frames of a batch, each by itself, on the device; a training batch is augmented there, too.
 
     Args:
         world_model: The model whose frozen encoder is used.
@@ -22,7 +22,8 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
         device: Where the model is.
         chunk: Frames that go through the encoder at once.
     """
-    inputs = pixels_to_input(batch.frames.to(device, non_blocking=True), world_model.image_size)
+    frames = batch.frames.to(device, non_blocking=True)
+    inputs = pixels_to_input(frames, world_model.image_size, batch.augmentations)
     return LatentBatch(
         latents=world_model.encode(inputs, chunk=chunk),
         states=batch.states.to(device, non_blocking=True),

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from paths import GOLDEN
-from vjepa2_ac.data.transforms import CropBox, crop, crop_box, pixels_to_input
+from vjepa2_ac.data.transforms import CropBox, crop_box, pixels_to_input, view
 
 FLOAT16_ROUNDING = 2.0**-10  # half a step between 2 and 4
 
@@ -21,6 +21,29 @@ def test_crops_equal_all_that_the_official_code_took() -> None:
         assert [CropBox(*seen) for seen in row["train_crops_seen"]] == [found]
 
 
+def test_the_square_is_what_the_official_code_evaluates_on() -> None:
+    rows = json.loads((GOLDEN / "crops.json").read_text())
+    for row in rows:
+        assert crop_box(row["height"], row["width"], "square") == CropBox(*row["eval_crop"])
+
+
+def test_of_a_tall_picture_the_square_is_the_middle() -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (2, 32, 18, 3), dtype=np.uint8)
+    assert np.array_equal(view(frames, "square"), frames[:, 7:25])
+
+
+@pytest.mark.parametrize(("height", "width"), [(18, 32), (32, 18), (17, 32), (20, 20)])
+def test_a_letterbox_shows_every_pixel_between_black_bars(height: int, width: int) -> None:
+    frames = np.random.default_rng(0).integers(1, 256, (2, height, width, 3), dtype=np.uint8)
+    seen = view(frames, "letterbox")
+    side = max(height, width)
+    assert seen.shape == (2, side, side, 3)
+    top, left = (side - height) // 2, (side - width) // 2
+    assert np.array_equal(seen[:, top : top + height, left : left + width], frames)
+    assert int((seen == 0).sum()) == 2 * 3 * side * (side - min(height, width))
+    assert crop_box(height, width, "letterbox") == CropBox(0, 0, height, width)
+
+
 @pytest.mark.parametrize(("height", "width", "expected"), [(200, 100, (33, 0, 133, 100)), (180, 243, (0, 0, 180, 243))])
 def test_tall_pictures_are_cut_too_and_cropped_ones_are_left(
     height: int, width: int, expected: tuple[int, ...]
@@ -30,7 +53,7 @@ def test_tall_pictures_are_cut_too_and_cropped_ones_are_left(
 
 def test_the_crop_is_a_slice_of_the_same_pixels() -> None:
     frames = np.random.default_rng(0).integers(0, 256, (2, 18, 32, 3), dtype=np.uint8)
-    cropped = crop(frames)
+    cropped = view(frames)
     assert cropped.base is frames
     assert np.array_equal(cropped, frames[:, :, 4:28])
 
@@ -38,14 +61,14 @@ def test_the_crop_is_a_slice_of_the_same_pixels() -> None:
 def test_the_transform_equals_the_official_one_on_a_frame() -> None:
     with np.load(GOLDEN / "transform_frame.npz") as golden:
         frame, expected = golden["frame"], golden["clip"].astype(np.float32)
-    found = pixels_to_input(torch.from_numpy(crop(frame[None]))[None], 256)[0, 0]
+    found = pixels_to_input(torch.from_numpy(view(frame[None]))[None], 256)[0, 0]
     assert abs(found.numpy()[:, ::8, ::8] - expected).max() <= FLOAT16_ROUNDING
 
 
 def test_the_transform_equals_the_official_one_on_every_pixel(shared: Path) -> None:
     with np.load(shared / "reference" / "transform.npz") as golden:
         frames, expected = golden["frames"], golden["clip"].astype(np.float32)
-    found = pixels_to_input(torch.from_numpy(crop(frames))[None], 256)[0]
+    found = pixels_to_input(torch.from_numpy(view(frames))[None], 256)[0]
     assert abs(found.permute(1, 0, 2, 3).numpy() - expected).max() <= FLOAT16_ROUNDING
 
 

@@ -1,6 +1,6 @@
-"""How does a camera's picture become what the encoder sees? The crop and the scaling of the released recipe.
+"""How does a camera's picture become what the encoder sees? Crop, augmentation, scaling, normalisation.
 
-The crop is a slice, taken in the loader; resize and normalisation run on the device, on a whole batch.
+The crop is taken in the loader, on uint8; all else runs on the device, on a whole batch.
 
 Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/transforms.py and src/datasets/utils/video/transforms.py. The
 recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, is always taken: nothing is random.
@@ -8,12 +8,19 @@ recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+
+from vjepa2_ac.data.augment import jittered
+from vjepa2_ac.episode import Augmentation
+
+Crop = Literal["released", "square", "letterbox"]
 
 NARROWEST, WIDEST = 0.75, 1.35  # width over height that the recipe lets through uncropped
 
@@ -31,32 +38,89 @@ class CropBox:
     width: int
 
 
-def crop_box(height: int, width: int) -> CropBox:
-    """Return the part of a picture that the model sees: the centre, cut to an aspect between 0.75 and 1.35."""
+def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
+    """Return the part of a picture that the model sees: all of it, or the centre cut to an aspect (width over height).
+
+    released: an aspect between 0.75 and 1.35. square: 1, as upstream evaluates. letterbox: all.
+    """
+    narrowest, widest = {
+        "released": (NARROWEST, WIDEST),
+        "square": (1.0, 1.0),
+        "letterbox": (0.0, float("inf")),
+    }[kind]
     box_height, box_width = height, width
-    if width / height < NARROWEST:
-        box_height = round(width / NARROWEST)
-    elif width / height > WIDEST:
-        box_width = round(height * WIDEST)
+    if width / height < narrowest:
+        box_height = round(width / narrowest)
+    elif width / height > widest:
+        box_width = round(height * widest)
     return CropBox((height - box_height) // 2, (width - box_width) // 2, box_height, box_width)
 
 
-def crop(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time cropped_height cropped_width 3"]:
-    """Return the part of the pictures that the model sees, as a view."""
-    box = crop_box(*frames.shape[1:3])
+def view(
+    frames: UInt8[np.ndarray, "time height width 3"], kind: Crop = "released"
+) -> UInt8[np.ndarray, "time seen_height seen_width 3"]:
+    """Return what the model sees of the pictures, in their own pixels; see `DataConfig.crop`.
+
+    A slice of the same memory, but for letterbox where bars must be added.
+    """
+    if kind == "letterbox":
+        return _with_bars(frames)
+    box = crop_box(frames.shape[1], frames.shape[2], kind)
     return frames[:, box.top : box.top + box.height, box.left : box.left + box.width]
 
 
+def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time side side 3"]:
+    time, height, width, channels = frames.shape
+    if height == width:
+        return frames
+    side = max(height, width)
+    top, left = (side - height) // 2, (side - width) // 2
+    square = np.zeros((time, side, side, channels), np.uint8)
+    square[:, top : top + height, left : left + width] = frames
+    return square
+
+
 def pixels_to_input(
-    frames: UInt8[Tensor, "batch time height width 3"], image_size: int
+    frames: UInt8[Tensor, "batch time height width 3"],
+    image_size: int,
+    augmentations: Sequence[Augmentation] = (),
 ) -> Float[Tensor, "batch time 3 size size"]:
-    """Return cropped pictures as the encoder wants them: squashed to a square (bilinear), ImageNet mean 0 and std 1."""
+    """Return cropped pictures as the encoder wants them: squashed to a square (bilinear), ImageNet mean 0 and std 1.
+
+    Args:
+        frames: What `view` returned, stacked, on any device.
+        image_size: Height and width of a result, in pixels.
+        augmentations: What is changed on the way, one for each clip; none: nothing.
+
+    Raises:
+        ValueError: There are some augmentations, but not one for each clip.
+    """
     batch, time = frames.shape[:2]
-    pixels = frames.flatten(0, 1).permute(0, 3, 1, 2).to(torch.float32)
-    resized = torch.nn.functional.interpolate(
-        pixels, size=(image_size, image_size), mode="bilinear", align_corners=False, antialias=False
-    )
+    if not augmentations:
+        resized = _resized(frames.flatten(0, 1), image_size)
+    elif len(augmentations) == batch:
+        pairs = zip(frames, augmentations, strict=True)
+        resized = torch.cat([_augmented(clip, image_size, augmentation) for clip, augmentation in pairs])
+    else:
+        raise ValueError(f"{len(augmentations)} augmentations for {batch} clips")
     mean = torch.tensor(_MEAN, device=frames.device).view(3, 1, 1)
     std = torch.tensor(_STD, device=frames.device).view(3, 1, 1)
     normalised: Tensor = (resized - mean) / std
     return normalised.reshape(batch, time, 3, image_size, image_size)
+
+
+def _augmented(clip: Tensor, image_size: int, augmentation: Augmentation) -> Float[Tensor, "time 3 size size"]:
+    top, left, height, width = augmentation.box
+    return jittered(_resized(clip[:, top : top + height, left : left + width], image_size), augmentation)
+
+
+def _resized(frames: UInt8[Tensor, "count height width 3"], size: int) -> Float[Tensor, "count 3 size size"]:
+    pixels = frames.permute(0, 3, 1, 2).to(torch.float32)
+    return torch.nn.functional.interpolate(
+        pixels, size=(size, size), mode="bilinear", align_corners=False, antialias=False
+    )
+
+
+def crop(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time cropped_height cropped_width 3"]:
+    """Return `view(frames, "released")`."""
+    return view(frames)
