@@ -93,12 +93,13 @@ def test_a_box_gives_what_the_sliced_pixels_give_and_leaves_the_other_clip_alone
     assert torch.equal(found[1:], pixels_to_input(frames[1:], 16))
 
 
-def test_equal_frames_of_a_clip_stay_equal_also_beside_a_dark_one() -> None:
-    frames = clip(batch=1)
-    frames[:, 1] = frames[:, 0]
-    frames[:, 2] = 0
-    found = pixels_to_input(frames, 16, [Augmentation((1, 2, 15, 20), 1.2, 0.7, 1.3)])
-    assert torch.equal(found[:, 0], found[:, 1])
+def test_a_colour_becomes_the_same_colour_in_a_bright_frame_and_in_a_dark_one() -> None:
+    frames = torch.zeros((1, 2, 16, 16, 3), dtype=torch.uint8)
+    frames[0, 0] = 200
+    frames[0, :, :, :8] = torch.tensor([100, 80, 60], dtype=torch.uint8)
+    found = pixels_to_input(frames, 16, [Augmentation((0, 0, 16, 16), 1.2, 0.7, 1.3)])
+    assert torch.equal(found[0, 0, :, :, :8], found[0, 1, :, :, :8])
+    assert not torch.equal(found[0, 0], found[0, 1])
 
 
 def test_a_number_of_augmentations_that_is_not_that_of_the_clips_is_a_mistake() -> None:
