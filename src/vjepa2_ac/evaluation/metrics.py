@@ -7,7 +7,7 @@ error of copying the last frame that was seen. A ratio of 1 means: as good as do
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -62,6 +62,14 @@ class Ratio:
         """Whether there were episodes enough to say how sure the value is."""
         return not math.isnan(self.low)
 
+    def as_dict(self) -> dict[str, float | None]:
+        """Return plain values, for JSON; None where there is no interval."""
+        return {
+            "value": self.value,
+            "low": self.low if self.has_interval else None,
+            "high": self.high if self.has_interval else None,
+        }
+
     def __str__(self) -> str:
         return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]" if self.has_interval else f"{self.value:.3f}"
 
@@ -111,23 +119,32 @@ def _stand_in(actions: Tensor) -> Tensor:
     return actions[1:2] if len(actions) > 1 else actions.flip(1)
 
 
+@torch.no_grad()
+def one_step_errors(
+    model: Predictor, batch: LatentBatch, actions: Float[Tensor, "batch steps 7"] | None = None
+) -> tuple[Float[np.ndarray, " batch"], Float[np.ndarray, " batch"]]:
+    """Return, for each clip, the teacher-forced error with its own or other actions, and that of persistence."""
+    latents, extrinsics = batch.latents, batch.extrinsics
+    tried = batch.actions if actions is None else actions
+    before = None if extrinsics is None else extrinsics[:, :-1]
+    predicted = model.predict(latents[:, :-1], tried, batch.states[:, :-1], before)
+    truth = latents[:, 1:]
+    return _error(predicted, truth).mean(axis=1), _error(latents[:, :-1], truth).mean(axis=1)
+
+
 def _batch_errors(model: Predictor, batch: LatentBatch, other_actions: Tensor) -> dict[str, np.ndarray]:
     latents, actions = batch.latents, batch.actions
     states = batch.states[:, :-1]
     extrinsics = None if batch.extrinsics is None else batch.extrinsics[:, :-1]
     truth = latents[:, 1:]
-
-    def one_step_error(tried: Tensor) -> np.ndarray:
-        error = _error(model.predict(latents[:, :-1], tried, states, extrinsics), truth)
-        return np.asarray(error.mean(axis=1))
-
+    one_step, one_step_persistence = one_step_errors(model, batch)
     return {
         "rollout": _error(model.rollout(latents[:, :1], actions, states, extrinsics), truth),
         "persistence": _error(latents[:, :1].expand_as(truth), truth),
-        "one_step": one_step_error(actions),
-        "one_step_zero_actions": one_step_error(torch.zeros_like(actions)),
-        "one_step_shuffled_actions": one_step_error(other_actions),
-        "one_step_persistence": _error(latents[:, :-1], truth).mean(axis=1),
+        "one_step": one_step,
+        "one_step_zero_actions": one_step_errors(model, batch, torch.zeros_like(actions))[0],
+        "one_step_shuffled_actions": one_step_errors(model, batch, other_actions)[0],
+        "one_step_persistence": one_step_persistence,
     }
 
 
@@ -149,14 +166,40 @@ def ratio(
 
     Clips of one episode resemble each other; drawing clips would make the interval too narrow.
     """
-    value = float(errors.sum() / persistence.sum())
+    return _bootstrapped(lambda sums: sums[0] / sums[1], (errors, persistence), episode_ids, resamples, seed)
+
+
+def ratio_difference(
+    one: tuple[Float[np.ndarray, " clips"], Float[np.ndarray, " clips"]],
+    other: tuple[Float[np.ndarray, " clips"], Float[np.ndarray, " clips"]],
+    episode_ids: tuple[str, ...],
+    *,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Ratio:
+    """Return the `ratio` of one pair of (errors, persistence) minus that of another on the same clips, with interval.
+
+    Both are drawn together, so what makes an episode hard for both does not widen the interval.
+    """
+    return _bootstrapped(
+        lambda sums: sums[0] / sums[1] - sums[2] / sums[3], (*one, *other), episode_ids, resamples, seed
+    )
+
+
+def _bootstrapped(
+    of_sums: Callable[[np.ndarray], np.ndarray],
+    columns: tuple[np.ndarray, ...],
+    episode_ids: tuple[str, ...],
+    resamples: int,
+    seed: int,
+) -> Ratio:
+    value = float(of_sums(np.stack([column.sum() for column in columns])))
     names, episode_of = np.unique(np.array(episode_ids), return_inverse=True)
     if len(names) < 2:
         return Ratio(value, math.nan, math.nan)
-    sums = np.stack([np.bincount(episode_of, weights=values) for values in (errors, persistence)])
+    sums = np.stack([np.bincount(episode_of, weights=column) for column in columns])
     drawn = np.random.default_rng(seed).integers(sums.shape[1], size=(resamples, sums.shape[1]))
-    resampled = sums[:, drawn].sum(axis=2)
-    low, high = np.percentile(resampled[0] / resampled[1], [2.5, 97.5])
+    low, high = np.percentile(of_sums(sums[:, drawn].sum(axis=2)), [2.5, 97.5])
     return Ratio(value, float(low), float(high))
 
 

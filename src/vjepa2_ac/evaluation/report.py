@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -61,12 +60,12 @@ def evaluation_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "models": {
             name: {
                 "rollout_error": errors.rollout.mean(axis=0).tolist(),
-                "rollout_over_persistence": [_plain(value) for value in ratios_by_horizon(errors)],
-                "one_step_over_persistence": {key: _plain(value) for key, value in one_step_ratios(errors).items()},
+                "rollout_over_persistence": [value.as_dict() for value in ratios_by_horizon(errors)],
+                "one_step_over_persistence": {key: value.as_dict() for key, value in one_step_ratios(errors).items()},
             }
             for name, errors in evaluation.models.items()
         },
-        "improvement_over_base": [_plain(gain) for gain in gains if gain is not None],
+        "improvement_over_base": [gain.as_dict() for gain in gains if gain is not None],
     }
 
 
@@ -83,8 +82,3 @@ def _interval(value: Ratio, form: str) -> str:
 
 def _mean_and_range(values: list[float], form: str) -> str:
     return f"{np.mean(values):{form}} ({min(values):{form}} to {max(values):{form}})"
-
-
-def _plain(value: Ratio) -> dict[str, float | None]:
-    bounds = {"low": value.low, "high": value.high}
-    return {"value": value.value, **{key: None if math.isnan(bound) else bound for key, bound in bounds.items()}}
