@@ -27,10 +27,7 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 _DEMUXER = "mp4"  # by name: libav would otherwise follow play lists to other files
-_STRICT = {
-    "err_detect": "crccheck+bitstream+buffer+careful+explode",
-    "ec": "0",
-}  # an error rather than a guessed picture
+_STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}  # an error rather than a guessed picture
 _START = -(1 << 40)  # before every picture
 _FIX = "Copy the file again, or leave the episode out"
 
