@@ -1,0 +1,188 @@
+"""How do LeRobot data sets become `Episode`s? v3.0 and v2.1, read with pyarrow and PyAV, without lerobot itself."""
+
+from __future__ import annotations
+
+import json
+import logging
+import threading
+from functools import cached_property, lru_cache
+from typing import Any
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.disk_cache import DiskCache
+from vjepa2_ac.data.index import cache_folder, kept_or_built, key_of
+from vjepa2_ac.data.sources.lerobot_episodes import EpisodeRow, data_file, read_episodes, tables_of_episodes, video_file
+from vjepa2_ac.data.sources.lerobot_files import fingerprint, list_by_template
+from vjepa2_ac.data.sources.lerobot_index import check_rows, find_problems, row_of, table_of
+from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo, read_info
+from vjepa2_ac.data.sources.lerobot_parquet import ParquetRows
+from vjepa2_ac.data.sources.lerobot_pictures import StoredPictures, VideoPictures
+from vjepa2_ac.data.sources.lerobot_ranges import RangedFile
+from vjepa2_ac.data.sources.lerobot_rows import EpisodeContent, content_of, wanted_columns
+from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.data.video import Clock
+from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import FileInfo
+
+logger = logging.getLogger(__name__)
+
+_SIZES_KEPT = 1024
+
+
+class LeRobotSource:
+    """The episodes of a LeRobot data set, v3.0 or v2.1, in the order of their numbers.
+
+    Nothing is read before the first call. Of a data set on this machine `infos` checks the states of every episode; of
+    one far away it reads what lies in meta, and states are checked when an episode is read (all of them at once where
+    `data.outcome` asks for what only the rows tell). `read` fetches the row groups with the episode's rows; pictures
+    are fetched and decoded when they are asked for.
+    """
+
+    def __init__(self, config: DataConfig) -> None:
+        self._config = config
+        self._lock = threading.RLock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Travel to a loader worker with the index, without what was read of the data."""
+        return {name: self.__dict__[name] for name in ("_config", "_info", "_table") if name in self.__dict__}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Arrive in a loader worker."""
+        self.__dict__ |= state | {"_lock": threading.RLock()}
+
+    def infos(self, progress: Progress | None = None) -> EpisodeTable:
+        """Return identity, length and outcome of every episode that can be used, and the problems of the others.
+
+        Raises:
+            InputError: No data set, one of another version, damaged metadata, or none of its episodes has what the
+                config names.
+            OSError: It is far away and cannot be read.
+        """
+        with self._lock:
+            if "_table" not in self.__dict__:
+                self._table = self._found_out(progress)
+            return self._table
+
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - pictures are fetched one by one
+        """Return one episode; see `episode.EpisodeSource`.
+
+        Raises:
+            InputError: Its rows are missing or damaged, lack a column, or hold what cannot be a robot's state.
+            OSError: They are far away and cannot be read.
+        """
+        table = self.infos()
+        info, row = table[index], row_of(table, index)
+        where = self._where(row)
+        content = self._content(row)
+        task = self._tasks[table.locators["task"][index]]
+        key = self._info.camera_key(self._config.lerobot, camera or self._config.cameras[0])
+        return Episode(
+            info=info,
+            states=content.states,
+            read_frames=self._pictures(row, key, where),
+            control_rate_hz=self._config.lerobot.fps or self._info.fps,
+            joint_velocities=content.joint_velocities,
+            metadata={"language": task} if task else {},
+        )
+
+    @cached_property
+    def _info(self) -> DatasetInfo:
+        return read_info(self._config.path)
+
+    @cached_property
+    def _tasks(self) -> list[str]:
+        return list(json.loads(self.infos().texts["tasks"]))
+
+    @cached_property
+    def _parquet(self) -> ParquetRows:
+        return ParquetRows(self._open, wanted_columns(self._config.lerobot))
+
+    @cached_property
+    def _kept(self) -> DiskCache:
+        limit = int(self._config.disk_cache.limit_gb * 1e9)
+        return DiskCache(cache_folder(self._config.disk_cache) / "lerobot", limit)
+
+    @cached_property
+    def _size(self) -> Any:
+        return lru_cache(_SIZES_KEPT)(storage.file_size)
+
+    @property
+    def _is_far(self) -> bool:
+        return storage.is_url(self._config.path)
+
+    @property
+    def _connections(self) -> int:
+        return self._config.connections if self._is_far else 1
+
+    def _open(self, path: str) -> str | RangedFile:
+        """Return what to open for a path: the path itself on this machine, a file of kept blocks far away."""
+        if not storage.is_url(path):
+            return path
+        version = self._table.texts["version"] if "_table" in self.__dict__ else self._version
+        return RangedFile(path, version=version, size=self._size(path), kept=self._kept)
+
+    def _found_out(self, progress: Progress | None) -> EpisodeTable:
+        info, config = self._info, self._config
+        info.require_mapping(config)
+        keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
+        tables = tables_of_episodes(info, self._connections)
+        files = list_by_template(info.root, info.data_path, connections=self._connections)
+        for key in keys:
+            if info.features[key].dtype == "video":
+                files |= list_by_template(info.root, info.video_path or "", key, connections=self._connections)
+        self._version = key_of(
+            {
+                "source": "lerobot",
+                "path": config.path,
+                "fields": config.lerobot.model_dump(),
+                "keys": keys,
+                "outcome": self._is_far and config.outcome != "all",
+                "info": repr(info),
+                "files": fingerprint(tables, files),
+            }
+        )
+        return kept_or_built(config.disk_cache, self._version, lambda: self._built(list(tables), files, keys, progress))
+
+    def _built(
+        self, tables: list[str], files: dict[str, FileInfo], keys: list[str], progress: Progress | None
+    ) -> EpisodeTable:
+        info, fields = self._info, self._config.lerobot
+        known = info.known_keys(fields)
+        rows = read_episodes(info, tables, known, fields.success, self._open)
+        problems = find_problems(info, rows, files.keys(), keys)
+        outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
+        if not self._is_far or (self._config.outcome != "all" and outcome_unknown):
+            unusable = [row for row in rows if row.index in problems]
+            checked = check_rows(
+                info,
+                rows,
+                problems,
+                lambda row: self._content(row).success,
+                connections=self._connections,
+                progress=progress,
+            )
+            rows = sorted(unusable + checked, key=lambda row: row.index)
+        if not rows:
+            raise InputError(where=info.where, found="no episodes", needed="a data set with episodes")
+        table = table_of(rows, problems, {"version": self._version})
+        logger.info("%s: %d episodes, %d steps", info.root, len(table), int(table.num_steps.sum()))
+        return table
+
+    def _content(self, row: EpisodeRow) -> EpisodeContent:
+        rows = self._parquet.rows(storage.join(self._info.root, data_file(self._info, row)), row.index)
+        return content_of(rows, row.length, self._info, self._config.lerobot, self._where(row))
+
+    def _pictures(self, row: EpisodeRow, key: str, where: str) -> FrameReader:
+        info = self._info
+        if info.features[key].dtype == "image":
+            path = storage.join(info.root, data_file(info, row))
+            return StoredPictures(lambda: self._parquet.pictures(path, key, row.index), row.length, f"{where}: {key}")
+        place = row.videos[key]
+        path = storage.join(info.root, video_file(info, place, key))
+        clock = Clock(start_s=place.start_s, rate_hz=info.fps)
+        return VideoPictures(self._open, path, clock, row.length, f"{path}: {row.id}")
+
+    def _where(self, row: EpisodeRow) -> str:
+        return f"{storage.join(self._info.root, data_file(self._info, row))}: {row.id}"

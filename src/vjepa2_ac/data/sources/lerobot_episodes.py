@@ -1,0 +1,196 @@
+"""Which episodes does a LeRobot data set have, and where do they lie? v3.0: Parquet tables. v2.1: lines of JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.sources.lerobot_files import filled, list_by_template
+from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo
+from vjepa2_ac.data.sources.lerobot_parquet import Opener, read_table
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import FileInfo
+
+EPISODES_V21 = "meta/episodes.jsonl"
+EPISODES_V30 = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+
+_FIX = "Get the files in meta again"
+
+
+@dataclass(frozen=True)
+class VideoPlace:
+    """Where the pictures of one camera of an episode lie."""
+
+    chunk: int
+    file: int
+    start_s: float  # of the episode's first picture
+    length_s: float | None  # None: the data set does not say
+
+
+@dataclass(frozen=True)
+class EpisodeRow:
+    """What the data set's own tables say of one episode."""
+
+    index: int
+    length: int
+    tasks: tuple[str, ...]
+    chunk: int  # of its rows
+    file: int
+    videos: Mapping[str, VideoPlace] = field(default_factory=dict)
+    success: bool | None = None
+
+    @property
+    def id(self) -> str:
+        """Its identity."""
+        return identity(self.index)
+
+
+def identity(index: int) -> str:
+    """Return how an episode is called: by its number, the only name that LeRobot gives."""
+    return f"episode_{index:06d}"
+
+
+def tables_of_episodes(info: DatasetInfo, connections: int) -> dict[str, FileInfo]:
+    """Return the files that list the episodes.
+
+    Raises:
+        OSError: They cannot be listed.
+    """
+    template = EPISODES_V30 if info.version == "v3.0" else EPISODES_V21
+    return list_by_template(info.root, template, connections=connections)
+
+
+def read_episodes(
+    info: DatasetInfo, tables: Sequence[str], keys: Sequence[str], success: str | None, open_file: Opener
+) -> list[EpisodeRow]:
+    """Return every episode, sorted by number.
+
+    Args:
+        info: Of the data set.
+        tables: The files that list the episodes, within the data set.
+        keys: Videos whose places are wanted.
+        success: Column whose statistics tell whether an episode succeeded.
+        open_file: Gives what to open for a path.
+
+    Raises:
+        InputError: The tables are missing, damaged, or list other episodes than meta/info.json counts.
+        OSError: A file far away cannot be read.
+    """
+    videos = [key for key in keys if info.features[key].dtype == "video"]
+    if info.version == "v3.0":
+        rows = [row for table in tables for row in _rows_of_table(info, table, videos, success, open_file)]
+    else:
+        rows = list(_rows_of_lines(info, videos))
+    rows.sort(key=lambda row: row.index)
+    numbers = [row.index for row in rows]
+    if len(set(numbers)) != len(numbers) or len(rows) != info.episodes:
+        raise InputError(
+            where=storage.join(info.root, tables[0] if tables else "meta"),
+            found=f"{len(rows)} episodes, of {len(set(numbers))} numbers",
+            needed=f"{info.episodes} of as many numbers, says {info.where}",
+            fix=_FIX,
+        )
+    return rows
+
+
+def data_file(info: DatasetInfo, row: EpisodeRow) -> str:
+    """Return the path, within the data set, of the file with an episode's rows."""
+    return filled(info.data_path, row.chunk, row.file)
+
+
+def video_file(info: DatasetInfo, place: VideoPlace, key: str) -> str:
+    """Return the path, within the data set, of the file with an episode's pictures."""
+    return filled(info.video_path or "", place.chunk, place.file, key)
+
+
+def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[EpisodeRow]:
+    where = storage.join(info.root, EPISODES_V21)
+    try:
+        lines = storage.read_bytes(where).decode().splitlines()
+    except FileNotFoundError:
+        raise InputError(where=where, found="no such file", needed="one line for each episode", fix=_FIX) from None
+    except UnicodeDecodeError as error:
+        raise _damaged(where, error) from None
+    for number, line in enumerate(lines):
+        if not line.strip():
+            continue
+        with_line = f"{where}: line {number + 1}"
+        row = _checked(with_line, lambda line=line: json.loads(line))
+        yield _checked(with_line, lambda row=row: _of_line(info, row, videos))
+
+
+def _of_line(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str]) -> EpisodeRow:
+    index = _count(row["episode_index"])
+    chunk = index // info.chunk_episodes
+    return EpisodeRow(
+        index=index,
+        length=_count(row["length"]),
+        tasks=_texts(row.get("tasks")),
+        chunk=chunk,
+        file=index,
+        videos={key: VideoPlace(chunk, index, 0.0, None) for key in videos},
+    )
+
+
+def _rows_of_table(
+    info: DatasetInfo, table: str, videos: Sequence[str], success: str | None, open_file: Opener
+) -> Iterator[EpisodeRow]:
+    path = storage.join(info.root, table)
+    outcome = f"stats/{success}/max"
+    prefixes = tuple(f"videos/{key}/" for key in videos)
+    own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome}
+    columns = read_table(open_file(path), path, lambda name: name in own or name.startswith(prefixes))
+    lengths = {len(column) for column in columns.values()}
+    if len(lengths) > 1:
+        raise _damaged(path, f"columns of {sorted(lengths)} rows")
+    for number in range(max(lengths, default=0)):
+        row = {name: column[number] for name, column in columns.items()}
+        yield _checked(f"{path}: row {number}", lambda row=row: _of_row(row, videos, row.get(outcome)))
+
+
+def _of_row(row: Mapping[str, Any], videos: Sequence[str], outcome: object) -> EpisodeRow:
+    while isinstance(outcome, list) and outcome:
+        outcome = outcome[0]
+    return EpisodeRow(
+        index=_count(row["episode_index"]),
+        length=_count(row["length"]),
+        tasks=_texts(row.get("tasks")),
+        chunk=_count(row["data/chunk_index"]),
+        file=_count(row["data/file_index"]),
+        videos={key: _place(row, f"videos/{key}") for key in videos},
+        success=bool(outcome) if isinstance(outcome, bool | int | float) else None,
+    )
+
+
+def _place(row: Mapping[str, Any], name: str) -> VideoPlace:
+    start, end = float(row[f"{name}/from_timestamp"]), row.get(f"{name}/to_timestamp")
+    if not math.isfinite(start) or start < 0:
+        raise ValueError(f"{name}/from_timestamp {start}")
+    length = None if end is None else float(end) - start
+    return VideoPlace(_count(row[f"{name}/chunk_index"]), _count(row[f"{name}/file_index"]), start, length)
+
+
+def _checked(where: str, read: Callable[[], Any]) -> Any:
+    try:
+        return read()
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        raise _damaged(where, error) from None
+
+
+def _count(value: object) -> int:
+    """Return a number of things; other than by `int`, neither True nor 1.5 nor "1" is one."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value) or not 0 <= value < 2**31:
+        raise ValueError(f"{value!r} is no count")
+    return int(value)
+
+
+def _texts(value: object) -> tuple[str, ...]:
+    return tuple(map(str, value)) if isinstance(value, list) else () if value is None else (str(value),)
+
+
+def _damaged(where: str, error: object) -> InputError:
+    return InputError(where=where, found=f"not a list of episodes ({error!r})", needed="LeRobot's own", fix=_FIX)

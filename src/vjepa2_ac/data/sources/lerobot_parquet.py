@@ -1,0 +1,250 @@
+"""How are the rows of one episode read from a Parquet file of many? Its row groups, and the columns that are needed."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Num
+
+from vjepa2_ac.data.sources.lerobot_ranges import RangedFile
+from vjepa2_ac.errors import InputError
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+Columns = Mapping[str, Num[np.ndarray, "rows _"]]
+Opener = Callable[[str], "str | RangedFile"]  # a path, or a file far away
+
+EPISODE = "episode_index"
+
+_KEPT_BYTES = 64 << 20  # of decoded row groups, in a process
+_KEPT_FOOTERS = 256
+_ROWS_LIMIT = 50_000_000  # of one row group: beyond, the file is damaged (or would not fit into memory)
+_FIX = "Copy the file again, or leave its episodes out"
+
+
+@dataclass(frozen=True)
+class _Footer:
+    metadata: parquet.FileMetaData
+    schema: pa.Schema
+    first: list[int | None]  # least and greatest episode of each row group, where the file says
+    last: list[int | None]
+
+
+class ParquetRows:
+    """Reads rows of Parquet files; the last footers and decoded row groups are kept. Safe in several threads.
+
+    Args:
+        open_file: Gives what to open for a path.
+        columns: Those that are wanted, where a file has them; the index of the episode is read in any case.
+    """
+
+    def __init__(self, open_file: Opener, columns: Sequence[str]) -> None:
+        self._open, self._columns = open_file, list(dict.fromkeys([EPISODE, *columns]))
+        self._lock = threading.Lock()
+        self._footers: OrderedDict[str, _Footer] = OrderedDict()
+        self._groups: OrderedDict[tuple[str, int], Columns] = OrderedDict()
+
+    def columns_of(self, path: str) -> list[str]:
+        """Return the columns that a file has.
+
+        Raises:
+            InputError: It is missing or damaged.
+        """
+        with _opened(self._open(path), path) as file:
+            return list(self._footer(path, file).schema.names)
+
+    def rows(self, path: str, episode: int) -> Columns:
+        """Return the rows of one episode, as columns of shape [rows, numbers].
+
+        Raises:
+            InputError: The file is missing or damaged, or a column holds something other than numbers.
+            OSError: A file far away cannot be read.
+        """
+        with _opened(self._open(path), path) as file:
+            footer = self._footer(path, file)
+            parts = []
+            for number, (first, last) in enumerate(zip(footer.first, footer.last, strict=True)):
+                if (first is None or first <= episode) and (last is None or episode <= last):
+                    group = self._group(path, file, number)
+                    chosen = group[EPISODE][:, 0] == episode
+                    parts.append({name: column[chosen] for name, column in group.items()})
+        if not parts:
+            return {}
+        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+    def pictures(self, path: str, column: str, episode: int) -> list[bytes]:
+        """Return the encoded pictures of one episode from a column of {bytes, path}.
+
+        Raises:
+            InputError: The file is missing or damaged, or the column does not hold pictures.
+            OSError: A file far away cannot be read.
+        """
+        found: list[bytes] = []
+        with _opened(self._open(path), path) as file:
+            footer = self._footer(path, file)
+            for number, (first, last) in enumerate(zip(footer.first, footer.last, strict=True)):
+                if (first is None or first <= episode) and (last is None or episode <= last):
+                    table = file.read_row_group(number, columns=[EPISODE, column], use_threads=False)
+                    found += _pictures_in(table, column, episode, path)
+        return found
+
+    def _footer(self, path: str, file: parquet.ParquetFile) -> _Footer:
+        with self._lock:
+            known = self._footers.get(path)
+        if known is not None:
+            return known
+        footer = _footer_of(file, path)
+        with self._lock:
+            self._footers[path] = footer
+            if len(self._footers) > _KEPT_FOOTERS:
+                self._footers.popitem(last=False)
+        return footer
+
+    def _group(self, path: str, file: parquet.ParquetFile, number: int) -> Columns:
+        with self._lock:
+            if (path, number) in self._groups:
+                self._groups.move_to_end((path, number))
+                return self._groups[path, number]
+        present = [name for name in self._columns if name in file.schema_arrow.names]
+        table = file.read_row_group(number, columns=present, use_threads=False)
+        group = {name: numbers_in(table.column(name), f"{path}: {name}") for name in present}
+        if EPISODE not in group:
+            raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=_FIX)
+        with self._lock:
+            self._groups[path, number] = group
+            while len(self._groups) > 1 and sum(map(_size_of, self._groups.values())) > _KEPT_BYTES:
+                self._groups.popitem(last=False)
+        return group
+
+
+def read_table(opened: str | RangedFile, path: str, wanted: Callable[[str], bool]) -> dict[str, list[Any]]:
+    """Return the columns of a small Parquet file whose names are wanted, as lists of Python's own values.
+
+    Raises:
+        InputError: It is missing or damaged.
+        OSError: A file far away cannot be read.
+    """
+    with _opened(opened, path) as file:
+        _require_sane(file, path)
+        present = [name for name in file.schema_arrow.names if wanted(name)]
+        table = file.read(columns=present, use_threads=False)
+        return {name: table.column(name).to_pylist() for name in present if name in table.column_names}
+
+
+def numbers_in(column: pa.ChunkedArray, where: str) -> Num[np.ndarray, "rows _"]:
+    """Return a column of numbers, or of lists of equally many numbers, as [rows, numbers].
+
+    Raises:
+        InputError: It holds something else, or gaps.
+    """
+    import pyarrow as pa
+
+    array = column.combine_chunks() if column.num_chunks != 1 else column.chunk(0)
+    rows, width = len(array), 1
+    while isinstance(array, pa.ExtensionArray):
+        array = array.storage
+    while pa.types.is_nested(array.type):
+        if array.null_count or not hasattr(array, "value_lengths"):
+            raise _no_numbers(where, str(column.type), array.null_count)
+        lengths = np.unique(array.value_lengths().to_numpy(zero_copy_only=False))
+        if len(lengths) > 1:
+            raise InputError(
+                where=where, found=f"{lengths[0]} numbers in one row and {lengths[-1]} in another", needed="as many"
+            )
+        width *= int(lengths[0]) if len(lengths) else 0
+        array = array.flatten()
+    kind = array.type
+    if array.null_count or not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_boolean(kind)):
+        raise _no_numbers(where, str(column.type), array.null_count)
+    return np.asarray(array.to_numpy(zero_copy_only=False)).reshape(rows, width)
+
+
+@contextmanager
+def _opened(opened: str | RangedFile, path: str) -> Iterator[parquet.ParquetFile]:
+    """Open a Parquet file with its pages' checksums verified; say in the user's words what is wrong with it."""
+    pa, parquet = _library(path)
+    try:
+        with parquet.ParquetFile(
+            opened, page_checksum_verification=True, pre_buffer=not isinstance(opened, str), memory_map=False
+        ) as file:
+            yield file
+    except FileNotFoundError:
+        raise InputError(where=path, found="no such file", needed="one, says the data set", fix=_FIX) from None
+    except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError) as error:
+        if isinstance(opened, RangedFile) and opened.failure is not None:
+            raise opened.failure from None
+        if isinstance(error, OSError) and error.errno is not None:
+            raise  # of the operating system, not of the file's content
+        reason = str(error).strip().splitlines()[:1]
+        raise InputError(
+            where=path, found=f"damaged: {' '.join(reason)[:200]}", needed="a whole Parquet file", fix=_FIX
+        ) from None
+
+
+def _footer_of(file: parquet.ParquetFile, path: str) -> _Footer:
+    _require_sane(file, path)
+    metadata, schema = file.metadata, file.schema_arrow
+    if EPISODE not in schema.names:
+        raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=_FIX)
+    names = [metadata.schema.column(number).path for number in range(metadata.num_columns)]
+    place = names.index(EPISODE)
+    first: list[int | None] = []
+    last: list[int | None] = []
+    for number in range(metadata.num_row_groups):
+        statistics = metadata.row_group(number).column(place).statistics
+        known = statistics is not None and statistics.has_min_max and isinstance(statistics.min, int)
+        first.append(statistics.min if known else None)
+        last.append(statistics.max if known else None)
+    return _Footer(metadata, schema, first, last)
+
+
+def _require_sane(file: parquet.ParquetFile, path: str) -> None:
+    rows = [file.metadata.row_group(number).num_rows for number in range(file.metadata.num_row_groups)]
+    if any(not 0 <= count <= _ROWS_LIMIT for count in rows) or sum(rows) != file.metadata.num_rows:
+        raise InputError(
+            where=path, found=f"damaged: row groups of {rows[:5]} rows", needed="a whole Parquet file", fix=_FIX
+        )
+
+
+def _pictures_in(table: pa.Table, column: str, episode: int, path: str) -> list[bytes]:
+    chosen = numbers_in(table.column(EPISODE), f"{path}: {EPISODE}")[:, 0] == episode
+    rows = table.column(column).to_pylist()
+    pictures = [row.get("bytes") if isinstance(row, dict) else row for row in rows]
+    wanted = [picture for picture, keep in zip(pictures, chosen, strict=True) if keep]
+    if not all(isinstance(picture, bytes) for picture in wanted):
+        raise InputError(
+            where=f"{path}: {column}",
+            found=f"pictures of type {table.column(column).type}, or names of files in their place",
+            needed="PNG or JPEG bytes in the column",
+        )
+    return wanted
+
+
+def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
+    found = f"{gaps} rows without a value" if gaps else f"values of type {kind}"
+    return InputError(where=where, found=found, needed="numbers, as many in each row", fix=_FIX)
+
+
+def _size_of(columns: Columns) -> int:
+    return sum(column.nbytes for column in columns.values())
+
+
+def _library(where: str) -> tuple[Any, Any]:
+    try:
+        import pyarrow as pa
+        from pyarrow import parquet
+    except ImportError:
+        raise InputError(
+            where=where,
+            found="pyarrow, which reads LeRobot data sets, is not installed",
+            fix='pip install -c constraints.txt -e ".[lerobot]"',
+        ) from None
+    return pa, parquet

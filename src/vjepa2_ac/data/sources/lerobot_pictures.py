@@ -1,0 +1,105 @@
+"""How do the pictures of a LeRobot episode become pixels? From its part of a video, or from the table itself."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import simplejpeg
+from jaxtyping import UInt8
+
+from vjepa2_ac.data import video
+from vjepa2_ac.data.sources.lerobot_parquet import Opener
+from vjepa2_ac.data.sources.lerobot_ranges import RangedFile
+from vjepa2_ac.errors import InputError
+
+_JPEG = b"\xff\xd8"
+
+
+@dataclass(frozen=True)
+class VideoPictures:
+    """Reads pictures of an episode from its part of a video: step k is shown at the part's start + k / fps."""
+
+    open_file: Opener
+    path: str
+    clock: video.Clock
+    num_steps: int
+    where: str
+
+    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
+        """Return the RGB pictures at these control steps, in this order.
+
+        Raises:
+            InputError: The video is missing, damaged, or shows no picture within half a step of the time.
+            OSError: It is far away and cannot be read.
+            ValueError: No steps, or a step outside the episode.
+        """
+        _require_within(steps, self.num_steps, self.where)
+        opened = self.open_file(self.path)
+        try:
+            return video.read_frames(opened, steps, where=self.where, clock=self.clock)
+        except InputError:
+            if isinstance(opened, RangedFile) and opened.failure is not None:
+                raise opened.failure from None
+            raise
+
+
+@dataclass(frozen=True)
+class StoredPictures:
+    """Decodes pictures of an episode that the table holds as PNG or JPEG; they are read when the first is asked for."""
+
+    read: Callable[[], list[bytes]]
+    num_steps: int
+    where: str
+
+    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
+        """Return the RGB pictures at these control steps, in this order.
+
+        Raises:
+            InputError: A picture is neither PNG nor JPEG, is damaged, or differs in size from the first.
+            OSError: The table is far away and cannot be read.
+            ValueError: No steps, or a step outside the episode.
+        """
+        _require_within(steps, self.num_steps, self.where)
+        frames = [_decoded(self._pictures[step], f"{self.where}: step {step}") for step in steps]
+        for step, frame in zip(steps, frames, strict=True):
+            if frame.shape != frames[0].shape:
+                raise InputError(
+                    where=f"{self.where}: step {step}",
+                    found=f"a picture of {frame.shape[0]}x{frame.shape[1]}",
+                    needed=f"{frames[0].shape[0]}x{frames[0].shape[1]} as at step {steps[0]}",
+                )
+        return np.stack(frames)
+
+    @cached_property
+    def _pictures(self) -> list[bytes]:
+        pictures = self.read()
+        if len(pictures) != self.num_steps:
+            raise InputError(
+                where=self.where, found=f"{len(pictures)} pictures", needed=f"one for each of {self.num_steps} steps"
+            )
+        return pictures
+
+
+def _decoded(picture: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    from PIL import Image
+
+    try:
+        if picture.startswith(_JPEG):
+            return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB"))
+        with Image.open(io.BytesIO(picture), formats=["PNG"]) as image:
+            return np.array(image.convert("RGB"))
+    except (OSError, ValueError, SyntaxError) as error:
+        raise InputError(
+            where=where,
+            found=f"{len(picture)} bytes that are no picture, starting with {picture[:4]!r} ({error})",
+            needed="PNG or JPEG",
+        ) from None
+
+
+def _require_within(steps: Sequence[int], num_steps: int, where: str) -> None:
+    if not steps or min(steps) < 0 or max(steps) >= num_steps:
+        raise ValueError(f"{where}: steps {list(steps)} of {num_steps}")

@@ -1,0 +1,61 @@
+"""How do a LeRobot data set's own columns become states? Select, turn the rotation, scale the gripper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Num
+from scipy.spatial.transform import Rotation
+
+from vjepa2_ac.config import LeRobotFields
+from vjepa2_ac.data.sources.states import require_plausible
+from vjepa2_ac.errors import InputError
+
+_UNIT_TOLERANCE = 1e-2
+_FIX = "Check data.lerobot: state, select, rotation, gripper_open and gripper_closed"
+
+
+def states_of(
+    columns: Sequence[Num[np.ndarray, "steps _"]], fields: LeRobotFields, where: str
+) -> Float[np.ndarray, "steps 7"]:
+    """Return states (legend: `vjepa2_ac.episode`) of the joined columns of an episode.
+
+    Raises:
+        InputError: They are not a robot's states under these settings: NaN, no unit quaternion, out of reach.
+    """
+    joined = np.concatenate([column.astype(np.float64) for column in columns], axis=1)
+    if fields.select is not None:
+        joined = joined[:, fields.select]
+    _require_finite(joined, where)
+    gripper = (joined[:, -1:] - fields.gripper_open) / (fields.gripper_closed - fields.gripper_open)
+    states = np.concatenate([joined[:, :3], _euler(joined[:, 3:-1], fields, where), gripper], axis=1)
+    require_plausible(states, where, fix=_FIX)
+    return states
+
+
+def _euler(rotation: Float[np.ndarray, "steps _"], fields: LeRobotFields, where: str) -> Float[np.ndarray, "steps 3"]:
+    if fields.rotation == "euler_xyz":
+        return rotation
+    lengths = np.linalg.norm(rotation, axis=1)
+    if (wrong := abs(lengths - 1) > _UNIT_TOLERANCE).any():
+        step = int(wrong.argmax())
+        raise InputError(
+            where=f"{where}: step {step}",
+            found=f"the quaternion {np.array2string(rotation[step], precision=4)} of length {lengths[step]:.4g}",
+            needed="a unit quaternion",
+            fix=_FIX,
+        )
+    x_first = rotation if fields.rotation == "quaternion_xyzw" else np.roll(rotation, -1, axis=1)
+    return np.asarray(Rotation.from_quat(x_first).as_euler("xyz")) if len(rotation) else np.zeros((0, 3))
+
+
+def _require_finite(joined: Float[np.ndarray, "steps _"], where: str) -> None:
+    if (wrong := ~np.isfinite(joined).all(axis=1)).any():
+        step = int(wrong.argmax())
+        raise InputError(
+            where=f"{where}: step {step}",
+            found=f"the numbers {np.array2string(joined[step], precision=4, max_line_width=200)}",
+            needed="finite numbers",
+            fix=_FIX,
+        )
