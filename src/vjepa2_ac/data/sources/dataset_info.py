@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from vjepa2_ac import storage
@@ -21,6 +21,13 @@ class Shard:
 
     path: str
     episodes: int
+    size: int = 0  # bytes
+    version: str = ""  # as `storage.list_files` says it: differs when the content does
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.replace("\\", "/").rsplit("/", 1)[-1]
 
 
 def find_shards(folder: str) -> list[Shard]:
@@ -43,8 +50,7 @@ def find_shards(folder: str) -> list[Shard]:
         ) from None
     if not shards:
         raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
-    _require_all(folder, shards)
-    return shards
+    return _as_listed(folder, shards)
 
 
 def index_shards(shards: list[Shard]) -> list[RecordSpan]:
@@ -115,9 +121,10 @@ def _shards_of(folder: str, dataset: str, split: dict[str, Any]) -> list[Shard]:
     return shards
 
 
-def _require_all(folder: str, shards: list[Shard]) -> None:
-    present = set(storage.list_names(folder))
-    missing = [name for shard in shards if (name := shard.path.replace("\\", "/").rsplit("/", 1)[-1]) not in present]
+def _as_listed(folder: str, shards: list[Shard]) -> list[Shard]:
+    """Return the shards with size and version, from one look at the folder."""
+    present = {file.name: file for file in storage.list_files(folder)}
+    missing = [shard.name for shard in shards if shard.name not in present]
     if missing:
         raise InputError(
             where=folder,
@@ -125,6 +132,7 @@ def _require_all(folder: str, shards: list[Shard]) -> None:
             needed=f"every shard that {_INFO} lists",
             fix="Download them",
         )
+    return [replace(shard, size=present[shard.name].size, version=present[shard.name].version) for shard in shards]
 
 
 def _shorten(names: list[str]) -> str:

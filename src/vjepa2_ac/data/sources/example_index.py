@@ -1,65 +1,162 @@
 """Which features does a serialised tf.train.Example hold, and where, without reading what they hold?
 
 A DROID episode is 18 MB, nearly all of it pictures; its identity and length are a few hundred bytes. Hopping over the
-tags and lengths of the protobuf wire format finds them in a file, or finds one camera's pictures in a record.
+tags and lengths of the protobuf wire format finds them in a file, and finds single pictures in a feature. The features
+of a record stand in no order: that of TFDS is a hash's, another one in every process that wrote.
 
 Source: protobuf.dev/programming-guides/encoding (the format; no code).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
-from vjepa2_ac.storage import ByteReader
+Read = Callable[[int, int], bytes]  # (offset, length) -> those bytes; fewer where the file ends
+
+BYTES_LIST, FLOAT_LIST, INT64_LIST = 1, 2, 3  # field numbers of tf.train.Feature
 
 _VARINT, _FIXED64, _DELIMITED, _FIXED32 = 0, 1, 2, 5
 _VARINT_BYTES = 10  # at most
 _HEAD_BYTES = 2 * _VARINT_BYTES
+_ENTRY_HEAD_BYTES = 160  # the headers and the name of nearly every feature
+_FIRST_FIELD, _SECOND_FIELD = 0x0A, 0x12  # tags of length-delimited fields
 
 
 class NotAnExampleError(ValueError):
     """The bytes are not a serialised tf.train.Example."""
 
 
-def locate_features(file: ByteReader, start: int, length: int) -> dict[str, tuple[int, int]]:
-    """Return where each feature's serialised tf.train.Feature lies: name -> (offset in the file, length).
+class Located(NamedTuple):
+    """Where a part of a record lies."""
 
-    What it returns has passed no CRC.
+    offset: int  # in the file
+    length: int
+
+
+def locate_features(read: Read, start: int, length: int) -> dict[str, Located]:
+    """Return where each feature's serialised tf.train.Feature lies. What it returns has passed no CRC.
 
     Raises:
         NotAnExampleError: The bytes are not an Example.
     """
-    found: dict[str, tuple[int, int]] = {}
-    for number, features_start, features_length in _delimited_fields(file, start, start + length):
-        if number != 1:
-            continue
-        for _, entry_start, entry_length in _delimited_fields(file, features_start, features_start + features_length):
-            name, span = _read_entry(file, entry_start, entry_start + entry_length)
-            found[name] = span
-    return found
+    return dict(iterate_features(read, start, length))
 
 
-def _read_entry(file: ByteReader, start: int, end: int) -> tuple[str, tuple[int, int]]:
-    """Read one entry of the map: field 1 is the name, field 2 the feature."""
-    name, span = "", (end, 0)
-    for number, offset, length in _delimited_fields(file, start, end):
+def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str, Located]]:
+    """Yield the name and place of each feature as they lie, reading no further than asked for.
+
+    Raises:
+        NotAnExampleError: The bytes are not an Example.
+    """
+    for number, features in _delimited_fields(read, start, start + length):
         if number == 1:
-            file.seek(offset)
-            try:
-                name = file.read(length).decode()
-            except UnicodeDecodeError:
-                raise NotAnExampleError(f"the name of a feature at byte {offset} is not text") from None
-        elif number == 2:
-            span = (offset, length)
-    return name, span
+            yield from _entries(read, features.offset, features.offset + features.length)
 
 
-def _delimited_fields(file: ByteReader, start: int, end: int) -> Iterator[tuple[int, int, int]]:
-    """Yield number, offset and length of the length-delimited fields between two offsets; skip the others."""
+def locate_items(read: Read, feature: Located, count: int | None = None) -> tuple[list[int], list[int]]:
+    """Return offsets and lengths of the texts or pictures of a feature that is a list of bytes; of the first `count`.
+
+    Raises:
+        NotAnExampleError: It is not a list of bytes, or damaged.
+    """
+    offsets: list[int] = []
+    lengths: list[int] = []
+    if feature.length == 0:
+        return offsets, lengths
+    lists = list(_delimited_fields(read, feature.offset, feature.offset + feature.length))
+    if [number for number, _ in lists] != [BYTES_LIST]:
+        raise NotAnExampleError(f"the feature at byte {feature.offset} is not a list of bytes")
+    position, end = lists[0][1].offset, sum(lists[0][1])
+    while position < end and len(offsets) != count:
+        head = read(position, 1 + _VARINT_BYTES)
+        if not head or head[0] != _FIRST_FIELD:
+            raise NotAnExampleError(f"byte {position} is not the start of an item")
+        length, used = _varint(head, 1)
+        position += used
+        offsets.append(position)
+        lengths.append(length)
+        position += length
+        if position > end:
+            raise NotAnExampleError(f"the item at byte {offsets[-1]} reaches beyond its list")
+    return offsets, lengths
+
+
+def packed_numbers(feature: bytes, kind: int) -> memoryview | None:
+    """Return the packed numbers of a serialised tf.train.Feature, or None where it is not of this plain form.
+
+    The plain form is what every writer makes: one list, packed.
+
+    Args:
+        feature: The whole feature.
+        kind: FLOAT_LIST (little-endian float32) or INT64_LIST (varints).
+    """
+    try:
+        outer, start = _varint(feature, 1)
+        if feature[0] != kind << 3 | _DELIMITED or start + outer != len(feature):
+            return None
+        if outer == 0:
+            return memoryview(b"")
+        inner, place = _varint(feature, start + 1)
+        plain = feature[start] == _FIRST_FIELD and place + inner == len(feature)
+        return memoryview(feature)[place:] if plain else None
+    except (IndexError, NotAnExampleError):
+        return None
+
+
+def _entries(read: Read, start: int, end: int) -> Iterator[tuple[str, Located]]:
     position = start
     while position < end:
-        file.seek(position)
-        head = file.read(_HEAD_BYTES)
+        entry = _plain_entry(read(position, _ENTRY_HEAD_BYTES), position, end)
+        if entry is None:
+            break
+        name, place, position = entry
+        yield name, place
+    for number, field in _delimited_fields(read, position, end):
+        if number == 1:
+            yield _any_entry(read, field.offset, field.offset + field.length)
+
+
+def _plain_entry(head: bytes, position: int, end: int) -> tuple[str, Located, int] | None:
+    """Read one entry of the map as every writer makes it: the name, then the feature. None: it is of another form."""
+    try:
+        if head[0] != _FIRST_FIELD:
+            return None
+        length, place = _varint(head, 1)
+        entry_end = position + place + length
+        if entry_end > end or head[place] != _FIRST_FIELD:
+            return None
+        name_length, name_start = _varint(head, place + 1)
+        name_end = name_start + name_length
+        if head[name_end] != _SECOND_FIELD:
+            return None
+        feature_length, feature_start = _varint(head, name_end + 1)
+        if position + feature_start + feature_length != entry_end:
+            return None
+        return head[name_start:name_end].decode(), Located(position + feature_start, feature_length), entry_end
+    except (IndexError, NotAnExampleError, UnicodeDecodeError):
+        return None
+
+
+def _any_entry(read: Read, start: int, end: int) -> tuple[str, Located]:
+    """Read one entry of the map: field 1 is the name, field 2 the feature, in any order."""
+    name, place = "", Located(end, 0)
+    for number, field in _delimited_fields(read, start, end):
+        if number == 1:
+            try:
+                name = read(*field).decode()
+            except UnicodeDecodeError:
+                raise NotAnExampleError(f"the name of a feature at byte {field.offset} is not text") from None
+        elif number == 2:
+            place = field
+    return name, place
+
+
+def _delimited_fields(read: Read, start: int, end: int) -> Iterator[tuple[int, Located]]:
+    """Yield number and place of the length-delimited fields between two offsets; skip the others."""
+    position = start
+    while position < end:
+        head = read(position, _HEAD_BYTES)
         tag, used = _varint(head, 0)
         kind = tag & 7
         if kind == _DELIMITED:
@@ -67,7 +164,7 @@ def _delimited_fields(file: ByteReader, start: int, end: int) -> Iterator[tuple[
             position += used
             if position + length > end:
                 raise NotAnExampleError(f"a field at byte {position} reaches beyond its message")
-            yield tag >> 3, position, length
+            yield tag >> 3, Located(position, length)
             position += length
         elif kind == _VARINT:
             position += _varint(head, used)[1]
@@ -81,9 +178,11 @@ def _delimited_fields(file: ByteReader, start: int, end: int) -> Iterator[tuple[
 
 def _varint(data: bytes, start: int) -> tuple[int, int]:
     """Return a number of variable length, and where it ends."""
-    value = 0
-    for place, byte in enumerate(data[start : start + _VARINT_BYTES]):
-        value |= (byte & 0x7F) << 7 * place
+    value = shift = 0
+    for place in range(start, min(len(data), start + _VARINT_BYTES)):
+        byte = data[place]
+        value |= (byte & 0x7F) << shift
         if byte < 0x80:
-            return value, start + place + 1
+            return value, place + 1
+        shift += 7
     raise NotAnExampleError("a number does not end")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import simplejpeg
@@ -12,42 +11,50 @@ from jaxtyping import UInt8
 from vjepa2_ac.errors import InputError
 
 
-@dataclass(frozen=True)
-class JpegReader:
-    """Decodes the JPEGs of one camera, those that are asked for; equal to TensorFlow's decoder bit for bit."""
+def decode_jpegs(
+    pictures: Sequence[bytes], steps: Sequence[int], where: str
+) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return pictures as RGB, equal to TensorFlow's decoder bit for bit.
 
-    pictures: Sequence[bytes]
-    where: str
+    Args:
+        pictures: One JPEG or more, all of one size.
+        steps: Control step of each, for messages.
+        where: File, episode and camera, for messages.
 
-    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order.
-
-        Raises:
-            InputError: A picture is not a JPEG, or differs in size from the first one.
-            ValueError: No steps, or a step outside the episode.
-        """
-        if not steps or min(steps) < 0 or max(steps) >= len(self.pictures):
-            raise ValueError(f"{self.where}: steps {list(steps)} of {len(self.pictures)}")
-        frames = [self._decode(step) for step in steps]
-        for step, frame in zip(steps, frames, strict=True):
-            if frame.shape != frames[0].shape:
-                raise InputError(
-                    where=f"{self.where}: step {step}",
-                    found=f"a picture of {frame.shape[0]}x{frame.shape[1]}",
-                    needed=f"{frames[0].shape[0]}x{frames[0].shape[1]} as at step {steps[0]}",
-                )
-        return np.stack(frames)
-
-    def _decode(self, step: int) -> UInt8[np.ndarray, "height width 3"]:
-        picture = self.pictures[step]
-        try:
-            return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB", fastdct=True))
-        except ValueError as error:
+    Raises:
+        InputError: A picture is not a JPEG, or differs in size from the first one.
+    """
+    height, width = _size_of(pictures[0], steps[0], where)
+    frames = np.empty((len(pictures), height, width, 3), np.uint8)  # decoded in place: half the time of stacking
+    for frame, picture, step in zip(frames, pictures, steps, strict=True):
+        size = _size_of(picture, step, where)
+        if size != (height, width):
             raise InputError(
-                where=f"{self.where}: step {step}",
-                found=f"{len(picture)} bytes that are not a JPEG, starting with {bytes(picture[:4])!r} ({error})",
-                needed="a JPEG picture",
-            ) from None
+                where=f"{where}: step {step}",
+                found=f"a picture of {size[0]}x{size[1]}",
+                needed=f"{height}x{width} as at step {steps[0]}",
+            )
+        try:
+            simplejpeg.decode_jpeg(picture, colorspace="RGB", fastdct=True, buffer=frame)
+        except ValueError as error:
+            raise _no_jpeg(picture, step, where, error) from None
+    return frames
+
+
+def _size_of(picture: bytes, step: int, where: str) -> tuple[int, int]:
+    try:
+        height, width, _, _ = simplejpeg.decode_jpeg_header(picture)
+    except ValueError as error:
+        raise _no_jpeg(picture, step, where, error) from None
+    return height, width
+
+
+def _no_jpeg(picture: bytes, step: int, where: str, error: ValueError) -> InputError:
+    return InputError(
+        where=f"{where}: step {step}",
+        found=f"{len(picture)} bytes that are not a JPEG, starting with {bytes(picture[:4])!r} ({error})",
+        needed="a JPEG picture",
+    )
 
 
 def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95) -> bytes:

@@ -2,210 +2,157 @@
 
 from __future__ import annotations
 
-import io
-import itertools
-import logging
-from collections import OrderedDict
-from collections.abc import Iterator, Sequence
-from contextlib import closing
-from functools import cached_property
+import threading
+from collections.abc import Iterable
+from dataclasses import astuple, dataclass
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float
-
-from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, RldsFields
-from vjepa2_ac.data.exclusion import NAMED, with_way_out
-from vjepa2_ac.data.sources.dataset_info import find_shards, index_shards
-from vjepa2_ac.data.sources.jpeg import JpegReader
+from vjepa2_ac.data.index import cache_folder, kept_or_built, key_of
+from vjepa2_ac.data.sources.dataset_info import Shard, find_shards
+from vjepa2_ac.data.sources.example_index import Read
 from vjepa2_ac.data.sources.record import Record
-from vjepa2_ac.data.sources.states import require_plausible
-from vjepa2_ac.data.sources.tfrecord import RecordSpan, read_record
-from vjepa2_ac.episode import STATE_DIM, Episode, EpisodeInfo
+from vjepa2_ac.data.sources.rlds_fields import (
+    identity_of,
+    info_of,
+    joint_velocities_of,
+    language_of,
+    num_steps_of,
+    states_of,
+)
+from vjepa2_ac.data.sources.rlds_index import index_local
+from vjepa2_ac.data.sources.rlds_pictures import LocalPictures, wrong_count
+from vjepa2_ac.data.sources.shard_file import open_shard
+from vjepa2_ac.data.sources.tfrecord import RecordSpan, require_intact
+from vjepa2_ac.data.sources.verified import Verified
+from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 
-logger = logging.getLogger(__name__)
 
-IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
+@dataclass(frozen=True)
+class _Opened:
+    """What is known once the data set was looked at."""
 
-_STEP_FLAG = "steps/is_first"
-_CACHED_EPISODES = 4
+    shards: tuple[Shard, ...]
+    table: EpisodeTable
+    verified: Verified
 
 
 class RldsSource:
     """The episodes of an RLDS data set, in the order of its shards.
 
-    Nothing is read before the first call. `infos` reads a few kilobytes of each episode and checks its states; `read`
-    reads the whole record and checks its CRC, and its pictures are decoded when asked for. The last few episodes are
-    kept per process. Of episodes in `data.exclude` nothing but the identity is read; their length is given as 0.
+    Nothing is read before the first call. `infos` hops through every record once and keeps what it found; `read` reads
+    the states alone, and its pictures are read and decoded when asked for. With `check_crc: once` a record is read
+    whole the first time on this machine: its CRC is checked, and that each camera has one picture for every step.
     """
 
     def __init__(self, config: DataConfig) -> None:
         self._config = config
-        self._kept: OrderedDict[int, Episode] = OrderedDict()
+        self._known: _Opened | None = None
+        self._opening = threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Travel to a loader worker with the index, without the kept episodes."""
-        return self.__dict__ | {"_kept": OrderedDict()}
+        """Travel to a loader worker with the index."""
+        return {"_config": self._config, "_known": self._known}
 
-    def infos(self) -> Sequence[EpisodeInfo]:
-        """Return identity, length and outcome of every episode.
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Arrive at a worker."""
+        self.__dict__ |= state
+        self._opening = threading.Lock()
+
+    def infos(self, progress: Progress | None = None) -> EpisodeTable:
+        """Return identity, length and outcome of every episode that can be used.
 
         Raises:
-            InputError: No data set, a damaged one, a missing field, what cannot be a robot's states, or two episodes
-                of the same identity.
+            InputError: No data set, missing shards, or no episode that can be used.
         """
-        return self._infos
+        return self._open(progress).table
 
-    def read(self, index: int) -> Episode:
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - all of a local episode is at hand
         """Return one episode.
 
         Raises:
-            InputError: The record is damaged, lacks a field, or holds what cannot be a robot's state.
+            InputError: The record is damaged, has changed, lacks a feature, or holds what cannot be a robot's state.
+            ValueError: A camera that the config does not know.
         """
-        if index in self._kept:
-            self._kept.move_to_end(index)
-            return self._kept[index]
-        episode = self._read(self._spans[index])
-        self._kept[index] = episode
-        if len(self._kept) > _CACHED_EPISODES:
-            self._kept.popitem(last=False)
-        return episode
-
-    @cached_property
-    def _spans(self) -> list[RecordSpan]:
-        return index_shards(find_shards(self._config.path))
-
-    @cached_property
-    def _infos(self) -> list[EpisodeInfo]:
-        infos: list[EpisodeInfo] = []
-        unusable: dict[str, InputError] = {}
-        for info, error in self._scan():
-            infos.append(info)
-            if error is not None:
-                unusable[info.id] = error
-            if len(unusable) == NAMED:
-                break
-        if unusable:
-            first = next(iter(unusable.values()))
-            settings_at_fault = len(unusable) == len(infos) > 1
-            raise first if settings_at_fault else with_way_out(first, list(unusable))
-        self._require_distinct(infos)
-        logger.info("%s: %d episodes, %d steps", self._config.path, len(infos), sum(info.num_steps for info in infos))
-        return infos
-
-    def _scan(self) -> Iterator[tuple[EpisodeInfo, InputError | None]]:
-        """Yield what is known of every episode, and why it cannot be used, if so.
-
-        Raises:
-            InputError: An episode cannot even be named.
-        """
-        for path, spans in itertools.groupby(self._spans, key=lambda span: span.path):
-            with closing(storage.open_to_read(path)) as file:
-                for span in spans:
-                    yield self._scan_episode(Record(file, span, span.data_offset), span)
-
-    def _scan_episode(self, record: Record, span: RecordSpan) -> tuple[EpisodeInfo, InputError | None]:
-        fields = self._config.fields
-        try:
-            info = EpisodeInfo(id=_identity_of(record, fields), num_steps=0)
-        except InputError as error:
-            raise _damage_or(error, span) from None
-        if info.id in self._config.exclude:
-            return info, None
-        try:
-            record.require([*fields.state, fields.cameras[self._config.camera]])
-            info = _info_of(record, fields)
-            _states_of(record, fields, info.num_steps, f"{span} ({info.id})")
-        except InputError as error:
-            return info, _damage_or(error, span)
-        return info, None
-
-    def _read(self, span: RecordSpan) -> Episode:
-        data = read_record(span, check_crc=self._config.check_crc)
-        record = Record(io.BytesIO(data), span, 0)
-        fields = self._config.fields
-        info = _info_of(record, fields)
+        opened, fields = self._open(None), self._config.fields
+        camera = camera or self._config.cameras[0]
+        if camera not in fields.cameras:
+            raise ValueError(f"camera {camera!r} is not one of {', '.join(fields.cameras)}")
+        feature, info = fields.cameras[camera], opened.table[index]
+        shard, span = _place_of(opened, index)
         where = f"{span} ({info.id})"
-        pictures = record.values(fields.cameras[self._config.camera], "bytes_list")
-        if len(pictures) != info.num_steps:
-            raise InputError(
-                where=f"{where}: {fields.cameras[self._config.camera]}",
-                found=f"{len(pictures)} pictures",
-                needed=f"one for each of the {info.num_steps} steps",
+        with open_shard(shard) as read:
+            record = Record(read, span)
+            if self._config.check_crc != "once" or index not in opened.verified:
+                self._check(record, read, span, info.num_steps, {feature, *self._features()}, where)
+                if self._config.check_crc == "once":
+                    opened.verified.add(index)
+            _require_as_indexed(record, info, fields, where)
+            record.require([feature])
+            return Episode(
+                info=info,
+                states=states_of(record, fields, info.num_steps, where),
+                read_frames=LocalPictures(shard, record.located[feature], info.num_steps, f"{where}: {feature}"),
+                control_rate_hz=fields.control_rate_hz,
+                joint_velocities=joint_velocities_of(record, fields, info.num_steps, where),
+                metadata=language_of(record, fields),
             )
-        metadata = {}
-        if fields.language in record.located:
-            metadata["language"] = b"".join(record.values(fields.language, "bytes_list")[:1]).decode(errors="replace")
-        return Episode(
-            info=info,
-            states=_states_of(record, fields, info.num_steps, where),
-            read_frames=JpegReader(pictures, where=f"{where}: {fields.cameras[self._config.camera]}"),
-            control_rate_hz=fields.control_rate_hz,
-            metadata=metadata,
-        )
 
-    def _require_distinct(self, infos: list[EpisodeInfo]) -> None:
-        seen: dict[str, int] = {}
-        for number, info in enumerate(infos):
-            if info.id in seen and info.id not in self._config.exclude:
-                error = InputError(
-                    where=str(self._spans[number]),
-                    found=f"the same identity as {self._spans[seen[info.id]]}: {info.id}",
-                    needed="episodes that can be told apart: the split is a hash of the identity",
-                    fix="Add a feature to data.fields.identity that differs between them",
-                )
-                raise with_way_out(error, [info.id])
-            seen[info.id] = number
+    def _check(
+        self, record: Record, read: Read, span: RecordSpan, num_steps: int, features: Iterable[str], where: str
+    ) -> None:
+        """Look at all of a record: its CRC, unless that is never to be checked, and the number of its pictures."""
+        if self._config.check_crc != "never":
+            require_intact(read, span)
+        for feature in features:
+            found = len(record.items(feature)[0])
+            if found != num_steps:
+                raise wrong_count(found, num_steps, f"{where}: {feature}")
 
+    def _features(self) -> list[str]:
+        """Return the features with the pictures of the config's cameras."""
+        return [self._config.fields.cameras[camera] for camera in self._config.cameras]
 
-def _damage_or(error: InputError, span: RecordSpan) -> InputError:
-    """Return what the CRC says, if it says that the record is damaged: then that is the error to show."""
-    try:
-        read_record(span)
-    except InputError as damage:
-        return damage
-    return error
+    def _open(self, progress: Progress | None) -> _Opened:
+        with self._opening:
+            if self._known is None:
+                self._known = self._look(progress)
+            return self._known
 
+    def _look(self, progress: Progress | None) -> _Opened:
+        config, fields = self._config, self._config.fields
+        shards = tuple(find_shards(config.path))
+        key = key_of({
+            "source": "rlds",
+            "path": config.path,
+            "state": fields.state,
+            "identity": fields.identity,
+            "cameras": self._features(),
+            "shards": [astuple(shard) for shard in shards],
+        })  # fmt: skip
 
-def _identity_of(record: Record, fields: RldsFields) -> str:
-    parts = []
-    for name in fields.identity:
-        values = record.values(name, "bytes_list", "int64_list")
-        parts += [value.decode(errors="replace") if isinstance(value, bytes) else str(value) for value in values]
-    return IDENTITY_SEPARATOR.join(parts)
+        def build() -> EpisodeTable:
+            return index_local(shards, fields, self._features(), threads=config.connections, progress=progress)
 
-
-def _info_of(record: Record, fields: RldsFields) -> EpisodeInfo:
-    identity = _identity_of(record, fields)
-    success = True if "/success/" in identity else False if "/failure/" in identity else None
-    return EpisodeInfo(id=identity, num_steps=_num_steps(record, fields), success=success)
+        table = kept_or_built(config.disk_cache, key, build)
+        return _Opened(shards, table, Verified(cache_folder(config.disk_cache) / "index" / f"{key}.checked"))
 
 
-def _num_steps(record: Record, fields: RldsFields) -> int:
-    """Count the steps by their first flag; a data set without it by its states."""
-    if _STEP_FLAG in record.located:
-        return len(record.values(_STEP_FLAG, "int64_list"))
-    return sum(len(record.values(name, "float_list")) for name in fields.state) // STATE_DIM
+def _place_of(opened: _Opened, index: int) -> tuple[Shard, RecordSpan]:
+    at = {name: int(column[index]) for name, column in opened.table.locators.items()}
+    shard = opened.shards[at["shard"]]
+    return shard, RecordSpan(path=shard.path, number=at["record"], offset=at["offset"], length=at["length"])
 
 
-def _states_of(record: Record, fields: RldsFields, steps: int, where: str) -> Float[np.ndarray, "steps 7"]:
-    columns = []
-    for name in fields.state:
-        values = np.asarray(record.values(name, "float_list"), dtype=np.float64)
-        if steps == 0 or len(values) == 0 or len(values) % steps:
-            raise InputError(
-                where=f"{where}: {name}", found=f"{len(values)} numbers", needed=f"as many for each of {steps} steps"
-            )
-        columns.append(values.reshape(steps, -1))
-    states = np.concatenate(columns, axis=1)
-    if states.shape[1] != STATE_DIM:
-        found = " + ".join(f"{name} [{column.shape[1]}]" for name, column in zip(fields.state, columns, strict=True))
+def _require_as_indexed(record: Record, info: EpisodeInfo, fields: RldsFields, where: str) -> None:
+    """Refuse a record that is not the one that the index speaks of."""
+    found = info_of(identity_of(record, fields), num_steps_of(record, fields))
+    if found != info:
         raise InputError(
-            where=f"{where}: data.fields.state", found=found, needed=f"{STATE_DIM} numbers a step: xyz, Euler, gripper"
+            where=where,
+            found=f"the episode {found.id} of {found.num_steps} steps",
+            needed=f"{info.num_steps} steps of {info.id}, says the index",
+            fix="Start again",
         )
-    require_plausible(states, where, fix="Check data.fields.state")
-    if fields.gripper == "openness":
-        states[:, 6] = 1.0 - states[:, 6]
-    return states

@@ -10,7 +10,7 @@ formats; no code).
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,8 +26,9 @@ from vjepa2_ac.errors import InputError
 
 Kind = Literal["bytes_list", "float_list", "int64_list"]
 
-_HEADER_BYTES = 12
+HEADER_BYTES = 12
 _FOOTER_BYTES = 4
+_PIECE_BYTES = 1 << 18  # small enough to stay in the processor's cache between reading and checking
 _MASK_DELTA = 0xA282EAD8
 
 
@@ -43,7 +44,7 @@ class RecordSpan:
     @property
     def data_offset(self) -> int:
         """Offset of the data."""
-        return self.offset + _HEADER_BYTES
+        return self.offset + HEADER_BYTES
 
     @property
     def end(self) -> int:
@@ -52,6 +53,59 @@ class RecordSpan:
 
     def __str__(self) -> str:
         return f"{self.path}: record {self.number} at byte {self.offset}"
+
+
+def span_at(header: bytes, path: str, number: int, offset: int, size: int) -> RecordSpan:
+    """Return where a record lies, from the bytes at its offset.
+
+    Args:
+        header: At least the first 12 bytes of the record, where the file has so many.
+        path: The file, as messages name it.
+        number: Of the record in the file.
+        offset: Of the record in the file.
+        size: Of the file.
+
+    Raises:
+        InputError: The CRC of the length does not match, or the file ends within the record.
+    """
+    where = f"{path}: record {number} at byte {offset}"
+    if len(header) < HEADER_BYTES:
+        raise _truncated(where, size, offset + HEADER_BYTES)
+    length, crc = struct.unpack_from("<QI", header)
+    if crc != _masked_crc(header[:8]):
+        raise InputError(
+            where=where,
+            found="the CRC of the length does not match: not a TFRecord file, or a damaged one",
+            needed="a TFRecord file as TFDS writes it",
+        )
+    span = RecordSpan(path=path, number=number, offset=offset, length=length)
+    if span.end > size:
+        raise _truncated(where, size, span.end)
+    return span
+
+
+def require_intact(read: Callable[[int, int], bytes], span: RecordSpan) -> None:
+    """Check the CRC of a record's data, reading it piece by piece.
+
+    Args:
+        read: Returns bytes of the file: (offset, length) -> those bytes, fewer where the file ends.
+        span: The record.
+
+    Raises:
+        InputError: The file ends within the record, or its CRC does not match.
+    """
+    crc, position, end = 0, span.data_offset, span.end - _FOOTER_BYTES
+    while position < end:
+        piece = read(position, min(_PIECE_BYTES, end - position))
+        if not piece:
+            raise _truncated(str(span), position, span.end)
+        crc = google_crc32c.extend(crc, piece)
+        position += len(piece)
+    footer = read(end, _FOOTER_BYTES)
+    if len(footer) < _FOOTER_BYTES:
+        raise _truncated(str(span), end + len(footer), span.end)
+    if _mask(crc) != struct.unpack("<I", footer)[0]:
+        raise _damaged(span)
 
 
 def index_records(path: str | Path) -> list[RecordSpan]:
@@ -83,11 +137,7 @@ def read_record(span: RecordSpan, *, check_crc: bool = True) -> bytes:
         raise _truncated(str(span), span.data_offset + len(data), span.end)
     record = data[: span.length]
     if check_crc and _masked_crc(record) != struct.unpack_from("<I", data, span.length)[0]:
-        raise InputError(
-            where=str(span),
-            found="the CRC of the data does not match: the file is damaged",
-            fix="Download the file again",
-        )
+        raise _damaged(span)
     return record
 
 
@@ -137,23 +187,9 @@ def _hop_headers(file: storage.ByteReader, path: str, size: int) -> list[RecordS
     spans: list[RecordSpan] = []
     offset = 0
     while offset < size:
-        where = f"{path}: record {len(spans)} at byte {offset}"
         file.seek(offset)
-        header = file.read(_HEADER_BYTES)
-        if len(header) < _HEADER_BYTES:
-            raise _truncated(where, size, offset + _HEADER_BYTES)
-        length, crc = struct.unpack("<QI", header)
-        if crc != _masked_crc(header[:8]):
-            raise InputError(
-                where=where,
-                found="the CRC of the length does not match: not a TFRecord file, or a damaged one",
-                needed="a TFRecord file as TFDS writes it",
-            )
-        span = RecordSpan(path=path, number=len(spans), offset=offset, length=length)
-        if span.end > size:
-            raise _truncated(where, size, span.end)
-        spans.append(span)
-        offset = span.end
+        spans.append(span_at(file.read(HEADER_BYTES), path, len(spans), offset, size))
+        offset = spans[-1].end
     return spans
 
 
@@ -166,8 +202,19 @@ def _truncated(where: str, size: int, needed: int) -> InputError:
     )
 
 
+def _damaged(span: RecordSpan) -> InputError:
+    return InputError(
+        where=str(span),
+        found="the CRC of the data does not match: the file is damaged",
+        fix="Download the file again",
+    )
+
+
 def _masked_crc(data: bytes) -> int:
-    crc = int(google_crc32c.value(data))
+    return _mask(int(google_crc32c.value(data)))
+
+
+def _mask(crc: int) -> int:
     return ((crc >> 15 | crc << 17) + _MASK_DELTA) & 0xFFFFFFFF
 
 
