@@ -18,7 +18,8 @@ import torch
 
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.loader import clip_at, collate, open_source, training_loader, validation_batches
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import clip_at, collate, training_loader, validation_batches
 from vjepa2_ac.data.sources.tfrecord import index_records
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
@@ -34,8 +35,7 @@ def config_of(folder: Path, **knobs: Any) -> DataConfig:
 
 def take(count: int, config: DataConfig, **knobs: Any) -> list[Batch]:
     chosen = {"seed": 1, "batch_size": 2} | knobs
-    loader = training_loader(open_source(config), config, **chosen)
-    return list(itertools.islice(loader, count))
+    return list(itertools.islice(training_loader(open_dataset(config), **chosen), count))
 
 
 def names(batches: list[Batch]) -> Names:
@@ -52,9 +52,9 @@ def assert_same(found: list[Batch], expected: list[Batch]) -> None:
 
 def test_a_clip_holds_the_strided_steps_of_its_episode(droid: Path) -> None:
     config = config_of(droid, frames=4, stride=3)
-    source = open_source(config)
-    episode = source.read(2)
-    clip = clip_at(source, 2, 4, config)
+    dataset = open_dataset(config)
+    episode = dataset.source.read(2)
+    clip = clip_at(dataset, 2, 4)
     assert (clip.episode_id, clip.start, clip.stride) == (episode.info.id, 4, 3)
     assert np.array_equal(clip.states, episode.states[[4, 7, 10, 13]].astype(np.float32))
     assert np.array_equal(clip.frames, episode.read_frames([4, 7, 10, 13])[:, :, 15:80])
@@ -62,7 +62,7 @@ def test_a_clip_holds_the_strided_steps_of_its_episode(droid: Path) -> None:
 
 def test_the_actions_of_a_clip_lead_from_each_state_to_the_next(droid: Path) -> None:
     config = config_of(droid)
-    clip = clip_at(open_source(config), 0, 1, config)
+    clip = clip_at(open_dataset(config), 0, 1)
     reached = apply_action(clip.states[:-1].astype(np.float64), clip.actions.astype(np.float64))
     np.testing.assert_allclose(reached[:, [0, 1, 2, 6]], clip.states[1:][:, [0, 1, 2, 6]], atol=1e-6)
     np.testing.assert_allclose(
@@ -97,10 +97,10 @@ def test_another_layout_goes_on_where_the_run_stopped(droid: Path) -> None:
 
 def test_an_epoch_holds_every_training_window_once_and_no_other(droid: Path) -> None:
     config = config_of(droid)
-    held_out = set(names(list(validation_batches(open_source(config), config, "validation", clips=1000, batch_size=1))))
+    held_out = set(names(list(validation_batches(open_dataset(config), "validation", clips=1000, batch_size=1))))
     everything = {
         (info.id, start)
-        for info in open_source(config).infos()
+        for info in open_dataset(config).table
         for start in range(info.num_steps - config.clip_steps + 1)
     }
     epoch = names(take(len(everything - held_out), config, batch_size=1))
@@ -117,7 +117,7 @@ def test_the_shards_change_neither_training_nor_validation(droid: Path, tmp_path
     other = config_of(write_synthetic_droid(tmp_path / "set", steps=range(12, 18), size=(48, 96), shards=5))
     config = config_of(droid)
     assert_same(take(9, other), take(9, config))
-    chosen = [list(validation_batches(open_source(c), c, "validation", clips=5, batch_size=2)) for c in (config, other)]
+    chosen = [list(validation_batches(open_dataset(c), "validation", clips=5, batch_size=2)) for c in (config, other)]
     assert_same(*chosen)
 
 
@@ -129,14 +129,11 @@ def test_loading_does_not_draw_from_the_generator_of_dropout(droid: Path) -> Non
 
 def test_validation_clips_are_few_distinct_and_from_all_held_out_episodes(droid: Path) -> None:
     config = config_of(droid, validation_share=0.6)
-    batches = list(validation_batches(open_source(config), config, "validation", clips=7, batch_size=3))
+    batches = list(validation_batches(open_dataset(config), "validation", clips=7, batch_size=3))
     assert [len(batch.starts) for batch in batches] == [3, 3, 1]
     assert len(set(names(batches))) == 7
     everyone = {
-        name
-        for name, _ in names(
-            list(validation_batches(open_source(config), config, "validation", clips=999, batch_size=9))
-        )
+        name for name, _ in names(list(validation_batches(open_dataset(config), "validation", clips=999, batch_size=9)))
     }
     assert len(everyone) > 1
     assert {name for name, _ in names(batches)} == everyone
@@ -145,7 +142,7 @@ def test_validation_clips_are_few_distinct_and_from_all_held_out_episodes(droid:
 def test_validation_without_held_out_episodes_says_so_at_once(droid: Path) -> None:
     config = config_of(droid, validation_share=0.0)
     with pytest.raises(InputError, match=r"no validation episodes among 6 .*Raise data\.validation_share"):
-        validation_batches(open_source(config), config, "validation", clips=1, batch_size=1)
+        validation_batches(open_dataset(config), "validation", clips=1, batch_size=1)
 
 
 @pytest.mark.parametrize("workers", [0, 1])
@@ -168,22 +165,22 @@ def test_a_clip_of_a_damaged_record_says_how_to_leave_it_out(droid: Path, tmp_pa
     folder = shutil.copytree(droid, tmp_path / "set")
     shard = sorted(folder.glob("*.tfrecord-*"))[0]
     config = config_of(folder)
-    source = open_source(config)
-    source.infos()
     whole = bytearray(shard.read_bytes())
     whole[index_records(shard)[0].end - 10] ^= 1
     shard.write_bytes(whole)
+    dataset = open_dataset(config)
     with pytest.raises(InputError, match=r"CRC of the data.*add to data\.exclude: .*episode_0000"):
-        clip_at(source, 0, 0, config)
+        clip_at(dataset, 0, 0)
 
 
 RUN_THAT_DIES = """
 import os, signal, sys
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.loader import open_source, training_loader
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import training_loader
 if __name__ == "__main__":
     config = DataConfig(path=sys.argv[1], frames=3, stride=2, workers=1, validation_share=0.0, test_share=0.0)
-    batches = training_loader(open_source(config), config, seed=0, batch_size=1)
+    batches = training_loader(open_dataset(config), seed=0, batch_size=1)
     next(batches)
     if sys.argv[2] == "error":
         raise RuntimeError("boom")
@@ -214,7 +211,7 @@ def test_workers_end_with_the_run_however_it_ends(droid: Path, tmp_path: Path, d
 
 def test_pictures_of_two_sizes_do_not_stack(droid: Path) -> None:
     config = config_of(droid)
-    clip = clip_at(open_source(config), 0, 0, config)
+    clip = clip_at(open_dataset(config), 0, 0)
     other = replace(clip, frames=clip.frames[:, :20], episode_id="the other")
     with pytest.raises(InputError, match=r"the other: pictures of 20x65.*48x65"):
         collate([clip, other])

@@ -1,6 +1,7 @@
 """Splits, windows and order are pure functions: nothing but identities, lengths, seed and position counts."""
 
 import itertools
+import json
 from collections import Counter
 from typing import Any
 
@@ -9,8 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from paths import GOLDEN, ROOT
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.windows import ClipOrder, far_neighbours, permuted, split_of, spread, windows_of
+from vjepa2_ac.config_file import load_config
+from vjepa2_ac.data.exclusion import included
+from vjepa2_ac.data.kept import KeptSteps
+from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.data.windows import ClipOrder, Split, Windows, far_neighbours, in_split, permuted, split_of, spread
+from vjepa2_ac.data.windows import windows_of as windows_of_kept
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
 
@@ -21,6 +28,12 @@ def settings_of(**knobs: Any) -> DataConfig:
 
 def episodes(*lengths: int) -> list[EpisodeInfo]:
     return [EpisodeInfo(id=f"episode {number}", num_steps=length) for number, length in enumerate(lengths)]
+
+
+def windows_of(infos: list[EpisodeInfo], config: DataConfig, split: Split) -> Windows:
+    """Return the windows of episodes of which every step is kept."""
+    table = EpisodeTable.of(infos)
+    return windows_of_kept(table, KeptSteps.whole(table, included(table, config)), config, split)
 
 
 ALL_TRAIN = {"validation_share": 0.0, "test_share": 0.0}
@@ -132,6 +145,14 @@ def test_shares_are_kept_and_growing_one_moves_few_episodes() -> None:
         assert before == after or (before, after) == ("train", "validation")
 
 
+def test_all_episodes_are_split_at_once_as_each_alone() -> None:
+    infos = episodes(*[20] * 300)
+    config = settings_of(validation_share=0.23, test_share=0.31)
+    for split in ("train", "validation", "test"):
+        expected = [split_of(info.id, config) == split for info in infos]
+        assert in_split(EpisodeTable.of(infos).id_hash, config, split).tolist() == expected
+
+
 def test_the_split_never_changes_between_versions() -> None:
     config = settings_of(validation_share=0.3, test_share=0.3)
     assert [split_of(f"episode {number}", config) for number in range(8)] == [
@@ -150,9 +171,23 @@ def test_the_order_never_changes_between_versions() -> None:
     assert [permuted(index, size=11, seed=7, epoch=2) for index in range(11)] == [7, 9, 1, 10, 3, 6, 8, 2, 0, 5, 4]
 
 
+def test_the_demo_sees_the_clips_it_always_saw() -> None:
+    golden = json.loads((GOLDEN / "demo_clip_order.json").read_text())
+    infos = [EpisodeInfo(f"{folder}/recordings/MP4--{folder}/trajectory.h5", 41) for folder in golden["folders"]]
+    config = load_config(ROOT / "configs/demo.yaml", []).data
+    for split, count in golden["windows"].items():
+        windows = windows_of(infos, config, split)
+        assert len(windows) == count
+        if split == "train":
+            order = ClipOrder(windows, seed=0)
+            assert {place: list(order.window(int(place))) for place in golden["train"]} == golden["train"]
+        else:
+            assert [list(windows[index]) for index in far_neighbours(spread(count, 40))] == golden[split]
+
+
 def test_short_episodes_are_left_out_counted_and_named(caplog: pytest.LogCaptureFixture) -> None:
     windows = windows_of(episodes(9, 10, 3), settings_of(**ALL_TRAIN), "train")
-    assert windows.short == ("episode 0", "episode 2")
+    assert windows.short.tolist() == [0, 2]
     assert windows.episodes.tolist() == [1]
     assert "2 of 3 train episodes are shorter than a clip of 10 control steps" in caplog.text
     assert "episode 2" in caplog.text
@@ -212,9 +247,9 @@ def test_an_empty_split_says_which_share_to_raise() -> None:
         windows_of([], settings_of(**ALL_TRAIN), "train")
 
 
-def test_an_episode_costs_sixteen_bytes() -> None:
+def test_a_range_of_kept_steps_costs_sixteen_bytes() -> None:
     windows = windows_of(episodes(*[300] * 1000), settings_of(**ALL_TRAIN), "train")
-    assert windows.episodes.nbytes + windows.ends.nbytes == 16_000
+    assert windows.episodes.nbytes + windows.firsts.nbytes + windows.ends.nbytes == 16_000
 
 
 @settings(max_examples=50, deadline=None)

@@ -8,6 +8,7 @@ import logging
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig
@@ -15,11 +16,13 @@ from vjepa2_ac.data.table import EpisodeTable, NotATableError
 
 logger = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 _VERSION = 1  # of what is kept: another number makes all of it be found out again
 
 
 def cache_folder(config: DiskCacheConfig) -> Path:
-    """Return the folder for what is kept on this machine: the config's, $VJEPA2_AC_CACHE, or the user's cache folder."""
+    """Return the folder for what is kept on this machine: the config's, $VJEPA2_AC_CACHE, or the user's."""
     if config.dir is not None:
         return Path(config.dir).expanduser()
     if named := os.environ.get("VJEPA2_AC_CACHE"):
@@ -35,16 +38,28 @@ def key_of(parts: Mapping[str, object]) -> str:
 
 def kept_or_built(config: DiskCacheConfig, key: str, build: Callable[[], EpisodeTable]) -> EpisodeTable:
     """Return the table kept under a key; build and keep it where there is none, or a damaged one."""
+    return kept_or_made(config, key, build, to_bytes=EpisodeTable.to_bytes, from_bytes=EpisodeTable.from_bytes)
+
+
+def kept_or_made(
+    config: DiskCacheConfig,
+    key: str,
+    make: Callable[[], T],
+    *,
+    to_bytes: Callable[[T], bytes],
+    from_bytes: Callable[[bytes], T],
+) -> T:
+    """Return what is kept under a key; make and keep it where there is none, or `from_bytes` raises NotATableError."""
     path = cache_folder(config) / "index" / f"{key}.npz"
     try:
-        return EpisodeTable.from_bytes(path.read_bytes())
+        return from_bytes(path.read_bytes())
     except FileNotFoundError:
         pass
     except (OSError, NotATableError) as error:
         logger.warning("%s: cannot be used (%s); the index is built again", path, error)
-    table = build()
+    made = make()
     try:
-        storage.write_atomically(path, table.to_bytes())
+        storage.write_atomically(path, to_bytes(made))
     except OSError as error:
         logger.warning("%s: cannot be written (%s); the index will be built again next time", path, error)
-    return table
+    return made

@@ -9,58 +9,63 @@ import itertools
 import multiprocessing
 import os
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset
+from jaxtyping import Float
+from torch.utils.data import DataLoader
+from torch.utils.data import Dataset as TorchDataset
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.exclusion import with_way_out
-from vjepa2_ac.data.sources.rlds import RldsSource
-from vjepa2_ac.data.transforms import crop
-from vjepa2_ac.data.windows import ClipOrder, Split, far_neighbours, spread, windows_of
-from vjepa2_ac.episode import Batch, Clip, EpisodeSource
+from vjepa2_ac.data.augment import draw
+from vjepa2_ac.data.broken import UnreachableError
+from vjepa2_ac.data.dataset import Dataset, open_source
+from vjepa2_ac.data.exclusion import named, with_way_out
+from vjepa2_ac.data.kept import drawn
+from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.data.transforms import view
+from vjepa2_ac.data.windows import ClipOrder, Split, far_neighbours, spread
+from vjepa2_ac.episode import ACTION_DIM, STATE_DIM, Augmentation, Batch, Clip, Episode, Skipped
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.geometry import actions_from_states, states_in_camera_frame
 
-_PREFETCHED_BATCHES = 2
+__all__ = ["clip_at", "collate", "open_source", "training_loader", "validation_batches"]
+
+_CLIPS_WORTH_WORKERS = 256  # fewer validation clips are read before the workers have started
+
+Augment = Callable[[int, int], Augmentation | None]  # from the height and width of a clip's frames
 
 
-def open_source(config: DataConfig) -> EpisodeSource:
-    """Return the source that `data.source` names; nothing is read yet."""
-    return {"rlds": RldsSource}[config.source](config)
-
-
-def clip_at(source: EpisodeSource, episode: int, start: int, config: DataConfig) -> Clip:
+def clip_at(
+    dataset: Dataset, episode: int, start: int, *, camera: str | None = None, augmentation: Augment | None = None
+) -> Clip:
     """Return the clip that starts at a control step of an episode; decodes its frames only.
+
+    Args:
+        dataset: Where it comes from.
+        episode: Index into the data set's table.
+        start: First control step.
+        camera: Whose pictures; None: the config's (first) camera.
+        augmentation: Draws what is to be changed, once the size of the frames is known.
 
     Raises:
         InputError: The episode or one of the pictures cannot be read; says how to leave the episode out.
     """
-    steps = range(start, start + config.clip_steps, config.stride)
     try:
-        recording = source.read(episode)
-        frames = recording.read_frames(steps)
+        return _clip_at(dataset, _Wish(episode, start, camera, augmentation))
+    except UnreachableError:
+        raise  # the network's fault, not the episode's
     except InputError as error:
-        raise with_way_out(error, [source.infos()[episode].id]) from None
-    states = recording.states[steps.start : steps.stop : steps.step]
-    extrinsics = recording.extrinsics
-    return Clip(
-        frames=crop(frames),
-        states=states.astype(np.float32),
-        actions=actions_from_states(states).astype(np.float32),
-        extrinsics=None if extrinsics is None else extrinsics[list(steps)].astype(np.float32),
-        episode_id=recording.info.id,
-        start=start,
-        stride=config.stride,
-    )
+        raise with_way_out(error, [dataset.table.identity(episode)]) from None
 
 
-def collate(clips: Sequence[Clip]) -> Batch:
-    """Stack clips into a batch.
+def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
+    """Stack clips into a batch; it has camera poses if each of the clips has.
 
     Raises:
         InputError: The pictures of two clips differ in size.
@@ -76,78 +81,214 @@ def collate(clips: Sequence[Clip]) -> Batch:
             )
             raise with_way_out(error, [clip.episode_id])
     extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
+    augmentations = tuple(clip.augmentation for clip in clips if clip.augmentation is not None)
     return Batch(
         frames=torch.from_numpy(np.stack([clip.frames for clip in clips])),
         states=torch.from_numpy(np.stack([clip.states for clip in clips])),
         actions=torch.from_numpy(np.stack([clip.actions for clip in clips])),
-        extrinsics=torch.from_numpy(np.stack(extrinsics)) if extrinsics else None,
+        extrinsics=torch.from_numpy(np.stack(extrinsics)) if len(extrinsics) == len(clips) else None,
         episode_ids=tuple(clip.episode_id for clip in clips),
         starts=tuple(clip.start for clip in clips),
+        augmentations=augmentations,
+        bytes_fetched=bytes_fetched,
     )
 
 
 def training_loader(
-    source: EpisodeSource,
-    config: DataConfig,
-    *,
-    seed: int,
-    batch_size: int,
-    start_position: int = 0,
-    rank: int = 0,
-    world_size: int = 1,
+    dataset: Dataset, *, seed: int, batch_size: int, start_position: int = 0, rank: int = 0, world_size: int = 1
 ) -> Iterator[Batch]:
     """Yield the micro-batches of one rank, without end, from any position of the run at once.
 
     The run is one row of clips. Micro-batch m of rank r holds the `batch_size` clips from position
     start_position + (m * world_size + r) * batch_size, so after m micro-batches of every rank the position to resume
-    from is start_position + m * world_size * batch_size.
+    from is start_position + m * world_size * batch_size. Where `data.broken_episodes` is skip, clips that cannot be
+    read are missing from their micro-batch, which may even be empty; no other clip takes their place.
 
     Raises:
         InputError: There is nothing to train on, or a clip cannot be read, also where a worker met it.
     """
-    order = ClipOrder(windows_of(source.infos(), config, "train"), seed)
-    clips = _Clips(source, config, order)
-    return _batches(
-        clips, _rows(start_position + rank * batch_size, batch_size, batch_size * world_size), config.workers
-    )
+    clips = _Clips(dataset, _TrainingClips(dataset.config, ClipOrder(dataset.windows("train"), seed)))
+    rows = _rows(start_position + rank * batch_size, batch_size, batch_size * world_size)
+    return _batches(clips, rows, dataset.config.workers)
 
 
-def validation_batches(
-    source: EpisodeSource, config: DataConfig, split: Split, *, clips: int, batch_size: int
-) -> Iterator[Batch]:
-    """Yield a fixed set of at most `clips` clips of a split, evenly spread over its windows, in this process.
+def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size: int) -> Iterator[Batch]:
+    """Yield a fixed set of at most `clips` clips of a split, evenly spread over its windows, in batches.
 
     The set follows from the data alone: neither the seed nor the number of shards changes it. Neighbours in it are
-    from far apart, so that the actions of one are no stand-in for those of the next.
+    from far apart, so that the actions of one are no stand-in for those of the next. A large set is read by workers.
 
     Raises:
         InputError: The split is empty, or a clip cannot be read.
     """
-    windows = windows_of(source.infos(), config, split)
+    windows = dataset.windows(split)
     chosen = [windows[index] for index in far_neighbours(spread(len(windows), clips))]
+    rows = [list(range(first, min(first + batch_size, len(chosen)))) for first in range(0, len(chosen), batch_size)]
+    workers = dataset.config.workers if len(chosen) >= _CLIPS_WORTH_WORKERS else 0
+    batches = _batches(_Clips(dataset, _ChosenClips(dataset.config, dataset.table, chosen)), iter(rows), workers)
+    return _some_of(batches, dataset, split)
 
-    def batches() -> Iterator[Batch]:
-        for first in range(0, len(chosen), batch_size):
-            row = chosen[first : first + batch_size]
-            yield collate([clip_at(source, episode, start, config) for episode, start in row])
 
-    return batches()
+def _some_of(batches: Iterator[Batch], dataset: Dataset, split: Split) -> Iterator[Batch]:
+    """Yield the batches that hold clips.
+
+    Raises:
+        InputError: None does.
+    """
+    empty = True
+    for batch in batches:
+        if batch.starts:
+            empty = False
+            yield batch
+    if empty:
+        raise InputError(
+            where=f"data.path: {dataset.config.path}",
+            found=f"no {split} clip that was tried can be read; broken episodes: {named(dataset.broken.names)}",
+            needed="at least one",
+            fix="Mend or fetch these episodes again, or add them to data.exclude",
+        )
 
 
 @dataclass(frozen=True)
-class _Clips(Dataset[Batch]):
-    """The clips of a run by position, read a batch at a time."""
+class _Wish:
+    """A clip that is to be read."""
 
-    source: EpisodeSource
+    episode: int
+    start: int
+    camera: str | None
+    augmentation: Augment | None = None
+
+
+@runtime_checkable
+class _Wishes(Protocol):
+    """Says which clip stands at a position; a pure function, the same in every worker."""
+
+    def at(self, position: int) -> _Wish: ...
+
+
+@dataclass(frozen=True)
+class _TrainingClips:
+    """The endless row of a run: a permutation of all windows each epoch; camera and changes are drawn per clip."""
+
     config: DataConfig
     order: ClipOrder
 
-    def __getitems__(self, positions: list[int]) -> Batch | InputError:
-        """Return a batch, or the error that prevents it: DataLoader could not carry that one home unharmed."""
+    def at(self, position: int) -> _Wish:
+        def augmentation(height: int, width: int) -> Augmentation | None:
+            return draw(self.config.augment, height, width, seed=self.order.seed, position=position)
+
+        cameras = self.config.cameras
+        return _Wish(*self.order.window(position), cameras[self.order.choice(position, len(cameras))], augmentation)
+
+
+@dataclass(frozen=True)
+class _ChosenClips:
+    """A fixed list of windows; the camera is drawn per window."""
+
+    config: DataConfig
+    table: EpisodeTable
+    windows: list[tuple[int, int]]
+
+    def at(self, position: int) -> _Wish:
+        episode, start = self.windows[position]
+        number = drawn(self.table.id_hash[[episode]], np.array([start], np.int32))[0]
+        return _Wish(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
+
+
+@dataclass(frozen=True)
+class _Row:
+    """What a worker sends home for one micro-batch."""
+
+    batch: Batch
+    skipped: tuple[Skipped, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Clips(TorchDataset[_Row]):
+    """Clips by position, read a micro-batch at a time."""
+
+    dataset: Dataset
+    wishes: _Wishes
+
+    def __getitems__(self, positions: list[int]) -> _Row | InputError:
+        """Return a micro-batch, or the error that prevents it: DataLoader could not carry that one home unharmed."""
+        before = storage.bytes_fetched()
         try:
-            return collate([clip_at(self.source, *self.order.window(position), self.config) for position in positions])
+            read = self._read(positions)
+            clips = [one for one in read if isinstance(one, Clip)]
+            skipped = tuple(one for one in read if isinstance(one, Skipped))
+            fetched = storage.bytes_fetched() - before
+            return _Row(collate(clips, fetched) if clips else _no_clips(self.dataset.config.frames, fetched), skipped)
         except InputError as error:
             return error
+
+    def _read(self, positions: list[int]) -> list[Clip | Skipped]:
+        config = self.dataset.config
+        if not storage.is_url(config.path):
+            return [self._clip(position) for position in positions]
+        with ThreadPoolExecutor(min(len(positions), config.connections)) as pool:
+            return list(pool.map(self._clip, positions))
+
+    def _clip(self, position: int) -> Clip | Skipped:
+        wish = self.wishes.at(position)
+        if self.dataset.config.broken_episodes == "error":
+            return clip_at(self.dataset, wish.episode, wish.start, camera=wish.camera, augmentation=wish.augmentation)
+        try:
+            return _clip_at(self.dataset, wish)
+        except UnreachableError:
+            raise  # the network's fault, not the episode's
+        except InputError as error:
+            return Skipped(self.dataset.table.identity(wish.episode), str(error))
+
+
+def _clip_at(dataset: Dataset, wish: _Wish) -> Clip:
+    config = dataset.config
+    steps = range(wish.start, wish.start + config.clip_steps, config.model_stride)
+    recording = dataset.source.read(wish.episode, wish.camera, dataset.needed_steps(wish.episode))
+    frames = view(recording.read_frames(steps), config.crop)
+    states, extrinsics = _poses(recording, list(steps), in_camera_frame=config.pose_frame == "camera")
+    draw_change = wish.augmentation
+    return Clip(
+        frames=frames,
+        states=states.astype(np.float32),
+        actions=actions_from_states(states).astype(np.float32),
+        extrinsics=None if extrinsics is None else extrinsics.astype(np.float32),
+        episode_id=recording.info.id,
+        start=wish.start,
+        stride=config.model_stride,
+        augmentation=None if draw_change is None else draw_change(frames.shape[1], frames.shape[2]),
+    )
+
+
+def _poses(
+    recording: Episode, steps: list[int], *, in_camera_frame: bool
+) -> tuple[Float[np.ndarray, "time 7"], Float[np.ndarray, "time 6"] | None]:
+    """Return states and camera poses at some steps."""
+    states = recording.states[steps]
+    extrinsics = None if recording.extrinsics is None else recording.extrinsics[steps]
+    if not in_camera_frame:
+        return states, extrinsics
+    if extrinsics is None:
+        raise InputError(
+            where=f"episode {recording.info.id}",
+            found="no pose of the camera",
+            needed="one, for data.pose_frame: camera",
+            fix="Set data.pose_frame: base, or choose a camera that has one",
+        )
+    return states_in_camera_frame(states, extrinsics), extrinsics
+
+
+def _no_clips(frames: int, bytes_fetched: int) -> Batch:
+    """Return a micro-batch of which no clip could be read."""
+    return Batch(
+        frames=torch.zeros(0, frames, 1, 1, 3, dtype=torch.uint8),
+        states=torch.zeros(0, frames, STATE_DIM),
+        actions=torch.zeros(0, frames - 1, ACTION_DIM),
+        extrinsics=None,
+        episode_ids=(),
+        starts=(),
+        bytes_fetched=bytes_fetched,
+    )
 
 
 def _rows(first: int, length: int, distance: int) -> Iterator[list[int]]:
@@ -168,12 +309,14 @@ def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int) -> Ite
         num_workers=workers,
         multiprocessing_context=context,
         worker_init_fn=_end_with_the_run if workers else None,
-        prefetch_factor=_PREFETCHED_BATCHES if workers else None,
+        prefetch_factor=clips.dataset.config.prefetch if workers else None,
     )
-    for batch in loader:
-        if isinstance(batch, InputError):
-            raise batch
-        yield batch
+    for row in loader:
+        if isinstance(row, InputError):
+            raise row
+        for one in row.skipped:  # noted here, when its turn has come: whatever workers there are, at the same step
+            clips.dataset.broken.met(one.episode_id, one.reason)
+        yield row.batch
 
 
 def _end_with_the_run(_worker: int) -> None:

@@ -1,7 +1,7 @@
 """Which clips are there, which split do they belong to, and in which order are they seen?
 
-Everything here is a pure function of the episodes' identities and lengths, the seed and a position: nothing depends on
-the number of shards, workers or ranks, and nothing needs to be saved to go on where a run stopped.
+Everything here is a pure function of the episodes' identities and kept steps, the seed and a position: nothing depends
+on the number of shards, workers or ranks, and nothing needs to be saved to go on where a run stopped.
 """
 
 from __future__ import annotations
@@ -9,17 +9,17 @@ from __future__ import annotations
 import hashlib
 import itertools
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Int32, Int64, UInt64
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.exclusion import included, named
-from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.data.exclusion import NAMED, named
+from vjepa2_ac.data.kept import KeptSteps, clip_starts
+from vjepa2_ac.data.table import EpisodeTable, identity_hash
 from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -31,13 +31,14 @@ _HALF_BITS = 3  # at least: narrower halves favour some orders of a handful of w
 _MASK64 = (1 << 64) - 1
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Windows:
-    """Every clip of a split: all starts in all episodes that are long enough, in the order of the identities."""
+    """Every clip of a split, in the order of the episodes' identities, then of the starts; runs of neighbours."""
 
-    episodes: Int[np.ndarray, " episodes"]  # index into the source
-    ends: Int[np.ndarray, " episodes"]  # windows up to and including each episode
-    short: tuple[str, ...]  # identities of the episodes left out because they are shorter than a clip
+    episodes: Int32[np.ndarray, " runs"]  # index into the source
+    firsts: Int32[np.ndarray, " runs"]  # control step at which the first clip of the run starts
+    ends: Int64[np.ndarray, " runs"]  # windows up to and including each run
+    short: Int32[np.ndarray, " short"]  # episodes left out because they are shorter than a clip
 
     def __len__(self) -> int:
         return int(self.ends[-1])
@@ -47,7 +48,7 @@ class Windows:
         if not 0 <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
         place = int(np.searchsorted(self.ends, index, side="right"))
-        return int(self.episodes[place]), index - (int(self.ends[place - 1]) if place else 0)
+        return int(self.episodes[place]), int(self.firsts[place]) + index - (int(self.ends[place - 1]) if place else 0)
 
 
 @dataclass(frozen=True)
@@ -62,41 +63,53 @@ class ClipOrder:
         epoch, index = divmod(position, len(self.windows))
         return self.windows[permuted(index, size=len(self.windows), seed=self.seed, epoch=epoch)]
 
+    def choice(self, position: int, count: int) -> int:
+        """Return one of `range(count)` for the clip at a position of the run, each as likely."""
+        digest = hashlib.blake2b(f"{self.seed} {position}".encode(), digest_size=8).digest()
+        return int.from_bytes(digest, "big") % count
+
 
 def split_of(episode_id: str, config: DataConfig) -> Split:
     """Return where an episode belongs: a hash of its identity, as a number in [0, 1), against the shares."""
-    digest = hashlib.sha256(episode_id.encode()).digest()
-    number = int.from_bytes(digest[:8], "big") / 2**64
+    number = identity_hash(episode_id) / 2**64
     if number < config.test_share:
         return "test"
     return "validation" if number < config.test_share + config.validation_share else "train"
 
 
-def windows_of(infos: Sequence[EpisodeInfo], config: DataConfig, split: Split) -> Windows:
-    """Return the windows of a split: every start from which a clip fits into its episode.
+def in_split(
+    id_hash: UInt64[np.ndarray, " episodes"], config: DataConfig, split: Split
+) -> Bool[np.ndarray, " episodes"]:
+    """Return which episodes belong to a split: `split_of` for all at once."""
+    number = id_hash.astype(np.float64) / 2**64
+    held_out = config.test_share + config.validation_share
+    low, high = {"test": (0.0, config.test_share), "validation": (config.test_share, held_out)}.get(
+        split, (held_out, 2.0)
+    )
+    return np.asarray((number >= low) & (number < high))
+
+
+def windows_of(table: EpisodeTable, kept: KeptSteps, config: DataConfig, split: Split) -> Windows:
+    """Return the windows of a split: every start from which a clip lies within one range of kept steps.
 
     Raises:
-        InputError: The split has no episodes, or only short ones, or `data.short_episodes` forbids short ones; or
-            `data.exclude` names an episode that there is not.
+        InputError: The split has no episodes, or only short ones, or none with a clip's length of kept steps, or
+            `data.short_episodes` forbids short ones.
     """
-    taking_part = included(infos, config)
-    members = [number for number in taking_part if split_of(infos[number].id, config) == split]
-    if not members:
-        raise _empty_split(len(taking_part), config, split)
-    members.sort(key=lambda number: infos[number].id)
-    counts = [infos[number].num_steps - config.clip_steps + 1 for number in members]
-    short = [infos[number] for number, count in zip(members, counts, strict=True) if count < 1]
-    if short and (config.short_episodes == "error" or len(short) == len(members)):
-        raise _too_short(short, len(members), config, split)
-    names = tuple(info.id for info in short)
-    if short:
-        _warn_of_short(config.path, split, config.clip_steps, len(members), names)
-    kept = [(number, count) for number, count in zip(members, counts, strict=True) if count >= 1]
-    return Windows(
-        episodes=np.array([number for number, _ in kept], dtype=np.int64),
-        ends=np.cumsum([count for _, count in kept], dtype=np.int64),
-        short=names,
-    )
+    members = kept.taking_part & in_split(table.id_hash, config, split)
+    if not members.any():
+        raise _empty_split(int(kept.taking_part.sum()), config, split)
+    short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
+    short = short[np.argsort(table.id_rank[short])]
+    if len(short) and (config.short_episodes == "error" or len(short) == members.sum()):
+        raise _too_short(table, short, int(members.sum()), config, split)
+    if len(short):
+        names = tuple(table.identity(int(number)) for number in short[: NAMED + 1])
+        _warn_of_short(config.path, split, config.clip_steps, int(members.sum()), len(short), names)
+    starts = clip_starts(table, kept.only(members), config)
+    if not starts.windows:
+        raise _nothing_kept(config, split)
+    return Windows(starts.episode, starts.first, np.cumsum(starts.count, dtype=np.int64), short)
 
 
 def spread(size: int, count: int) -> list[int]:
@@ -149,10 +162,10 @@ def _round_keys(size: int, seed: int, epoch: int) -> tuple[int, ...]:
 
 
 @lru_cache(maxsize=64)  # said once: every validation asks for the same windows
-def _warn_of_short(path: str, split: Split, clip_steps: int, members: int, short: tuple[str, ...]) -> None:
+def _warn_of_short(path: str, split: Split, clip_steps: int, members: int, short: int, names: tuple[str, ...]) -> None:
     logger.warning(
         "%s: %d of %d %s episodes are shorter than a clip of %d control steps and left out: %s",
-        path, len(short), members, split, clip_steps, named(short),
+        path, short, members, split, clip_steps, named(names, short),
     )  # fmt: skip
 
 
@@ -171,14 +184,26 @@ def _empty_split(episodes: int, config: DataConfig, split: Split) -> InputError:
     )
 
 
-def _too_short(short: Sequence[EpisodeInfo], members: int, config: DataConfig, split: Split) -> InputError:
-    longest = max(short, key=lambda info: info.num_steps)
+def _too_short(
+    table: EpisodeTable, short: Int32[np.ndarray, " short"], members: int, config: DataConfig, split: Split
+) -> InputError:
+    longest = int(short[np.argmax(table.num_steps[short])])
     everyone = len(short) == members
     fix = "Lower data.frames or data.stride" + ("" if everyone else ", or set data.short_episodes: skip")
+    names = [table.identity(int(number)) for number in short[:NAMED]]
     return InputError(
         where=f"data.path: {config.path}",
         found=f"{len(short)} of {members} {split} episodes are shorter than a clip; the longest of these,"
-        f" {longest.id}, has {longest.num_steps} steps. Too short: {named([info.id for info in short])}",
+        f" {table.identity(longest)}, has {table.num_steps[longest]} steps. Too short: {named(names, len(short))}",
         needed=f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}",
         fix=fix,
+    )
+
+
+def _nothing_kept(config: DataConfig, split: Split) -> InputError:
+    return InputError(
+        where=f"data.path: {config.path}",
+        found=f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})",
+        needed=f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}",
+        fix="Lower data.frames or data.stride, raise data.idle.keep_share, or set data.idle.rule: none",
     )

@@ -13,11 +13,12 @@ from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.loader import open_source, training_loader, validation_batches
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import training_loader, validation_batches
 from vjepa2_ac.data.windows import Split
-from vjepa2_ac.episode import Batch, EpisodeSource, LatentBatch
+from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.latents import encode_batch
+from vjepa2_ac.latents import encode_batch, extrinsics_for
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import add_adapter, load_trained, save_trained, trainable_report
 from vjepa2_ac.model.world_model import WorldModel
@@ -29,6 +30,8 @@ from vjepa2_ac.training.run_folder import CHECKPOINTS
 ADAPTER = "adapter"
 OPTIMIZER = "optimizer.pt"
 
+_CLIPS_TRIED = 8  # one is read; the others are for where data.broken_episodes passes over it
+
 
 @dataclass
 class Run:
@@ -39,7 +42,7 @@ class Run:
     world_model: WorldModel
     objective: torch.nn.Module
     optimizer: torch.optim.Optimizer
-    source: EpisodeSource
+    dataset: Dataset
     state: RunState
 
 
@@ -50,9 +53,10 @@ def assemble(config: Config, note: Callable[[str], None]) -> Run:
         InputError: Something cannot be used.
     """
     accelerator = make_accelerator(config)
-    source = open_source(config.data)
-    _read_one_clip_of_each_split(source, config)
+    dataset = open_dataset(config.data)
+    first_clip = _read_one_clip_of_each_split(dataset)
     world_model = load_base(config.model, seed=config.seed)
+    extrinsics_for(world_model, first_clip)
     add_adapter(world_model, config.adapter, seed=config.seed)
     note(str(trainable_report(world_model)))
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
@@ -60,7 +64,7 @@ def assemble(config: Config, note: Callable[[str], None]) -> Run:
     optimizer = make_optimizer(world_model, config.training)
     state = _take_up(config, world_model, optimizer, note)
     objective, optimizer = accelerator.prepare(Objective(world_model, config.training.rollout_steps), optimizer)
-    return Run(config, accelerator, world_model, objective, optimizer, source, state)
+    return Run(config, accelerator, world_model, objective, optimizer, dataset, state)
 
 
 def make_accelerator(config: Config) -> Accelerator:
@@ -92,8 +96,7 @@ def batches_from(run: Run, step: int) -> Iterator[Batch]:
     training = run.config.training
     micro_batches_done = step * training.accumulation
     return training_loader(
-        run.source,
-        run.config.data,
+        run.dataset,
         seed=run.config.seed,
         batch_size=training.batch_size,
         start_position=micro_batches_done * run.accelerator.num_processes * training.batch_size,
@@ -118,11 +121,11 @@ def save_checkpoint(run: Run, folder: Path) -> Path:
     return write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
 
 
-def _read_one_clip_of_each_split(source: EpisodeSource, config: Config) -> None:
-    """Fail early: an empty split, a broken first clip. A test split of share 0 is nobody's mistake."""
-    splits: tuple[Split, ...] = ("train", "validation", "test") if config.data.test_share else ("train", "validation")
-    for split in splits:
-        next(validation_batches(source, config.data, split, clips=1, batch_size=1))
+def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:
+    """Fail early: an empty split, a broken clip. A test split of share 0 is nobody's mistake."""
+    splits: list[Split] = ["train", "validation", *(["test"] if dataset.config.test_share else [])]
+    firsts = [next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1)) for split in splits]
+    return firsts[0]
 
 
 def _take_up(

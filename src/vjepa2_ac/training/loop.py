@@ -118,11 +118,7 @@ def _validate(run: Run, reporter: Reporter) -> PredictionErrors:
     config = run.config
     run.world_model.eval()
     batches = validation_batches(
-        run.source,
-        config.data,
-        "validation",
-        clips=config.validation.clips,
-        batch_size=config.validation.batch_size,
+        run.dataset, "validation", clips=config.validation.clips, batch_size=config.validation.batch_size
     )
     with run.accelerator.autocast():
         errors = prediction_errors(run.world_model, (encode(run, batch) for batch in batches))

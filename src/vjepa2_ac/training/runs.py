@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.loader import open_source, validation_batches
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import Evaluation, evaluate
@@ -62,8 +63,8 @@ def evaluate_run(folder: Path, *, split: Split, clips: int) -> tuple[Evaluation,
     """
     run = load_run(folder)
     config = run.config
-    source = open_source(config.data)
-    batches = validation_batches(source, config.data, split, clips=clips, batch_size=config.validation.batch_size)
+    dataset = open_dataset(config.data)
+    batches = validation_batches(dataset, split, clips=clips, batch_size=config.validation.batch_size)
     accelerator = make_accelerator(config)
     run.world_model.to(accelerator.device)
     with accelerator.autocast():
@@ -73,7 +74,7 @@ def evaluate_run(folder: Path, *, split: Split, clips: int) -> tuple[Evaluation,
             has_base=config.model.base is not None,
             device=accelerator.device,
             encode_chunk=config.model.encode_chunk,
-            seconds_per_step=config.data.stride / config.data.fields.control_rate_hz,
+            seconds_per_step=dataset.config.model_stride / dataset.control_rate_hz,
         )
     figures = folder / "evaluation.json"
     about = {"checkpoint": str(run.checkpoint), "split": split, **evaluation_as_dict(evaluation)}

@@ -6,13 +6,26 @@ import contextlib
 import hashlib
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import torch
 
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import is_url
 from vjepa2_ac.training.assembly import Run, encode
 from vjepa2_ac.training.optim import learning_rate_at, set_learning_rate, trained_parameters
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """What the gradients of one optimizer step were taken from."""
+
+    forced_loss: float  # mean over the clips; NaN where there is none
+    rollout_loss: float
+    norm: float  # before clipping
+    clips: int  # that could be read
+    bytes_fetched: int
 
 
 def training_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, float]:
@@ -24,43 +37,73 @@ def training_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, fl
     torch.manual_seed(step_seed(run.config.seed, step, run.accelerator.process_index))
     learning_rate = learning_rate_at(step, run.config.training)
     set_learning_rate(run.optimizer, learning_rate)
-    forced_loss, rollout_loss, grad_norm = gradients(run, batches)
-    run.optimizer.step()
+    taken = gradients(run, batches)
+    if taken.clips:
+        run.optimizer.step()
     run.optimizer.zero_grad(set_to_none=True)
     return {
-        "loss": forced_loss + rollout_loss,
-        "loss_teacher_forcing": forced_loss,
-        "loss_rollout": rollout_loss,
-        "grad_norm": grad_norm,
+        "loss": taken.forced_loss + taken.rollout_loss,
+        "loss_teacher_forcing": taken.forced_loss,
+        "loss_rollout": taken.rollout_loss,
+        "grad_norm": taken.norm,
         "learning_rate": learning_rate,
+        **_about_the_data(run, taken),
     }
 
 
-def gradients(run: Run, batches: Iterator[Batch]) -> tuple[float, float, float]:
+def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
     """Accumulate and clip the gradients of the next micro-batches; the weights do not move.
 
-    Returns:
-        Both losses, averaged over the micro-batches, and the norm of the gradients before clipping.
+    Loss and gradient are means over the clips of the step. Where clips are left out (`data.broken_episodes`: skip) they
+    are means over those that are left: each counts as much as the others, whatever micro-batch it is in.
 
     Raises:
         InputError: A loss or gradient is not finite; names the clips.
     """
-    accumulation = run.config.training.accumulation
+    training = run.config.training
     run.world_model.train()
     sums = torch.zeros(2, device=run.accelerator.device)
     seen: list[str] = []
-    for micro in range(accumulation):
+    fetched = 0
+    for micro in range(training.accumulation):
         batch = next(batches)
+        fetched += batch.bytes_fetched
+        if not batch.starts:
+            continue
         seen += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
-        last = micro == accumulation - 1
+        parts = training.accumulation * (training.batch_size / len(batch.starts))
+        last = micro == training.accumulation - 1
         with contextlib.nullcontext() if last else run.accelerator.no_sync(run.objective):
             forced, rollout = run.objective(encode(run, batch))
-            run.accelerator.backward((forced + rollout) / accumulation)
-        sums += torch.stack([forced.detach(), rollout.detach()]) / accumulation
+            run.accelerator.backward((forced + rollout) / parts)
+        sums += torch.stack([forced.detach(), rollout.detach()]) / parts
+    if not seen:
+        return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=fetched)
+    _scale_up(run, sums, training.accumulation * training.batch_size / len(seen))
     grad_norm = _clip(run)
     forced_loss, rollout_loss = sums.tolist()
     _refuse_not_finite(forced_loss + rollout_loss + grad_norm, seen)
-    return forced_loss, rollout_loss, grad_norm
+    return Gradients(forced_loss, rollout_loss, grad_norm, len(seen), fetched)
+
+
+def _scale_up(run: Run, sums: torch.Tensor, factor: float) -> None:
+    """Turn shares of the clips that were to come into shares of those that came."""
+    if factor == 1:
+        return
+    sums *= factor
+    for parameter in trained_parameters(run.objective):
+        if parameter.grad is not None:
+            parameter.grad *= factor
+
+
+def _about_the_data(run: Run, taken: Gradients) -> dict[str, float]:
+    data, training = run.config.data, run.config.training
+    figures: dict[str, float] = {}
+    if data.broken_episodes == "skip":
+        figures["clips_left_out"] = training.accumulation * training.batch_size - taken.clips
+    if is_url(data.path):
+        figures["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
+    return figures
 
 
 def step_seed(seed: int, step: int, rank: int) -> int:

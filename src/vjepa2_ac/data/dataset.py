@@ -1,0 +1,213 @@
+"""Which episodes and steps of a data set take part? Opened once, filtered once, and small enough for every worker."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Bool
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.broken import BrokenEpisodes
+from vjepa2_ac.data.exclusion import included, with_way_out
+from vjepa2_ac.data.idle_search import FoundRanges, find_ranges
+from vjepa2_ac.data.kept import KeptSteps, clip_starts
+from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.data.windows import Split, Windows, windows_of
+from vjepa2_ac.episode import EpisodeSource, Progress, StepRanges
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Removed:
+    """What a filter took away, after those before it."""
+
+    name: str  # excluded, broken, outcome, idle
+    episodes: int  # of which no step is left
+    steps: int  # of episodes that could be read
+    windows: int | None  # clips; None while data.stride is auto
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A data set that is open: its episodes, and what the config leaves of them. Can be pickled to a loader worker."""
+
+    config: DataConfig
+    source: EpisodeSource
+    table: EpisodeTable
+    kept: KeptSteps
+    removed: tuple[Removed, ...]
+    broken: BrokenEpisodes  # grows in the process that opened the set
+
+    def windows(self, split: Split) -> Windows:
+        """Return the clips of a split.
+
+        Raises:
+            InputError: There are none; see `windows_of`.
+        """
+        return windows_of(self.table, self.kept, self.config, split)
+
+    def with_stride(self, stride: int) -> Dataset:
+        """Return the same data at another stride."""
+        config = self.config.with_stride(stride)
+        return replace(self, config=config, removed=_removed(config, self.table, self.kept))
+
+    @cached_property
+    def control_rate_hz(self) -> float:
+        """Control steps per second: what the source says of the whole set, or else of its first episode."""
+        said = self.table.texts.get("control_rate_hz")
+        return float(said) if said is not None else self.source.read(int(self.kept.episode[0])).control_rate_hz
+
+    def needed_steps(self, episode: int) -> StepRanges | None:
+        """Return the steps of an episode that clips may come from; None: all of them."""
+        if self.config.idle.rule == "none" or self.config.idle.keep_share > 0:
+            return None
+        return self.kept.of(episode)
+
+
+def open_source(config: DataConfig) -> EpisodeSource:
+    """Return the source that `data.source` names; nothing is read yet."""
+    if config.source == "rlds":
+        from vjepa2_ac.data.sources.rlds import RldsSource
+
+        return RldsSource(config)
+    if config.source == "droid_raw":
+        from vjepa2_ac.data.sources.droid_raw import RawDroidSource
+
+        return RawDroidSource(config)
+    if config.source == "lerobot":
+        from vjepa2_ac.data.sources.lerobot import LeRobotSource
+
+        return LeRobotSource(config)
+    from vjepa2_ac.data.sources.npz import NpzSource
+
+    return NpzSource(config)
+
+
+def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dataset:
+    """Open a data set and decide what of it takes part.
+
+    Args:
+        config: Where it is, and what is left out.
+        progress: Told (done, total) where the set is looked through for the first time.
+
+    Raises:
+        InputError: There is no such set; an episode is broken and `data.broken_episodes` does not skip it, or too many
+            are; two episodes have one identity; a filter cannot be applied; or nothing is left.
+    """
+    source = open_source(config)
+    table = EpisodeTable.of(source.infos(progress))
+    broken = BrokenEpisodes(config, len(table) + len(table.problems))
+    taking_part = included(table, config)
+    _require_distinct(table, taking_part, config)
+    excluded = frozenset(config.exclude)
+    broken.found([problem for problem in table.problems if problem.name not in excluded])
+    taking_part &= _of_outcome(table, config)
+    if config.idle.rule == "none":
+        kept = KeptSteps.whole(table, taking_part)
+    else:
+        ranges = find_ranges(source, table, config, progress)
+        kept = _kept_of(ranges, table, taking_part, broken)
+        _say_how_many_are_listed(ranges, table, config)
+    removed = _removed(config, table, kept)
+    if not len(kept.episode):
+        raise _nothing_left(config, len(table) + len(table.problems), removed)
+    logger.info("%s: %d episodes take part, %d steps of them", config.path, kept.taking_part.sum(), kept.steps)
+    return Dataset(config, source, table, kept, removed, broken)
+
+
+def _nothing_left(config: DataConfig, episodes: int, removed: Sequence[Removed]) -> InputError:
+    filters = ", ".join(f"{one.name} {one.episodes}" for one in removed if one.episodes)
+    return InputError(
+        where=f"data.path: {config.path}",
+        found=f"none of {episodes} episodes is left" + (f" (left out: {filters})" if filters else ""),
+        needed="at least one",
+        fix="Look at data.exclude, data.outcome and data.idle" if filters else "",
+    )
+
+
+def _kept_of(
+    found: FoundRanges, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], broken: BrokenEpisodes
+) -> KeptSteps:
+    met = [(place, problem) for place, problem in found.problems if taking_part[place]]
+    broken.found([problem for _, problem in met])
+    taking_part[[place for place, _ in met]] = False
+    everything = KeptSteps(found.episode, found.start, found.end, np.ones(len(table), bool))
+    return everything.only(taking_part)
+
+
+def _of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
+    if config.outcome == "all":
+        return np.ones(len(table), bool)
+    if len(table) and (table.success < 0).all():
+        raise InputError(
+            where=f"data.outcome: {config.outcome}",
+            found=f"no episode of {config.path} says whether it succeeded",
+            needed="at least some that do",
+            fix="Set data.outcome: all",
+        )
+    return np.asarray(table.success == (config.outcome == "success"))
+
+
+def _say_how_many_are_listed(found: FoundRanges, table: EpisodeTable, config: DataConfig) -> None:
+    if config.idle.rule != "published":
+        return
+    logger.log(
+        logging.INFO if found.listed == len(table) else logging.WARNING,
+        "%s: knows %d of the %d episodes; the other %d are left out",
+        config.idle.ranges, found.listed, len(table), len(table) - found.listed,
+    )  # fmt: skip
+
+
+def _require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig) -> None:
+    """Refuse two episodes of one identity: they would fall into one split, and an error could not name one of them."""
+    order = np.argsort(table.id_hash, kind="stable")
+    order = order[taking_part[order]]
+    hashes = table.id_hash[order]
+    for place in np.flatnonzero(hashes[1:] == hashes[:-1]):
+        first, second = sorted((int(order[place]), int(order[place + 1])))
+        if table.identity(first) == table.identity(second):
+            error = InputError(
+                where=f"data.path: {config.path}",
+                found=f"episodes {first} and {second} have the same identity: {table.identity(first)}",
+                needed="episodes that can be told apart: the split is a hash of the identity",
+                fix="Add a feature to data.fields.identity that differs between them"
+                if config.source == "rlds"
+                else "",
+            )
+            raise with_way_out(error, [table.identity(first)])
+
+
+def _removed(config: DataConfig, table: EpisodeTable, kept: KeptSteps) -> tuple[Removed, ...]:
+    """Count what each filter took away, in the order in which they are applied."""
+    everyone = np.ones(len(table), bool)
+    included_ones = included(table, config)
+    of_outcome = included_ones & _of_outcome(table, config)
+    excluded_problems = sum(problem.name in config.exclude for problem in table.problems)
+    stages = [
+        ("excluded", KeptSteps.whole(table, everyone), KeptSteps.whole(table, included_ones), excluded_problems),
+        ("outcome", KeptSteps.whole(table, included_ones), KeptSteps.whole(table, of_outcome), 0),
+        (
+            "broken",
+            KeptSteps.whole(table, of_outcome),
+            KeptSteps.whole(table, kept.taking_part),
+            len(table.problems) - excluded_problems,
+        ),
+        ("idle", KeptSteps.whole(table, kept.taking_part), kept, 0),
+    ]
+    return tuple(_difference(name, before, after, more, table, config) for name, before, after, more in stages)
+
+
+def _difference(
+    name: str, before: KeptSteps, after: KeptSteps, unread: int, table: EpisodeTable, config: DataConfig
+) -> Removed:
+    windows = None
+    if config.stride != "auto":
+        windows = clip_starts(table, before, config).windows - clip_starts(table, after, config).windows
+    episodes = len(np.unique(before.episode)) - len(np.unique(after.episode)) + unread
+    return Removed(name, episodes, before.steps - after.steps, windows)

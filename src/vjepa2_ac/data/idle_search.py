@@ -1,0 +1,202 @@
+"""Which steps does the idle filter keep, in every episode? Looked up or computed once, and kept on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int32
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.broken import UnreachableError, as_error, as_problem
+from vjepa2_ac.data.idle import kept_ranges
+from vjepa2_ac.data.index import kept_or_made, key_of
+from vjepa2_ac.data.table import EpisodeTable, NotATableError, Problem
+from vjepa2_ac.episode import EpisodeSource, Progress
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+_ALL_BROKEN = 10  # as many broken episodes at the start, and no other, are no accident
+
+Found = list[tuple[int, int]] | Problem
+
+
+@dataclass(frozen=True, eq=False)
+class FoundRanges:
+    """The kept ranges [start, end) of all episodes of a table, and the episodes that broke on the way."""
+
+    episode: Int32[np.ndarray, " ranges"]  # ascending
+    start: Int32[np.ndarray, " ranges"]
+    end: Int32[np.ndarray, " ranges"]
+    problems: tuple[tuple[int, Problem], ...] = ()  # with the episode's place in the table
+    listed: int = 0  # episodes of the table that the list knows, for the rule `published`
+
+    @classmethod
+    def of(cls, found: Sequence[Found], *, listed: int = 0) -> FoundRanges:
+        """Join what was found in each episode."""
+        problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, Problem))
+        ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
+        columns = np.array(ranges, np.int32).reshape(-1, 3)
+        return cls(*(np.ascontiguousarray(column) for column in columns.T), problems, listed)
+
+    def to_bytes(self) -> bytes:
+        """Return this as a file's content, with checksums."""
+        problems = [[place, vars(problem)] for place, problem in self.problems]
+        text = json.dumps({"problems": problems, "listed": self.listed}).encode()
+        file = io.BytesIO()
+        np.savez(file, text=np.frombuffer(text, np.uint8), episode=self.episode, start=self.start, end=self.end)
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> FoundRanges:
+        """Read what `to_bytes` returned.
+
+        Raises:
+            NotATableError: It is something else, or damaged.
+        """
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as file:
+                text = json.loads(file["text"].tobytes())
+                columns = (file["episode"], file["start"], file["end"])
+            problems = tuple((int(place), Problem(**problem)) for place, problem in text["problems"])
+            return cls(*columns, problems, int(text["listed"]))
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise NotATableError(str(error)) from None
+
+
+def find_ranges(
+    source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress | None
+) -> FoundRanges:
+    """Return the ranges that `data.idle.rule` keeps, of all episodes, whether they take part or not.
+
+    Raises:
+        InputError: The list of ranges cannot be read or is of another data set; or the rule fits no episode.
+    """
+    parts = {"found": "idle ranges", "table": _fingerprint(table), "data": _knobs_that_matter(config)}
+    if config.idle.rule == "published":
+        path = str(config.idle.ranges)
+        return _kept(config, parts | {"list": _version(path)}, lambda: _published(path, table))
+    return _kept(config, parts, lambda: _computed(source, table, config, progress))
+
+
+def _kept(config: DataConfig, parts: dict[str, object], make: Callable[[], FoundRanges]) -> FoundRanges:
+    return kept_or_made(
+        config.disk_cache, key_of(parts), make, to_bytes=FoundRanges.to_bytes, from_bytes=FoundRanges.from_bytes
+    )
+
+
+def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress | None) -> FoundRanges:
+    def look(place: int) -> Found:
+        try:
+            return kept_ranges(source.read(place), config.idle)
+        except UnreachableError:
+            raise
+        except InputError as error:
+            return as_problem(error, table.identity(place))
+
+    threads = config.connections if storage.is_url(config.path) else 1
+    found: list[Found] = []
+    for one in _in_order(look, len(table), threads):
+        found.append(one)
+        if progress is not None:
+            progress(len(found), len(table))
+        if isinstance(one, Problem) and len(found) == min(_ALL_BROKEN, len(table)):
+            _refuse_all_broken(found)
+    return FoundRanges.of(found)
+
+
+def _in_order(look: Callable[[int], Found], count: int, threads: int) -> Iterator[Found]:
+    """Look at every episode, several at once; an error is raised in its turn."""
+    with ThreadPoolExecutor(threads) as pool:
+        for first in range(0, count, 4 * threads):
+            yield from pool.map(look, range(first, min(first + 4 * threads, count)))
+
+
+def _refuse_all_broken(found: list[Found]) -> None:
+    problems = [one for one in found if isinstance(one, Problem)]
+    if len(problems) == len(found):
+        raise as_error(problems[0])
+
+
+def _published(path: str, table: EpisodeTable) -> FoundRanges:
+    lists = _read_list(path)
+    found: list[Found] = []
+    listed = 0
+    for place in range(len(table)):
+        name = table.identity(place)
+        listed += name in lists
+        found.append(_checked(lists.get(name, []), name, int(table.num_steps[place]), path))
+    if not listed:
+        first = next(iter(lists), "none at all")
+        raise InputError(
+            where=f"data.idle.ranges: {path}",
+            found=f"none of the {len(table)} episodes; its first is {first}",
+            needed="the identities of the episodes" + (f", such as {table.identity(0)}" if len(table) else ""),
+            fix="Name the list of this version of the data set, or set data.idle.rule: commands or motion",
+        )
+    return FoundRanges.of(found, listed=listed)
+
+
+def _read_list(path: str) -> dict[str, list[list[int]]]:
+    needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
+    try:
+        content = json.loads(storage.read_bytes(path))
+    except OSError as error:
+        raise InputError(where=f"data.idle.ranges: {path}", found=f"cannot be read ({error})", needed=needed) from None
+    except ValueError as error:
+        raise InputError(where=f"data.idle.ranges: {path}", found=f"not JSON ({error})", needed=needed) from None
+    if not isinstance(content, dict):
+        raise InputError(where=f"data.idle.ranges: {path}", found=f"a JSON {type(content).__name__}", needed=needed)
+    return content
+
+
+def _checked(ranges: object, name: str, steps: int, path: str) -> list[tuple[int, int]]:
+    try:
+        pairs = sorted((start, end) for start, end in ranges)  # type: ignore[attr-defined] # that is what is tried
+        whole = all(type(number) is int for pair in pairs for number in pair)
+    except (TypeError, ValueError):
+        pairs, whole = [], False
+    edges = [edge for pair in pairs for edge in pair]
+    if not whole or edges != sorted(edges) or any(start == end for start, end in pairs):
+        raise InputError(
+            where=f"data.idle.ranges: {path}: {name}",
+            found=str(ranges)[:200],
+            needed="pairs [start, end) of steps that do not overlap",
+        )
+    if edges and not 0 <= edges[0] <= edges[-1] <= steps:
+        raise InputError(
+            where=f"data.idle.ranges: {path}: {name}",
+            found=f"steps {edges[0]} to {edges[-1]}",
+            needed=f"steps from 0 to {steps}, which is the length of the episode",
+            fix="Name the list of this version of the data set, or set data.idle.rule: commands or motion",
+        )
+    return pairs
+
+
+def _fingerprint(table: EpisodeTable) -> str:
+    """Name everything that the source found out, down to the place of each episode."""
+    return hashlib.sha256(table.to_bytes()).hexdigest()
+
+
+def _knobs_that_matter(config: DataConfig) -> dict[str, object]:
+    return config.model_dump(include={"source", "path", "fields", "droid_raw", "lerobot"}) | {
+        "idle": config.idle.model_dump(exclude={"keep_share"})
+    }
+
+
+def _version(path: str) -> list[object]:
+    """Tell one content of the list from another without reading it, as far as that goes."""
+    try:
+        return [path, storage.file_size(path), None if storage.is_url(path) else Path(path).stat().st_mtime_ns]
+    except OSError:
+        return [path]
