@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Num
+from jaxtyping import Shaped
 
 from vjepa2_ac.data.sources.lerobot_ranges import RangedFile
 from vjepa2_ac.errors import InputError
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow import parquet
 
-Columns = Mapping[str, Num[np.ndarray, "rows _"]]
+Columns = Mapping[str, Shaped[np.ndarray, "rows _"]]
 Opener = Callable[[str], "str | RangedFile"]  # a path, or a file far away
 
 EPISODE = "episode_index"
@@ -139,7 +139,7 @@ def read_table(opened: str | RangedFile, path: str, wanted: Callable[[str], bool
         return {name: table.column(name).to_pylist() for name in present if name in table.column_names}
 
 
-def numbers_in(column: pa.ChunkedArray, where: str) -> Num[np.ndarray, "rows _"]:
+def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows _"]:
     """Return a column of numbers, or of lists of equally many numbers, as [rows, numbers].
 
     Raises:

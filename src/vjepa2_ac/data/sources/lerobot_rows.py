@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float, Shaped
 
 from vjepa2_ac.config import LeRobotFields
 from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo, missing
@@ -83,7 +83,7 @@ def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
         )
 
 
-def _column(rows: Columns, name: str, info: DatasetInfo, where: str) -> Num[np.ndarray, "steps _"]:
+def _column(rows: Columns, name: str, info: DatasetInfo, where: str) -> Shaped[np.ndarray, "steps _"]:
     if name not in rows:
         raise missing("data.lerobot", "column", name, where, rows)
     column, feature = rows[name], info.features.get(name)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Num
+from jaxtyping import Float, Shaped
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config import LeRobotFields
@@ -17,7 +17,7 @@ _FIX = "Check data.lerobot: state, select, rotation, gripper_open and gripper_cl
 
 
 def states_of(
-    columns: Sequence[Num[np.ndarray, "steps _"]], fields: LeRobotFields, where: str
+    columns: Sequence[Shaped[np.ndarray, "steps _"]], fields: LeRobotFields, where: str
 ) -> Float[np.ndarray, "steps 7"]:
     """Return states (legend: `vjepa2_ac.episode`) of the joined columns of an episode.
 

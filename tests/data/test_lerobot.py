@@ -1,0 +1,502 @@
+"""LeRobot data sets: the same states and the right pictures from v3.0 and v2.1, conventions, and what can be wrong."""
+
+import json
+import pickle
+import shutil
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lerobot_sets import (
+    FPS,
+    SIZE,
+    STATE,
+    Recorded,
+    change_info,
+    change_table,
+    column_of,
+    numbers_of,
+    recorded,
+    write_v21,
+    write_v30,
+)
+from recordings import write_mp4
+from synthetic import synthetic_states, write_synthetic_droid
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.lerobot import LeRobotSource
+from vjepa2_ac.data.sources.lerobot_parquet import ParquetRows
+from vjepa2_ac.data.sources.rlds import RldsSource
+from vjepa2_ac.episode import Episode, EpisodeSource
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
+
+LENGTHS = (12, 13, 14, 15, 16)
+KEY = "observation.images.exterior_1_left"
+VIDEO_V30 = f"videos/{KEY}/chunk-000/file-000.mp4"
+
+
+def config_of(path: object, **changes: Any) -> DataConfig:
+    return DataConfig.model_validate_json(json.dumps({"source": "lerobot", "path": str(path)} | changes))
+
+
+def source_of(path: object, **changes: Any) -> LeRobotSource:
+    return LeRobotSource(config_of(path, **changes))
+
+
+@pytest.fixture(scope="session")
+def episodes() -> list[Recorded]:
+    return [recorded(number, steps) for number, steps in enumerate(LENGTHS)]
+
+
+@pytest.fixture(scope="session")
+def v30(episodes: list[Recorded], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes in a Parquet file, three in a video. Read only."""
+    return write_v30(tmp_path_factory.mktemp("v30"), episodes)
+
+
+@pytest.fixture(scope="session")
+def v21(episodes: list[Recorded], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A Parquet file and a video for each episode, three in a chunk. Read only."""
+    return write_v21(tmp_path_factory.mktemp("v21"), episodes, gop=10)
+
+
+@pytest.fixture(params=["v30", "v21"])
+def either(request: pytest.FixtureRequest) -> Path:
+    return request.getfixturevalue(request.param)
+
+
+@pytest.fixture
+def copy(either: Path, tmp_path: Path) -> Path:
+    """A data set of either version to spoil."""
+    return Path(shutil.copytree(either, tmp_path / "set"))
+
+
+def first_rows(root: Path) -> Path:
+    return sorted(root.glob("data/*/*.parquet"))[0]
+
+
+def first_video(root: Path) -> Path:
+    return next(path for path in sorted(root.glob("videos/**/*.mp4")) if KEY in str(path))
+
+
+# --- what is read ------------------------------------------------------------------------------------------------
+
+
+def test_states_are_those_that_were_written_whatever_the_version(either: Path, episodes: list[Recorded]) -> None:
+    source = source_of(either)
+    assert isinstance(source, EpisodeSource)
+    infos = source.infos()
+    assert [info.num_steps for info in infos] == list(LENGTHS)
+    assert [info.success for info in infos] == [number % 3 != 2 for number in range(5)]
+    assert not infos.problems
+    for number, episode in enumerate(episodes):
+        read = source.read(number)
+        written = np.concatenate([episode.columns[name] for name in STATE], axis=1)
+        np.testing.assert_array_equal(read.states, written.astype(np.float64))
+        assert read.joint_velocities is not None
+        np.testing.assert_array_equal(read.joint_velocities, episode.columns["action.joint_velocity"])
+        assert read.control_rate_hz == FPS
+        assert read.metadata == {"language": episode.task}
+
+
+def test_the_same_trajectory_gives_the_same_episode_from_rlds(tmp_path: Path) -> None:
+    lengths = (9, 11)
+    droid = write_synthetic_droid(tmp_path / "rlds" / "1.0.0", steps=lengths, episodes=2, size=SIZE, shards=1)
+    rlds = RldsSource(DataConfig(path=str(droid), camera="exterior_1_left"))
+    rlds.infos()
+    decoded = [rlds.read(number).read_frames(range(steps)) for number, steps in enumerate(lengths)]
+    states = [synthetic_states(steps + 1, seed=number)[:-1].astype(np.float32) for number, steps in enumerate(lengths)]
+    same = [
+        Recorded({STATE[0]: state[:, :6], STATE[1]: state[:, 6:]}, {KEY: list(frames)})
+        for state, frames in zip(states, decoded, strict=True)
+    ]
+    for name, write in (("v30", write_v30), ("v21", write_v21)):
+        source = source_of(write(tmp_path / name, same))
+        for number, steps in enumerate(lengths):
+            read = source.read(number)
+            np.testing.assert_array_equal(read.states, rlds.read(number).states)
+            difference = abs(read.read_frames(range(steps)).astype(int) - decoded[number])
+            assert difference.mean() < 8, "more than a codec loses"
+
+
+@pytest.mark.parametrize("gop", [2, 10])
+@pytest.mark.parametrize("write", [write_v30, write_v21])
+def test_each_picture_is_that_of_its_step(
+    write: Callable[..., Path], gop: int, episodes: list[Recorded], tmp_path: Path
+) -> None:
+    source = source_of(write(tmp_path / "set", episodes, gop=gop))
+    generator = np.random.default_rng(gop)
+    for camera, name in enumerate(("exterior_1_left", "wrist_left")):
+        for number in generator.permutation(len(LENGTHS)):
+            steps = [int(step) for step in generator.permutation(LENGTHS[number])[:6]]
+            frames = source.read(int(number), camera=name).read_frames([*steps, 0, LENGTHS[number] - 1])
+            expected = [(int(number), step, camera) for step in (*steps, 0, LENGTHS[number] - 1)]
+            assert [numbers_of(frame) for frame in frames] == expected
+
+
+def test_what_is_read_does_not_depend_on_the_order_nor_on_threads_nor_on_the_process(either: Path) -> None:
+    def everything(source: LeRobotSource, order: list[int]) -> dict[int, tuple[bytes, bytes]]:
+        with ThreadPoolExecutor(4) as pool:
+            read: list[Episode] = list(pool.map(source.read, order))
+            frames = list(pool.map(lambda episode: episode.read_frames([3, 8]), read))
+        return {
+            number: (episode.states.tobytes(), pictures.tobytes())
+            for number, episode, pictures in zip(order, read, frames, strict=True)
+        }
+
+    source = source_of(either)
+    source.infos()
+    forward = everything(source, [0, 1, 2, 3, 4, 0, 1, 2])
+    assert everything(pickle.loads(pickle.dumps(source)), [4, 2, 0, 3, 1]) == forward  # noqa: S301 - our own bytes
+
+
+def test_row_groups_need_not_be_episodes(episodes: list[Recorded], tmp_path: Path) -> None:
+    source = source_of(write_v30(tmp_path / "set", episodes, episodes_per_table=5, row_group=10))
+    assert pq.ParquetFile(first_rows(tmp_path / "set")).num_row_groups == 7
+    for number, episode in enumerate(episodes):
+        np.testing.assert_array_equal(source.read(number).states[:, 6:], episode.columns[STATE[1]])
+
+
+def test_only_row_groups_and_columns_of_the_episode_are_read(
+    episodes: list[Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = write_v30(tmp_path / "set", episodes, episodes_per_table=5, row_group=10)
+    read: list[tuple[int, tuple[str, ...]]] = []
+    original = pq.ParquetFile.read_row_group
+
+    def noted(self: pq.ParquetFile, number: int, columns: list[str], **options: Any) -> pa.Table:
+        read.append((number, tuple(columns)))
+        return original(self, number, columns=columns, **options)
+
+    monkeypatch.setattr(pq.ParquetFile, "read_row_group", noted)
+    rows = ParquetRows(str, [STATE[1]])
+    assert len(rows.rows(str(first_rows(root)), 1)[STATE[1]]) == LENGTHS[1]  # rows 12 to 24
+    assert read == [(1, ("episode_index", STATE[1])), (2, ("episode_index", STATE[1]))]
+    rows.rows(str(first_rows(root)), 1)
+    assert len(read) == 2, "row groups are kept"
+
+
+@pytest.mark.parametrize("pictures", ["png", "jpeg"])
+@pytest.mark.parametrize("write", [write_v30, write_v21])
+def test_pictures_may_be_in_the_table(
+    write: Callable[..., Path], pictures: str, episodes: list[Recorded], tmp_path: Path
+) -> None:
+    source = source_of(write(tmp_path / "set", episodes[:3], pictures=pictures))
+    frames = source.read(1).read_frames([7, 2])
+    assert [numbers_of(frame) for frame in frames] == [(1, 7, 0), (1, 2, 0)]
+    if pictures == "png":
+        np.testing.assert_array_equal(frames[0], episodes[1].frames[KEY][7])
+
+
+def test_a_picture_in_the_table_that_is_none_is_named(episodes: list[Recorded], tmp_path: Path) -> None:
+    root = write_v21(tmp_path / "set", episodes[:1], pictures="png")
+    rows = pq.read_table(first_rows(root)).column(KEY).to_pylist()
+    rows[3]["bytes"] = rows[3]["bytes"][:40]
+    rows[4]["bytes"] = None
+    kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
+    change_table(first_rows(root), **{KEY: pa.array([*rows[:4], rows[5], *rows[5:]], type=kind)})
+    with pytest.raises(InputError, match=r"episode_000000.*step 3: 40 bytes that are no picture"):
+        source_of(root).read(0).read_frames([3])
+    change_table(first_rows(root), **{KEY: pa.array(rows, type=kind)})
+    with pytest.raises(InputError, match="names of files in their place"):
+        source_of(root).read(0).read_frames([0])
+
+
+def test_the_rate_is_the_configs_where_it_names_one(v30: Path) -> None:
+    source = source_of(v30, lerobot={"fps": 12.5})
+    assert source.read(0).control_rate_hz == 12.5
+    assert numbers_of(source.read(1).read_frames([9])[0]) == (1, 9, 0), "pictures stay where info.json says"
+
+
+def test_progress_is_told(either: Path, tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    source = source_of(either, disk_cache={"dir": str(tmp_path)})
+    source.infos(lambda done, total: told.append((done, total)))
+    assert told[-1] == (5, 5)
+    assert told == sorted(told)
+
+
+def test_the_index_is_kept_until_a_file_changes(copy: Path) -> None:
+    assert len(source_of(copy).infos()) == 5
+    states = synthetic_states(LENGTHS[0]).astype(np.float32)
+    states[4, 1] = np.nan
+    rows = pq.read_table(first_rows(copy)).num_rows
+    grown = np.concatenate([states, synthetic_states(rows - len(states)).astype(np.float32)])
+    change_table(first_rows(copy), **{STATE[0]: column_of(grown[:, :6])})
+    assert [problem.name for problem in source_of(copy).infos().problems] == ["episode_000000"]
+
+
+# --- conventions -------------------------------------------------------------------------------------------------
+
+
+def own_set(folder: Path, state: np.ndarray, **columns: np.ndarray) -> Path:
+    frames = {"observation.images.front": [np.zeros((*SIZE, 3), np.uint8)] * len(state)}
+    named = {"observation.state": state} | {name.replace("__", "."): values for name, values in columns.items()}
+    return write_v30(folder, [Recorded(named, frames)])
+
+
+OWN = {"state": ["observation.state"], "cameras": {"front": "observation.images.front"}}
+
+
+@pytest.mark.parametrize("convention", ["quaternion_wxyz", "quaternion_xyzw"])
+def test_every_way_to_write_a_rotation_is_the_same_rotation(convention: str, tmp_path: Path) -> None:
+    states = synthetic_states(20, seed=3)
+    matrices = matrices_from_euler(states[:, 3:6])
+    quaternions = Rotation.from_matrix(matrices).as_quat(scalar_first=convention == "quaternion_wxyz")
+    quaternions[::2] *= -1  # q and -q are one rotation
+    own = np.concatenate([states[:, :3], quaternions, states[:, 6:]], axis=1)
+    source = source_of(own_set(tmp_path / "set", own), lerobot=OWN | {"rotation": convention})
+    read = source.read(0).states
+    np.testing.assert_allclose(matrices_from_euler(read[:, 3:6]), matrices, atol=1e-9)
+    np.testing.assert_allclose(read[:, 3:6], euler_from_matrices(matrices), atol=1e-9)
+    np.testing.assert_allclose(read[:, [0, 1, 2, 6]], states[:, [0, 1, 2, 6]], atol=1e-12)
+
+
+def test_a_quaternion_that_is_not_of_unit_length_is_refused(tmp_path: Path) -> None:
+    own = np.tile([0.4, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0, 0.5], (5, 1))
+    own[3, 4] = 0.5
+    with pytest.raises(InputError, match=r"episode_000000: step 3: the quaternion .* of length 1\.118"):
+        source_of(own_set(tmp_path / "set", own), lerobot=OWN | {"rotation": "quaternion_wxyz"}).infos()
+
+
+@pytest.mark.parametrize(("opened", "closed"), [(0.08, 0.0), (0.0, 0.08), (100.0, 0.0), (-1.0, 1.0), (1.0, 0.0)])
+def test_the_gripper_is_closedness_whatever_its_range_and_sign(opened: float, closed: float, tmp_path: Path) -> None:
+    states = synthetic_states(15, seed=1)
+    own = states.copy()
+    own[:, 6] = opened + states[:, 6] * (closed - opened)
+    root = own_set(tmp_path / "set", own)
+    source = source_of(root, lerobot=OWN | {"gripper_open": opened, "gripper_closed": closed})
+    np.testing.assert_allclose(source.read(0).states, states, atol=1e-12)
+    if abs(closed - opened) > 1.1:
+        with pytest.raises(InputError, match=r"needed: a gripper between 0 and 1\. Check data\.lerobot"):
+            source_of(root, lerobot=OWN).infos()
+
+
+def test_numbers_are_selected_and_put_in_order(tmp_path: Path) -> None:
+    states = synthetic_states(10)
+    joints = np.full((10, 7), 9.0)
+    root = own_set(tmp_path / "set", np.concatenate([joints, states[:, 6:], states[:, :6]], axis=1))
+    order = (8, 9, 10, 11, 12, 13, 7)
+    np.testing.assert_array_equal(source_of(root, lerobot=OWN | {"select": order}).read(0).states, states)
+
+
+def test_a_data_set_without_commands_or_outcome_says_so(tmp_path: Path) -> None:
+    source = source_of(own_set(tmp_path / "set", synthetic_states(10)), lerobot=OWN)
+    assert source.infos()[0].success is None
+    assert source.read(0).joint_velocities is None
+
+
+# --- settings at fault -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"lerobot": {"state": ["observation.state.cartesian_positon"]}},
+            r"Did you mean observation\.state\.cart.*It has: ",
+        ),
+        ({"lerobot": {"state": [STATE[0]]}}, r"6 numbers a step from .*cartesian_position \[6\]\. needed: 7: x, y, z"),
+        ({"lerobot": {"rotation": "quaternion_wxyz"}}, r"7 numbers a step .*needed: 8: x, y, z, a quaternion's 4"),
+        ({"lerobot": {"select": [0, 1, 2, 3, 4, 5, 7]}}, r"select: 7, of 7 numbers .*needed: 0 to 6"),
+        ({"lerobot": {"cameras": {"left": "observation.images.left"}}}, r"no camera observation\.images\.left"),
+    ],
+)
+def test_a_mapping_that_does_not_fit_is_one_error_of_the_settings(
+    changes: dict[str, Any], message: str, either: Path
+) -> None:
+    with pytest.raises(InputError, match=message):
+        source_of(either, **changes).infos()
+
+
+def test_a_camera_that_the_config_does_not_name_cannot_be_read(v30: Path) -> None:
+    with pytest.raises(InputError, match=r"no camera exterior_3_left .*Did you mean exterior_"):
+        source_of(v30).read(0, camera="exterior_3_left")
+
+
+@pytest.mark.parametrize("version", ["v1.6", "v2.0", "v3.1", 3, None])
+def test_other_versions_are_refused(version: object, copy: Path) -> None:
+    change_info(copy, codebase_version=version)
+    with pytest.raises(InputError, match=r"meta/info\.json: codebase_version .*needed: v2\.1 or v3\.0"):
+        source_of(copy).infos()
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda info: info.write_text(info.read_text()[:200]),
+        lambda info: info.write_bytes(b"\xff\xfe\x00"),
+        lambda info: info.write_text("[1, 2]"),
+        lambda info: info.write_text("[" * 100_000),
+        lambda info: change_info(info.parent.parent, fps="fast"),
+        lambda info: change_info(info.parent.parent, fps=0),
+        lambda info: change_info(info.parent.parent, features=["state"]),
+        lambda info: change_info(info.parent.parent, total_episodes=None),
+        lambda info: change_info(info.parent.parent, total_episodes=6),
+        lambda info: change_info(info.parent.parent, data_path="../{episode_index}"),
+        lambda info: change_info(info.parent.parent, data_path="data/{episode_index.__class__}"),
+        lambda info: change_info(info.parent.parent, data_path="data/{file_index:0999999999d}"),
+        lambda info: change_info(info.parent.parent, video_path=None),
+    ],
+)
+def test_damaged_descriptions_are_named(spoil: Callable[[Path], None], copy: Path) -> None:
+    spoil(copy / "meta/info.json")
+    with pytest.raises(InputError, match=r"meta/(info\.json|episodes)"):
+        source_of(copy).infos()
+
+
+def test_no_data_set_says_what_a_data_set_is(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"data\.path: no meta/info\.json in .*the folder that holds meta, data"):
+        source_of(tmp_path).infos()
+
+
+# --- episodes that cannot be used --------------------------------------------------------------------------------
+
+
+def only_problem(root: Path) -> str:
+    table = source_of(root).infos()
+    assert len(table) + len(table.problems) == 5
+    assert table.find("episode_000000") is None
+    first = table.problems[0]
+    assert first.name == "episode_000000"
+    return f"{first.where}: {first.found}. needed: {first.needed}. {first.fix}"
+
+
+def test_rows_without_their_video_name_both(copy: Path) -> None:
+    first_video(copy).unlink()
+    problem = only_problem(copy)
+    assert KEY in problem
+    assert "no such video" in problem
+    assert first_rows(copy).relative_to(copy).as_posix() in problem
+
+
+def test_a_missing_parquet_file_is_the_problem_of_its_episodes(copy: Path) -> None:
+    first_rows(copy).unlink()
+    assert "no such file" in only_problem(copy)
+
+
+def test_a_truncated_parquet_file_is_the_problem_of_its_episodes(copy: Path) -> None:
+    path = first_rows(copy)
+    path.write_bytes(path.read_bytes()[:-200])
+    problem = only_problem(copy)
+    assert str(path) in problem
+    assert "damaged" in problem
+
+
+def test_a_column_that_a_file_lacks_is_named_with_those_it_has(copy: Path) -> None:
+    change_table(first_rows(copy), **{STATE[0]: None})
+    problem = only_problem(copy)
+    assert f"no column {STATE[0]}" in problem
+    assert f"It has: episode_index, frame_index, timestamp, {STATE[1]}" in problem
+
+
+def spoiled_rows(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    rows = np.array(pq.read_table(first_rows(root)).column(STATE[0]).to_pylist(), np.float32)
+    change_table(first_rows(root), **{STATE[0]: column_of(change(rows))})
+
+
+def nan_at_3(rows: np.ndarray) -> np.ndarray:
+    rows[3, 2] = np.nan
+    return rows
+
+
+def far_at_5(rows: np.ndarray) -> np.ndarray:
+    rows[5, 0] = 50.0
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (nan_at_3, "episode_000000: step 3: the numbers"),
+        (far_at_5, "needed: a position within 5 m"),
+        (lambda rows: rows[:, :5], "5 numbers a row. needed: 6, says"),
+        (lambda rows: rows.astype(np.int64), "values of type int64. needed: float32"),
+    ],
+)
+def test_rows_that_are_no_states_are_a_problem(
+    change: Callable[[np.ndarray], np.ndarray], message: str, copy: Path
+) -> None:
+    spoiled_rows(copy, change)
+    assert message in only_problem(copy)
+
+
+def test_lists_of_uneven_length_and_gaps_and_words_are_no_states(v21: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(v21, tmp_path / "set"))
+    rows = pq.read_table(first_rows(root)).column(STATE[0]).to_pylist()
+    change_table(first_rows(root), **{STATE[0]: pa.array([rows[0][:5], *rows[1:]], type=pa.list_(pa.float32()))})
+    assert "5 numbers in one row and 6 in another" in only_problem(root)
+    change_table(first_rows(root), **{STATE[0]: pa.array([None, *rows[1:]], type=pa.list_(pa.float32()))})
+    assert "1 rows without a value" in only_problem(root)
+    change_table(first_rows(root), **{STATE[0]: pa.array(["a"] * len(rows))})
+    assert "values of type string" in only_problem(root)
+
+
+def test_rows_that_were_lost_or_mixed_up_are_a_problem(v21: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(v21, tmp_path / "set"))
+    table = pq.read_table(first_rows(root))
+    pq.write_table(table.slice(0, 10), first_rows(root))
+    assert "10 rows. needed: 12" in only_problem(root)
+    pq.write_table(table.take([1, 0, *range(2, 12)]), first_rows(root))
+    assert "frame_index that is not 0 to 11 in order" in only_problem(root)
+
+
+def test_an_episode_of_no_steps_is_a_problem(v21: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(v21, tmp_path / "set"))
+    lines = (root / "meta/episodes.jsonl").read_text().splitlines()
+    (root / "meta/episodes.jsonl").write_text("\n".join([lines[0].replace("12", "0"), *lines[1:]]))
+    assert "no steps" in only_problem(root)
+
+
+def test_a_wrong_rate_is_found_out_by_the_timestamps(v21: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(v21, tmp_path / "set"))
+    change_info(root, fps=10)
+    with pytest.raises(
+        InputError, match=r"step 2: the timestamp 0\.1333 s\. needed: 0\.2 s, at the 10 rows per second"
+    ):
+        source_of(root).infos()
+
+
+def test_a_video_that_says_it_is_shorter_than_its_rows_is_a_problem(v30: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(v30, tmp_path / "set"))
+    path, name = root / "meta/episodes/chunk-000/file-000.parquet", f"videos/{KEY}/to_timestamp"
+    ends = pq.read_table(path).column(name).to_pylist()
+    change_table(path, **{name: pa.array([11 / FPS, *ends[1:]])})
+    assert "0.733 s of video, says the data set, for 12 rows" in only_problem(root)
+
+
+def test_a_video_that_is_shorter_than_its_rows_is_found_when_it_is_read(
+    v21: Path, episodes: list[Recorded], tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(v21, tmp_path / "set"))
+    write_mp4(first_video(root), episodes[0].frames[KEY][:9], rate=FPS, gop=2)
+    episode = source_of(root).read(0)
+    assert numbers_of(episode.read_frames([8])[0]) == (0, 8, 0)
+    with pytest.raises(InputError, match=r"episode_000000\.mp4: episode_000000: no picture at 0\.600 s"):
+        episode.read_frames([3, 9])
+
+
+def test_pictures_that_come_at_other_times_are_not_taken_for_the_right_ones(
+    v21: Path, episodes: list[Recorded], tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(v21, tmp_path / "set"))
+    late = [number * 1024 + (5120 if number > 5 else 0) for number in range(12)]  # a third of a second is missing
+    write_mp4(first_video(root), episodes[0].frames[KEY], rate=FPS, gop=2, times=late)
+    episode = source_of(root).read(0)
+    assert numbers_of(episode.read_frames([4])[0]) == (0, 4, 0)
+    with pytest.raises(InputError, match="no picture at"):
+        episode.read_frames([7])
+
+
+def test_a_set_whose_every_episode_is_a_problem_is_an_error(v21: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(v21, tmp_path / "set"))
+    shutil.rmtree(root / "videos")
+    with pytest.raises(InputError, match="episode_000000: no such video"):
+        source_of(root).infos()
