@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
+import h5py
 import numpy as np
 from jaxtyping import UInt8
 
@@ -41,3 +44,36 @@ def write_mp4(
             file.mux(stream.encode(frame))
         file.mux(stream.encode())
     return Path(path)
+
+
+def write_raw_droid(
+    folder: str | Path,
+    states: np.ndarray,
+    *,
+    pictures: Mapping[str, Sequence[np.ndarray]],
+    success: bool = True,
+    skipped: Sequence[int] = (),
+    extrinsics: Mapping[str, np.ndarray] | None = None,
+    joint_velocities: np.ndarray | None = None,
+    language: str = "move to place 0",
+    **video: Any,
+) -> Path:
+    """Write one episode as DROID's raw data is; `pictures` by serial number: the left, the right, the wrist camera."""
+    target = Path(folder)
+    target.mkdir(parents=True)
+    with h5py.File(target / "trajectory.h5", "w") as file:
+        file["observation/robot_state/cartesian_position"] = states[:, :6]
+        file["observation/robot_state/gripper_position"] = states[:, 6]
+        file["observation/timestamp/skip_action"] = np.isin(np.arange(len(states)), skipped)
+        file["action/cartesian_position"] = states[:, :6] + 0.01  # commanded, not measured: never to be read
+        if joint_velocities is not None:
+            file["action/joint_velocity"] = joint_velocities
+        for serial, poses in (extrinsics or {}).items():
+            file[f"observation/camera_extrinsics/{serial}_left"] = poses
+    for serial, frames in pictures.items():
+        write_mp4(target / "recordings/MP4" / f"{serial}.mp4", frames, **video)
+    names = dict(zip(("left", "right", "wrist"), pictures, strict=False))
+    paths = {f"{name}_mp4_path": f"success/any/recordings/MP4/{serial}.mp4" for name, serial in names.items()}
+    metadata = {"uuid": target.name, "success": success, "current_task": language, **paths}
+    (target / f"metadata_{target.name}.json").write_text(json.dumps(metadata))
+    return target

@@ -29,7 +29,7 @@ HOMES = {
     "matplotlib": {"evaluation/plots.py", "evaluation/contact_sheet.py"},
     "fsspec": {"remote.py"},
     "av": {"data/video.py"},
-    "h5py": {"data/sources/droid_raw.py"},
+    "h5py": {"data/sources/droid_trajectory.py"},
     "pyarrow": {"data/sources/lerobot"},
     "rich": {"console.py"},
     "tensorflow": set(),

@@ -1,0 +1,66 @@
+"""What does the metadata of a raw DROID episode say: which camera is which, did it succeed, what was the task?"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+from typing import Any
+
+from vjepa2_ac.config.data import RAW_CAMERAS
+from vjepa2_ac.errors import InputError
+
+
+@dataclass(frozen=True)
+class DroidMetadata:
+    """The content of a metadata_*.json."""
+
+    values: dict[str, Any]
+    where: str
+
+    @classmethod
+    def parse(cls, data: bytes, where: str) -> DroidMetadata:
+        """Read the file's content.
+
+        Raises:
+            InputError: It is not a JSON object.
+        """
+        try:
+            values = json.loads(data)
+        except (ValueError, RecursionError) as error:
+            raise InputError(where=where, found=f"not JSON ({error})", needed="the metadata of an episode") from None
+        if not isinstance(values, dict):
+            raise InputError(where=where, found=f"JSON of type {type(values).__name__}", needed="a JSON object")
+        return cls(values, where)
+
+    def serial(self, camera: str) -> str:
+        """Return the serial number of a camera: left, right, wrist, ext1, ext2, or a serial number itself.
+
+        Raises:
+            InputError: The metadata does not name that camera.
+        """
+        if camera not in RAW_CAMERAS:
+            return camera
+        key = f"{camera}_mp4_path"
+        path = self.values.get(key)
+        name = PurePosixPath(path).name if isinstance(path, str) else ""
+        if not name.endswith(".mp4") or name == ".mp4":
+            raise InputError(
+                where=self.where,
+                found=f"{key}: {path!r}",
+                needed="the path of an MP4",
+                fix="Set data.camera to one that every episode has",
+            )
+        return name.removesuffix(".mp4")
+
+    @property
+    def success(self) -> bool | None:
+        """Whether the episode succeeded, where that is told."""
+        value = self.values.get("success")
+        return value if isinstance(value, bool) else None
+
+    @property
+    def language(self) -> str | None:
+        """The task in words, where it is told."""
+        value = self.values.get("current_task")
+        return value if isinstance(value, str) and value else None

@@ -1,0 +1,236 @@
+"""How do DROID's raw recordings become `Episode`s? States from HDF5, pictures from MP4, names from JSON."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int, UInt8
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.index import kept_or_built, key_of
+from vjepa2_ac.data.sources.droid_folders import (
+    TRAJECTORY,
+    VIDEOS,
+    EpisodeFolder,
+    find_episodes,
+    identity_of,
+    in_parallel,
+    list_episode,
+    success_of,
+)
+from vjepa2_ac.data.sources.droid_metadata import DroidMetadata
+from vjepa2_ac.data.sources.droid_trajectory import Trajectory, parse_trajectory
+from vjepa2_ac.data.sources.lines import line_of, pack_lines
+from vjepa2_ac.data.sources.states import require_plausible
+from vjepa2_ac.data.sources.whole_files import WholeFiles
+from vjepa2_ac.data.table import EpisodeTable, Problem
+from vjepa2_ac.data.video import count_frames, read_frames
+from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+_FIX = "Copy the episode again"
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where an episode lies, and what its index entry was made of."""
+
+    folder: str
+    metadata: str
+    version: str
+    pictures: int  # of the camera that has the fewest
+
+
+class RawDroidSource:
+    """The episodes of a raw DROID tree, or of a part of it, in the order of their paths.
+
+    Nothing is read before the first call. `infos` reads every trajectory and the headers of the MP4s of the config's
+    cameras, once; for data behind a URL it is not looked at again until folders come or go. An episode is known as
+    LAB/outcome/DATE/TIME (`droid_folders.identity_of`).
+
+    An MP4 holds one picture per control step, in order, whatever rate its header states, and may lack the last step's.
+    """
+
+    def __init__(self, config: DataConfig) -> None:
+        self._config = config
+        self._root = config.path
+        self._files = WholeFiles(config)
+        self._table: EpisodeTable | None = None
+
+    def infos(self, progress: Progress | None = None) -> EpisodeTable:
+        """Return identity, length and outcome of every usable episode.
+
+        Raises:
+            InputError: There are no episodes, or not a single one can be used.
+            OSError: Data behind a URL cannot be read.
+        """
+        if self._table is None:
+            self._table = self._indexed(progress)
+        return self._table
+
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - files are kept whole
+        """Return one episode; of pictures, only those that are asked for are decoded.
+
+        Raises:
+            InputError: A file is missing or damaged, or has changed since it was indexed.
+            OSError: Data behind a URL cannot be read.
+        """
+        table = self.infos()
+        info, place = table[index], _Place(**json.loads(line_of("place", table.locators, index)))
+        metadata = self._metadata(place)
+        serial = metadata.serial(camera or self._config.cameras[0])
+        trajectory = self._trajectory(place, (serial,))
+        if len(trajectory.states) != info.num_steps:
+            raise InputError(
+                where=self._path(place, TRAJECTORY),
+                found=f"{len(trajectory.states)} steps",
+                needed=f"the {info.num_steps} that were indexed",
+                fix="Leave files in peace while a run reads them",
+            )
+        video = self._path(place, f"{VIDEOS}/{serial}.mp4")
+        return Episode(
+            info=info,
+            states=trajectory.states,
+            read_frames=_VideoReader(video, place.version, trajectory.pictures, self._files),
+            control_rate_hz=self._config.droid_raw.control_rate_hz,
+            extrinsics=trajectory.extrinsics[serial],
+            joint_velocities=trajectory.joint_velocities,
+            metadata={} if metadata.language is None else {"language": metadata.language},
+        )
+
+    def _indexed(self, progress: Progress | None) -> EpisodeTable:
+        """Return the kept table, or scan every episode; a local file that changed makes another key."""
+        config = self._config
+        folders = find_episodes(self._root, config.connections)
+        if not folders:
+            raise InputError(
+                where="data.path",
+                found=f"no episodes under {self._root}",
+                needed=f"folders LAB/success|failure/DATE/TIME with a {TRAJECTORY}",
+                fix="DROID's are in gs://gresearch/robotics/droid_raw/1.0.1",
+            )
+        listed: Sequence[EpisodeFolder | str] = folders
+        if not storage.is_url(self._root):
+            listed = [list_episode(self._root, folder) for folder in folders]
+        knobs = {"cameras": config.cameras, "droid_raw": config.droid_raw, "pose_frame": config.pose_frame}
+        key = key_of({"source": "droid_raw", "path": self._root, **knobs, "listed": listed})
+        return kept_or_built(config.disk_cache, key, lambda: self._scan_all(folders, progress))
+
+    def _scan_all(self, folders: list[str], progress: Progress | None) -> EpisodeTable:
+        done = 0
+
+        def scan(folder: str) -> tuple[EpisodeInfo, _Place] | Problem:
+            nonlocal done
+            found = self._scan(folder)
+            done += 1
+            if progress is not None:
+                progress(done, len(folders))
+            return found
+
+        infos: dict[str, EpisodeInfo] = {}
+        places, problems = [], []
+        for found in in_parallel(scan, folders, self._config.connections if storage.is_url(self._root) else 1):
+            if isinstance(found, Problem):
+                problems.append(found)
+            elif found[0].id in infos:
+                problems.append(_twice(found[0].id, self._path(found[1], TRAJECTORY)))
+            else:
+                infos[found[0].id] = found[0]
+                places.append(json.dumps(vars(found[1])))
+        if not infos:
+            first = problems[0]
+            raise InputError(where=first.where, found=first.found, needed=first.needed, fix=first.fix)
+        logger.info("%s: %d episodes, %d that cannot be used", self._root, len(infos), len(problems))
+        return EpisodeTable.of(list(infos.values()), problems=problems, locators=pack_lines("place", places))
+
+    def _scan(self, folder: str) -> tuple[EpisodeInfo, _Place] | Problem:
+        identity = identity_of(self._root, folder)
+        listed = list_episode(self._root, folder)
+        try:
+            place = self._place_of(listed, identity)
+            metadata = self._metadata(place)
+            serials = tuple(metadata.serial(camera) for camera in self._config.cameras)
+            place = _Place(place.folder, place.metadata, place.version, self._count(place, listed, serials))
+            steps = len(self._trajectory(place, serials).states)
+        except InputError as error:
+            return Problem(identity, error.where, error.found, error.needed, error.fix)
+        success = success_of(identity) if metadata.success is None else metadata.success
+        return EpisodeInfo(identity, steps, success), place
+
+    def _place_of(self, listed: EpisodeFolder, identity: str) -> _Place:
+        if not listed.has_trajectory or listed.metadata is None:
+            missing = TRAJECTORY if not listed.has_trajectory else "metadata_*.json"
+            where = self._path(listed.path, "")
+            raise InputError(where=where, found=f"episode {identity} has no {missing}", needed="one", fix=_FIX)
+        return _Place(listed.path, listed.metadata, key_of({"files": listed}), 0)
+
+    def _count(self, place: _Place, listed: EpisodeFolder, serials: tuple[str, ...]) -> int:
+        """Return how many pictures every camera has."""
+        counts = []
+        for serial in serials:
+            path = self._path(place, f"{VIDEOS}/{serial}.mp4")
+            if not any(video.name == f"{serial}.mp4" for video in listed.videos):
+                there = ", ".join(video.name for video in listed.videos) or "none"
+                raise InputError(where=path, found="no such file", needed=f"an MP4; there are {there}", fix=_FIX)
+            counts.append(count_frames(path, where=path))
+        return min(counts)
+
+    def _metadata(self, place: _Place) -> DroidMetadata:
+        path = self._path(place, place.metadata)
+        return DroidMetadata.parse(self._files.read(path, version=place.version, where=path), path)
+
+    def _trajectory(self, place: _Place, serials: tuple[str, ...]) -> Trajectory:
+        path = self._path(place, TRAJECTORY)
+        data = self._files.read(path, version=place.version, where=path)
+        trajectory = parse_trajectory(data, where=path, serials=serials, pictures=place.pictures)
+        if self._config.pose_frame == "camera" and any(trajectory.extrinsics[serial] is None for serial in serials):
+            needed = "observation/camera_extrinsics of the camera"
+            raise InputError(where=path, found="no poses of the camera", needed=needed, fix="Set data.pose_frame: base")
+        if self._config.droid_raw.skip_action == "drop":
+            trajectory = trajectory.at(np.flatnonzero(~trajectory.skipped))
+        require_plausible(trajectory.states, path, fix=_FIX)
+        return trajectory
+
+    def _path(self, place: _Place | str, name: str) -> str:
+        folder = place if isinstance(place, str) else place.folder
+        path = storage.join(self._root, folder) if folder else self._root
+        return storage.join(path, name) if name else path
+
+
+@dataclass(frozen=True)
+class _VideoReader:
+    """Decodes the pictures of one camera that are asked for."""
+
+    path: str
+    version: str
+    pictures: Int[np.ndarray, " steps"]
+    files: WholeFiles | None  # where the MP4 is kept whole; None: what is needed is fetched each time
+
+    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
+        """Return the RGB pictures at these control steps, in this order.
+
+        Raises:
+            InputError: The MP4 is missing, damaged, or ends before.
+            OSError: A file behind a URL cannot be read.
+            ValueError: No steps, or a step outside the episode.
+        """
+        if not steps or min(steps) < 0 or max(steps) >= len(self.pictures):
+            raise ValueError(f"{self.path}: steps {list(steps)} of {len(self.pictures)}")
+        places = self.pictures[list(steps)].tolist()
+        if self.files is None or not storage.is_url(self.path):
+            return read_frames(self.path, places, where=self.path)
+        data = self.files.read(self.path, version=self.version, where=self.path)
+        return read_frames(io.BytesIO(data), places, where=self.path)
+
+
+def _twice(identity: str, where: str) -> Problem:
+    found = f"a second episode of the same identity: {identity}"
+    return Problem(identity, where, found, "episodes that can be told apart", "Name a smaller folder in data.path")

@@ -1,0 +1,139 @@
+"""What does the trajectory.h5 of a raw DROID episode hold, and does it fit the pictures?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int
+
+from vjepa2_ac.data.sources.states import zero_steps
+from vjepa2_ac.errors import InputError
+
+_POSE = "observation/robot_state/cartesian_position"
+_GRIPPER = "observation/robot_state/gripper_position"
+_SKIP = "observation/timestamp/skip_action"
+_JOINT_VELOCITY = "action/joint_velocity"
+_JOINTS = 7
+_MOST_STEPS = 1_000_000  # a damaged header may promise any number
+_FIX = "Copy the episode again"
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """The control steps of an episode that have a picture (legend: `vjepa2_ac.episode`)."""
+
+    states: Float[np.ndarray, "steps 7"]
+    pictures: Int[np.ndarray, " steps"]  # place of each step's picture in the MP4
+    skipped: Bool[np.ndarray, " steps"]  # the operator was not in control
+    extrinsics: dict[str, np.ndarray | None]  # of each camera, by its serial number: [steps 6]
+    joint_velocities: Float[np.ndarray, "steps 7"] | None  # commanded
+
+    def at(self, steps: Int[np.ndarray, " kept"]) -> Trajectory:
+        """Return some of the steps."""
+        return Trajectory(
+            self.states[steps],
+            self.pictures[steps],
+            self.skipped[steps],
+            {serial: None if poses is None else poses[steps] for serial, poses in self.extrinsics.items()},
+            None if self.joint_velocities is None else self.joint_velocities[steps],
+        )
+
+
+def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], pictures: int) -> Trajectory:
+    """Read the content of a trajectory.h5.
+
+    Args:
+        data: The whole file.
+        where: The file, as an error names it.
+        serials: Cameras whose poses are wanted; one without any has None.
+        pictures: How many the MP4 holds: as many as there are steps, or one more or less.
+
+    Raises:
+        InputError: Not HDF5, damaged, without what is needed, or of another length than the MP4.
+    """
+    h5py = _library(where)
+    try:
+        # From memory: HDF5 then never waits for a network, nor crashes on a file that shrinks under it.
+        with h5py.File(h5py.h5f.open_file_image(data)) as file:
+            trajectory = _Reader(file, where).trajectory(serials)
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError, MemoryError, OverflowError) as error:
+        found = f"{len(data)} bytes that cannot be read as HDF5 ({str(error)[:200]})"
+        raise InputError(where=where, found=found, needed="an undamaged trajectory.h5", fix=_FIX) from None
+    steps = len(trajectory.states)
+    if abs(steps - pictures) > 1:
+        raise InputError(
+            where=where,
+            found=f"{steps} steps, but {pictures} pictures in the MP4",
+            needed="a picture for every step; the last one may be missing",
+            fix=_FIX,
+        )
+    return trajectory.at(np.arange(min(steps, pictures)))
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Takes arrays out of an HDF5 file that may hold anything."""
+
+    file: Any
+    where: str
+
+    def trajectory(self, serials: Sequence[str]) -> Trajectory:
+        pose = self.required(_POSE, 6, None)
+        steps = len(pose)
+        if steps == 0:
+            raise zero_steps(self.where)
+        skipped = self.optional(_SKIP, 1, steps)
+        return Trajectory(
+            states=np.concatenate([pose, self.required(_GRIPPER, 1, steps)], axis=1),
+            pictures=np.arange(steps),
+            skipped=np.zeros(steps, bool) if skipped is None else skipped[:, 0] != 0,
+            extrinsics={
+                serial: self.optional(f"observation/camera_extrinsics/{serial}_left", 6, steps) for serial in serials
+            },
+            joint_velocities=self.optional(_JOINT_VELOCITY, _JOINTS, steps),
+        )
+
+    def required(self, name: str, width: int, steps: int | None) -> Float64[np.ndarray, "steps width"]:
+        """Return an array of so many numbers a step; of one number, the second axis may be absent."""
+        found = self.optional(name, width, steps)
+        if found is None:
+            there = ", ".join(sorted(self.file))[:200]
+            raise InputError(where=f"{self.where}: {name}", found=f"no such array; there are {there}", fix=_FIX)
+        return found
+
+    def optional(self, name: str, width: int, steps: int | None) -> Float64[np.ndarray, "steps width"] | None:
+        """Return an array likewise, or None where there is none of this name."""
+        if name not in self.file:
+            return None
+        data = self.file[name]
+        shape, kind = tuple(getattr(data, "shape", None) or ()), getattr(getattr(data, "dtype", None), "kind", "?")
+        rows = shape[0] if shape else 0
+        as_asked = shape == (rows, width) or (width == 1 and shape == (rows,))
+        if not as_asked or rows != (rows if steps is None else steps) or rows > _MOST_STEPS or kind not in "fiub":
+            raise InputError(
+                where=f"{self.where}: {name}",
+                found=f"shape {shape} of kind {kind!r}",
+                needed=f"{width} numbers for each of {steps or 'the'} steps",
+                fix=_FIX,
+            )
+        values = np.asarray(data[()], dtype=np.float64).reshape(-1, width)
+        if not np.isfinite(values).all():
+            step = int((~np.isfinite(values)).any(axis=1).argmax())
+            found, needed = f"{values[step]} at step {step}", "finite numbers"
+            raise InputError(where=f"{self.where}: {name}", found=found, needed=needed, fix=_FIX)
+        return values
+
+
+def _library(where: str) -> Any:
+    try:
+        import h5py
+    except ImportError:
+        raise InputError(
+            where=where,
+            found="h5py, which reads trajectory.h5, is not installed",
+            fix='pip install -c constraints.txt -e ".[raw]"',
+        ) from None
+    return h5py
