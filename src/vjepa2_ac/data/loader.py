@@ -34,7 +34,7 @@ from vjepa2_ac.episode import ACTION_DIM, STATE_DIM, Augmentation, Batch, Clip, 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states, states_in_camera_frame
 
-__all__ = ["clip_at", "collate", "open_source", "training_loader", "validation_batches"]
+__all__ = ["batches_of", "clip_at", "collate", "open_source", "training_loader", "validation_batches"]
 
 _CLIPS_WORTH_WORKERS = 256  # fewer validation clips are read before the workers have started
 
@@ -123,10 +123,21 @@ def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size
     """
     windows = dataset.windows(split)
     chosen = [windows[index] for index in far_neighbours(spread(len(windows), clips))]
-    rows = [list(range(first, min(first + batch_size, len(chosen)))) for first in range(0, len(chosen), batch_size)]
-    workers = dataset.config.workers if len(chosen) >= _CLIPS_WORTH_WORKERS else 0
-    batches = _batches(_Clips(dataset, _ChosenClips(dataset.config, dataset.table, chosen)), iter(rows), workers)
-    return _some_of(batches, dataset, split)
+    return _some_of(batches_of(dataset, chosen, batch_size=batch_size), dataset, split)
+
+
+def batches_of(dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int) -> Iterator[Batch]:
+    """Yield the clips that start at these (episode, first control step), in this order, in batches.
+
+    A batch may be smaller, or empty, where `data.broken_episodes` is skip. Many clips are read by workers.
+
+    Raises:
+        InputError: A clip cannot be read.
+    """
+    count = len(windows)
+    rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
+    workers = dataset.config.workers if count >= _CLIPS_WORTH_WORKERS else 0
+    return _batches(_Clips(dataset, _ChosenClips(dataset.config, dataset.table, list(windows))), iter(rows), workers)
 
 
 def _some_of(batches: Iterator[Batch], dataset: Dataset, split: Split) -> Iterator[Batch]:
