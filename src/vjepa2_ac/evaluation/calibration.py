@@ -1,0 +1,250 @@
+"""How long is a model step? The model itself says: at which stride is its prediction best, beside doing nothing?
+
+The step length of the released weights is unsettled (see IMPLEMENTATION_NOTES), and a robot of another control rate has
+another. At each candidate stride the same clips begin at the same control steps of the same held-out episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.loader import batches_of
+from vjepa2_ac.data.windows import Split, far_neighbours, spread
+from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.metrics import Predictor, Ratio, one_step_errors, ratio, ratio_difference
+
+FRAMES = 8  # of a clip at most: as the released weights were trained, and short enough for the widest stride
+_EPISODES_NEEDED = 2  # for an interval
+
+
+@dataclass(frozen=True)
+class TriedStride:
+    """The one-step, teacher-forced error of a model at one stride."""
+
+    stride: int
+    seconds_per_step: float
+    ratio: Ratio  # of the error to that of copying the frame before
+    error: float  # mean over clips
+    persistence: float
+    moved_cm: float  # median distance of the flange per model step
+    clips: int
+    episodes: int
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was found at each stride, and which one is best."""
+
+    tried: tuple[TriedStride, ...]
+    impossible: dict[int, str]  # stride -> why it could not be tried
+    frames: int
+    split: Split
+    runner_up: int | None  # the stride that comes second
+    difference: Ratio | None  # of the two best ratios, the best's minus the other's, paired by clip
+
+    @property
+    def best(self) -> TriedStride:
+        """The stride with the lowest ratio."""
+        return min(self.tried, key=lambda one: one.ratio.value)
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether the best stride beats the next with its whole 95 % interval."""
+        return self.difference is not None and self.difference.has_interval and self.difference.high < 0
+
+    def verdict(self) -> str:
+        """Say in words which stride to take, and how sure that is."""
+        best = self.best
+        words = (
+            f"Best: stride {best.stride} ({best.seconds_per_step:.2f} s per model step), error/persistence {best.ratio}"
+        )
+        if self.difference is None:
+            words += "; there is no other to compare with"
+        else:
+            words += f"; {-self.difference.value:.3f} below stride {self.runner_up}"
+            words += _interval(self.difference)
+        if best.ratio.value >= 1:
+            words += ". At no stride is the model better than doing nothing: does it fit this data at all?"
+        return words if words.endswith("?") else words + "."
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return every figure as plain values, for `calibration.json`."""
+        strides = [
+            {**{name: getattr(one, name) for name in _FIGURES}, "error_over_persistence": one.ratio.as_dict()}
+            for one in self.tried
+        ]
+        return {
+            "stride": self.best.stride,
+            "certain": self.is_certain,
+            "verdict": self.verdict(),
+            "split": self.split,
+            "frames": self.frames,
+            "strides": strides,
+            "impossible": {str(stride): why for stride, why in self.impossible.items()},
+            "runner_up": self.runner_up,
+            "difference": None if self.difference is None else self.difference.as_dict(),
+        }
+
+
+_FIGURES = ("stride", "seconds_per_step", "error", "persistence", "moved_cm", "clips", "episodes")
+
+
+def _interval(difference: Ratio) -> str:
+    if not difference.has_interval:
+        return ", from one episode only: not certain"
+    words = f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
+    return words if difference.high < 0 else f"{words}: not certain, try more clips or episodes"
+
+
+def calibrate(
+    model: Predictor,
+    encode: Callable[[Batch], LatentBatch],
+    dataset: Dataset,
+    *,
+    split: Split = "validation",
+    strides: Sequence[int] = (),
+    frames: int | None = None,
+    clips: int = 64,
+    batch_size: int = 8,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Measure a model's one-step error over persistence at each stride.
+
+    A stride is possible if clips of it fit into at least two episodes (one, if no stride fits into two). All possible
+    ones are tried on the starts from which a clip of the widest fits.
+
+    Args:
+        model: What predicts.
+        encode: Turns a batch of pixels into latents on the model's device.
+        dataset: Where clips come from; its own stride and number of frames do not matter.
+        split: Which episodes.
+        strides: To try; none: those of the config.
+        frames: Of a clip; None: the config's, but 8 at most, so that wide strides fit.
+        clips: At each stride.
+        batch_size: Clips that are measured at once.
+        progress: Told (clips done, clips in all).
+
+    Raises:
+        InputError: The split is empty, no stride fits into any of its episodes, or a clip cannot be read.
+    """
+    frames = min(dataset.config.frames, FRAMES) if frames is None else frames
+    strides = sorted(set(strides or dataset.config.strides_to_try(dataset.control_rate_hz)))
+    settings = dataset.config.model_copy(update={"frames": frames, "short_episodes": "skip"})
+    views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}
+    possible, impossible = _possible(views, split)
+    windows = views[possible[-1]].windows(split)
+    chosen = [windows[index] for index in far_neighbours(spread(len(windows), clips))]
+    measured = {}
+    for done, stride in enumerate(possible):
+        parts = _measure(model, encode, batches_of(views[stride], chosen, batch_size=batch_size))
+        tell = _told(progress, done * len(chosen), len(possible) * len(chosen))
+        measured[stride] = _Measured.joined(list(tell(parts)))
+    runner_up, difference = _compared(measured)
+    rate = dataset.control_rate_hz
+    tried = tuple(one.summary(stride, stride / rate) for stride, one in measured.items())
+    return Calibration(tried, impossible, frames, split, runner_up, difference)
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Figures by clip; a clip is named by its episode and first step."""
+
+    errors: Float[np.ndarray, " clips"]
+    persistence: Float[np.ndarray, " clips"]
+    moved_cm: Float[np.ndarray, " steps"]
+    clips: tuple[tuple[str, int], ...]
+
+    @classmethod
+    def joined(cls, parts: Sequence[_Measured]) -> _Measured:
+        if not parts:
+            raise ValueError("no clips to measure on")
+        return cls(
+            errors=np.concatenate([part.errors for part in parts]),
+            persistence=np.concatenate([part.persistence for part in parts]),
+            moved_cm=np.concatenate([part.moved_cm for part in parts]),
+            clips=tuple(clip for part in parts for clip in part.clips),
+        )
+
+    @property
+    def episode_ids(self) -> tuple[str, ...]:
+        return tuple(episode for episode, _ in self.clips)
+
+    @property
+    def value(self) -> float:
+        return float(self.errors.sum() / self.persistence.sum())
+
+    def summary(self, stride: int, seconds_per_step: float) -> TriedStride:
+        return TriedStride(
+            stride=stride,
+            seconds_per_step=seconds_per_step,
+            ratio=ratio(self.errors, self.persistence, self.episode_ids),
+            error=float(self.errors.mean()),
+            persistence=float(self.persistence.mean()),
+            moved_cm=float(np.median(self.moved_cm)),
+            clips=len(self.clips),
+            episodes=len(set(self.episode_ids)),
+        )
+
+
+def _measure(model: Predictor, encode: Callable[[Batch], LatentBatch], batches: Iterator[Batch]) -> Iterator[_Measured]:
+    for batch in batches:
+        if not batch.starts:  # none of its clips could be read
+            continue
+        with torch.no_grad():
+            errors, persistence = one_step_errors(model, encode(batch))
+        moved_cm = batch.actions[..., :3].norm(dim=-1).flatten().numpy().astype(np.float64) * 100
+        yield _Measured(errors, persistence, moved_cm, tuple(zip(batch.episode_ids, batch.starts, strict=True)))
+
+
+def _told(progress: Progress | None, before: int, total: int) -> Callable[[Iterator[_Measured]], Iterator[_Measured]]:
+    def tell(parts: Iterator[_Measured]) -> Iterator[_Measured]:
+        done = before
+        for part in parts:
+            done += len(part.clips)
+            if progress is not None:
+                progress(done, total)
+            yield part
+
+    return tell
+
+
+def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:
+    """Tell the strides whose clips fit into episodes enough from the others, and say why not."""
+    fitting, reasons = {}, {}
+    for stride, dataset in views.items():
+        try:
+            fitting[stride] = len(np.unique(dataset.windows(split).episodes))
+        except InputError as error:
+            reasons[stride] = f"{error.found}; needed: {error.needed}" if error.needed else error.found
+            if len(reasons) == len(views):
+                raise
+    needed = min(_EPISODES_NEEDED, max(fitting.values()))
+    for stride, episodes in fitting.items():
+        if episodes < needed:
+            reasons[stride] = f"a clip of {views[stride].config.clip_steps} control steps fits into 1 episode only"
+    return [stride for stride in fitting if stride not in reasons], dict(sorted(reasons.items()))
+
+
+def _compared(measured: dict[int, _Measured]) -> tuple[int | None, Ratio | None]:
+    """Return the stride that comes second, and how far the best ratio lies below its ratio."""
+    if len(measured) < 2:
+        return None, None
+    first, second = sorted(measured, key=lambda stride: measured[stride].value)[:2]
+    best, other = measured[first], measured[second]
+    places = {clip: place for place, clip in enumerate(other.clips)}
+    pairs = [(place, places[clip]) for place, clip in enumerate(best.clips) if clip in places]
+    mine, theirs = (np.array(side, dtype=np.int64) for side in zip(*pairs, strict=True))
+    difference = ratio_difference(
+        (best.errors[mine], best.persistence[mine]),
+        (other.errors[theirs], other.persistence[theirs]),
+        tuple(best.episode_ids[place] for place in mine),
+    )
+    return second, difference

@@ -1,0 +1,124 @@
+"""Which episodes, pictures and figures go on the contact sheet of a data set?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.inspection import RELEASED_STEP_CM, Inspection, ReadEpisode, idle_runs
+from vjepa2_ac.data.transforms import crop_box
+from vjepa2_ac.evaluation.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
+
+_PLACES = 6000  # points of the map, at most
+
+
+def picture_data_set(dataset: Dataset, inspection: Inspection, path: Path, *, rows: int = 8) -> Path:
+    """Write the contact sheet of a data set that was looked at; decodes the pictures that it shows and no others.
+
+    Raises:
+        InputError: A picture cannot be read.
+    """
+    shown = _rows_of(inspection, rows)
+    names = _short_names([dataset.table.identity(one.index) for one in shown])
+    strips = [_strip(dataset, one, name) for one, name in zip(shown, names, strict=True)]
+    return plot_contact_sheet(sheet_of(inspection, strips), path)
+
+
+def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
+    """Return what the sheet shows besides the strips: the title, the facts and the data of the plots."""
+    config = inspection.config
+    places = np.concatenate([one.states[:, :3] for one in inspection.sample])
+    return ContactSheet(
+        title=config.path,
+        facts=_facts(inspection),
+        strips=tuple(strips),
+        control_rate_hz=inspection.control_rate_hz,
+        lengths_s=inspection.lengths / inspection.control_rate_hz,
+        moved_cm={one.stride: one.moved_cm for one in inspection.motions},
+        reference_cm=RELEASED_STEP_CM,
+        places_m=places[:: -(-len(places) // _PLACES)],
+        shaded_means="standing still" if config.idle.rule == "none" else f"left out by data.idle ({config.idle.rule})",
+    )
+
+
+def _facts(inspection: Inspection) -> tuple[str, ...]:
+    config = inspection.config
+    success = inspection.success_share
+    shortest, _, median, _, longest = inspection.length_percentiles
+    steps = int(inspection.lengths.sum())
+    lasting = f"{inspection.hours:,.1f} h" if inspection.hours >= 1 else f"{inspection.hours * 60:.1f} min"
+    first = [
+        f"{len(inspection.lengths):,} episodes",
+        f"{steps:,} steps at {inspection.control_rate_hz:g} per second: {lasting}",
+        f"{shortest} to {longest} steps (median {median})",
+        "outcome not known" if success is None else f"{success:.0%} successes",
+        f"{inspection.still_share:.0%} of the time standing still",
+    ]
+    if inspection.broken:
+        first.append(f"{inspection.broken} broken")
+    gripper = inspection.range_of(6)
+    second = [
+        f"camera {', '.join(config.cameras)} of {', '.join(inspection.cameras)}",
+        f"crop {config.crop}",
+        f"gripper {gripper[0]:.2f} to {gripper[1]:.2f}",
+        f"clips of {config.frames} frames at stride {config.model_stride}: "
+        + ", ".join(f"{count:,} {name}" for name, count in inspection.windows_of.items()),
+    ]
+    sampled = len(inspection.sample)
+    third = (
+        f"Motion and gripper: from {'all' if sampled == len(inspection.lengths) else 'a sample of'} {sampled} episodes."
+    )
+    return "  ·  ".join(first), "  ·  ".join(second), third
+
+
+def _rows_of(inspection: Inspection, rows: int) -> list[ReadEpisode]:
+    """Return episodes of the sample, some of each outcome that there is."""
+    groups = [[one for one in inspection.sample if inspection.success[one.index] == kind] for kind in (1, 0, -1)]
+    groups = [group for group in groups if group]
+    whole = sum(map(len, groups))
+    shares = [max(1, round(rows * len(group) / whole)) for group in groups]
+    shares[shares.index(max(shares))] += rows - sum(shares)
+    chosen = [one for group, share in zip(groups, shares, strict=True) for one in group[: max(share, 0)]]
+    return sorted(chosen, key=lambda one: inspection.sample.index(one))
+
+
+def _short_names(names: Sequence[str]) -> list[str]:
+    """Return names without the folders that all of them begin with; of "a--b" only a, where that tells them apart."""
+    heads = [name.split("--")[0] for name in names]
+    parts = [name.split("/") for name in (heads if len(set(heads)) == len(names) else names)]
+    while len(parts) > 1 and len({part[0] for part in parts}) == 1 and min(map(len, parts)) > 1:
+        parts = [part[1:] for part in parts]
+    return ["/".join(part) for part in parts]
+
+
+def _strip(dataset: Dataset, one: ReadEpisode, name: str) -> Strip:
+    episode = dataset.source.read(one.index)
+    steps = len(one.states)
+    height, width = episode.read_frames([0]).shape[1:3]
+    count = min(pictures_per_row(height, width), steps)
+    at = ((np.arange(count) + 0.5) * steps / count).astype(np.int64)
+    speed = np.linalg.norm(np.gradient(one.states[:, :3], axis=0), axis=1) if steps > 1 else np.zeros(1)
+    return Strip(
+        name=name,
+        success=episode.info.success,
+        frames=episode.read_frames([int(step) for step in at]),
+        steps=at,
+        speed_cm_s=speed * episode.control_rate_hz * 100,
+        closedness=one.states[:, 6],
+        shaded=_shaded(dataset, one),
+        seen=crop_box(height, width, dataset.config.crop),
+    )
+
+
+def _shaded(dataset: Dataset, one: ReadEpisode) -> tuple[tuple[int, int], ...]:
+    if dataset.config.idle.rule == "none":
+        mask = idle_runs(one.states, dataset.config)
+    else:
+        mask = np.ones(len(one.states), bool)
+        for start, end in one.kept:
+            mask[start:end] = False
+    edges = np.flatnonzero(np.diff(mask.astype(np.int8), prepend=0, append=0)).tolist()
+    return tuple(zip(edges[::2], edges[1::2], strict=True))
