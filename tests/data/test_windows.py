@@ -14,10 +14,10 @@ from paths import GOLDEN, ROOT
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config_file import load_config
 from vjepa2_ac.data.exclusion import included
-from vjepa2_ac.data.kept import KeptSteps
+from vjepa2_ac.data.kept import KeptSteps, clip_starts
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.windows import ClipOrder, Split, Windows, far_neighbours, in_split, permuted, split_of, spread
-from vjepa2_ac.data.windows import windows_of as windows_of_kept
+from vjepa2_ac.data.windows import windows_of as windows_of_starts
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
 
@@ -33,7 +33,9 @@ def episodes(*lengths: int) -> list[EpisodeInfo]:
 def windows_of(infos: list[EpisodeInfo], config: DataConfig, split: Split) -> Windows:
     """Return the windows of episodes of which every step is kept."""
     table = EpisodeTable.of(infos)
-    return windows_of_kept(table, KeptSteps.whole(table, included(table, config)), config, split)
+    taking_part = included(table, config)
+    starts = clip_starts(table, KeptSteps.whole(table, taking_part), config)
+    return windows_of_starts(table, taking_part, starts, config, split)
 
 
 ALL_TRAIN = {"validation_share": 0.0, "test_share": 0.0}
@@ -247,9 +249,9 @@ def test_an_empty_split_says_which_share_to_raise() -> None:
         windows_of([], settings_of(**ALL_TRAIN), "train")
 
 
-def test_a_range_of_kept_steps_costs_sixteen_bytes() -> None:
+def test_a_range_of_kept_steps_costs_a_few_bytes() -> None:
     windows = windows_of(episodes(*[300] * 1000), settings_of(**ALL_TRAIN), "train")
-    assert windows.episodes.nbytes + windows.firsts.nbytes + windows.ends.nbytes == 16_000
+    assert sum(column.nbytes for column in (*windows.starts.columns, windows.ends)) == 24_000
 
 
 @settings(max_examples=50, deadline=None)

@@ -9,14 +9,9 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.exclusion import named, with_way_out
 from vjepa2_ac.data.table import Problem
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 
-try:
-    from vjepa2_ac.remote import UnreachableError
-except ImportError:
-
-    class UnreachableError(InputError):  # type: ignore[no-redef] # until remote.py is there
-        """The network cannot be reached."""
-
+__all__ = ["BrokenEpisodes", "UnreachableError", "as_error", "as_problem"]
 
 logger = logging.getLogger(__name__)
 

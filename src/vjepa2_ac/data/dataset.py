@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -14,7 +13,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import BrokenEpisodes
 from vjepa2_ac.data.exclusion import included, with_way_out
 from vjepa2_ac.data.idle_search import FoundRanges, find_ranges
-from vjepa2_ac.data.kept import KeptSteps, clip_starts
+from vjepa2_ac.data.kept import KeptSteps, Starts, clip_starts
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.windows import Split, Windows, windows_of
 from vjepa2_ac.episode import EpisodeSource, Progress, StepRanges
@@ -41,7 +40,6 @@ class Dataset:
     source: EpisodeSource
     table: EpisodeTable
     kept: KeptSteps
-    removed: tuple[Removed, ...]
     broken: BrokenEpisodes  # grows in the process that opened the set
 
     def windows(self, split: Split) -> Windows:
@@ -50,12 +48,47 @@ class Dataset:
         Raises:
             InputError: There are none; see `windows_of`.
         """
-        return windows_of(self.table, self.kept, self.config, split)
+        return windows_of(self.table, self.kept.taking_part, self._starts, self.config, split)
 
     def with_stride(self, stride: int) -> Dataset:
         """Return the same data at another stride."""
-        config = self.config.with_stride(stride)
-        return replace(self, config=config, removed=_removed(config, self.table, self.kept))
+        return replace(self, config=self.config.with_stride(stride))
+
+    @cached_property
+    def removed(self) -> tuple[Removed, ...]:
+        """What each filter took away, in the order in which they are applied."""
+        included_ones = included(self.table, self.config)
+        of_outcome = included_ones & _of_outcome(self.table, self.config)
+        excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
+        stages = (
+            ("excluded", np.ones(len(self.table), bool), excluded),
+            ("outcome", included_ones, 0),
+            ("broken", of_outcome, len(self.table.problems) - excluded),
+            ("idle", self.kept.taking_part, 0),
+        )
+        left = [self._count(KeptSteps.whole(self.table, mask)) for _, mask, _ in stages]
+        pairs = zip(stages, left, [*left[1:], self._count(self.kept)], strict=True)
+        return tuple(
+            Removed(
+                name,
+                before[0] - after[0] + unread,
+                before[1] - after[1],
+                before[2] - after[2] if self.config.stride != "auto" else None,
+            )
+            for (name, _, unread), before, after in pairs
+        )
+
+    def _count(self, kept: KeptSteps) -> tuple[int, int, int]:
+        """Return episodes, steps and, where the stride is known, windows."""
+        windows = 0
+        if self.config.stride != "auto":
+            starts = self._starts if kept is self.kept else clip_starts(self.table, kept, self.config)
+            windows = starts.windows
+        return len(np.unique(kept.episode)), kept.steps, windows
+
+    @cached_property
+    def _starts(self) -> Starts:
+        return clip_starts(self.table, self.kept, self.config)
 
     @cached_property
     def control_rate_hz(self) -> float:
@@ -114,18 +147,19 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
         ranges = find_ranges(source, table, config, progress)
         kept = _kept_of(ranges, table, taking_part, broken)
         _say_how_many_are_listed(ranges, table, config)
-    removed = _removed(config, table, kept)
+    dataset = Dataset(config, source, table, kept, broken)
     if not len(kept.episode):
-        raise _nothing_left(config, len(table) + len(table.problems), removed)
+        raise _nothing_left(dataset)
     logger.info("%s: %d episodes take part, %d steps of them", config.path, kept.taking_part.sum(), kept.steps)
-    return Dataset(config, source, table, kept, removed, broken)
+    return dataset
 
 
-def _nothing_left(config: DataConfig, episodes: int, removed: Sequence[Removed]) -> InputError:
-    filters = ", ".join(f"{one.name} {one.episodes}" for one in removed if one.episodes)
+def _nothing_left(dataset: Dataset) -> InputError:
+    filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
     return InputError(
-        where=f"data.path: {config.path}",
-        found=f"none of {episodes} episodes is left" + (f" (left out: {filters})" if filters else ""),
+        where=f"data.path: {dataset.config.path}",
+        found=f"none of {len(dataset.table) + len(dataset.table.problems)} episodes is left"
+        + (f" (left out: {filters})" if filters else ""),
         needed="at least one",
         fix="Look at data.exclude, data.outcome and data.idle" if filters else "",
     )
@@ -181,33 +215,3 @@ def _require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episo
                 else "",
             )
             raise with_way_out(error, [table.identity(first)])
-
-
-def _removed(config: DataConfig, table: EpisodeTable, kept: KeptSteps) -> tuple[Removed, ...]:
-    """Count what each filter took away, in the order in which they are applied."""
-    everyone = np.ones(len(table), bool)
-    included_ones = included(table, config)
-    of_outcome = included_ones & _of_outcome(table, config)
-    excluded_problems = sum(problem.name in config.exclude for problem in table.problems)
-    stages = [
-        ("excluded", KeptSteps.whole(table, everyone), KeptSteps.whole(table, included_ones), excluded_problems),
-        ("outcome", KeptSteps.whole(table, included_ones), KeptSteps.whole(table, of_outcome), 0),
-        (
-            "broken",
-            KeptSteps.whole(table, of_outcome),
-            KeptSteps.whole(table, kept.taking_part),
-            len(table.problems) - excluded_problems,
-        ),
-        ("idle", KeptSteps.whole(table, kept.taking_part), kept, 0),
-    ]
-    return tuple(_difference(name, before, after, more, table, config) for name, before, after, more in stages)
-
-
-def _difference(
-    name: str, before: KeptSteps, after: KeptSteps, unread: int, table: EpisodeTable, config: DataConfig
-) -> Removed:
-    windows = None
-    if config.stride != "auto":
-        windows = clip_starts(table, before, config).windows - clip_starts(table, after, config).windows
-    episodes = len(np.unique(before.episode)) - len(np.unique(after.episode)) + unread
-    return Removed(name, episodes, before.steps - after.steps, windows)

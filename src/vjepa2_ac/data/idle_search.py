@@ -17,12 +17,13 @@ from jaxtyping import Int32
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.broken import UnreachableError, as_error, as_problem
+from vjepa2_ac.data.broken import as_error, as_problem
 from vjepa2_ac.data.idle import kept_ranges
 from vjepa2_ac.data.index import kept_or_made, key_of
 from vjepa2_ac.data.table import EpisodeTable, NotATableError, Problem
 from vjepa2_ac.episode import EpisodeSource, Progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
@@ -82,7 +83,7 @@ def find_ranges(
     Raises:
         InputError: The list of ranges cannot be read or is of another data set; or the rule fits no episode.
     """
-    parts = {"found": "idle ranges", "table": _fingerprint(table), "data": _knobs_that_matter(config)}
+    parts = {"found": "idle ranges", "table": _fingerprint(table, config.path), "data": _knobs_that_matter(config)}
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
         return _kept(config, parts | {"list": _version(path)}, lambda: _published(path, table))
@@ -183,9 +184,16 @@ def _checked(ranges: object, name: str, steps: int, path: str) -> list[tuple[int
     return pairs
 
 
-def _fingerprint(table: EpisodeTable) -> str:
-    """Name everything that the source found out, down to the place of each episode."""
-    return hashlib.sha256(table.to_bytes()).hexdigest()
+def _fingerprint(table: EpisodeTable, path: str) -> str:
+    """Name everything that the source found out, down to the place of each episode, and the files as they are now."""
+    digest = hashlib.sha256(json.dumps([vars(problem) for problem in table.problems]).encode())
+    columns = {name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)}
+    for name, column in sorted({**columns, **table.locators}.items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(column).data)
+    files = [(file.name, file.size, file.version) for file in storage.list_files(path)]
+    digest.update(json.dumps([dict(table.texts), files]).encode())
+    return digest.hexdigest()
 
 
 def _knobs_that_matter(config: DataConfig) -> dict[str, object]:

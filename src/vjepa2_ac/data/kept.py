@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int32, UInt64
+from jaxtyping import Bool, Float64, Int, Int32, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.episode import StepRanges
 
-_WINDOWS_AT_ONCE = 1 << 19  # idle windows that are drawn in one go: bounds the memory
+_WINDOWS_AT_ONCE = 1 << 17  # idle windows that are drawn in one go
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +48,21 @@ class KeptSteps:
 
 @dataclass(frozen=True, eq=False)
 class Starts:
-    """First steps of clips, as runs of neighbours."""
+    """First steps of clips as runs of neighbours: all of a run where count is span, else those that `drawn` chose."""
 
     episode: Int32[np.ndarray, " runs"]
     first: Int32[np.ndarray, " runs"]
+    span: Int32[np.ndarray, " runs"]
     count: Int32[np.ndarray, " runs"]
+
+    def __getitem__(self, chosen: np.ndarray) -> Starts:
+        """Return some of the runs, by a mask or by places."""
+        return Starts(*(column[chosen] for column in self.columns))
+
+    @property
+    def columns(self) -> tuple[Int32[np.ndarray, " runs"], ...]:
+        """Episode, first, span, count."""
+        return self.episode, self.first, self.span, self.count
 
     @property
     def windows(self) -> int:
@@ -65,34 +74,29 @@ def clip_starts(table: EpisodeTable, kept: KeptSteps, config: DataConfig) -> Sta
     """Return every start of a clip, by the episodes' identities: those of kept steps, and a share of the idle ones."""
     counts = kept.end - kept.start - (config.clip_steps - 1)
     fits = counts > 0
-    runs = Starts(kept.episode[fits], kept.start[fits], counts[fits])
+    runs = Starts(kept.episode[fits], kept.start[fits], counts[fits], counts[fits])
     if config.idle.rule != "none" and config.idle.keep_share > 0:
-        still = list(_still_runs(table, kept.taking_part, runs, config))
-        runs = Starts(*(np.concatenate([getattr(s, name) for s in (runs, *still)]) for name in _COLUMNS))
-    order = np.lexsort((runs.first, table.id_rank[runs.episode]))
-    return Starts(runs.episode[order], runs.first[order], runs.count[order])
+        still = _still(table, kept.taking_part, runs, config)
+        runs = Starts(*(np.concatenate(pair) for pair in zip(runs.columns, still.columns, strict=True)))
+    return runs[np.lexsort((runs.first, table.id_rank[runs.episode]))]
 
 
-_COLUMNS = ("episode", "first", "count")
-
-
-def _still_runs(
-    table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], runs: Starts, config: DataConfig
-) -> Iterator[Starts]:
-    """Yield the idle windows that stay: each is drawn by a hash of its identity and start."""
+def _still(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], runs: Starts, config: DataConfig) -> Starts:
+    """Return the idle windows that stay: each is drawn by a hash of its episode's identity and its start."""
     gaps = _gaps(table, taking_part, runs, config)
-    ends = np.cumsum(gaps.count, dtype=np.int64)
+    ends = np.cumsum(gaps.span, dtype=np.int64)
+    counts = np.zeros_like(gaps.span)
     cut = 0
-    while cut < len(ends):
+    while cut < len(ends):  # some at a time: bounds the memory
         before = int(ends[cut - 1]) if cut else 0
         upto = max(cut + 1, int(np.searchsorted(ends, before + _WINDOWS_AT_ONCE, side="right")))
-        count = gaps.count[cut:upto]
-        episode = np.repeat(gaps.episode[cut:upto], count)
-        place = np.arange(len(episode), dtype=np.int32) - np.repeat((ends[cut:upto] - before - count), count)
-        start = (np.repeat(gaps.first[cut:upto], count) + place).astype(np.int32)
-        stays = drawn(table.id_hash[episode], start) < config.idle.keep_share
-        yield _as_runs(episode[stays], start[stays])
+        some = gaps[np.arange(cut, upto)]
+        opens = ends[cut:upto] - before - some.span
+        start = np.arange(int(some.span.sum())) + np.repeat(some.first - opens, some.span)
+        stays = drawn(table.id_hash[np.repeat(some.episode, some.span)], start) < config.idle.keep_share
+        counts[cut:upto] = np.add.reduceat(stays, opens, dtype=np.int32)
         cut = upto
+    return Starts(gaps.episode, gaps.first, gaps.span, counts)[counts > 0]
 
 
 def _gaps(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], runs: Starts, config: DataConfig) -> Starts:
@@ -101,24 +105,17 @@ def _gaps(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], runs:
     members = np.flatnonzero(taking_part & (windows > 0)).astype(np.int32)
     episode = np.concatenate([runs.episode, members])  # an empty run ends each episode
     first = np.concatenate([runs.first, windows[members]])
-    after = first + np.concatenate([runs.count, np.zeros_like(members)])
+    after = first + np.concatenate([runs.span, np.zeros_like(members)])
     order = np.lexsort((first, episode))
     episode, first, after = episode[order], first[order], after[order]
     begin = np.zeros_like(first)
     begin[1:] = np.where(episode[1:] == episode[:-1], after[:-1], 0)
-    gap = first > begin
-    return Starts(episode[gap], begin[gap], (first - begin)[gap])
-
-
-def _as_runs(episode: Int32[np.ndarray, " windows"], start: Int32[np.ndarray, " windows"]) -> Starts:
-    begins = np.ones(len(start), bool)
-    begins[1:] = (episode[1:] != episode[:-1]) | (start[1:] != start[:-1] + 1)
-    places = np.flatnonzero(begins)
-    return Starts(episode[places], start[places], np.diff(places, append=len(start)).astype(np.int32))
+    span = first - begin
+    return Starts(episode, begin, span, span)[span > 0]
 
 
 def drawn(
-    id_hash: UInt64[np.ndarray, " windows"], start: Int32[np.ndarray, " windows"]
+    id_hash: UInt64[np.ndarray, " windows"], start: Int[np.ndarray, " windows"]
 ) -> Float64[np.ndarray, " windows"]:
     """Return a number in [0, 1) for each window: a hash of its episode's identity and its first step.
 
@@ -128,4 +125,4 @@ def drawn(
     value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     value ^= value >> np.uint64(31)
-    return (value >> np.uint64(11)) / float(1 << 53)
+    return np.asarray((value >> np.uint64(11)) / float(1 << 53))

@@ -23,7 +23,6 @@ from torch.utils.data import Dataset as TorchDataset
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.augment import draw
-from vjepa2_ac.data.broken import UnreachableError
 from vjepa2_ac.data.dataset import Dataset, open_source
 from vjepa2_ac.data.exclusion import named, with_way_out
 from vjepa2_ac.data.kept import drawn
@@ -33,6 +32,7 @@ from vjepa2_ac.data.windows import ClipOrder, Split, far_neighbours, spread
 from vjepa2_ac.episode import ACTION_DIM, STATE_DIM, Augmentation, Batch, Clip, Episode, Skipped
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states, states_in_camera_frame
+from vjepa2_ac.remote import UnreachableError
 
 __all__ = ["batches_of", "clip_at", "collate", "open_source", "training_loader", "validation_batches"]
 

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Int32, Int64, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.exclusion import NAMED, named
-from vjepa2_ac.data.kept import KeptSteps, clip_starts
+from vjepa2_ac.data.kept import Starts, drawn
 from vjepa2_ac.data.table import EpisodeTable, identity_hash
 from vjepa2_ac.errors import InputError
 
@@ -35,10 +35,11 @@ _MASK64 = (1 << 64) - 1
 class Windows:
     """Every clip of a split, in the order of the episodes' identities, then of the starts; runs of neighbours."""
 
-    episodes: Int32[np.ndarray, " runs"]  # index into the source
-    firsts: Int32[np.ndarray, " runs"]  # control step at which the first clip of the run starts
+    starts: Starts
     ends: Int64[np.ndarray, " runs"]  # windows up to and including each run
     short: Int32[np.ndarray, " short"]  # episodes left out because they are shorter than a clip
+    id_hash: UInt64[np.ndarray, " episodes"]
+    keep_share: float  # of the idle windows
 
     def __len__(self) -> int:
         return int(self.ends[-1])
@@ -47,8 +48,18 @@ class Windows:
         """Return (episode, first control step) of a window."""
         if not 0 <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
-        place = int(np.searchsorted(self.ends, index, side="right"))
-        return int(self.episodes[place]), int(self.firsts[place]) + index - (int(self.ends[place - 1]) if place else 0)
+        run = int(np.searchsorted(self.ends, index, side="right"))
+        episode, first, span, count = (int(column[run]) for column in self.starts.columns)
+        place = index - (int(self.ends[run]) - count)
+        if count < span:
+            numbers = drawn(np.repeat(self.id_hash[[episode]], span), np.arange(first, first + span))
+            place = int(np.flatnonzero(numbers < self.keep_share)[place])
+        return episode, first + place
+
+    @property
+    def episodes(self) -> Int32[np.ndarray, " episodes"]:
+        """The episodes that clips come from; an index into the source."""
+        return np.unique(self.starts.episode)
 
 
 @dataclass(frozen=True)
@@ -89,16 +100,29 @@ def in_split(
     return np.asarray((number >= low) & (number < high))
 
 
-def windows_of(table: EpisodeTable, kept: KeptSteps, config: DataConfig, split: Split) -> Windows:
-    """Return the windows of a split: every start from which a clip lies within one range of kept steps.
+def windows_of(
+    table: EpisodeTable,
+    taking_part: Bool[np.ndarray, " episodes"],
+    starts: Starts,
+    config: DataConfig,
+    split: Split,
+) -> Windows:
+    """Return the windows of a split.
+
+    Args:
+        table: The episodes.
+        taking_part: Which of them take part.
+        starts: What `clip_starts` returned for all of these.
+        config: Shares of the splits, and what to do with short episodes.
+        split: Which split.
 
     Raises:
         InputError: The split has no episodes, or only short ones, or none with a clip's length of kept steps, or
             `data.short_episodes` forbids short ones.
     """
-    members = kept.taking_part & in_split(table.id_hash, config, split)
+    members = taking_part & in_split(table.id_hash, config, split)
     if not members.any():
-        raise _empty_split(int(kept.taking_part.sum()), config, split)
+        raise _empty_split(int(taking_part.sum()), config, split)
     short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
     short = short[np.argsort(table.id_rank[short])]
     if len(short) and (config.short_episodes == "error" or len(short) == members.sum()):
@@ -106,10 +130,10 @@ def windows_of(table: EpisodeTable, kept: KeptSteps, config: DataConfig, split: 
     if len(short):
         names = tuple(table.identity(int(number)) for number in short[: NAMED + 1])
         _warn_of_short(config.path, split, config.clip_steps, int(members.sum()), len(short), names)
-    starts = clip_starts(table, kept.only(members), config)
-    if not starts.windows:
+    own = starts[members[starts.episode]]
+    if not own.windows:
         raise _nothing_kept(config, split)
-    return Windows(starts.episode, starts.first, np.cumsum(starts.count, dtype=np.int64), short)
+    return Windows(own, np.cumsum(own.count, dtype=np.int64), short, table.id_hash, config.idle.keep_share)
 
 
 def spread(size: int, count: int) -> list[int]:

@@ -123,7 +123,8 @@ def save_checkpoint(run: Run, folder: Path) -> Path:
 
 def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:
     """Fail early: an empty split, a broken clip. A test split of share 0 is nobody's mistake."""
-    splits: list[Split] = ["train", "validation", *(["test"] if dataset.config.test_share else [])]
+    splits: tuple[Split, ...] = ("train", "validation", "test")
+    splits = splits if dataset.config.test_share else splits[:2]
     firsts = [next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1)) for split in splits]
     return firsts[0]
 

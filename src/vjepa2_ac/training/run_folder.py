@@ -26,12 +26,18 @@ CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
 CHECKPOINTS = "checkpoints"
 
-# Settings that may change between two starts of one run. They do not change what is computed, but for data.exclude:
-# leaving a broken episode out changes the order of the clips that are still to come.
+# Settings that may change between two starts of one run. They do not change what is computed, but for those by which a
+# broken episode is left out: data.exclude changes the order of the clips that are still to come, data.broken_episodes
+# leaves gaps in it.
 _FREE_TO_CHANGE = (
     "run_dir",
     "data.workers",
+    "data.prefetch",
+    "data.connections",
+    "data.disk_cache.",
+    "data.check_crc",
     "data.exclude",
+    "data.broken_episodes",
     "checkpoint.",
     "tracking.",
     "training.log_every",
