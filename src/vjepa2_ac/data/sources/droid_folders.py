@@ -5,23 +5,18 @@ The tree is LAB/success|failure/DATE/TIME/{trajectory.h5, metadata_*.json, recor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
 
 from vjepa2_ac import storage
+from vjepa2_ac.data.sources.folders import DEEPEST, in_parallel, list_folder, within
 from vjepa2_ac.storage import FileInfo
 
 TRAJECTORY = "trajectory.h5"
 VIDEOS = "recordings/MP4"
 
 _OUTCOMES = ("success", "failure")
-_DEEPEST = 8  # folders below the data set's: a link that leads back up is not followed for ever
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -53,7 +48,7 @@ def find_episodes(root: str, connections: int) -> list[str]:
         return [""]
     found: list[str] = []
     folders = [""]
-    for _ in range(_DEEPEST):
+    for _ in range(DEEPEST):
         children = in_parallel(lambda folder: _children(root, folder), folders, connections)
         together = [child for group in children for child in group]
         found += [path for path, is_episode in together if is_episode]
@@ -88,27 +83,19 @@ def success_of(identity: str) -> bool | None:
     return parts[-3] == "success" if _ends_as_in_droid(parts) else None
 
 
-def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> list[Result]:
-    """Return the function of every item, in order, computed in several threads; the first error is raised."""
-    with ThreadPoolExecutor(max_workers=connections) as pool:
-        return list(pool.map(function, items))
-
-
 def _children(root: str, folder: str) -> list[tuple[str, bool]]:
     """Return the folders in a folder, and whether each is an episode's.
 
     In DROID's own layout the depth tells that, without a listing of every episode.
     """
-    place = storage.join(root, folder) if folder else root
-    files = {file.name for file in storage.list_files(place)}
-    children = []
-    for name in storage.list_names(place):
-        if name in files or name.startswith("."):
-            continue
-        path = f"{folder}/{name}" if folder else name
-        known = _ends_as_in_droid(identity_of(root, path).split("/"))
-        children.append((path, known or _is_episode(storage.list_names(storage.join(root, path)))))
-    return children
+    children = [within(folder, name) for name in list_folder(root, folder)[1]]
+    return [
+        (path, _is_droid(root, path) or _is_episode(storage.list_names(storage.join(root, path)))) for path in children
+    ]
+
+
+def _is_droid(root: str, path: str) -> bool:
+    return _ends_as_in_droid(identity_of(root, path).split("/"))
 
 
 def _ends_as_in_droid(parts: Sequence[str]) -> bool:

@@ -13,6 +13,7 @@ from jaxtyping import Int, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.broken import UnreachableError, as_error
 from vjepa2_ac.data.index import kept_or_built, key_of
 from vjepa2_ac.data.sources.droid_folders import (
     TRAJECTORY,
@@ -20,12 +21,12 @@ from vjepa2_ac.data.sources.droid_folders import (
     EpisodeFolder,
     find_episodes,
     identity_of,
-    in_parallel,
     list_episode,
     success_of,
 )
 from vjepa2_ac.data.sources.droid_metadata import DroidMetadata
 from vjepa2_ac.data.sources.droid_trajectory import Trajectory, parse_trajectory
+from vjepa2_ac.data.sources.folders import in_parallel
 from vjepa2_ac.data.sources.lines import line_of, pack_lines
 from vjepa2_ac.data.sources.states import require_plausible
 from vjepa2_ac.data.sources.whole_files import WholeFiles
@@ -146,10 +147,12 @@ class RawDroidSource:
                 infos[found[0].id] = found[0]
                 places.append(json.dumps(vars(found[1])))
         if not infos:
-            first = problems[0]
-            raise InputError(where=first.where, found=first.found, needed=first.needed, fix=first.fix)
+            raise as_error(problems[0])
+        texts = {"control_rate_hz": str(self._config.droid_raw.control_rate_hz)}
         logger.info("%s: %d episodes, %d that cannot be used", self._root, len(infos), len(problems))
-        return EpisodeTable.of(list(infos.values()), problems=problems, locators=pack_lines("place", places))
+        return EpisodeTable.of(
+            list(infos.values()), problems=problems, locators=pack_lines("place", places), texts=texts
+        )
 
     def _scan(self, folder: str) -> tuple[EpisodeInfo, _Place] | Problem:
         identity = identity_of(self._root, folder)
@@ -160,6 +163,8 @@ class RawDroidSource:
             serials = tuple(metadata.serial(camera) for camera in self._config.cameras)
             place = _Place(place.folder, place.metadata, place.version, self._count(place, listed, serials))
             steps = len(self._trajectory(place, serials).states)
+        except UnreachableError:
+            raise  # the network's fault, not the episode's
         except InputError as error:
             return Problem(identity, error.where, error.found, error.needed, error.fix)
         success = success_of(identity) if metadata.success is None else metadata.success

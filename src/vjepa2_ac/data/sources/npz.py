@@ -1,0 +1,156 @@
+"""How do plain .npz files become `Episode`s? One file each, in a folder or in folders below it."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt8
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.broken import UnreachableError, as_error
+from vjepa2_ac.data.index import kept_or_built, key_of
+from vjepa2_ac.data.sources.folders import in_parallel, walk, within
+from vjepa2_ac.data.sources.npz_episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_pictures
+from vjepa2_ac.data.table import EpisodeTable, Problem
+from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+_SUFFIX = ".npz"
+
+
+class NpzSource:
+    """The episodes of a folder of .npz files, in the order of their paths; a path without .npz is the identity.
+
+    Nothing is read before the first call. `infos` reads all of every file but the pictures.
+    """
+
+    def __init__(self, config: DataConfig) -> None:
+        self._config = config
+        self._root = config.path
+        self._table: EpisodeTable | None = None
+
+    def infos(self, progress: Progress | None = None) -> EpisodeTable:
+        """Return identity, length and outcome of every usable episode.
+
+        Raises:
+            InputError: There are no episodes, or not a single one can be used.
+            OSError: Data behind a URL cannot be read.
+        """
+        if self._table is None:
+            self._table = self._indexed(progress)
+        return self._table
+
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is kept
+        """Return one episode; of its pictures, only those that are asked for are read.
+
+        Raises:
+            InputError: The file is missing or damaged, or has changed since it was indexed.
+            OSError: Data behind a URL cannot be read.
+        """
+        info = self.infos()[index]
+        path = self._path(info.id)
+        camera = camera or self._config.cameras[0]
+        found = read_episode(path, (camera,), self._config)
+        if len(found.states) != info.num_steps:
+            raise InputError(
+                where=path,
+                found=f"{len(found.states)} steps",
+                needed=f"the {info.num_steps} that were indexed",
+                fix="Leave files in peace while a run reads them",
+            )
+        return Episode(
+            info=info,
+            states=found.states,
+            read_frames=_PictureReader(path, camera, info.num_steps),
+            control_rate_hz=found.fps_hz,
+            extrinsics=found.extrinsics[camera],
+            joint_velocities=found.joint_velocities,
+            metadata={} if found.language is None else {"language": found.language},
+        )
+
+    def _indexed(self, progress: Progress | None) -> EpisodeTable:
+        """Return the kept table, or read every episode; a file that changed makes another key."""
+        config = self._config
+        listed = sorted(
+            (within(folder, file.name), file.size, file.version)
+            for folder, file in walk(self._root, config.connections)
+            if file.name.endswith(_SUFFIX)
+        )
+        if not listed:
+            raise InputError(
+                where="data.path",
+                found=f"no .npz files under {self._root}",
+                needed="one for each episode",
+                fix=FORMAT_HELP,
+            )
+        knobs = {"cameras": config.cameras, "pose_frame": config.pose_frame}
+        key = key_of({"source": "npz", "path": self._root, **knobs, "listed": listed})
+        ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
+        return kept_or_built(config.disk_cache, key, lambda: self._scan_all(ids, progress))
+
+    def _scan_all(self, ids: list[str], progress: Progress | None) -> EpisodeTable:
+        counter = itertools.count(1)
+
+        def scan(identity: str) -> NpzEpisode | Problem:
+            found = self._scan(identity)
+            if progress is not None:
+                progress(next(counter), len(ids))
+            return found
+
+        connections = self._config.connections if storage.is_url(self._root) else 1
+        scanned = dict(zip(ids, in_parallel(scan, ids, connections), strict=True))
+        found = {identity: one for identity, one in scanned.items() if isinstance(one, NpzEpisode)}
+        problems = [one for one in scanned.values() if isinstance(one, Problem)]
+        if not found:
+            raise as_error(problems[0])
+        rate = Counter(one.fps_hz for one in found.values()).most_common(1)[0][0]
+        problems += [self._other_rate(name, one.fps_hz, rate) for name, one in found.items() if one.fps_hz != rate]
+        infos = [EpisodeInfo(name, len(one.states), one.success) for name, one in found.items() if one.fps_hz == rate]
+        logger.info("%s: %d episodes, %d that cannot be used", self._root, len(infos), len(problems))
+        return EpisodeTable.of(infos, problems=problems, texts={"control_rate_hz": str(rate)})
+
+    def _scan(self, identity: str) -> NpzEpisode | Problem:
+        try:
+            return read_episode(self._path(identity), self._config.cameras, self._config)
+        except UnreachableError:
+            raise  # the network's fault, not the episode's
+        except InputError as error:
+            return Problem(identity, error.where, error.found, error.needed, error.fix)
+
+    def _other_rate(self, identity: str, rate: float, others: float) -> Problem:
+        needed = f"{others:g}, as in most episodes: strides count control steps"
+        return Problem(identity, f"{self._path(identity)}: fps_hz", f"{rate:g}", needed, "Resample the episode")
+
+    def _path(self, identity: str) -> str:
+        return storage.join(self._root, identity + _SUFFIX)
+
+
+@dataclass(frozen=True)
+class _PictureReader:
+    """Reads the pictures of one camera that are asked for."""
+
+    path: str
+    camera: str
+    steps: int
+
+    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
+        """Return the RGB pictures at these control steps, in this order.
+
+        Raises:
+            InputError: The file is missing or damaged.
+            OSError: A file behind a URL cannot be read.
+            ValueError: No steps, or a step outside the episode.
+        """
+        if not steps or min(steps) < 0 or max(steps) >= self.steps:
+            raise ValueError(f"{self.path}: steps {list(steps)} of {self.steps}")
+        with opened_npz(self.path) as file:
+            require_pictures(file, self.camera, self.steps, self.path)
+            return np.asarray(file.rows(self.camera, steps))

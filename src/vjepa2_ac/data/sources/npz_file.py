@@ -1,0 +1,151 @@
+"""How are single arrays, or single pictures of one, taken out of an .npz file?"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from math import prod
+from typing import IO, cast
+
+import numpy as np
+from jaxtyping import Shaped
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import ByteReader
+
+_LOCAL_HEADER_BYTES = 30
+_MOST_BYTES = 1 << 30  # of an array that is read whole
+_DEFLATE_LIMIT = 1040  # DEFLATE shortens a thousandfold at most: what claims more is damaged
+_CHUNK_BYTES = 1 << 20
+_FIX = "Write the file again, with numpy.savez"
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    ValueError,
+    EOFError,
+    KeyError,
+    NotImplementedError,
+    RuntimeError,
+    SyntaxError,
+)
+
+
+@dataclass(frozen=True)
+class ArrayHeader:
+    """What an array is, and where in its member of the archive the values begin."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    start: int
+
+    @property
+    def row_bytes(self) -> int:
+        """Size of one row."""
+        return int(prod(self.shape[1:])) * self.dtype.itemsize
+
+
+class NpzFile:
+    """An .npz file that is open to read. Nothing in it is ever unpickled.
+
+    Raises:
+        InputError: It is not an .npz file; likewise each method, where something is damaged.
+    """
+
+    def __init__(self, file: ByteReader, where: str) -> None:
+        self._file, self._where = file, where
+        with self._damage_is_named():
+            self._archive = zipfile.ZipFile(cast("IO[bytes]", file))
+            members = [info for info in self._archive.infolist() if info.filename.endswith(".npy")]
+        self._members = {info.filename.removesuffix(".npy"): info for info in members}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the arrays."""
+        return tuple(self._members)
+
+    def header(self, name: str) -> ArrayHeader:
+        """Return shape and type of an array, without its values; raises what is no plain array in rows."""
+        with self._damage_is_named(name), self._archive.open(self._members[name]) as member:
+            version = np.lib.format.read_magic(member)
+            if version not in {(1, 0), (2, 0)}:
+                raise ValueError(f"version {version} of the format")
+            first = version == (1, 0)
+            read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+            shape, by_columns, dtype = read(member)
+            if dtype.hasobject:
+                raise ValueError("an array of Python objects, which would have to be executed")
+            if by_columns and len(shape) > 1:
+                raise ValueError("an array in Fortran order; numpy.ascontiguousarray gives it rows")
+            header = ArrayHeader(tuple(int(size) for size in shape), dtype, member.tell())
+            self._require_fitting(self._members[name], header)
+            return header
+
+    def array(self, name: str) -> Shaped[np.ndarray, ...]:
+        """Return a whole array; its checksum is checked."""
+        header = self.header(name)
+        with self._damage_is_named(name), self._archive.open(self._members[name]) as member:
+            if prod(header.shape) * header.dtype.itemsize > _MOST_BYTES:
+                raise ValueError(f"shape {header.shape}, more than is ever read at once")
+            values = member.read()[header.start :]
+            return np.frombuffer(values, header.dtype).reshape(header.shape)
+
+    def rows(self, name: str, rows: Sequence[int]) -> Shaped[np.ndarray, "rows ..."]:
+        """Return some rows of an array, in this order.
+
+        Of an array that is stored as it is, only these rows are read, and no checksum is checked: it covers the whole
+        array. One that is compressed is gone through up to the last of these rows; no others are kept.
+        """
+        header = self.header(name)
+        member = self._members[name]
+        wanted = sorted(set(rows))
+        stored = member.compress_type == zipfile.ZIP_STORED
+        with self._damage_is_named(name):
+            pieces = self._stored(member, header, wanted) if stored else self._unpacked(member, header, wanted)
+            found = {row: np.frombuffer(piece, header.dtype) for row, piece in zip(wanted, pieces, strict=True)}
+        return np.stack([found[row] for row in rows]).reshape(len(rows), *header.shape[1:])
+
+    def _stored(self, member: zipfile.ZipInfo, header: ArrayHeader, rows: list[int]) -> Iterator[bytes]:
+        """Yield rows of an array that is not compressed, each from its place in the file."""
+        self._file.seek(member.header_offset)
+        local = self._exactly(self._file, _LOCAL_HEADER_BYTES)
+        names = int.from_bytes(local[26:28], "little") + int.from_bytes(local[28:30], "little")
+        values = member.header_offset + _LOCAL_HEADER_BYTES + names + header.start
+        for row in rows:
+            self._file.seek(values + row * header.row_bytes)
+            yield self._exactly(self._file, header.row_bytes)
+
+    def _unpacked(self, member: zipfile.ZipInfo, header: ArrayHeader, rows: list[int]) -> Iterator[bytes]:
+        """Yield rows of an array that is compressed, going through it from its start."""
+        with self._archive.open(member) as values:
+            place = 0
+            for row in rows:
+                start = header.start + row * header.row_bytes
+                while place < start:
+                    place += len(self._exactly(values, min(_CHUNK_BYTES, start - place)))
+                yield self._exactly(values, header.row_bytes)
+                place += header.row_bytes
+
+    @staticmethod
+    def _exactly(file: ByteReader, size: int) -> bytes:
+        data = file.read(size)
+        if len(data) != size:
+            raise EOFError(f"it ends {size - len(data)} bytes early")
+        return data
+
+    def _require_fitting(self, member: zipfile.ZipInfo, header: ArrayHeader) -> None:
+        """Refuse sizes that contradict each other before anything of that size is made room for."""
+        promised = header.start + prod(header.shape) * header.dtype.itemsize
+        if promised != member.file_size or member.file_size > member.compress_size * _DEFLATE_LIMIT + _CHUNK_BYTES:
+            raise ValueError(f"shape {header.shape} of {header.dtype} in {member.file_size} bytes")
+
+    @contextmanager
+    def _damage_is_named(self, name: str = "") -> Iterator[None]:
+        try:
+            yield
+        except _DAMAGE as error:
+            place = f"{self._where}: {name}" if name else self._where
+            found = f"cannot be read ({str(error)[:200] or type(error).__name__})"
+            raise InputError(where=place, found=found, needed="an undamaged .npz file", fix=_FIX) from None

@@ -1,0 +1,190 @@
+"""Anybody's robot, as plain arrays."""
+
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from synthetic import draw_frame, synthetic_episode, synthetic_states
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.npz import NpzSource
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import actions_from_states
+
+STEPS, SIZE = 20, (36, 64)
+STATES = synthetic_states(STEPS)
+FRAMES = np.stack([draw_frame(state, size=SIZE) for state in STATES])
+WRIST = np.stack([draw_frame(state, size=SIZE, camera=1) for state in STATES])
+EPISODE = {"states": STATES, "frames": FRAMES, "fps_hz": 15.0}
+
+
+def write(path: Path, *, compressed: bool = False, without: str = "", **changes: Any) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    arrays = {name: value for name, value in (EPISODE | changes).items() if name != without}
+    (np.savez_compressed if compressed else np.savez)(path, **arrays)
+    return path
+
+
+def source(path: Path | str, **knobs: Any) -> NpzSource:
+    return NpzSource(DataConfig(source="npz", path=str(path), **knobs))
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_an_episode_is_what_was_written(tmp_path: Path, compressed: bool) -> None:
+    write(tmp_path / "kitchen/one.npz", compressed=compressed, success=True, language="pick it up", wrist=WRIST)
+    plain = source(tmp_path)
+    (info,) = plain.infos()
+    assert (info.id, info.num_steps, info.success) == ("kitchen/one", STEPS, True)
+    episode = plain.read(0)
+    np.testing.assert_array_equal(episode.states, STATES)
+    np.testing.assert_array_equal(episode.read_frames([7, 0, 19, 7]), FRAMES[[7, 0, 19, 7]])
+    np.testing.assert_array_equal(plain.read(0, "wrist").read_frames([3]), WRIST[[3]])
+    assert (episode.control_rate_hz, episode.metadata) == (15.0, {"language": "pick it up"})
+    assert episode.extrinsics is None
+    assert episode.joint_velocities is None
+
+
+def test_states_and_actions_equal_those_of_rlds(tmp_path: Path) -> None:
+    measured = synthetic_episode(0, steps=STEPS, size=SIZE).observation
+    write(tmp_path / "one.npz")
+    states = np.concatenate([measured.cartesian_position, measured.gripper_position], axis=1)
+    np.testing.assert_array_equal(actions_from_states(source(tmp_path).read(0).states), actions_from_states(states))
+
+
+def test_a_camera_has_its_own_poses_or_those_of_all(tmp_path: Path) -> None:
+    moving = np.arange(STEPS * 6.0).reshape(STEPS, 6)
+    write(tmp_path / "one.npz", wrist=WRIST, extrinsics=np.arange(6.0), extrinsics_wrist=moving)
+    plain = source(tmp_path, pose_frame="camera")
+    np.testing.assert_array_equal(plain.read(0).extrinsics, np.tile(np.arange(6.0), (STEPS, 1)))
+    np.testing.assert_array_equal(plain.read(0, "wrist").extrinsics, moving)
+
+
+def test_joint_velocities_reach_the_idle_filter(tmp_path: Path) -> None:
+    velocities = np.arange(STEPS * 7.0).reshape(STEPS, 7)
+    write(tmp_path / "one.npz", joint_velocities=velocities)
+    np.testing.assert_array_equal(source(tmp_path).read(0).joint_velocities, velocities)
+
+
+class CountedFile:
+    """Notes how much is read of it."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.file, self.count = Path(path).open("rb"), 0  # noqa: SIM115 - closed by its reader
+
+    def read(self, size: int = -1) -> bytes:
+        data = self.file.read(size)
+        self.count += len(data)
+        return data
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.file, name)
+
+
+def test_of_a_plain_file_only_the_asked_pictures_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "one.npz")
+    episode = source(tmp_path).read(0)
+    opened: list[CountedFile] = []
+
+    def open_counted(path: str | Path) -> CountedFile:
+        opened.append(CountedFile(path))
+        return opened[-1]
+
+    monkeypatch.setattr(storage, "open_to_read", open_counted)
+    episode.read_frames([5, 6])
+    assert sum(file.count for file in opened) < FRAMES[:2].nbytes + 16384 < FRAMES.nbytes / 2
+
+
+def test_a_source_travels_to_a_worker(tmp_path: Path) -> None:
+    write(tmp_path / "one.npz")
+    plain = pickle.loads(pickle.dumps(source(tmp_path)))  # noqa: S301 - our own
+    reader = pickle.loads(pickle.dumps(plain.read(0).read_frames))  # noqa: S301
+    np.testing.assert_array_equal(reader([3]), FRAMES[[3]])
+    with pytest.raises(ValueError, match="steps"):
+        reader([STEPS])
+
+
+def test_what_was_found_out_is_kept_until_a_file_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "one.npz")
+    assert len(source(tmp_path).infos()) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(NpzSource, "_scan_all", None)
+        assert len(source(tmp_path).infos()) == 1
+    write(tmp_path / "two.npz")
+    assert [info.id for info in source(tmp_path).infos()] == ["one", "two"]
+
+
+def test_a_file_that_changed_after_indexing_is_named(tmp_path: Path) -> None:
+    path = write(tmp_path / "one.npz")
+    plain = source(tmp_path)
+    plain.infos()
+    write(path, states=STATES[:9], frames=FRAMES[:9])
+    with pytest.raises(InputError, match=r"one.npz: 9 steps. needed: the 20"):
+        plain.read(0)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-200])
+
+
+def flip_in_states(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[data.index(STATES.tobytes()) + 1] ^= 1
+    path.write_bytes(data)
+
+
+NAN = np.where(np.arange(STEPS)[:, None] == 3, np.nan, STATES)
+
+BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no states": (lambda path: write(path, without="states"), "states: no such array"),
+    "no rate": (lambda path: write(path, without="fps_hz"), "fps_hz: no such array"),
+    "no rate worth the name": (lambda path: write(path, fps_hz=0.0), "fps_hz: 0"),
+    "another rate": (lambda path: write(path, fps_hz=30.0), "fps_hz: 30. needed: 15"),
+    "no such camera": (lambda path: write(path, without="frames", wrist=WRIST), "frames: no such array"),
+    "too few pictures": (lambda path: write(path, frames=FRAMES[:-1]), r"frames: shape \(19, 36, 64, 3\)"),
+    "float pictures": (lambda path: write(path, frames=FRAMES / 255), "frames: shape .* float64"),
+    "wide pictures": (lambda path: write(path, frames=FRAMES.astype(np.uint16)), "pictures of uint16"),
+    "grey pictures": (lambda path: write(path, frames=FRAMES[..., 0]), "frames: shape"),
+    "pickled pictures": (lambda path: write(path, frames=np.array([{}, []], object)), "frames: .*objects"),
+    "turned pictures": (lambda path: write(path, frames=np.asfortranarray(FRAMES)), "ascontiguousarray"),
+    "states of another width": (lambda path: write(path, states=STATES[:, :6]), r"states: shape \(20, 6\)"),
+    "no steps": (lambda path: write(path, states=STATES[:0], frames=FRAMES[:0]), "no steps"),
+    "not a number": (lambda path: write(path, states=NAN), "step 3"),
+    "out of reach": (lambda path: write(path, states=STATES + 6), "5 m"),
+    "gripper outside its range": (lambda path: write(path, states=STATES + np.eye(7)[6] * 2), "gripper"),
+    "poses of another length": (lambda path: write(path, extrinsics=NAN[:4, :6]), r"extrinsics: shape \(4, 6\)"),
+    "numbers for words": (lambda path: write(path, language=3), "language: shape"),
+    "cut": (cut, "one.npz: cannot be read"),
+    "empty": (lambda path: path.write_bytes(b""), "one.npz: cannot be read"),
+    "not an archive": (lambda path: path.write_text("<html>404</html>" * 99), "one.npz: cannot be read"),
+    "a flipped bit in the states": (flip_in_states, "states: cannot be read .*CRC"),
+}
+
+
+@pytest.mark.parametrize("damage", BROKEN)
+def test_an_episode_that_cannot_be_used_is_a_named_problem(tmp_path: Path, damage: str) -> None:
+    write(tmp_path / "a.npz")
+    write(tmp_path / "b.npz")
+    change, message = BROKEN[damage]
+    path = write(tmp_path / "one.npz")
+    change(path)
+    infos = source(tmp_path).infos()
+    assert [info.id for info in infos] == ["a", "b"]
+    (problem,) = infos.problems
+    assert problem.name == "one"
+    with pytest.raises(InputError, match=message):
+        raise InputError(where=problem.where, found=problem.found, needed=problem.needed, fix=problem.fix)
+    if damage != "another rate":
+        (tmp_path / "alone").mkdir()
+        shutil.move(path, tmp_path / "alone")
+        with pytest.raises(InputError, match=message):
+            source(tmp_path / "alone").infos()
+
+
+def test_a_folder_without_episodes_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no \.npz files"):
+        source(tmp_path).infos()
