@@ -27,7 +27,7 @@ HOMES = {
     "simplejpeg": {"data/"},
     "mujoco": {"simulation/"},
     "matplotlib": {"evaluation/plots.py", "evaluation/contact_sheet.py"},
-    "fsspec": {"remote.py"},
+    "fsspec": {"remote/"},
     "av": {"data/video.py"},
     "h5py": {"data/sources/droid_trajectory.py"},
     "pyarrow": {"data/sources/lerobot"},

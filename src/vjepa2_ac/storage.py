@@ -1,6 +1,9 @@
 """How are files listed, read, written and hashed, on this machine and behind URLs?
 
-A path is local, or an fsspec URL such as `gs://bucket/folder`; fsspec is imported for URLs only.
+A path is local, or a URL such as `gs://bucket/folder` (see remote). What an OSError says of a file is true of the file:
+it is not there, it ends too soon, the disk cannot read it. What a network does is none of that. It is tried again, and
+in the end raises `remote.UnreachableError`: an InputError that must never be booked as a broken episode. Whoever makes
+problems of InputErrors lets that one pass first.
 """
 
 from __future__ import annotations
@@ -13,8 +16,9 @@ from collections.abc import Iterator, Sequence, Set
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol, cast, runtime_checkable
+from typing import BinaryIO, Protocol, runtime_checkable
 
+from vjepa2_ac import remote
 from vjepa2_ac.errors import InputError
 
 _HASH_CHUNK_BYTES = 1 << 20
@@ -58,7 +62,7 @@ def join(folder: str | Path, name: str) -> str:
 
 def exists(path: str | Path) -> bool:
     """Return whether there is a file or folder."""
-    return bool(_filesystem(path).exists(str(path))) if is_url(path) else Path(path).exists()
+    return remote.exists(str(path)) if is_url(path) else Path(path).exists()
 
 
 def file_size(path: str | Path) -> int:
@@ -67,61 +71,7 @@ def file_size(path: str | Path) -> int:
     Raises:
         OSError: There is no such file, or it cannot be read.
     """
-    return int(_filesystem(path).size(str(path))) if is_url(path) else Path(path).stat().st_size
-
-
-def list_names(folder: str | Path) -> list[str]:
-    """Return the names of the files and folders in a folder, sorted; none where there is no such folder."""
-    if not is_url(folder):
-        return sorted(entry.name for entry in Path(folder).iterdir()) if Path(folder).is_dir() else []
-    try:
-        found = _filesystem(folder).ls(str(folder), detail=False)
-    except FileNotFoundError:
-        return []
-    return sorted(str(path).rstrip("/").rsplit("/", 1)[-1] for path in found)
-
-
-def open_to_read(path: str | Path) -> ByteReader:
-    """Open a file to read and seek in; the caller closes it.
-
-    Raises:
-        OSError: There is no such file, or it cannot be read.
-    """
-    return cast("ByteReader", _filesystem(path).open(str(path), "rb") if is_url(path) else Path(path).open("rb"))
-
-
-def read_bytes(path: str | Path) -> bytes:
-    """Return a whole file.
-
-    Raises:
-        OSError: There is no such file, or it cannot be read.
-    """
-    with closing(open_to_read(path)) as file:
-        return file.read()
-
-
-def read_range(path: str | Path, start: int, length: int) -> bytes:
-    """Return `length` bytes from `start`; fewer where the file ends before.
-
-    Raises:
-        OSError: There is no such file, or it cannot be read.
-    """
-    with closing(open_to_read(path)) as file:
-        file.seek(start)
-        return file.read(length)
-
-
-def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-    """Return several (start, length) pieces of a file, each whole; those of a URL are fetched at the same time.
-
-    Raises:
-        OSError: There is no such file, it cannot be read, or it ends within a piece.
-    """
-    pieces = [read_range(path, start, length) for start, length in ranges]
-    for (start, length), piece in zip(ranges, pieces, strict=True):
-        if len(piece) < length:
-            raise ShortReadError(f"{path}: {len(piece)} of {length} bytes at {start}")
-    return pieces
+    return remote.file_size(str(path)) if is_url(path) else Path(path).stat().st_size
 
 
 @dataclass(frozen=True)
@@ -139,16 +89,85 @@ def list_files(folder: str | Path) -> list[FileInfo]:
     Raises:
         OSError: The folder cannot be listed.
     """
-    if not is_url(folder):
-        files = [path for path in Path(folder).iterdir() if path.is_file()] if Path(folder).is_dir() else []
-        stats = {path.name: path.stat() for path in files}
-        return [FileInfo(name, stat.st_size, str(stat.st_mtime_ns)) for name, stat in sorted(stats.items())]
-    raise NotImplementedError
+    if is_url(folder):
+        return [FileInfo(file.name, file.size, file.version) for file in _remote_entries(folder) if file.is_file]
+    files = [path for path in Path(folder).iterdir() if path.is_file()] if Path(folder).is_dir() else []
+    stats = {path.name: path.stat() for path in files}
+    return [FileInfo(name, stat.st_size, str(stat.st_mtime_ns)) for name, stat in sorted(stats.items())]
+
+
+def list_names(folder: str | Path) -> list[str]:
+    """Return the names of the files and folders in a folder, sorted; none where there is no such folder."""
+    if is_url(folder):
+        return [entry.name for entry in _remote_entries(folder)]
+    return sorted(entry.name for entry in Path(folder).iterdir()) if Path(folder).is_dir() else []
+
+
+def open_to_read(path: str | Path) -> ByteReader:
+    """Open a file to read and seek in; the caller closes it.
+
+    Of a URL only what is read is fetched, in blocks, so that one can hand it to a reader of videos or tables.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+    """
+    return remote.open_to_read(str(path)) if is_url(path) else Path(path).open("rb")
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Return a whole file.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+    """
+    if is_url(path):
+        return remote.read_range(str(path), 0, remote.file_size(str(path)))
+    return Path(path).read_bytes()
+
+
+def read_range(path: str | Path, start: int, length: int) -> bytes:
+    """Return `length` bytes from `start`; fewer where the file ends before.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+    """
+    if is_url(path):
+        return remote.read_range(str(path), start, length)
+    with Path(path).open("rb") as file:
+        file.seek(start)
+        return file.read(length)
+
+
+def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
+    """Return several (start, length) pieces of a file, each whole; those of a URL are fetched at the same time.
+
+    Raises:
+        OSError: There is no such file, it cannot be read, or it ends within a piece.
+    """
+    pieces = remote.read_ranges(str(path), ranges) if is_url(path) else list(_local_ranges(path, ranges))
+    for (start, length), piece in zip(ranges, pieces, strict=True):
+        if len(piece) < length:
+            raise ShortReadError(f"{path}: {len(piece)} of {length} bytes at {start}")
+    return pieces
+
+
+def _local_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> Iterator[bytes]:
+    with Path(path).open("rb") as file:
+        for start, length in ranges:
+            file.seek(start)
+            yield file.read(length)
+
+
+def _remote_entries(folder: str | Path) -> list[remote.Entry]:
+    try:
+        return remote.list_folder(str(folder))
+    except FileNotFoundError:
+        return []
 
 
 def bytes_fetched() -> int:
     """Return how many bytes this process has read over the network so far."""
-    return 0
+    return remote.bytes_fetched()
 
 
 @contextmanager
@@ -261,9 +280,3 @@ def sha256_of_file(path: str | Path) -> str:
         while chunk := file.read(_HASH_CHUNK_BYTES):
             digest.update(chunk)
     return digest.hexdigest()
-
-
-def _filesystem(url: str | Path) -> Any:
-    import fsspec
-
-    return fsspec.core.url_to_fs(str(url))[0]

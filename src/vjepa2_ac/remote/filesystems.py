@@ -1,0 +1,122 @@
+"""Which file system of fsspec serves a URL, and as whom does it ask?"""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+from vjepa2_ac.errors import InputError
+
+GOOGLE = frozenset({"gs", "gcs"})
+
+_LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
+_EMULATOR = "STORAGE_EMULATOR_HOST"
+_MACHINE = Path("/sys/class/dmi/id/product_name")
+
+
+def ask(url: str, method: str, timeout_s: float, **arguments: Any) -> Any:
+    """Call a method of the URL's file system with the URL's path, once; cut it off in time where that is possible.
+
+    Raises:
+        Exception: Whatever the library raises.
+        InputError: The library is not installed, or there is none.
+    """
+    filesystem = _filesystem(url)
+    path = filesystem._strip_protocol(url)
+    if not filesystem.async_impl:
+        return getattr(filesystem, method)(path, **arguments)
+    from fsspec.asyn import sync
+
+    return sync(filesystem.loop, getattr(filesystem, f"_{method}"), path, timeout=timeout_s, **arguments)
+
+
+def is_asynchronous(url: str) -> bool:
+    """Return whether the URL's file system reads ranges as they are asked for, and can be cut off."""
+    return bool(_filesystem(url).async_impl)
+
+
+def way_in(url: str) -> str:
+    """Return what to do where permission is missing, as a sentence."""
+    protocol = _protocol(url)
+    log_in = f"Log in with `{_LOG_IN[protocol]}`, or check the name" if protocol in _LOG_IN else "Check the login"
+    return f"You are not logged in. {log_in}" if protocol == "gs" and google_token() == "anon" else log_in
+
+
+def google_token() -> str:
+    """Return as whom Google is asked: the user's default login where there is one, else the machine's, else nobody.
+
+    DROID needs no login. A local emulator is never shown one.
+    """
+    if os.environ.get(_EMULATOR):
+        return "anon"
+    folder = Path(os.environ.get("CLOUDSDK_CONFIG") or Path.home() / ".config" / "gcloud")
+    if os.environ.get("GOOGLE_APPLICATION_CREDENTIALS") or (folder / "application_default_credentials.json").is_file():
+        return "google_default"
+    return "cloud" if _is_google_machine() else "anon"
+
+
+def _is_google_machine() -> bool:
+    """Look at what the firmware says: asking the network for it takes seconds everywhere else."""
+    try:
+        return _MACHINE.read_text().startswith("Google")
+    except OSError:
+        return False
+
+
+_filesystems: dict[tuple[object, ...], Any] = {}
+_opening = threading.Lock()
+
+
+def _filesystem(url: str) -> Any:
+    """Return the file system of a URL: one for all threads of a process, where fsspec would give one to each.
+
+    Raises:
+        InputError: The library for it is not installed, or there is none.
+    """
+    protocol = _protocol(url)
+    with _opening:
+        kind = _kind(url, protocol)
+        options: dict[str, Any] = kind._get_kwargs_from_urls(url)
+        key = (os.getpid(), protocol, repr(sorted(options.items())), os.environ.get(_EMULATOR))
+        if key not in _filesystems:
+            _filesystems[key] = (
+                _google(kind, options) if protocol == "gs" else kind(**options, skip_instance_cache=True)
+            )
+        return _filesystems[key]
+
+
+def _protocol(url: str) -> str:
+    protocol = url.partition("://")[0]
+    return "gs" if protocol in GOOGLE else protocol
+
+
+def _kind(url: str, protocol: str) -> Any:
+    # Before gcsfs is imported: its support for zonal buckets, on by default, makes the first call to each bucket wait
+    # for a minute where the Storage Control API does not answer.
+    os.environ.setdefault("GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT", "false")
+    import fsspec
+
+    try:
+        return fsspec.get_filesystem_class(protocol)
+    except ImportError as error:
+        fix = 'Install it: pip install -c constraints.txt -e ".[gcs]"' if protocol == "gs" else str(error)
+        raise InputError(where=url, found=f"the library that reads {protocol}:// is not installed", fix=fix) from None
+    except ValueError:
+        known = "a folder of this machine, or gs://, hf://, s3://"
+        raise InputError(where=url, found=f"nothing reads {protocol}://", needed=known) from None
+
+
+def _google(kind: Any, options: dict[str, Any]) -> Any:
+    """Open Google's without its own retries: six for each of ours, of up to half a minute together."""
+    once = getattr(kind._request, "__wrapped__", kind._request)
+    kind = type(kind.__name__, (kind,), {"_request": once})
+    options = {"access": "read_only", "use_listings_cache": False, **options}
+    who = google_token()
+    if who == "cloud":  # a machine may have no account of its own
+        try:
+            return kind(token=who, **options)
+        except (ValueError, OSError):
+            who = "anon"
+    return kind(token=who, **options)

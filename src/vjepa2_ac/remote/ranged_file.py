@@ -1,0 +1,100 @@
+"""How is a file that lies elsewhere read and sought in, a few ranges of it at a time?"""
+
+from __future__ import annotations
+
+import io
+from collections import OrderedDict
+from collections.abc import Callable
+
+_BLOCK_BYTES = 128 << 10
+_AHEAD_BLOCKS = 32  # most that is fetched at once for someone who reads on and on
+_KEPT_BLOCKS = 128
+
+
+class RangedFile(io.RawIOBase):
+    """A file to read and seek in, fetched in blocks; the last 16 MB read are kept.
+
+    A jump costs one block of 128 KB. Whoever reads on where the last fetch ended gets twice as much each time, up to
+    4 MB. So a video's header, or one group of its pictures, costs little more than its bytes, and a whole file few
+    reads.
+
+    Args:
+        fetch: Returns `length` bytes from `start`, all of them: called with (start, length).
+        size: Size of the file.
+    """
+
+    def __init__(self, fetch: Callable[[int, int], bytes], size: int) -> None:
+        super().__init__()
+        self._fetch, self._size = fetch, size
+        self._position = 0
+        self._blocks: OrderedDict[int, bytes] = OrderedDict()
+        self._fetched_to, self._ahead = -1, 1
+
+    def readable(self) -> bool:
+        """Return that it can be read."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return that one can seek in it."""
+        return True
+
+    def tell(self) -> int:
+        """Return the offset of the next byte."""
+        return self._position
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        """Go to an offset from the start, from here, or from the end; return it from the start."""
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
+        if base + offset < 0:
+            raise ValueError(f"negative position {base + offset}")
+        self._position = base + offset
+        return self._position
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        """Return the next `size` bytes, fewer where the file ends; all that are left with -1."""
+        if self.closed:
+            raise ValueError("the file is closed")
+        start = min(self._position, self._size)
+        end = self._size if size is None or size < 0 else min(start + size, self._size)
+        data = self._range(start, end)
+        self._position += len(data)
+        return data
+
+    def readall(self) -> bytes:
+        """Return all that is left."""
+        return self.read()
+
+    def readinto(self, buffer: bytearray | memoryview, /) -> int:  # type: ignore[override] # any writable buffer
+        """Fill a buffer with the next bytes; return how many there were."""
+        view = memoryview(buffer).cast("B")
+        data = self.read(len(view))
+        view[: len(data)] = data
+        return len(data)
+
+    def _range(self, start: int, end: int) -> bytes:
+        if start >= end:
+            return b""
+        first, last = start // _BLOCK_BYTES, (end - 1) // _BLOCK_BYTES
+        pieces: dict[int, bytes] = {}
+        for number in range(first, last + 1):
+            if number not in pieces:
+                pieces |= self._load(number, last)
+        data = b"".join(pieces[number] for number in range(first, last + 1))
+        return data[start - first * _BLOCK_BYTES : end - first * _BLOCK_BYTES]
+
+    def _load(self, number: int, last: int) -> dict[int, bytes]:
+        """Return the block of a number, and where it must be fetched all that are wanted up to the next one at hand."""
+        if number in self._blocks:
+            self._blocks.move_to_end(number)
+            return {number: self._blocks[number]}
+        self._ahead = min(2 * self._ahead, _AHEAD_BLOCKS) if number == self._fetched_to else 1
+        stop = max(last + 1, number + self._ahead)
+        stop = next((other for other in range(number + 1, stop) if other in self._blocks), stop)
+        start = number * _BLOCK_BYTES
+        data = self._fetch(start, min(stop * _BLOCK_BYTES, self._size) - start)
+        blocks = {number + i: data[i * _BLOCK_BYTES : (i + 1) * _BLOCK_BYTES] for i in range(stop - number)}
+        self._fetched_to = stop
+        self._blocks |= blocks
+        while len(self._blocks) > _KEPT_BLOCKS:
+            self._blocks.popitem(last=False)
+        return blocks
