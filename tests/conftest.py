@@ -9,6 +9,7 @@ _hook = install_import_hook("vjepa2_ac", "beartype.beartype")  # shapes and type
 
 import pytest  # noqa: E402 - the hook comes first
 
+import gcs as gcs_server  # noqa: E402
 from paths import ROOT  # noqa: E402
 
 
@@ -27,6 +28,23 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VJEPA2_AC_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture(scope="session")
+def _gcs() -> Iterator[gcs_server.Gcs]:
+    with gcs_server.running() as running:
+        yield running
+
+
+@pytest.fixture
+def gcs(_gcs: gcs_server.Gcs, monkeypatch: pytest.MonkeyPatch) -> gcs_server.Gcs:
+    """A local Google Cloud Storage, empty; gs:// means it. What fails is tried again at once, 5 times in all."""
+    from vjepa2_ac.remote import retries
+
+    _gcs.wipe()
+    monkeypatch.setenv("STORAGE_EMULATOR_HOST", _gcs.url)
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=5, first_wait_s=0.001, timeout_s=5.0))
+    return _gcs
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,244 @@
+"""A Google Cloud Storage for tests: the real emulator, in memory, behind a proxy that fails on demand."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import re
+import threading
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import parse_qs, quote, unquote, urlsplit
+
+from gcp_storage_emulator.server import Server, create_server
+
+LOOPBACK = "127.0.0.1"
+
+Failure = int | str
+
+
+@dataclass(frozen=True)
+class Request:
+    """One request that came in, and how it was answered."""
+
+    target: str  # "METHOD /address", unquoted
+    object: str  # "bucket/name" of the object whose bytes were asked for; else ""
+    start: int  # of the bytes that were asked for
+    status: int  # 0: the connection was cut before
+    sent: int  # bytes of the body
+
+
+@dataclass
+class _Fault:
+    failure: Failure
+    times: int
+    match: str
+
+
+class Gcs:
+    """What a test tells the storage, and asks it. A test begins with an empty one without faults.
+
+    Attributes:
+        url: Where it answers; STORAGE_EMULATOR_HOST is set to it.
+        requests: All that came in, in the order of the answers.
+        latency_s: Waited before every answer, as many at once as come.
+        most_in_flight: Most requests that were open at the same time.
+    """
+
+    def __init__(self, emulator: Server, port: int) -> None:
+        self._emulator, self._port, self._lock = emulator, port, threading.Lock()
+        self._faults: list[_Fault] = []
+        self._in_flight = 0
+        self.url = ""
+        self.requests: list[Request] = []
+        self.latency_s = 0.0
+        self.most_in_flight = 0
+
+    def upload(self, source: Path, place: str) -> str:
+        """Put a file, or all files of a folder, at "bucket" or "bucket/prefix"; return the gs:// URL of it."""
+        files = [source] if source.is_file() else [path for path in sorted(source.rglob("*")) if path.is_file()]
+        for file in files:
+            self.put(f"{place}/{file.relative_to(source).as_posix()}" if source.is_dir() else place, file.read_bytes())
+        return f"gs://{place}"
+
+    def put(self, place: str, data: bytes) -> str:
+        """Put bytes at "bucket/name", past the proxy; return the gs:// URL."""
+        bucket, _, name = place.partition("/")
+        if self._post("/storage/v1/b", json.dumps({"name": bucket}).encode(), "application/json") not in {200, 409}:
+            raise RuntimeError(f"no bucket {bucket}")
+        address = f"/upload/storage/v1/b/{bucket}/o?uploadType=media&name={quote(name, safe='')}"
+        if self._post(address, data, "application/octet-stream") != 200:
+            raise RuntimeError(f"no object {place}")
+        return f"gs://{place}"
+
+    def fail_next(self, failure: Failure, *, times: int = 1, match: str = "") -> None:
+        """Let the next requests fail.
+
+        Args:
+            failure: An HTTP status. "reset": the connection is cut. "cut": it is cut in the middle of the body.
+                "short": half the body is sent as if it were all. "hang": no answer until the client goes.
+            times: How many requests.
+            match: Regular expression that is searched in the unquoted "METHOD /address"; empty: any request. Bytes of
+                objects are asked for with "GET /download/storage/v1/b/BUCKET/o/NAME".
+        """
+        with self._lock:
+            self._faults.append(_Fault(failure, times, match))
+
+    @property
+    def faults_left(self) -> int:
+        """How many of the faults asked for have not happened."""
+        return sum(fault.times for fault in self._faults)
+
+    def reads(self, end: str = "") -> list[Request]:
+        """Return the requests for bytes of objects whose "bucket/name" ends so."""
+        return [request for request in self.requests if request.object.endswith(end) and request.object]
+
+    def bytes_read(self, end: str = "") -> int:
+        """Return how many bytes of such objects were sent."""
+        return sum(request.sent for request in self.reads(end))
+
+    def forget(self) -> None:
+        """Forget requests, faults and latency; the objects stay."""
+        with self._lock:
+            self._faults.clear()
+            self.requests.clear()
+            self.latency_s, self.most_in_flight = 0.0, 0
+
+    def wipe(self) -> None:
+        """Forget everything."""
+        self.forget()
+        self._emulator.wipe()
+
+    def _post(self, address: str, data: bytes, kind: str) -> int:
+        with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=10)) as connection:
+            connection.request("POST", address, data, {"Content-Type": kind})
+            return connection.getresponse().status
+
+    def _failure_of(self, target: str) -> Failure | None:
+        with self._lock:
+            for fault in self._faults:
+                if fault.times and re.search(fault.match, target):
+                    fault.times -= 1
+                    return fault.failure
+        return None
+
+
+@contextmanager
+def running() -> Iterator[Gcs]:
+    """Start emulator and proxy on free ports of this machine; stop them in the end."""
+    emulator = create_server(LOOPBACK, 0, in_memory=True)
+    emulator.start()
+    gcs = Gcs(emulator, emulator._api._httpd.server_address[1])
+    loop = asyncio.new_event_loop()
+    proxy = loop.run_until_complete(asyncio.start_server(_Proxy(gcs).serve, LOOPBACK, 0, backlog=256))
+    gcs.url = f"http://{LOOPBACK}:{proxy.sockets[0].getsockname()[1]}"
+    thread = threading.Thread(target=loop.run_forever, name="gcs proxy")
+    thread.start()
+    try:
+        yield gcs
+    finally:
+        asyncio.run_coroutine_threadsafe(_stop(proxy), loop).result(timeout=10)
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+        emulator.stop()
+
+
+async def _stop(proxy: asyncio.Server) -> None:
+    proxy.close()
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    for task in others:
+        task.cancel()
+    await asyncio.gather(*others, return_exceptions=True)
+
+
+class _Proxy:
+    """HTTP/1.1 with connections that stay, in front of the emulator, which answers one request at a time."""
+
+    def __init__(self, gcs: Gcs) -> None:
+        self._gcs, self._one_at_a_time = gcs, asyncio.Semaphore(1)
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer the requests of one connection."""
+        with suppress(ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError):
+            while await self._answer(*await _read_message(reader), writer):
+                pass
+        writer.close()
+
+    async def _answer(self, head: bytes, body: bytes, writer: asyncio.StreamWriter) -> bool:
+        """Answer one request; return whether the connection stays."""
+        gcs = self._gcs
+        method, address, _ = head.split(b"\r\n", 1)[0].decode().split(" ")
+        target = f"{method} {unquote(address)}"
+        gcs._in_flight += 1
+        gcs.most_in_flight = max(gcs.most_in_flight, gcs._in_flight)
+        try:
+            if gcs.latency_s:
+                await asyncio.sleep(gcs.latency_s)
+            failure = gcs._failure_of(target)
+            status, answer, sent = await self._result(failure, head, body)
+            gcs.requests.append(Request(target, _object_of(address), _start_of(head), status, sent))
+        finally:
+            gcs._in_flight -= 1
+        writer.write(answer)
+        await writer.drain()
+        if failure in {"reset", "cut"}:
+            writer.transport.abort() if failure == "reset" else writer.close()
+        return failure not in {"reset", "cut"}
+
+    async def _result(self, failure: Failure | None, head: bytes, body: bytes) -> tuple[int, bytes, int]:
+        """Return status, all bytes to send, and how many of them are body."""
+        if failure == "hang":
+            await asyncio.Event().wait()
+        if failure == "reset":
+            return 0, b"", 0
+        if isinstance(failure, int):
+            message = json.dumps({"error": {"code": failure, "message": "made to fail by a test"}}).encode()
+            return failure, _message(f"HTTP/1.1 {failure} Failed", "application/json", message), len(message)
+        async with self._one_at_a_time:
+            status_line, kind, data = await self._ask_emulator(head, body)
+        status, half = int(status_line.split()[1]), data[: len(data) // 2]
+        if failure == "short":
+            return status, _message(status_line, kind, half), len(half)
+        answer = _message(status_line, kind, data)
+        if failure == "cut":
+            return status, answer[: len(answer) - len(data) + len(half)], len(half)
+        return status, answer, len(data)
+
+    async def _ask_emulator(self, head: bytes, body: bytes) -> tuple[str, str, bytes]:
+        reader, writer = await asyncio.open_connection(LOOPBACK, self._gcs._port, limit=1 << 20)
+        try:
+            writer.write(head + body)
+            head, data = await _read_message(reader)
+        finally:
+            writer.close()
+        return head.split(b"\r\n", 1)[0].decode().replace("HTTP/1.0", "HTTP/1.1"), _header(head, "Content-Type"), data
+
+
+async def _read_message(reader: asyncio.StreamReader) -> tuple[bytes, bytes]:
+    """Return head and body of one request or answer; a request without a length has no body."""
+    head = await reader.readuntil(b"\r\n\r\n")
+    return head, await reader.readexactly(int(_header(head, "Content-Length") or 0))
+
+
+def _message(status_line: str, kind: str, data: bytes) -> bytes:
+    return f"{status_line}\r\nContent-Type: {kind}\r\nContent-Length: {len(data)}\r\n\r\n".encode() + data
+
+
+def _header(head: bytes, name: str) -> str:
+    found = re.search(rf"^{name}: *(.*?)\r$", head.decode("latin-1"), re.IGNORECASE | re.MULTILINE)
+    return found[1] if found else ""
+
+
+def _object_of(address: str) -> str:
+    parts = urlsplit(address)
+    found = re.search(r"/b/([^/]+)/o/([^/?]+)$", parts.path)
+    return f"{found[1]}/{unquote(found[2])}" if found and parse_qs(parts.query).get("alt") == ["media"] else ""
+
+
+def _start_of(head: bytes) -> int:
+    found = re.match(r"bytes=(\d+)-", _header(head, "Range"))
+    return int(found[1]) if found else 0
