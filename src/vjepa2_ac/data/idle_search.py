@@ -148,7 +148,7 @@ def _published(path: str, table: EpisodeTable) -> FoundRanges:
     return FoundRanges.of(found, listed=listed)
 
 
-def _read_list(path: str) -> dict[str, list[list[int]]]:
+def _read_list(path: str) -> dict[str, object]:
     needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
     try:
         content = json.loads(storage.read_bytes(path))
