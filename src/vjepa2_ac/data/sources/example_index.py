@@ -16,7 +16,8 @@ Read = Callable[[int, int], bytes]  # (offset, length) -> those bytes; fewer whe
 
 BYTES_LIST, FLOAT_LIST, INT64_LIST = 1, 2, 3  # field numbers of tf.train.Feature
 
-_VARINT, _FIXED64, _DELIMITED, _FIXED32 = 0, 1, 2, 5
+DELIMITED = 2  # wire type of everything with a length
+_VARINT, _FIXED64, _FIXED32 = 0, 1, 5
 _VARINT_BYTES = 10  # at most
 _HEAD_BYTES = 2 * _VARINT_BYTES
 _ENTRY_HEAD_BYTES = 160  # the headers and the name of nearly every feature
@@ -93,7 +94,7 @@ def packed_numbers(feature: bytes, kind: int) -> memoryview | None:
     """
     try:
         outer, start = _varint(feature, 1)
-        if feature[0] != kind << 3 | _DELIMITED or start + outer != len(feature):
+        if feature[0] != kind << 3 | DELIMITED or start + outer != len(feature):
             return None
         if outer == 0:
             return memoryview(b"")
@@ -159,7 +160,7 @@ def _delimited_fields(read: Read, start: int, end: int) -> Iterator[tuple[int, L
         head = read(position, _HEAD_BYTES)
         tag, used = _varint(head, 0)
         kind = tag & 7
-        if kind == _DELIMITED:
+        if kind == DELIMITED:
             length, used = _varint(head, used)
             position += used
             if position + length > end:

@@ -57,6 +57,11 @@ def _no_jpeg(picture: bytes, step: int, where: str, error: ValueError) -> InputE
     )
 
 
+def looks_like_jpeg(picture: bytes) -> bool:
+    """Return whether bytes begin and end as a JPEG does."""
+    return picture.startswith(b"\xff\xd8\xff") and picture.endswith(b"\xff\xd9")
+
+
 def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95) -> bytes:
     """Return an RGB picture as JPEG; the default quality is TFDS's."""
     return bytes(

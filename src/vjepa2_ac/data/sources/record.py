@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from vjepa2_ac.data.sources.example_index import (
+    DELIMITED,
     FLOAT_LIST,
     INT64_LIST,
     Located,
@@ -62,6 +63,10 @@ class Record:
         if packed is None or len(packed) % 4:
             return np.asarray(self.values(name, "float_list"), np.float32)
         return np.frombuffer(packed, "<f4")
+
+    def is_float(self, name: str) -> bool:
+        """Return whether a feature holds floats, as far as its first byte tells."""
+        return self._read(self.located[name].offset, 1) == bytes([FLOAT_LIST << 3 | DELIMITED])
 
     def count_integers(self, name: str) -> int:
         """Return how many integers a feature holds.

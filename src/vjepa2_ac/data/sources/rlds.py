@@ -7,12 +7,14 @@ from collections.abc import Iterable
 from dataclasses import astuple, dataclass
 from typing import Any
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, RldsFields
 from vjepa2_ac.data.index import cache_folder, kept_or_built, key_of
 from vjepa2_ac.data.sources.dataset_info import Shard, find_shards
 from vjepa2_ac.data.sources.example_index import Read
 from vjepa2_ac.data.sources.record import Record
 from vjepa2_ac.data.sources.rlds_fields import (
+    STEP_FLAG,
     identity_of,
     info_of,
     joint_velocities_of,
@@ -21,12 +23,14 @@ from vjepa2_ac.data.sources.rlds_fields import (
     states_of,
 )
 from vjepa2_ac.data.sources.rlds_index import index_local
-from vjepa2_ac.data.sources.rlds_pictures import LocalPictures, wrong_count
+from vjepa2_ac.data.sources.rlds_pictures import LocalPictures, PicturesAt, wrong_count
+from vjepa2_ac.data.sources.rlds_remote import RemoteCache, RemoteEpisode, whole_record
+from vjepa2_ac.data.sources.rlds_remote_index import index_remote
 from vjepa2_ac.data.sources.shard_file import open_shard
 from vjepa2_ac.data.sources.tfrecord import RecordSpan, require_intact
 from vjepa2_ac.data.sources.verified import Verified
 from vjepa2_ac.data.table import EpisodeTable
-from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
+from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 
 
@@ -37,6 +41,7 @@ class _Opened:
     shards: tuple[Shard, ...]
     table: EpisodeTable
     verified: Verified
+    cache: RemoteCache
 
 
 class RldsSource:
@@ -45,6 +50,10 @@ class RldsSource:
     Nothing is read before the first call. `infos` hops through every record once and keeps what it found; `read` reads
     the states alone, and its pictures are read and decoded when asked for. With `check_crc: once` a record is read
     whole the first time on this machine: its CRC is checked, and that each camera has one picture for every step.
+
+    Behind a URL only parts of a record are fetched, and no CRC is of a part: checked are then the CRCs of the lengths,
+    that features and pictures lie within one another as they should, and the pictures' own form; the rest is up to the
+    transport. There `always` fetches whole records, every time, and checks their CRC.
     """
 
     def __init__(self, config: DataConfig) -> None:
@@ -69,19 +78,25 @@ class RldsSource:
         """
         return self._open(progress).table
 
-    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - all of a local episode is at hand
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
         """Return one episode.
 
         Raises:
             InputError: The record is damaged, has changed, lacks a feature, or holds what cannot be a robot's state.
+            UnreachableError: The network fails.
             ValueError: A camera that the config does not know.
         """
         opened, fields = self._open(None), self._config.fields
         camera = camera or self._config.cameras[0]
         if camera not in fields.cameras:
             raise ValueError(f"camera {camera!r} is not one of {', '.join(fields.cameras)}")
-        feature, info = fields.cameras[camera], opened.table[index]
         shard, span = _place_of(opened, index)
+        if storage.is_url(shard.path):
+            return self._read_remote(opened, shard, span, index, fields.cameras[camera], needed)
+        return self._read_local(opened, shard, span, index, fields.cameras[camera])
+
+    def _read_local(self, opened: _Opened, shard: Shard, span: RecordSpan, index: int, feature: str) -> Episode:
+        info = opened.table[index]
         where = f"{span} ({info.id})"
         with open_shard(shard) as read:
             record = Record(read, span)
@@ -89,16 +104,45 @@ class RldsSource:
                 self._check(record, read, span, info.num_steps, {feature, *self._features()}, where)
                 if self._config.check_crc == "once":
                     opened.verified.add(index)
-            _require_as_indexed(record, info, fields, where)
             record.require([feature])
-            return Episode(
-                info=info,
-                states=states_of(record, fields, info.num_steps, where),
-                read_frames=LocalPictures(shard, record.located[feature], info.num_steps, f"{where}: {feature}"),
-                control_rate_hz=fields.control_rate_hz,
-                joint_velocities=joint_velocities_of(record, fields, info.num_steps, where),
-                metadata=language_of(record, fields),
-            )
+            pictures = LocalPictures(shard, record.located[feature], info.num_steps, f"{where}: {feature}")
+            return self._episode(record, info, pictures, where)
+
+    def _read_remote(
+        self,
+        opened: _Opened,
+        shard: Shard,
+        span: RecordSpan,
+        index: int,
+        feature: str,
+        needed: StepRanges | None,
+    ) -> Episode:
+        fields, info = self._config.fields, opened.table[index]
+        where = f"{span} ({info.id})"
+        if self._config.check_crc == "always":
+            read = whole_record(shard, span)
+            record = Record(read, span)
+            self._check(record, read, span, info.num_steps, {feature}, where)
+            pictures: FrameReader = PicturesAt(read, record.located[feature], info.num_steps, f"{where}: {feature}")
+        else:
+            remote = RemoteEpisode(shard, span, opened.cache, index)
+            numbers = [*fields.identity, *fields.state, STEP_FLAG, fields.joint_velocity]
+            record = remote.record([name for name in numbers if name], [fields.language] if fields.language else [])
+            record.require([feature])
+            pictures = remote.pictures(feature, record.located, info.num_steps, needed, f"{where}: {feature}")
+        return self._episode(record, info, pictures, where)
+
+    def _episode(self, record: Record, info: EpisodeInfo, pictures: FrameReader, where: str) -> Episode:
+        fields = self._config.fields
+        _require_as_indexed(record, info, fields, where)
+        return Episode(
+            info=info,
+            states=states_of(record, fields, info.num_steps, where),
+            read_frames=pictures,
+            control_rate_hz=fields.control_rate_hz,
+            joint_velocities=joint_velocities_of(record, fields, info.num_steps, where),
+            metadata=language_of(record, fields),
+        )
 
     def _check(
         self, record: Record, read: Read, span: RecordSpan, num_steps: int, features: Iterable[str], where: str
@@ -133,11 +177,18 @@ class RldsSource:
             "shards": [astuple(shard) for shard in shards],
         })  # fmt: skip
 
-        def build() -> EpisodeTable:
-            return index_local(shards, fields, self._features(), threads=config.connections, progress=progress)
+        make = index_remote if storage.is_url(config.path) else index_local
 
-        table = kept_or_built(config.disk_cache, key, build)
-        return _Opened(shards, table, Verified(cache_folder(config.disk_cache) / "index" / f"{key}.checked"))
+        def build() -> EpisodeTable:
+            return make(shards, fields, self._features(), threads=config.connections, progress=progress)
+
+        folder = cache_folder(config.disk_cache)
+        return _Opened(
+            shards,
+            kept_or_built(config.disk_cache, key, build),
+            Verified(folder / "index" / f"{key}.checked"),
+            RemoteCache.at(folder, key, config.disk_cache.limit_gb),
+        )
 
 
 def _place_of(opened: _Opened, index: int) -> tuple[Shard, RecordSpan]:

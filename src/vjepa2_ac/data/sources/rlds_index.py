@@ -144,6 +144,11 @@ def table_of(shards: Sequence[Shard], found: Iterator[list[Found]]) -> EpisodeTa
     )
 
 
+def place_of(span: RecordSpan) -> str:
+    """Return what to call an episode of which not even the identity can be read."""
+    return f"{span.path.replace(chr(92), '/').rsplit('/', 1)[-1]}: record {span.number}"
+
+
 def problem_of(error: InputError, name: str) -> Problem:
     """Return an error as a row of the table's problems."""
     return Problem(name=name, where=error.where, found=error.found, needed=error.needed, fix=error.fix)
@@ -151,7 +156,7 @@ def problem_of(error: InputError, name: str) -> Problem:
 
 def _examine(read: Read, span: RecordSpan, fields: RldsFields, cameras: Sequence[str]) -> Found:
     """Look at identity, steps, states and the presence of the pictures."""
-    name = f"{span.path.replace(chr(92), '/').rsplit('/', 1)[-1]}: record {span.number}"
+    name = place_of(span)
     record = Record(read, span)
     try:
         name = identity_of(record, fields)

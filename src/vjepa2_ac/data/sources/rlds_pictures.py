@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vjepa2_ac.data.sources.dataset_info import Shard
-from vjepa2_ac.data.sources.example_index import Located, NotAnExampleError, locate_items
+from vjepa2_ac.data.sources.example_index import Located, NotAnExampleError, Read, locate_items
 from vjepa2_ac.data.sources.jpeg import decode_jpegs
 from vjepa2_ac.data.sources.shard_file import open_shard
 from vjepa2_ac.errors import InputError
@@ -31,16 +31,34 @@ class LocalPictures:
             InputError: The file has changed, there are too few pictures, one is not a JPEG, or differs in size.
             ValueError: No steps, or a step outside the episode.
         """
-        require_steps(steps, self.num_steps, self.where)
         with open_shard(self.shard) as read:
-            try:
-                offsets, lengths = locate_items(read, self.feature, max(steps) + 1)
-            except NotAnExampleError as error:
-                raise InputError(where=self.where, found=str(error), needed="a list of pictures") from None
-            if len(offsets) <= max(steps):
-                raise wrong_count(len(offsets), self.num_steps, self.where)
-            pictures = [read(offsets[step], lengths[step]) for step in steps]
-        return decode_jpegs(pictures, steps, self.where)
+            return PicturesAt(read, self.feature, self.num_steps, self.where)(steps)
+
+
+@dataclass(frozen=True)
+class PicturesAt:
+    """The same, of a file that is open, or of a record that is in memory."""
+
+    read: Read
+    feature: Located
+    num_steps: int
+    where: str
+
+    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
+        """Return the RGB pictures at these control steps, in this order.
+
+        Raises:
+            InputError: There are too few pictures, one is not a JPEG, or differs in size.
+            ValueError: No steps, or a step outside the episode.
+        """
+        require_steps(steps, self.num_steps, self.where)
+        try:
+            offsets, lengths = locate_items(self.read, self.feature, max(steps) + 1)
+        except NotAnExampleError as error:
+            raise InputError(where=self.where, found=str(error), needed="a list of pictures") from None
+        if len(offsets) <= max(steps):
+            raise wrong_count(len(offsets), self.num_steps, self.where)
+        return decode_jpegs([self.read(offsets[step], lengths[step]) for step in steps], steps, self.where)
 
 
 def require_steps(steps: Sequence[int], num_steps: int, where: str) -> None:

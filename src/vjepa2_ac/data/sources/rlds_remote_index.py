@@ -1,0 +1,190 @@
+"""Which episodes does an RLDS data set behind a URL hold? Found out with a few small reads for each.
+
+A read costs tens of milliseconds, so many shards are read at once, and of a record no more is read than names it and
+tells its steps: its states are checked when it is read. TFDS writes the features of a record in a hash's order, another
+one in every process: the names of an episode lie before, between or behind its pictures. One read a record where they
+come first, three to five on the average of all orders. How many bytes one read takes is decided by a few records.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import pairwise
+
+from vjepa2_ac.config import RldsFields
+from vjepa2_ac.data.sources.dataset_info import Shard
+from vjepa2_ac.data.sources.example_index import Located, NotAnExampleError, Read, iterate_features
+from vjepa2_ac.data.sources.record import Record, not_an_example
+from vjepa2_ac.data.sources.remote_file import RemoteFile
+from vjepa2_ac.data.sources.rlds_fields import STEP_FLAG, identity_of, info_of, num_steps_of, states_of
+from vjepa2_ac.data.sources.rlds_index import Found, Row, in_parallel, place_of, problem_of, scan_shard, table_of
+from vjepa2_ac.data.sources.states import zero_steps
+from vjepa2_ac.data.sources.tfrecord import HEADER_BYTES, RecordSpan, span_at
+from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
+
+logger = logging.getLogger(__name__)
+
+FEWEST_IN_FLIGHT = 128  # reads of an index are small and wait for one another within a shard
+
+_SAMPLES = 8
+_SAMPLE_WINDOW = 1 << 16
+_WINDOWS = tuple(1 << power for power in range(10, 17))
+_ASSUMED_LATENCY_S, _ASSUMED_BYTES_PER_S = 0.04, 1e8
+_FLAGS = (STEP_FLAG, "steps/is_last", "steps/is_terminal")  # one byte a step, always
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What a few whole records say of all: how many bytes of which feature are one step, and what to read at once."""
+
+    step_bytes: dict[str, int]
+    window: int
+
+    def steps_in(self, name: str, length: int) -> int | None:
+        """Return the number of steps that a feature's length tells, or None where it does not."""
+        payload = _payload(_payload(length))
+        width = self.step_bytes.get(name)
+        if width is None or payload is None or payload % width:
+            return None
+        return payload // width
+
+
+def index_remote(
+    shards: Sequence[Shard], fields: RldsFields, cameras: Sequence[str], *, threads: int, progress: Progress | None
+) -> EpisodeTable:
+    """Return every episode of shards behind a URL, by identity and number of steps.
+
+    Args:
+        shards: All of the data set's.
+        fields: Names of the features.
+        cameras: Features with pictures that episodes must have; looked for in a few of them.
+        threads: Shards that are read at once, at least `FEWEST_IN_FLIGHT`.
+        progress: Told how many of the episodes have been found.
+
+    Raises:
+        InputError: No episode can be used; a shard cannot be read.
+    """
+    layout = learn_layout(shards, fields, cameras)
+
+    def examine(read: Read, span: RecordSpan) -> Found:
+        return _examine(read, span, fields, layout)
+
+    def scan(shard: Shard) -> list[Found]:
+        return list(scan_shard(RemoteFile(shard, window=layout.window, kept=1), shard, examine))
+
+    return table_of(shards, in_parallel(scan, shards, max(threads, FEWEST_IN_FLIGHT), progress))
+
+
+def learn_layout(shards: Sequence[Shard], fields: RldsFields, cameras: Sequence[str]) -> Layout:
+    """Look at the first record of a few shards, as closely as at a local one.
+
+    Raises:
+        InputError: None of them can be used: the settings are at fault, or the data set is.
+    """
+
+    def first_record(shard: Shard) -> tuple[Record, int] | InputError:
+        try:
+            return _whole_record(shard, fields, cameras)
+        except UnreachableError:
+            raise  # says nothing of the record
+        except InputError as error:
+            return error
+
+    chosen = [shards[number * len(shards) // _SAMPLES] for number in range(_SAMPLES)]
+    with ThreadPoolExecutor(_SAMPLES) as pool:
+        looked = list(pool.map(first_record, dict.fromkeys(chosen)))
+    good = [one for one in looked if not isinstance(one, InputError)]
+    if not good:
+        raise next(one for one in looked if isinstance(one, InputError))
+    step_bytes = _step_bytes(good, fields)
+    wanted = frozenset(fields.identity)
+    places = [record.located for record, _ in good]
+    seconds = {
+        window: sum(_reads(one, wanted, step_bytes.keys(), window) for one in places)
+        * (_ASSUMED_LATENCY_S + FEWEST_IN_FLIGHT * window / _ASSUMED_BYTES_PER_S)
+        for window in _WINDOWS
+    }
+    layout = Layout(step_bytes, min(seconds, key=seconds.__getitem__))
+    reads = sum(_reads(one, wanted, step_bytes.keys(), layout.window) for one in places) / len(places)
+    logger.info("about %.1f reads of %d KB for each episode", reads, layout.window >> 10)
+    return layout
+
+
+def _whole_record(shard: Shard, fields: RldsFields, cameras: Sequence[str]) -> tuple[Record, int]:
+    read = RemoteFile(shard, window=_SAMPLE_WINDOW)
+    span = span_at(read(0, HEADER_BYTES), shard.path, 0, 0, shard.size)
+    record = Record(read, span)
+    record.require([*fields.identity, *fields.state, *cameras])
+    steps = num_steps_of(record, fields)
+    states_of(record, fields, steps, str(span))
+    return record, steps
+
+
+def _step_bytes(records: Iterable[tuple[Record, int]], fields: RldsFields) -> dict[str, int]:
+    """Return the bytes of a step of every feature that has as many for each step, in all of the records."""
+    found: dict[str, set[float]] = {}
+    for record, steps in records:
+        for name, place in record.located.items():
+            if name in fields.state or (name.startswith("steps/") and record.is_float(name)) or name in _FLAGS:
+                found.setdefault(name, set()).add((_payload(_payload(place.length)) or 0) / steps)
+    widths = {name: next(iter(of_all)) for name, of_all in found.items() if len(of_all) == 1}
+    return {name: int(width) for name, width in widths.items() if width >= 1 and width == int(width)}
+
+
+def _reads(places: dict[str, Located], wanted: Iterable[str], telling: Iterable[str], window: int) -> int:
+    """Count the reads of a window that lead to the identity of an episode and a feature that tells its steps."""
+    missing, steps_known = set(wanted), False
+    starts = [0, *(place.offset + place.length for place in places.values())]
+    reads, end = 1, min(place.offset for place in places.values()) + window
+    for (start, _), (name, place) in zip(pairwise([*starts, 0]), places.items(), strict=True):
+        if place.offset > end or (name in missing and place.offset + place.length > end):
+            reads, end = reads + 1, start + window
+        missing.discard(name)
+        steps_known = steps_known or name in telling
+        if steps_known and not missing:
+            break
+    return reads
+
+
+def _examine(read: Read, span: RecordSpan, fields: RldsFields, layout: Layout) -> Found:
+    """Hop until identity and steps are known."""
+    name = place_of(span)
+    found: dict[str, Located] = {}
+    steps: int | None = None
+    try:
+        try:
+            for feature, place in iterate_features(read, span.data_offset, span.length):
+                found[feature] = place
+                if steps is None:
+                    steps = layout.steps_in(feature, place.length)
+                if steps is not None and found.keys() >= set(fields.identity):
+                    break
+        except NotAnExampleError as error:
+            raise not_an_example(span, error) from None
+        record = Record(read, span, found)
+        name = identity_of(record, fields)
+        steps = num_steps_of(record, fields) if steps is None else steps
+        if steps == 0:
+            raise zero_steps(f"{span} ({name})")
+    except UnreachableError:
+        raise  # says nothing of the record
+    except InputError as error:
+        return problem_of(error, name)
+    return Row(info_of(name, steps), span)
+
+
+def _payload(length: int | None) -> int | None:
+    """Return how long the content of a length-delimited field is that takes `length` bytes with its tag and length."""
+    if length is None:
+        return None
+    for header in range(2, 7):
+        content = length - header
+        if content >= 0 and 1 + max(1, -(-content.bit_length() // 7)) == header:
+            return content
+    return None
