@@ -15,7 +15,7 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 RANK = {
     "__init__": 0, "errors": 0, "config": 1, "config_file": 1.5, "episode": 1, "geometry": 1, "remote": 0.5, "storage": 1,
     "data": 2, "model": 2, "latents": 3, "planning": 4, "evaluation": 5, "training": 6, "simulation": 7,
-    "console": 8, "cli": 9,
+    "console": 8, "console_data": 8.2, "cli_data": 8.5, "cli": 9,
 }  # fmt: skip
 
 HOMES = {
@@ -31,7 +31,7 @@ HOMES = {
     "av": {"data/video.py"},
     "h5py": {"data/sources/droid_trajectory.py"},
     "pyarrow": {"data/sources/lerobot"},
-    "rich": {"console.py"},
+    "rich": {"console.py", "console_data.py"},
     "tensorflow": set(),
     "torchvision": set(),
     "decord": set(),

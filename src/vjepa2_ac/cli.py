@@ -10,13 +10,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from vjepa2_ac import __version__
+from vjepa2_ac.cli_data import add_data, count
 from vjepa2_ac.errors import InputError
 
-Handler = Callable[[argparse.Namespace], None]
+Handler = Callable[[argparse.Namespace], int | None]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return the exit status: 0 done, 2 something given cannot be used, 130 interrupted."""
+    """Run a command; return its status: 0 done, 1 a check failed, 2 something given cannot be used, 130 broken off."""
     parser = _parser()
     options, rest = parser.parse_known_args(arguments)
     if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
@@ -26,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _show_our_warnings()
     handler: Handler = options.handler
     try:
-        handler(options)
+        return handler(options) or 0
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
@@ -36,7 +37,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
-    return 0
 
 
 def _show_our_warnings() -> None:
@@ -49,14 +49,6 @@ def _show_our_warnings() -> None:
     logging.getLogger("bitsandbytes").setLevel(logging.ERROR)
 
 
-def _count(text: str) -> int:
-    """Read a number of things: a whole number from 1."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 1")
-    return number
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped."
@@ -65,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_train(commands)
     _add_evaluate(commands)
+    add_data(commands)
     _add_export(commands)
     _add_config(commands)
     _add_download(commands)
@@ -124,7 +117,7 @@ def _add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="folder of a run; several: their spread too")
     parser.add_argument("--split", choices=["test", "validation"], default="test", help="which held-out episodes")
-    parser.add_argument("--clips", type=_count, default=256, help="at most this many clips, spread over the episodes")
+    parser.add_argument("--clips", type=count, default=256, help="at most this many clips, spread over the episodes")
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -204,15 +197,15 @@ def _add_simulate(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--domain", default="A", help="A, B, or random: another camera, light and look in every episode"
     )
-    parser.add_argument("--episodes", type=_count, default=40)
-    parser.add_argument("--steps", type=_count, default=41, help="control steps of an episode, 15 per second")
+    parser.add_argument("--episodes", type=count, default=40)
+    parser.add_argument("--steps", type=count, default=41, help="control steps of an episode, 15 per second")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--cameras", type=int, choices=[1, 3], default=1, help="1: all three pictures are the same one")
     parser.add_argument(
         "--renderer", choices=["rays", "opengl"], default="rays", help="opengl needs a working MUJOCO_GL"
     )
     parser.add_argument(
-        "--workers", type=_count, default=1, help="processes; the data are the same whatever their number"
+        "--workers", type=count, default=1, help="processes; the data are the same whatever their number"
     )
 
 

@@ -50,6 +50,29 @@ class ProgressBar:
             self._bar = None
 
 
+class LateProgress:
+    """A bar of work of which one learns how long it is when it begins; none is shown where there is nothing to do."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._bar: ProgressBar | None = None
+        self._total = -1
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that `done` of `total` are done; another total begins another bar."""
+        if total != self._total:
+            self.close()
+            self._bar, self._total = ProgressBar(self._title, total), total
+        if self._bar is not None:
+            self._bar.advance_to(done)
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
 class DownloadProgress:
     """Shows a download as it grows."""
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import logging
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextvars import ContextVar
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -19,6 +22,28 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 _VERSION = 1  # of what is kept: another number makes all of it be found out again
+
+
+@dataclass
+class Watch:
+    """What of the index was used while somebody watched."""
+
+    rebuild: bool
+    files: list[Path] = field(default_factory=list)
+
+
+_watch: ContextVar[Watch | None] = ContextVar("watch", default=None)
+
+
+@contextlib.contextmanager
+def watched(*, rebuild: bool = False) -> Iterator[Watch]:
+    """Note which files of the index are used meanwhile; with `rebuild`, none is read: what they hold is made again."""
+    watch = Watch(rebuild)
+    token = _watch.set(watch)
+    try:
+        yield watch
+    finally:
+        _watch.reset(token)
 
 
 def cache_folder(config: DiskCacheConfig) -> Path:
@@ -51,8 +76,12 @@ def kept_or_made(
 ) -> T:
     """Return what is kept under a key; make and keep it where there is none, or `from_bytes` raises NotATableError."""
     path = cache_folder(config) / "index" / f"{key}.npz"
+    watch = _watch.get()
+    if watch is not None:
+        watch.files.append(path)
     try:
-        return from_bytes(path.read_bytes())
+        if watch is None or not watch.rebuild:
+            return from_bytes(path.read_bytes())
     except FileNotFoundError:
         pass
     except (OSError, NotATableError) as error:

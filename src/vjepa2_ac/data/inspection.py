@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import RAW_CAMERAS
-from vjepa2_ac.data.broken import UnreachableError
 from vjepa2_ac.data.dataset import Dataset, Removed
 from vjepa2_ac.data.idle import idle_by_motion
 from vjepa2_ac.data.windows import Split, in_split, spread
 from vjepa2_ac.episode import Episode, Progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 
 PERCENTILES = (10, 50, 90, 99)
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")

@@ -75,6 +75,15 @@ class Calibration:
             words += ". At no stride is the model better than doing nothing: does it fit this data at all?"
         return words if words.endswith("?") else words + "."
 
+    def lines(self) -> list[str]:
+        """Return what was found as lines of text, the verdict last."""
+        tried = [
+            f"  stride {one.stride} ({one.seconds_per_step:.2f} s): error/persistence {one.ratio},"
+            f" {one.clips} clips of {one.episodes} episodes"
+            for one in self.tried
+        ]
+        return [*tried, *(f"  stride {n}: not possible: {why}" for n, why in self.impossible.items()), self.verdict()]
+
     def as_dict(self) -> dict[str, Any]:
         """Return every figure as plain values, for `calibration.json`."""
         strides = [

@@ -18,6 +18,7 @@ from vjepa2_ac.data.loader import training_loader, validation_batches
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.calibration import Calibration
 from vjepa2_ac.latents import encode_batch, extrinsics_for
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import add_adapter, load_trained, save_trained, trainable_report
@@ -26,6 +27,7 @@ from vjepa2_ac.training.checkpoint import RunState, newest_checkpoint, read_stat
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer
 from vjepa2_ac.training.run_folder import CHECKPOINTS
+from vjepa2_ac.training.stride import choose_stride, with_stride
 
 ADAPTER = "adapter"
 OPTIMIZER = "optimizer.pt"
@@ -37,13 +39,14 @@ _CLIPS_TRIED = 8  # one is read; the others are for where data.broken_episodes p
 class Run:
     """Everything the loop needs, assembled and checked."""
 
-    config: Config
+    config: Config  # its stride is a number
     accelerator: Accelerator
     world_model: WorldModel
     objective: torch.nn.Module
     optimizer: torch.optim.Optimizer
     dataset: Dataset
     state: RunState
+    calibration: Calibration | None = None  # where data.stride was auto and is now chosen
 
 
 def assemble(config: Config, note: Callable[[str], None]) -> Run:
@@ -54,8 +57,13 @@ def assemble(config: Config, note: Callable[[str], None]) -> Run:
     """
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data)
+    world_model, calibration = None, None
+    if config.data.stride == "auto":
+        world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
+        calibration = choose_stride(world_model, dataset, config, accelerator, note)
+        config, dataset = with_stride(config, calibration.best.stride), dataset.with_stride(calibration.best.stride)
     first_clip = _read_one_clip_of_each_split(dataset)
-    world_model = load_base(config.model, seed=config.seed)
+    world_model = world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, first_clip)
     add_adapter(world_model, config.adapter, seed=config.seed)
     note(str(trainable_report(world_model)))
@@ -64,7 +72,7 @@ def assemble(config: Config, note: Callable[[str], None]) -> Run:
     optimizer = make_optimizer(world_model, config.training)
     state = _take_up(config, world_model, optimizer, note)
     objective, optimizer = accelerator.prepare(Objective(world_model, config.training.rollout_steps), optimizer)
-    return Run(config, accelerator, world_model, objective, optimizer, dataset, state)
+    return Run(config, accelerator, world_model, objective, optimizer, dataset, state, calibration)
 
 
 def make_accelerator(config: Config) -> Accelerator:

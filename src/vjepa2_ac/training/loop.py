@@ -7,6 +7,7 @@ step). A run that was killed continues from its newest checkpoint as if nothing 
 from __future__ import annotations
 
 import contextlib
+import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,11 +19,13 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, prediction_errors, ratios_by_horizon
+from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, save_checkpoint
 from vjepa2_ac.training.checkpoint import RunState
 from vjepa2_ac.training.journal import Journal
 from vjepa2_ac.training.run_folder import check_run_folder, open_run_folder
 from vjepa2_ac.training.step import gradients, training_step
+from vjepa2_ac.training.stride import CALIBRATION, with_settled_stride
 
 
 @runtime_checkable
@@ -60,6 +63,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False) -> Pa
     Raises:
         InputError: Something the user gave cannot be used; raised before the first step wherever that can be known.
     """
+    config = with_settled_stride(config)
     check_run_folder(config)
     with _out_of_memory_explained():
         return _train(config, reporter, check_only=check_only)
@@ -67,6 +71,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False) -> Pa
 
 def _train(config: Config, reporter: Reporter, *, check_only: bool) -> Path:
     run = assemble(config, reporter.note)
+    config = run.config
     first = _validate(run, reporter) if run.state.step == 0 else None
     if first is not None:
         _refuse_weak_base(config, first)
@@ -75,6 +80,8 @@ def _train(config: Config, reporter: Reporter, *, check_only: bool) -> Path:
         reporter.note("Everything is in place: data, model, validation and gradients were tried; nothing was written.")
         return Path(config.run_dir)
     folder = open_run_folder(config)
+    if run.calibration is not None:
+        write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
     with Journal(folder, first_step=run.state.step, tensorboard=config.tracking.tensorboard) as journal:
         if first is not None:
             journal.write("validation", 0, validation_figures(first))

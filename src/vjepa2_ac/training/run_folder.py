@@ -1,7 +1,8 @@
 """What does a run's folder hold, and whose is it?
 
-RUN/config.yaml         the resolved config, defaults included
+RUN/config.yaml         the resolved config, defaults and a chosen stride included
 RUN/environment.json    versions, machine and command of every start
+RUN/calibration.json    figures of each stride, where data.stride was auto
 RUN/metrics.jsonl       figures, a row per line
 RUN/checkpoints/        step-XXXXXXXX folders
 RUN/tensorboard/        event files

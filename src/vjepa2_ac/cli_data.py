@@ -1,0 +1,201 @@
+"""What can be asked about data on the command line? check, index, inspect, calibrate."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from vjepa2_ac.errors import InputError
+
+_Commands = argparse._SubParsersAction
+Handler = Callable[[argparse.Namespace], int | None]
+
+
+def add_data(commands: _Commands[argparse.ArgumentParser]) -> None:
+    """Add `data` with its commands to a parser."""
+    text = "Look at a data set before training on it."
+    parser = commands.add_parser("data", help=text, description=text)
+    inner = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_check(inner)
+    _add_index(inner)
+    _add_inspect(inner)
+    _add_calibrate(inner)
+
+
+def count(text: str) -> int:
+    """Read a number of things: a whole number from 1."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 1")
+    return number
+
+
+def _frames(text: str) -> int:
+    number = int(text)
+    if not 2 <= number <= 256:
+        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 2 to 256")
+    return number
+
+
+def _command(
+    commands: _Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=text, description=text)
+    parser.set_defaults(handler=handler)
+    parser.add_argument("config", metavar="CONFIG", help="a YAML config")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as data.camera=wrist_left")
+    return parser
+
+
+def _add_check(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "check", _check,
+        "Open the data, load some clips as training would, and look at every number. Exit status 0: all is well or"
+        " only warnings, 1: training would learn nothing or not begin, 2: something cannot be used.",
+    )  # fmt: skip
+    parser.add_argument("--limit", metavar="N", type=count, default=32, help="clips to load (32)")
+
+
+def _check(options: argparse.Namespace) -> int:
+    from vjepa2_ac.config_file import load_config
+    from vjepa2_ac.console_data import print_finding
+    from vjepa2_ac.data.check import check_data
+
+    config = load_config(options.config, options.overrides)
+    wrong = 0
+    with _progress("reading the index") as progress:
+        findings = check_data(
+            config.data,
+            seed=config.seed,
+            batch_size=config.training.batch_size,
+            clips=options.limit,
+            progress=progress,
+        )
+        for finding in findings:
+            print_finding(finding)
+            wrong += finding.level == "error"
+    return 1 if wrong else 0
+
+
+def _add_index(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "index", _index, "Build the index of a data set, or show the one that is kept on this machine."
+    )
+    parser.add_argument("--rebuild", action="store_true", help="build it again, also where one is kept")
+
+
+def _index(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config_file import load_config
+    from vjepa2_ac.console import console
+    from vjepa2_ac.console_data import index_lines
+    from vjepa2_ac.data.dataset import open_dataset
+    from vjepa2_ac.data.index import watched
+
+    config = load_config(options.config, options.overrides).data
+    started = time.perf_counter()
+    with _progress("reading the index") as progress, watched(rebuild=options.rebuild) as watch:
+        dataset = open_dataset(config, progress=progress)
+    for line in index_lines(dataset.table, watch, time.perf_counter() - started):
+        console.print(line, markup=False)
+
+
+def _add_inspect(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "inspect", _inspect, "Say what is in a data set, and picture it: text, inspect.json, a contact sheet."
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("inspection"), help="where to (inspection)")
+    parser.add_argument(
+        "--episodes", "--limit", metavar="N", type=count, default=100, help="episodes whose motion is looked at (100)"
+    )
+    parser.add_argument("--rows", metavar="N", type=count, default=8, help="episodes on the contact sheet (8)")
+
+
+def _inspect(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config_file import load_config
+    from vjepa2_ac.console import console
+    from vjepa2_ac.console_data import inspection_lines, motion_table
+    from vjepa2_ac.data.check import at_some_stride
+    from vjepa2_ac.data.dataset import open_dataset
+    from vjepa2_ac.data.inspection import RELEASED, inspect_dataset
+    from vjepa2_ac.evaluation.data_picture import picture_data_set
+    from vjepa2_ac.storage import write_atomically
+
+    config = load_config(options.config, options.overrides)
+    _make_folder(options.out)
+    with _progress("reading the index") as progress:
+        dataset = at_some_stride(open_dataset(config.data, progress=progress))
+    if config.data.stride == "auto":
+        console.print(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
+    with _progress("reading states") as progress:
+        inspection = inspect_dataset(dataset, episodes=options.episodes, progress=progress)
+    for line in inspection_lines(inspection):
+        console.print(line, markup=False)
+    console.print(motion_table(inspection))
+    console.print(f"For comparison: {RELEASED}.", markup=False)
+    write_atomically(options.out / "inspect.json", json.dumps(inspection.as_dict(), indent=1).encode())
+    picture = picture_data_set(dataset, inspection, options.out / "contact_sheet.png", rows=options.rows)
+    console.print(f"  {picture}\n  {options.out / 'inspect.json'}", markup=False)
+
+
+def _add_calibrate(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "calibrate", _calibrate,
+        "Let a model say how many control steps its model step is: its error over persistence at each stride.",
+    )  # fmt: skip
+    parser.add_argument("--model", metavar="MODEL", help="another than model.base: a .pt, a folder, or a run")
+    parser.add_argument("--split", choices=["train", "validation", "test"], default="validation", help="(validation)")
+    parser.add_argument("--limit", metavar="N", type=count, default=64, help="clips at each stride (64)")
+    parser.add_argument("--frames", metavar="N", type=_frames, help="of a clip (the config's, 8 at most)")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("inspection"), help="where to (inspection)")
+
+
+def _calibrate(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config_file import load_config
+    from vjepa2_ac.console import console
+    from vjepa2_ac.console_data import calibration_table
+    from vjepa2_ac.storage import write_atomically
+    from vjepa2_ac.training.calibrate import calibrate_config
+
+    config = load_config(options.config, options.overrides)
+    _make_folder(options.out)
+    with _progress("reading the index") as indexing, _progress("measuring clips") as measuring:
+        calibration = calibrate_config(
+            config,
+            model=options.model,
+            split=options.split,
+            clips=options.limit,
+            frames=options.frames,
+            indexing=indexing,
+            measuring=measuring,
+        )
+    console.print(calibration_table(calibration))
+    console.print(calibration.verdict(), markup=False)
+    path = options.out / "calibration.json"
+    write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
+    console.print(f"  {path}", markup=False)
+
+
+@contextlib.contextmanager
+def _progress(title: str) -> Iterator[Callable[[int, int], None]]:
+    """Give a function that shows how far long work is; nothing is shown of work that is done at once."""
+    from vjepa2_ac.console import LateProgress
+
+    bar = LateProgress(title)
+    try:
+        yield bar
+    finally:
+        bar.close()
+
+
+def _make_folder(folder: Path) -> None:
+    """Make the folder for results before anything long is begun."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            where=f"--out {folder}", found=f"cannot be made ({error.strerror})", needed="a folder of yours"
+        ) from None

@@ -1,0 +1,102 @@
+"""How does a data set look in a terminal? The lines and tables of check, index, inspect and calibrate."""
+
+from __future__ import annotations
+
+from rich.markup import escape
+from rich.table import Table
+
+from vjepa2_ac.console import console
+from vjepa2_ac.data.check import Finding
+from vjepa2_ac.data.index import Watch
+from vjepa2_ac.data.inspection import Inspection
+from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.evaluation.calibration import Calibration
+
+_LEVELS = {"ok": "[green]ok[/]     ", "warning": "[yellow]warning[/]", "error": "[red]error[/]  "}
+
+
+def print_finding(finding: Finding) -> None:
+    """Print one line of `data check`."""
+    console.print(f"{_LEVELS[finding.level]}  {escape(f'{finding.about:<16}{finding.text}')}")
+
+
+def index_lines(table: EpisodeTable, watch: Watch, seconds: float) -> list[str]:
+    """Return what `data index` says."""
+    lines = [f"{len(table):,} episodes, {int(table.num_steps.sum()):,} steps; opened in {seconds:.2f} s"]
+    if table.problems:
+        lines.append(f"{len(table.problems):,} broken episodes; the first: {table.problems[0].where}")
+    for path in dict.fromkeys(watch.files):
+        size = f"{path.stat().st_size / 1e6:.2f} MB" if path.is_file() else "could not be kept"
+        lines.append(f"  {path}  {size}")
+    return lines
+
+
+def inspection_lines(inspection: Inspection) -> list[str]:
+    """Return what `data inspect` says before its table."""
+    success = inspection.success_share
+    known = int((inspection.success >= 0).sum())
+    shortest, low, median, high, longest = inspection.length_percentiles
+    gripper, config = inspection.range_of(6), inspection.config
+    limits = [(axis, *inspection.range_of(column)) for column, axis in enumerate("xyz")]
+    places = ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in limits)
+    splits = ", ".join(
+        f"{name} {windows:,} clips in {inspection.episodes_of[name]:,} episodes"
+        for name, windows in inspection.windows_of.items()
+    )
+    removed = ", ".join(
+        f"{one.name} {one.episodes:,} episodes, {one.steps:,} steps"
+        for one in inspection.removed
+        if one.episodes or one.steps
+    )
+    rows = {
+        "data set": f"{config.path} ({config.source})",
+        "episodes": f"{len(inspection.lengths):,} ({inspection.broken:,} broken)",
+        "steps": f"{int(inspection.lengths.sum()):,} at {inspection.control_rate_hz:g} per second:"
+        f" {_lasting(inspection.hours)}",
+        "length": f"{shortest} / {low} / {median} / {high} / {longest} steps (least, 10 %, median, 90 %, most)",
+        "cameras": f"{', '.join(inspection.cameras)}; used: {', '.join(config.cameras)}",
+        "success": "not known" if success is None else f"{success:.1%} of {known:,} episodes of which it is known",
+        "left out": removed or "nothing",
+        "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
+        "sample": f"{len(inspection.sample):,} episodes, for what follows",
+        "standing still": f"{inspection.still_share:.1%} of the steps, by the measured motion",
+        "position": f"{places} m",
+        "gripper": f"{gripper[0]:.2f} to {gripper[1]:.2f} (0 open, 1 closed)",
+    }
+    return [f"{name:<16}{text}" for name, text in rows.items()]
+
+
+def _lasting(hours: float) -> str:
+    return f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
+
+
+def motion_table(inspection: Inspection) -> Table:
+    """Return the percentiles of the motion per model step at several strides."""
+    table = Table(title="Motion per model step: 10 / 50 / 90 / 99 %", title_justify="left")
+    for name in ("stride", "seconds", "moves by (cm)", "turns by (degrees)"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for one in inspection.motions:
+        figures = (one.percentiles("moved_cm"), one.percentiles("turned_deg"))
+        cells = (" / ".join(f"{value:.1f}" for value in values) or "no step fits" for values in figures)
+        table.add_row(str(one.stride), f"{one.seconds:.2f}", *cells)
+    return table
+
+
+def calibration_table(calibration: Calibration) -> Table:
+    """Return the table of `data calibrate`."""
+    table = Table(
+        title=f"One-step error / persistence on {calibration.split} episodes, {calibration.frames} frames a clip"
+        " (95 % interval over episodes)",
+        title_justify="left",
+    )
+    for name in ("stride", "seconds", "error / persistence", "error", "persistence", "moves by", "clips", "episodes"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for one in calibration.tried:
+        mark = " <" if one is calibration.best else ""
+        table.add_row(
+            f"{one.stride}{mark}", f"{one.seconds_per_step:.2f}", str(one.ratio), f"{one.error:.4f}",
+            f"{one.persistence:.4f}", f"{one.moved_cm:.1f} cm", str(one.clips), str(one.episodes),
+        )  # fmt: skip
+    for stride, reason in calibration.impossible.items():
+        table.add_row(str(stride), "", f"not possible: {escape(reason)}")
+    return table

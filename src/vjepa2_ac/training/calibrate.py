@@ -1,0 +1,65 @@
+"""Which stride does a model choose on the data of a config, outside of a run?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.windows import Split
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.calibration import Calibration
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.assembly import make_accelerator
+from vjepa2_ac.training.run_folder import CONFIG
+from vjepa2_ac.training.runs import load_run
+from vjepa2_ac.training.stride import calibrate_model
+
+
+def calibrate_config(
+    config: Config,
+    *,
+    model: str | None = None,
+    split: Split = "validation",
+    clips: int = 64,
+    frames: int | None = None,
+    indexing: Progress | None = None,
+    measuring: Progress | None = None,
+) -> Calibration:
+    """Calibrate the model of a config, or another one, on the config's data.
+
+    Args:
+        config: The data, the model, the device and the precision.
+        model: Another model: what `model.base` takes, or the folder of a run.
+        split: Episodes to measure on.
+        clips: At each stride.
+        frames: Of a clip; None: the config's, but 8 at most.
+        indexing: Told where the data set is looked through.
+        measuring: Told how many clips are measured.
+
+    Raises:
+        InputError: The data or the model cannot be used.
+    """
+    accelerator = make_accelerator(config)
+    dataset = open_dataset(config.data, progress=indexing)
+    world_model = _load(config, model)
+    world_model.to(accelerator.device)
+    return calibrate_model(
+        world_model, dataset, config, accelerator, clips=clips, split=split, frames=frames, progress=measuring
+    )
+
+
+def _load(config: Config, model: str | None) -> WorldModel:
+    if model is not None and (Path(model) / CONFIG).is_file():
+        return load_run(Path(model)).world_model
+    chosen = config.model if model is None else config.model.model_copy(update={"base": model, "random": None})
+    if chosen.base is None:
+        raise InputError(
+            where="model.random",
+            found="a model that has learned nothing",
+            needed="one that can say which stride it was trained at",
+            fix="Name one with --model or model.base, or set data.stride to a number",
+        )
+    return load_base(chosen, seed=config.seed)

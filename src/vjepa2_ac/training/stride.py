@@ -1,0 +1,83 @@
+"""Which stride does a run take where `data.stride` is auto? The one that its model chose before the first step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from accelerate import Accelerator
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.windows import Split
+from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.evaluation.calibration import Calibration, calibrate
+from vjepa2_ac.latents import encode_batch
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.run_folder import CONFIG, read_run_config
+
+CALIBRATION = "calibration.json"
+
+
+def with_settled_stride(config: Config) -> Config:
+    """Return a config whose stride is a number where the run in its folder has chosen one: it is chosen once."""
+    folder = Path(config.run_dir)
+    if config.data.stride != "auto" or not (folder / CONFIG).is_file():
+        return config
+    stride = read_run_config(folder).data.stride
+    return config if stride == "auto" else with_stride(config, stride)
+
+
+def with_stride(config: Config, stride: int) -> Config:
+    """Return the config with a stride that was found out."""
+    return config.model_copy(update={"data": config.data.with_stride(stride)})
+
+
+def choose_stride(
+    world_model: WorldModel, dataset: Dataset, config: Config, accelerator: Accelerator, note: Callable[[str], None]
+) -> Calibration:
+    """Let the model of a run, before it is changed, choose among the candidates on the validation episodes.
+
+    Raises:
+        InputError: As `calibrate`.
+    """
+    note("data.stride is auto: measuring the model at each candidate stride")
+    calibration = calibrate_model(world_model, dataset, config, accelerator, clips=config.validation.clips)
+    for line in calibration.lines():
+        note(line)
+    return calibration
+
+
+def calibrate_model(
+    world_model: WorldModel,
+    dataset: Dataset,
+    config: Config,
+    accelerator: Accelerator,
+    *,
+    clips: int,
+    split: Split = "validation",
+    frames: int | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Calibrate a model that is on the accelerator's device, in the run's precision.
+
+    Raises:
+        InputError: As `calibrate`.
+    """
+    world_model.eval()
+
+    def encode(batch: Batch) -> LatentBatch:
+        return encode_batch(world_model, batch, device=accelerator.device, chunk=config.model.encode_chunk)
+
+    with accelerator.autocast(), torch.no_grad():
+        return calibrate(
+            world_model,
+            encode,
+            dataset,
+            split=split,
+            frames=frames,
+            clips=clips,
+            batch_size=config.validation.batch_size,
+            progress=progress,
+        )
