@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -33,6 +34,10 @@ class MemorySource:
     def infos(self, progress: Progress | None = None) -> EpisodeTable:
         """Return the episodes."""
         del progress
+        return self._table
+
+    @cached_property
+    def _table(self) -> EpisodeTable:
         outcomes = self.success or [None] * len(self.lengths)
         names = self.names or [f"episode {number}" for number in range(len(self.lengths))]
         infos = [EpisodeInfo(*about) for about in zip(names, self.lengths, outcomes, strict=True)]
@@ -41,7 +46,7 @@ class MemorySource:
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
         """Return an episode, and remember it."""
         self.reads.append((index, camera, needed))
-        info = self.infos()[index]
+        info = self._table[index]
         if index in self.unreadable:
             raise self.fault(f"memory: {info.id}")
 
