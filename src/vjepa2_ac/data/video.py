@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from av.container import InputContainer
     from av.packet import Packet
     from av.video.frame import VideoFrame
+    from av.video.reformatter import VideoReformatter
     from av.video.stream import VideoStream
 
 _DEMUXER = "mp4"  # by name: libav would otherwise follow play lists to other files
@@ -98,7 +99,7 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
         return
     local = f"file:{file}" if isinstance(file, (str, Path)) else file
     try:
-        with av.open(local, format=_DEMUXER) as container:
+        with av.open(local, format=_DEMUXER, metadata_errors="replace") as container:
             stream = container.streams.best("video")
             if stream is None:
                 raise InputError(where=where, found="no video in the file", needed="an MP4 with pictures", fix=_FIX)
@@ -106,7 +107,7 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
                 raise _cannot_decode(where)
             stream.codec_context.thread_count = 1
             stream.codec_context.options = _STRICT
-            yield _Video(container, stream, where)
+            yield _Video(container, stream, av.video.reformatter.VideoReformatter(), where)
     except av.FFmpegError as error:
         found = f"cannot be read as a video: {error.strerror}"
         raise InputError(where=where, found=found, needed="a whole, undamaged MP4", fix=_FIX) from None
@@ -118,6 +119,7 @@ class _Video:
 
     container: InputContainer
     stream: VideoStream
+    converter: VideoReformatter  # one for all pictures: making one takes as long as using it
     where: str
 
     @property
@@ -216,7 +218,8 @@ class _Video:
             if frame.is_corrupt:
                 time = f"{target * self._unit_s:.3f} s"
                 raise InputError(where=self.where, found=f"a damaged picture at {time}", needed="a whole MP4", fix=_FIX)
-            wanted.frames[target] = np.asarray(frame.to_ndarray(format="rgb24"))
+            picture = self.converter.reformat(frame, format="rgb24", threads=1)
+            wanted.frames[target] = np.asarray(picture.to_ndarray())
 
     @property
     def _unit_s(self) -> float:
