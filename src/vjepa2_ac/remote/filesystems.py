@@ -41,6 +41,8 @@ def way_in(url: str) -> str:
     """Return what to do where permission is missing, as a sentence."""
     protocol = _protocol(url)
     log_in = f"Log in with `{_LOG_IN[protocol]}`, or check the name" if protocol in _LOG_IN else "Check the login"
+    if protocol == "hf":
+        log_in += ". Or set HF_TOKEN. A gated data set must be asked for on its page first"
     return f"You are not logged in. {log_in}" if protocol == "gs" and google_token() == "anon" else log_in
 
 

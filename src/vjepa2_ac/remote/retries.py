@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
-_NETWORK_LIBRARIES = frozenset({"aiohttp", "requests", "httpx", "httpcore", "urllib3"})
+_NETWORK_LIBRARIES = frozenset({"aiohttp", "requests", "httpx", "httpx2", "httpcore", "httpcore2", "urllib3"})
 _PASSING_STATUS = frozenset({408, 425, 429, *range(500, 600)})
 _NO_ACCESS = frozenset({401, 403, 407})
 _ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
