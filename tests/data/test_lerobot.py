@@ -353,7 +353,7 @@ def test_damaged_descriptions_are_named(spoil: Callable[[Path], None], copy: Pat
 
 
 def test_no_data_set_says_what_a_data_set_is(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"data\.path: no meta/info\.json in .*the folder that holds meta, data"):
+    with pytest.raises(InputError, match=r"data\.path: no meta/info\.json in .*the folder with meta, data"):
         source_of(tmp_path).infos()
 
 

@@ -18,7 +18,7 @@ from vjepa2_ac.data.sources.lerobot_index import check_rows, find_problems, row_
 from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo, read_info
 from vjepa2_ac.data.sources.lerobot_parquet import ParquetRows
 from vjepa2_ac.data.sources.lerobot_pictures import StoredPictures, VideoPictures
-from vjepa2_ac.data.sources.lerobot_ranges import RangedFile
+from vjepa2_ac.data.sources.lerobot_ranges import KeptFile
 from vjepa2_ac.data.sources.lerobot_rows import EpisodeContent, content_of, wanted_columns
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.video import Clock
@@ -116,12 +116,12 @@ class LeRobotSource:
     def _connections(self) -> int:
         return self._config.connections if self._is_far else 1
 
-    def _open(self, path: str) -> str | RangedFile:
+    def _open(self, path: str) -> str | KeptFile:
         """Return what to open for a path: the path itself on this machine, a file of kept blocks far away."""
         if not storage.is_url(path):
             return path
         version = self._table.texts["version"] if "_table" in self.__dict__ else self._version
-        return RangedFile(path, version=version, size=self._size(path), kept=self._kept)
+        return KeptFile(path, version=version, size=self._size(path), kept=self._kept)
 
     def _found_out(self, progress: Progress | None) -> EpisodeTable:
         info, config = self._info, self._config

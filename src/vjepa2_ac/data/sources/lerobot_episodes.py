@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.lerobot_files import filled, list_by_template
@@ -17,6 +17,8 @@ from vjepa2_ac.storage import FileInfo
 
 EPISODES_V21 = "meta/episodes.jsonl"
 EPISODES_V30 = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+
+_T = TypeVar("_T")
 
 _FIX = "Get the files in meta again"
 
@@ -119,8 +121,8 @@ def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[Episode
         if not line.strip():
             continue
         with_line = f"{where}: line {number + 1}"
-        row = _checked(with_line, lambda line=line: json.loads(line))
-        yield _checked(with_line, lambda row=row: _of_line(info, row, videos))
+        row = _checked(with_line, json.loads, line)
+        yield _checked(with_line, _of_line, info, row, videos)
 
 
 def _of_line(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str]) -> EpisodeRow:
@@ -149,7 +151,7 @@ def _rows_of_table(
         raise _damaged(path, f"columns of {sorted(lengths)} rows")
     for number in range(max(lengths, default=0)):
         row = {name: column[number] for name, column in columns.items()}
-        yield _checked(f"{path}: row {number}", lambda row=row: _of_row(row, videos, row.get(outcome)))
+        yield _checked(f"{path}: row {number}", _of_row, row, videos, row.get(outcome))
 
 
 def _of_row(row: Mapping[str, Any], videos: Sequence[str], outcome: object) -> EpisodeRow:
@@ -174,9 +176,9 @@ def _place(row: Mapping[str, Any], name: str) -> VideoPlace:
     return VideoPlace(_count(row[f"{name}/chunk_index"]), _count(row[f"{name}/file_index"]), start, length)
 
 
-def _checked(where: str, read: Callable[[], Any]) -> Any:
+def _checked(where: str, read: Callable[..., _T], *arguments: object) -> _T:
     try:
-        return read()
+        return read(*arguments)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         raise _damaged(where, error) from None
 

@@ -16,6 +16,7 @@ from vjepa2_ac.data.sources.states import zero_steps
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import EpisodeInfo, Progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 
 Check = Callable[[EpisodeRow], "bool | None"]  # reads an episode's rows; whether it succeeded
 
@@ -82,7 +83,7 @@ def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], tex
         raise problems[min(problems)]
     tasks = sorted({"; ".join(row.tasks) for row in usable})
     number = {task: place for place, task in enumerate(tasks)}
-    locators = {
+    locators: dict[str, np.ndarray] = {
         "index": np.array([row.index for row in usable], np.int64),
         "chunk": np.array([row.chunk for row in usable], np.int32),
         "file": np.array([row.file for row in usable], np.int32),
@@ -127,6 +128,8 @@ def _all(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError]) -> list
 def _checked(row: EpisodeRow, check: Check) -> tuple[EpisodeRow, InputError | None]:
     try:
         success = check(row)
+    except UnreachableError:  # says nothing of the episode
+        raise
     except InputError as error:
         return row, error
     return (row if success is None else replace(row, success=success)), None

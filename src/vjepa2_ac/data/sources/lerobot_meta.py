@@ -19,6 +19,7 @@ VERSIONS = ("v2.1", "v3.0")
 
 _STATE_NUMBERS = {"euler_xyz": 7, "quaternion_wxyz": 8, "quaternion_xyzw": 8}
 _FIX = "Get meta/info.json again"
+_WAY_TO_HUB = "Check the name in hf://datasets/owner/name; for a private data set, `hf auth login` or set HF_TOKEN"
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ def read_info(root: str) -> DatasetInfo:
             where="data.path",
             found=f"no {INFO} in {root}",
             needed="a LeRobot data set",
-            fix="Set data.path to the folder that holds meta, data and videos",
+            fix=_WAY_TO_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos",
         ) from None
     try:
         content = dict(json.loads(data))

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Shaped
 
-from vjepa2_ac.data.sources.lerobot_ranges import RangedFile
+from vjepa2_ac.data.sources.lerobot_ranges import KeptFile
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pyarrow import parquet
 
 Columns = Mapping[str, Shaped[np.ndarray, "rows _"]]
-Opener = Callable[[str], "str | RangedFile"]  # a path, or a file far away
+Opener = Callable[[str], "str | KeptFile"]  # a path, or a file far away
 
 EPISODE = "episode_index"
 
@@ -125,7 +125,7 @@ class ParquetRows:
         return group
 
 
-def read_table(opened: str | RangedFile, path: str, wanted: Callable[[str], bool]) -> dict[str, list[Any]]:
+def read_table(opened: str | KeptFile, path: str, wanted: Callable[[str], bool]) -> dict[str, list[Any]]:
     """Return the columns of a small Parquet file whose names are wanted, as lists of Python's own values.
 
     Raises:
@@ -168,7 +168,7 @@ def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
 
 
 @contextmanager
-def _opened(opened: str | RangedFile, path: str) -> Iterator[parquet.ParquetFile]:
+def _opened(opened: str | KeptFile, path: str) -> Iterator[parquet.ParquetFile]:
     """Open a Parquet file with its pages' checksums verified; say in the user's words what is wrong with it."""
     pa, parquet = _library(path)
     try:
@@ -179,7 +179,7 @@ def _opened(opened: str | RangedFile, path: str) -> Iterator[parquet.ParquetFile
     except FileNotFoundError:
         raise InputError(where=path, found="no such file", needed="one, says the data set", fix=_FIX) from None
     except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError) as error:
-        if isinstance(opened, RangedFile) and opened.failure is not None:
+        if isinstance(opened, KeptFile) and opened.failure is not None:
             raise opened.failure from None
         if isinstance(error, OSError) and error.errno is not None:
             raise  # of the operating system, not of the file's content
@@ -217,15 +217,15 @@ def _require_sane(file: parquet.ParquetFile, path: str) -> None:
 def _pictures_in(table: pa.Table, column: str, episode: int, path: str) -> list[bytes]:
     chosen = numbers_in(table.column(EPISODE), f"{path}: {EPISODE}")[:, 0] == episode
     rows = table.column(column).to_pylist()
-    pictures = [row.get("bytes") if isinstance(row, dict) else row for row in rows]
-    wanted = [picture for picture, keep in zip(pictures, chosen, strict=True) if keep]
-    if not all(isinstance(picture, bytes) for picture in wanted):
+    stored = [row.get("bytes") if isinstance(row, dict) else row for row in rows]
+    pictures = [picture for picture, keep in zip(stored, chosen, strict=True) if keep and isinstance(picture, bytes)]
+    if len(pictures) != chosen.sum():
         raise InputError(
             where=f"{path}: {column}",
             found=f"pictures of type {table.column(column).type}, or names of files in their place",
             needed="PNG or JPEG bytes in the column",
         )
-    return wanted
+    return pictures
 
 
 def _no_numbers(where: str, kind: str, gaps: int) -> InputError:

@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac.data import video
 from vjepa2_ac.data.sources.lerobot_parquet import Opener
-from vjepa2_ac.data.sources.lerobot_ranges import RangedFile
+from vjepa2_ac.data.sources.lerobot_ranges import KeptFile
 from vjepa2_ac.errors import InputError
 
 _JPEG = b"\xff\xd8"
@@ -42,7 +42,7 @@ class VideoPictures:
         try:
             return video.read_frames(opened, steps, where=self.where, clock=self.clock)
         except InputError:
-            if isinstance(opened, RangedFile) and opened.failure is not None:
+            if isinstance(opened, KeptFile) and opened.failure is not None:
                 raise opened.failure from None
             raise
 

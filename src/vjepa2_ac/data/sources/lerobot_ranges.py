@@ -2,120 +2,60 @@
 
 from __future__ import annotations
 
-import io
-import os
-import threading
-from collections import OrderedDict
+from itertools import groupby
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.disk_cache import DiskCache
+from vjepa2_ac.remote.ranged_file import RangedFile
 
-_BLOCK_BYTES = 1 << 18
-_MOST_AHEAD = 16  # blocks fetched at once where a file is read from front to back
-_BLOCKS_IN_MEMORY = 32
+_BLOCK_BYTES = 128 << 10
 
 
-class RangedFile(io.RawIOBase):
+class KeptFile(RangedFile):
     """A file behind a URL to read and seek in; each block is fetched once on this machine.
 
-    An error of a fetch stays in `failure`: libraries that read through this object wrap it in one of theirs.
+    The error of a fetch stays in `failure`: libraries that read through this object may wrap it in one of theirs.
 
     Args:
         path: The URL.
         version: Differs when the content does; blocks of another version are not used.
-        size: The file's size, where it is known.
+        size: The file's size.
         kept: Where blocks stay on this machine.
     """
 
-    def __init__(self, path: str, *, version: str, size: int | None, kept: DiskCache) -> None:
-        super().__init__()
+    def __init__(self, path: str, *, version: str, size: int, kept: DiskCache) -> None:
+        super().__init__(self._fetched, size)
         self._path, self._kept = path, kept
-        self._size = storage.file_size(path) if size is None else size
-        self._key = f"{path} {version} {self._size}"
-        self._position = 0
-        self._ahead, self._expected = 1, 0
-        self._blocks: OrderedDict[int, bytes] = OrderedDict()
-        self._lock = threading.Lock()
+        self._bytes, self._key = size, f"{path} {version} {size}"
         self.failure: Exception | None = None
 
-    def readable(self) -> bool:
-        """Return that it can be read."""
-        return True
-
-    def seekable(self) -> bool:
-        """Return that any place can be read."""
-        return True
-
-    def size(self) -> int:
-        """Return how many bytes the file has."""
-        return self._size
-
-    def tell(self) -> int:
-        """Return where the next read starts."""
-        return self._position
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
-        """Go to an offset from the start, from here or from the end."""
-        start = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
-        self._position = max(0, start + offset)
-        return self._position
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """Return the next bytes, all that are left with -1; fewer only at the end.
-
-        Raises:
-            OSError: They cannot be fetched.
-        """
-        end = self._size if size is None or size < 0 else min(self._size, self._position + size)
-        if end <= self._position:
-            return b""
-        first, last = self._position // _BLOCK_BYTES, (end - 1) // _BLOCK_BYTES
+    def _fetched(self, start: int, length: int) -> bytes:
+        first, last = start // _BLOCK_BYTES, (start + length - 1) // _BLOCK_BYTES
         try:
-            with self._lock:
-                data = b"".join(self._fetched(first, last))
+            data = b"".join(self._blocks_of(first, last))
         except Exception as error:
             self.failure = error
             raise
-        offset = self._position - first * _BLOCK_BYTES
-        self._position, length = end, end - self._position
-        return data[offset : offset + length]
+        return data[start - first * _BLOCK_BYTES :][:length]
 
-    def readall(self) -> bytes:
-        """Return all that is left."""
-        return self.read()
+    def _blocks_of(self, first: int, last: int) -> list[bytes]:
+        """Return blocks from the disk; those that lack are fetched, neighbours together."""
+        found = {number: self._at_hand(number) for number in range(first, last + 1)}
+        lacking = [number for number, block in found.items() if block is None]
+        runs = [
+            [number for _, number in run] for _, run in groupby(enumerate(lacking), key=lambda pair: pair[1] - pair[0])
+        ]
+        ranges = [(run[0] * _BLOCK_BYTES, sum(map(self._length_of, run))) for run in runs]
+        for run, data in zip(runs, storage.read_ranges(self._path, ranges), strict=True):
+            for place, number in enumerate(run):
+                block = data[place * _BLOCK_BYTES :][: self._length_of(number)]
+                self._kept.write(f"{self._key} {number}", block)
+                found[number] = block
+        return [block for block in found.values() if block is not None]
 
-    def _fetched(self, first: int, last: int) -> list[bytes]:
-        """Return blocks, from memory, from the disk, and what is left in one read over the network."""
-        found = {number: self._known(number) for number in range(first, last + 1)}
-        if lacking := [number for number, block in found.items() if block is None]:
-            self._ahead = min(2 * self._ahead, _MOST_AHEAD) if lacking[0] == self._expected else 1
-            blocks = (self._size + _BLOCK_BYTES - 1) // _BLOCK_BYTES
-            end = min(max(lacking[-1] + 1, lacking[0] + self._ahead), blocks)
-            found |= self._fetch(lacking[0], end)
-            self._expected = end
-        result = [block for number in range(first, last + 1) if (block := found[number]) is not None]
-        while len(self._blocks) > _BLOCKS_IN_MEMORY:
-            self._blocks.popitem(last=False)
-        return result
-
-    def _known(self, number: int) -> bytes | None:
-        if number in self._blocks:
-            self._blocks.move_to_end(number)
-            return self._blocks[number]
+    def _at_hand(self, number: int) -> bytes | None:
         block = self._kept.read(f"{self._key} {number}")
-        if block is None or len(block) != min(_BLOCK_BYTES, self._size - number * _BLOCK_BYTES):
-            return None
-        self._blocks[number] = block
-        return block
+        return block if block is not None and len(block) == self._length_of(number) else None
 
-    def _fetch(self, first: int, end: int) -> dict[int, bytes]:
-        start = first * _BLOCK_BYTES
-        (data,) = storage.read_ranges(self._path, [(start, min(end * _BLOCK_BYTES, self._size) - start)])
-        blocks = {
-            number: data[number * _BLOCK_BYTES - start : (number + 1) * _BLOCK_BYTES - start]
-            for number in range(first, end)
-        }
-        for number, block in blocks.items():
-            self._kept.write(f"{self._key} {number}", block)
-        self._blocks |= blocks
-        return blocks
+    def _length_of(self, number: int) -> int:
+        return min(_BLOCK_BYTES, self._bytes - number * _BLOCK_BYTES)

@@ -48,6 +48,9 @@ def content_of(rows: Columns, length: int, info: DatasetInfo, fields: LeRobotFie
     """
     _require_rows(rows, length, info.fps, where)
     states = states_of([_column(rows, name, info, where) for name in fields.state], fields, where)
+    for name in (fields.joint_velocity, fields.success):
+        if name is not None and name in info.features and name not in rows:
+            raise missing("data.lerobot", "column", name, where, rows)
     velocities = None
     if fields.joint_velocity is not None and fields.joint_velocity in rows:
         velocities = _column(rows, fields.joint_velocity, info, where).astype(np.float64)
