@@ -48,7 +48,8 @@ class FoundRanges:
         problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, Problem))
         ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
         columns = np.array(ranges, np.int32).reshape(-1, 3)
-        return cls(*(np.ascontiguousarray(column) for column in columns.T), problems, listed)
+        episode, start, end = (np.ascontiguousarray(column) for column in columns.T)
+        return cls(episode, start, end, problems, listed)
 
     def to_bytes(self) -> bytes:
         """Return this as a file's content, with checksums."""
@@ -83,7 +84,11 @@ def find_ranges(
     Raises:
         InputError: The list of ranges cannot be read or is of another data set; or the rule fits no episode.
     """
-    parts = {"found": "idle ranges", "table": _fingerprint(table, config.path), "data": _knobs_that_matter(config)}
+    parts: dict[str, object] = {
+        "found": "idle ranges",
+        "table": _fingerprint(table, config.path),
+        "data": _knobs_that_matter(config),
+    }
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
         return _kept(config, parts | {"list": _version(path)}, lambda: _published(path, table))

@@ -96,7 +96,8 @@ def _loop(run: Run, folder: Path, journal: Journal, reporter: Reporter) -> None:
     for step in range(run.state.step + 1, training.steps + 1):
         started = time.perf_counter()
         figures = training_step(run, batches, step)
-        figures["samples_per_second"] = training.batch_size * training.accumulation / (time.perf_counter() - started)
+        clips = training.batch_size * training.accumulation - figures.get("clips_left_out", 0.0)
+        figures["samples_per_second"] = clips / (time.perf_counter() - started)
         reporter.stepped(step, figures)
         last = step == training.steps
         if step % training.log_every == 0 or last:

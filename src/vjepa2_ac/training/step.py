@@ -100,7 +100,7 @@ def _about_the_data(run: Run, taken: Gradients) -> dict[str, float]:
     data, training = run.config.data, run.config.training
     figures: dict[str, float] = {}
     if data.broken_episodes == "skip":
-        figures["clips_left_out"] = training.accumulation * training.batch_size - taken.clips
+        figures["clips_left_out"] = float(training.accumulation * training.batch_size - taken.clips)
     if is_url(data.path):
         figures["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
     return figures
