@@ -165,10 +165,12 @@ def _strip(page: _Page, strip: Strip, control_rate_hz: float, fastest: float, to
     slot = across / len(strip.frames)
     height, width = strip.frames.shape[1:3]
     shown_width = min(slot - _GAP, _PICTURE * width / height)
+    film = page.axes(left, top, across, _PICTURE)
+    film.set_axis_off()
     for number, frame in enumerate(strip.frames):
-        middle = left + (number + 0.5) * slot
-        axes = page.axes(middle - shown_width / 2, top, shown_width, shown_width * height / width)
-        _picture(axes, frame, strip.seen)
+        start = (number + 0.5) * slot - shown_width / 2
+        _picture(film, frame, strip.seen, (start, start + shown_width, shown_width * height / width, 0.0))
+    film.set(xlim=(0, across), ylim=(_PICTURE, 0), aspect="auto")
     _motion_of(page.axes(left, top + _PICTURE + 0.03, across, _PLOT), strip, control_rate_hz, fastest)
 
 
@@ -180,12 +182,13 @@ def _wrapped(name: str, across: int = 22, down: int = 5) -> str:
     return "\n".join(lines)
 
 
-def _picture(axes: Any, frame: UInt8[np.ndarray, "height width 3"], seen: CropBox) -> None:
+def _picture(
+    axes: Any, frame: UInt8[np.ndarray, "height width 3"], seen: CropBox, extent: tuple[float, float, float, float]
+) -> None:
     shown = (frame * 0.3 + 255 * 0.35).astype(np.uint8)
     part = np.s_[seen.top : seen.top + seen.height, seen.left : seen.left + seen.width]
     shown[part] = frame[part]
-    axes.imshow(shown, aspect="auto", interpolation="nearest" if len(frame) < 100 else "bilinear")
-    axes.set_axis_off()
+    axes.imshow(shown, extent=extent, interpolation="nearest" if len(frame) < 100 else "bilinear")
 
 
 def _motion_of(axes: Any, strip: Strip, control_rate_hz: float, fastest: float) -> None:
