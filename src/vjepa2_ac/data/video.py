@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from jaxtyping import UInt8
@@ -97,20 +97,63 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
         with closing(storage.open_to_read(file)) as opened, _opened(opened, where) as video:
             yield video
         return
-    local = f"file:{file}" if isinstance(file, (str, Path)) else file
+    source = f"file:{file}" if isinstance(file, (str, Path)) else _Quiet(file)
     try:
-        with av.open(local, format=_DEMUXER, metadata_errors="replace") as container:
-            stream = container.streams.best("video")
-            if stream is None:
-                raise InputError(where=where, found="no video in the file", needed="an MP4 with pictures", fix=_FIX)
-            if stream.codec_context is None:
-                raise _cannot_decode(where)
-            stream.codec_context.thread_count = 1
-            stream.codec_context.options = _STRICT
-            yield _Video(container, stream, av.video.reformatter.VideoReformatter(), where)
-    except av.FFmpegError as error:
+        with av.open(source, format=_DEMUXER, metadata_errors="replace") as container:
+            yield _video_of(container, av.video.reformatter.VideoReformatter(), where)
+    except (av.FFmpegError, InputError) as error:
+        if isinstance(source, _Quiet) and source.error is not None:
+            raise source.error from None
+        if isinstance(error, InputError):
+            raise
         found = f"cannot be read as a video: {error.strerror}"
         raise InputError(where=where, found=found, needed="a whole, undamaged MP4", fix=_FIX) from None
+    if isinstance(source, _Quiet) and source.error is not None:
+        raise source.error
+
+
+def _video_of(container: InputContainer, converter: VideoReformatter, where: str) -> _Video:
+    stream = container.streams.best("video")
+    if stream is None:
+        raise InputError(where=where, found="no video in the file", needed="an MP4 with pictures", fix=_FIX)
+    if stream.codec_context is None:
+        raise InputError(
+            where=where,
+            found="a video of a codec that this build of PyAV cannot decode",
+            needed="H.264, H.265 or AV1",
+            fix="Install PyAV from PyPI, or convert the video",
+        )
+    stream.codec_context.thread_count = 1
+    stream.codec_context.options = _STRICT
+    return _Video(container, cast("VideoStream", stream), converter, where)
+
+
+class _Quiet:
+    """A file for libav that seems to end where reading fails: PyAV would print the error, and take it for damage."""
+
+    def __init__(self, file: Any) -> None:
+        self._file = file
+        self.error: Exception | None = None
+
+    def read(self, size: int) -> bytes:
+        """Return the next bytes, none after a failure."""
+        if self.error is None:
+            try:
+                return bytes(self._file.read(size))
+            except Exception as error:  # whatever it is, it is raised once libav has let go
+                self.error = error
+        return b""
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        """Go to an offset; what a damaged file has of these may be refused."""
+        try:
+            return int(self._file.seek(offset, whence))
+        except (OSError, ValueError):
+            return -1
+
+    def tell(self) -> int:
+        """Return the offset of the next byte."""
+        return int(self._file.tell())
 
 
 @dataclass(frozen=True)
@@ -271,12 +314,3 @@ def _library(where: str) -> Any:
             fix='pip install -c constraints.txt -e ".[video]"',
         ) from None
     return av
-
-
-def _cannot_decode(where: str) -> InputError:
-    return InputError(
-        where=where,
-        found="a video of a codec that this build of PyAV cannot decode",
-        needed="H.264, H.265 or AV1",
-        fix="Install PyAV from PyPI, or convert the video",
-    )

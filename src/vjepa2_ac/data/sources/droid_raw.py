@@ -13,7 +13,7 @@ from jaxtyping import Int, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.broken import UnreachableError, as_error
+from vjepa2_ac.data.broken import as_error
 from vjepa2_ac.data.index import kept_or_built, key_of
 from vjepa2_ac.data.sources.droid_folders import (
     TRAJECTORY,
@@ -34,6 +34,7 @@ from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.data.video import count_frames, read_frames
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
@@ -184,7 +185,8 @@ class RawDroidSource:
             path = self._path(place, f"{VIDEOS}/{serial}.mp4")
             if not any(video.name == f"{serial}.mp4" for video in listed.videos):
                 there = ", ".join(video.name for video in listed.videos) or "none"
-                raise InputError(where=path, found="no such file", needed=f"an MP4; there are {there}", fix=_FIX)
+                needed = f"the MP4 that {place.metadata} or data.camera names; there are {there}"
+                raise InputError(where=path, found="no such file", needed=needed, fix=_FIX)
             counts.append(count_frames(path, where=path))
         return min(counts)
 

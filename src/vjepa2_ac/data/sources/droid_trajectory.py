@@ -66,7 +66,7 @@ def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], picture
     if abs(steps - pictures) > 1:
         raise InputError(
             where=where,
-            found=f"{steps} steps, but {pictures} pictures in the MP4",
+            found=f"{steps} steps, but {pictures} pictures in {' or '.join(f'{serial}.mp4' for serial in serials)}",
             needed="a picture for every step; the last one may be missing",
             fix=_FIX,
         )

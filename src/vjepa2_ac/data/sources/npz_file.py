@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -145,7 +146,9 @@ class NpzFile:
     def _damage_is_named(self, name: str = "") -> Iterator[None]:
         try:
             yield
-        except _DAMAGE as error:
+        except (*_DAMAGE, OSError) as error:
+            if isinstance(error, OSError) and error.errno != errno.EINVAL:  # EINVAL: sent to a place before the start
+                raise
             place = f"{self._where}: {name}" if name else self._where
             found = f"cannot be read ({str(error)[:200] or type(error).__name__})"
             raise InputError(where=place, found=found, needed="an undamaged .npz file", fix=_FIX) from None
