@@ -1,0 +1,101 @@
+"""One trajectory in every form gives the same clips in the same order."""
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_sets import STATE, Recorded, write_v21, write_v30
+from recordings import write_raw_droid
+from synthetic import draw_frame, synthetic_episode
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import training_loader
+from vjepa2_ac.data.sources.rlds_writer import write_droid_rlds
+from vjepa2_ac.episode import Batch
+
+LENGTHS = (14, 17, 15, 12)
+SIZE = (36, 64)
+FORMS = ("rlds", "droid_raw", "lerobot_v3.0", "lerobot_v2.1", "npz")
+COMMANDS = {
+    "rule": "commands", "velocity_change_rad_s": 0.004, "shortest_idle_steps": 1, "shortest_kept_steps": 3,
+    "cut_last_steps": 0,
+}  # fmt: skip
+MOTION = {
+    "rule": "motion", "translation_m": 0.02, "rotation_rad": 0.03, "gripper": 0.03, "shortest_idle_steps": 2,
+    "shortest_kept_steps": 3, "cut_last_steps": 1,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def forms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the same four episodes in every form; their identities differ, but not their order."""
+    root = tmp_path_factory.mktemp("forms")
+    drawn = [synthetic_episode(number, steps=steps, size=SIZE) for number, steps in enumerate(LENGTHS)]
+    write_droid_rlds(root / "rlds" / "1.0.0", drawn, shards=2)
+    recorded = []
+    for number, episode in enumerate(drawn):
+        measured = episode.observation
+        states = np.concatenate([measured.cartesian_position, measured.gripper_position], axis=1).astype(np.float32)
+        velocities = np.asarray(episode.action_dict.joint_velocity, np.float32)
+        frames = [draw_frame(state, size=SIZE) for state in states]
+        recorded.append(
+            Recorded(
+                {STATE[0]: states[:, :6], STATE[1]: states[:, 6:], "action.joint_velocity": velocities},
+                {"observation.images.exterior_1_left": frames},
+            )
+        )
+        write_raw_droid(
+            root / f"droid_raw/LAB/success/2023-07-07/Fri_Jul__7_09:4{number}:00_2023",
+            states.astype(np.float64), pictures={"23404442": frames}, joint_velocities=velocities, gop=4,
+        )  # fmt: skip
+        (root / "npz").mkdir(exist_ok=True)
+        np.savez(root / f"npz/{number}.npz", states=states, frames=np.stack(frames), fps_hz=15.0)
+    write_v30(root / "lerobot_v3.0", recorded)
+    write_v21(root / "lerobot_v2.1", recorded)
+    return root
+
+
+def opened(forms: Path, form: str, **knobs: Any) -> Dataset:
+    chosen = {"frames": 3, "stride": 2, "workers": 0, "validation_share": 0.0, "test_share": 0.0} | knobs
+    path = forms / form / ("1.0.0" if form == "rlds" else "")
+    return open_dataset(DataConfig(source=form.split("_v", maxsplit=1)[0], path=str(path), **chosen))
+
+
+def clips(dataset: Dataset, count: int) -> tuple[list[tuple[int, int]], list[Batch]]:
+    """Return (episode, start) of the first clips, episodes by their place in alphabetical order, and the batches."""
+    batches = list(itertools.islice(training_loader(dataset, seed=5, batch_size=3), count))
+    ranks = {info.id: int(rank) for info, rank in zip(dataset.table, dataset.table.id_rank, strict=True)}
+    return [(ranks[n], s) for b in batches for n, s in zip(b.episode_ids, b.starts, strict=True)], batches
+
+
+@pytest.mark.parametrize("form", FORMS[1:])
+def test_every_form_gives_the_same_clips_in_the_same_order(forms: Path, form: str) -> None:
+    expected_order, expected = clips(opened(forms, "rlds"), 16)
+    order, found = clips(opened(forms, form), 16)
+    assert order == expected_order
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.states, other.states)
+        np.testing.assert_array_equal(one.actions, other.actions)
+        assert one.frames.shape == other.frames.shape
+        assert abs(one.frames.int() - other.frames.int()).float().mean() < 8, "more than a codec loses"
+
+
+@pytest.mark.parametrize("form", FORMS[1:])
+def test_every_form_moves_and_rests_at_the_same_steps(forms: Path, form: str) -> None:
+    rules = [MOTION] if form == "npz" else [MOTION, COMMANDS]  # .npz has no commanded velocities
+    for rule in rules:
+        expected, found = opened(forms, "rlds", idle=rule), opened(forms, form, idle=rule)
+        assert 0 < expected.kept.steps < sum(LENGTHS)
+        by_rank = [
+            [dataset.kept.of(episode) for episode in np.argsort(dataset.table.id_rank).tolist()]
+            for dataset in (expected, found)
+        ]
+        assert by_rank[0] == by_rank[1]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_tells_its_control_rate(forms: Path, form: str) -> None:
+    assert opened(forms, form).control_rate_hz == 15.0
