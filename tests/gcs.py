@@ -19,6 +19,11 @@ LOOPBACK = "127.0.0.1"
 
 Failure = int | str
 
+_NOTHING = (
+    b"--B\r\nContent-Type: application/json\r\n\r\n{}\r\n"
+    b"--B\r\nContent-Type: application/octet-stream\r\n\r\n\r\n--B--\r\n"
+)
+
 
 @dataclass(frozen=True)
 class Request:
@@ -49,7 +54,7 @@ class Gcs:
     """
 
     def __init__(self, emulator: Server, port: int) -> None:
-        self._emulator, self._port, self._lock = emulator, port, threading.Lock()
+        self._emulator, self._port, self._lock = emulator, port, threading.Condition()
         self._faults: list[_Fault] = []
         self._in_flight = 0
         self.url = ""
@@ -69,8 +74,12 @@ class Gcs:
         bucket, _, name = place.partition("/")
         if self._post("/storage/v1/b", json.dumps({"name": bucket}).encode(), "application/json") not in {200, 409}:
             raise RuntimeError(f"no bucket {bucket}")
-        address = f"/upload/storage/v1/b/{bucket}/o?uploadType=media&name={quote(name, safe='')}"
-        if self._post(address, data, "application/octet-stream") != 200:
+        address = f"/upload/storage/v1/b/{bucket}/o?name={quote(name, safe='')}&uploadType="
+        if data:
+            status = self._post(f"{address}media", data, "application/octet-stream")
+        else:  # the emulator takes an empty object only so
+            status = self._post(f"{address}multipart", _NOTHING, "multipart/related; boundary=B")
+        if status != 200:
             raise RuntimeError(f"no object {place}")
         return f"gs://{place}"
 
@@ -108,7 +117,9 @@ class Gcs:
             self.latency_s, self.most_in_flight = 0.0, 0
 
     def wipe(self) -> None:
-        """Forget everything."""
+        """Forget everything, also what a client gave up waiting for."""
+        with self._lock:
+            self._lock.wait_for(lambda: self._in_flight == 0, timeout=5)
         self.forget()
         self._emulator.wipe()
 
@@ -116,6 +127,12 @@ class Gcs:
         with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=10)) as connection:
             connection.request("POST", address, data, {"Content-Type": kind})
             return connection.getresponse().status
+
+    def _count(self, change: int) -> None:
+        with self._lock:
+            self._in_flight += change
+            self.most_in_flight = max(self.most_in_flight, self._in_flight)
+            self._lock.notify_all()
 
     def _failure_of(self, target: str) -> Failure | None:
         with self._lock:
@@ -164,36 +181,37 @@ class _Proxy:
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Answer the requests of one connection."""
         with suppress(ConnectionError, asyncio.IncompleteReadError, asyncio.CancelledError):
-            while await self._answer(*await _read_message(reader), writer):
+            while await self._answer(*await _read_message(reader), reader, writer):
                 pass
         writer.close()
 
-    async def _answer(self, head: bytes, body: bytes, writer: asyncio.StreamWriter) -> bool:
+    async def _answer(
+        self, head: bytes, body: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> bool:
         """Answer one request; return whether the connection stays."""
         gcs = self._gcs
         method, address, _ = head.split(b"\r\n", 1)[0].decode().split(" ")
         target = f"{method} {unquote(address)}"
-        gcs._in_flight += 1
-        gcs.most_in_flight = max(gcs.most_in_flight, gcs._in_flight)
+        gcs._count(1)
         try:
             if gcs.latency_s:
                 await asyncio.sleep(gcs.latency_s)
             failure = gcs._failure_of(target)
+            if failure == "hang":
+                await reader.read()
             status, answer, sent = await self._result(failure, head, body)
             gcs.requests.append(Request(target, _object_of(address), _start_of(head), status, sent))
         finally:
-            gcs._in_flight -= 1
+            gcs._count(-1)
         writer.write(answer)
         await writer.drain()
-        if failure in {"reset", "cut"}:
-            writer.transport.abort() if failure == "reset" else writer.close()
-        return failure not in {"reset", "cut"}
+        if failure == "reset":
+            writer.transport.abort()
+        return failure not in {"reset", "cut", "hang"}
 
     async def _result(self, failure: Failure | None, head: bytes, body: bytes) -> tuple[int, bytes, int]:
         """Return status, all bytes to send, and how many of them are body."""
-        if failure == "hang":
-            await asyncio.Event().wait()
-        if failure == "reset":
+        if failure in {"reset", "hang"}:
             return 0, b"", 0
         if isinstance(failure, int):
             message = json.dumps({"error": {"code": failure, "message": "made to fail by a test"}}).encode()

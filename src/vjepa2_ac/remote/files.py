@@ -14,7 +14,7 @@ from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
 from vjepa2_ac.remote import retries
-from vjepa2_ac.remote.filesystems import GOOGLE, ask, is_asynchronous, way_in
+from vjepa2_ac.remote.filesystems import GOOGLE, ask, is_asynchronous, size_of, way_in
 from vjepa2_ac.remote.ranged_file import RangedFile
 from vjepa2_ac.remote.retries import UnreachableError
 
@@ -54,7 +54,7 @@ def file_size(url: str) -> int:
         FileNotFoundError: There is no such file.
         UnreachableError: It cannot be reached.
     """
-    return int(_call(url, "info")["size"])
+    return _persist(url, lambda timeout_s: size_of(url, timeout_s))
 
 
 def list_folder(url: str) -> list[Entry]:
@@ -157,8 +157,7 @@ def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
     _fetched.add(len(data))
     if len(data) == length:
         return data
-    size = int(ask(url, "info", timeout_s)["size"])
-    there = max(0, min(start + length, size) - start)
+    there = max(0, min(start + length, size_of(url, timeout_s)) - start)
     if len(data) != there:
         raise ConnectionError(f"{len(data)} of {there} bytes at {start}")
     return data

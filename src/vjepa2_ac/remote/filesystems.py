@@ -32,6 +32,16 @@ def ask(url: str, method: str, timeout_s: float, **arguments: Any) -> Any:
     return sync(filesystem.loop, getattr(filesystem, f"_{method}"), path, timeout=timeout_s, **arguments)
 
 
+def size_of(url: str, timeout_s: float) -> int:
+    """Ask for the size of a file, once; of Google without looking, too, whether it is a folder.
+
+    Raises:
+        Exception: Whatever the library raises.
+    """
+    method = "get_object" if hasattr(_filesystem(url), "_get_object") else "info"
+    return int(ask(url, method, timeout_s)["size"])
+
+
 def is_asynchronous(url: str) -> bool:
     """Return whether the URL's file system reads ranges as they are asked for, and can be cut off."""
     return bool(_filesystem(url).async_impl)

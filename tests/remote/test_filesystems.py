@@ -1,0 +1,48 @@
+"""Google is asked as the user where there is a login, and anonymously where there is none."""
+
+from pathlib import Path
+
+import pytest
+
+from vjepa2_ac.remote import filesystems
+
+
+@pytest.fixture(autouse=True)
+def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A machine without any login."""
+    for name in ("STORAGE_EMULATOR_HOST", "GOOGLE_APPLICATION_CREDENTIALS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("CLOUDSDK_CONFIG", str(tmp_path))
+    monkeypatch.setattr(filesystems, "_MACHINE", tmp_path / "product_name")
+
+
+def test_without_a_login_google_is_asked_anonymously() -> None:
+    assert filesystems.google_token() == "anon"
+    assert filesystems.way_in("gs://a/b").startswith("You are not logged in. Log in with `gcloud auth application-de")
+
+
+def test_a_default_login_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "application_default_credentials.json").write_text("{}")
+    assert filesystems.google_token() == "google_default"
+    assert filesystems.way_in("gcs://a/b").startswith("Log in with `gcloud")
+    (tmp_path / "application_default_credentials.json").unlink()
+    monkeypatch.setenv("GOOGLE_APPLICATION_CREDENTIALS", "key.json")
+    assert filesystems.google_token() == "google_default"
+
+
+def test_a_machine_of_google_asks_as_itself(tmp_path: Path) -> None:
+    (tmp_path / "product_name").write_text("Google Compute Engine\n")
+    assert filesystems.google_token() == "cloud"
+    (tmp_path / "product_name").write_text("Some other machine\n")
+    assert filesystems.google_token() == "anon"
+
+
+def test_an_emulator_is_shown_no_login(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("GOOGLE_APPLICATION_CREDENTIALS", "key.json")
+    monkeypatch.setenv("STORAGE_EMULATOR_HOST", "http://127.0.0.1:1")
+    assert filesystems.google_token() == "anon"
+
+
+def test_the_way_in_is_that_of_the_place() -> None:
+    assert "hf auth login" in filesystems.way_in("hf://datasets/owner/name")
+    assert filesystems.way_in("https://host/file") == "Check the login"

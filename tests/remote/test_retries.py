@@ -1,0 +1,72 @@
+"""Waits grow, are not the same twice, and end."""
+
+import pytest
+
+from vjepa2_ac.remote import UnreachableError, retries
+from vjepa2_ac.remote.retries import RetryPolicy, persist
+
+AT_ONCE = RetryPolicy(attempts=3, first_wait_s=0.0, longest_wait_s=0.0)
+
+
+def test_waits_double_to_the_longest_and_half_of_each_is_chance() -> None:
+    policy = RetryPolicy(first_wait_s=1.0, longest_wait_s=8.0)
+    for failures, longest in ((1, 1.0), (2, 2.0), (4, 8.0), (5, 8.0), (60, 8.0)):
+        waits = [policy.wait_s(failures) for _ in range(50)]
+        assert longest / 2 <= min(waits) < max(waits) <= longest
+
+
+def test_a_run_that_cannot_reach_anything_gives_up_within_minutes() -> None:
+    policy = retries.DEFAULT
+    waits = sum(min(policy.first_wait_s * 2**number, policy.longest_wait_s) for number in range(policy.attempts - 1))
+    assert waits <= 60
+    assert policy.attempts * policy.timeout_s + waits <= 300
+
+
+def test_a_policy_that_never_tries_is_a_mistake() -> None:
+    with pytest.raises(ValueError, match="never tries"):
+        RetryPolicy(attempts=0)
+
+
+@pytest.mark.parametrize("error", [TypeError("ours"), KeyError("ours"), AssertionError("ours")])
+def test_a_mistake_of_ours_is_neither_tried_again_nor_blamed_on_the_network(error: Exception) -> None:
+    calls = []
+
+    def action(timeout_s: float) -> None:
+        calls.append(timeout_s)
+        raise error
+
+    with pytest.raises(type(error), match="ours"):
+        persist("gs://a", action, policy=AT_ONCE, access="")
+    assert calls == [AT_ONCE.timeout_s]
+
+
+class StatusError(Exception):
+    def __init__(self, status: int) -> None:
+        super().__init__("as another library says it")
+        self.response = type("Response", (), {"status_code": status})()
+
+
+@pytest.mark.parametrize(
+    ("error", "attempts", "words"),
+    [
+        (ConnectionResetError("gone"), 3, "not reached in 3 attempts"),
+        (TimeoutError(), 3, "the last: time-out"),
+        (StatusError(503), 3, "HTTP 503: as another library says it"),
+        (StatusError(403), 1, r"no permission \(HTTP 403"),
+        (PermissionError("not yours"), 1, "no permission.*Log in so"),
+        (OSError("Forbidden: https://somewhere\nno"), 1, r"no permission \(HTTP 403: Forbidden.*Log in so"),
+        (ValueError("Bad Request"), 1, "cannot be read.*Bad Request.*Check the address"),
+    ],
+)
+def test_errors_of_any_library_are_told_apart(error: Exception, attempts: int, words: str) -> None:
+    calls = []
+
+    def action(timeout_s: float) -> None:
+        calls.append(timeout_s)
+        raise error
+
+    with pytest.raises(UnreachableError, match=words) as caught:
+        persist("gs://a", action, policy=AT_ONCE, access="Log in so")
+    assert len(calls) == attempts
+    assert caught.value.__cause__ is error
+    assert "\n" not in str(caught.value)
