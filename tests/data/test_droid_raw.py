@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 import simplejpeg
 
+from gcs import Gcs
 from recordings import write_mp4, write_raw_droid
 from synthetic import draw_frame, synthetic_episode, synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.droid_raw import RawDroidSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.remote import UnreachableError
 
 STEPS, SIZE = 24, (72, 128)
 LEFT, RIGHT, WRIST = "23404442", "29838012", "16787047"
@@ -235,3 +237,23 @@ def test_a_video_that_was_cut_after_indexing_is_named(tmp_path: Path) -> None:
     cut(MP4, 0.4)(tmp_path / PLACE)
     with pytest.raises(InputError, match=f"{LEFT}.mp4"):
         raw.read(0).read_frames([3])
+
+
+def test_a_tree_in_the_cloud_reads_as_here(tree: Path, gcs: Gcs, tmp_path: Path) -> None:
+    url, here = gcs.upload(tree, "bucket/droid_raw/1.0.1"), source(tree)
+    raw = source(url, disk_cache={"dir": str(tmp_path)})
+    assert list(raw.infos()) == list(here.infos())
+    episode, same = raw.read(1), here.read(1)
+    np.testing.assert_array_equal(episode.states, same.states)
+    np.testing.assert_array_equal(episode.read_frames([3, 20]), same.read_frames([3, 20]))
+    gcs.forget()
+    again = source(url, disk_cache={"dir": str(tmp_path)}).read(1)
+    np.testing.assert_array_equal(again.read_frames([7]), same.read_frames([7]))
+    assert gcs.reads() == []  # all of it is kept
+
+
+def test_a_network_that_is_down_is_not_a_broken_episode(tree: Path, gcs: Gcs, tmp_path: Path) -> None:
+    url = gcs.upload(tree, "bucket/droid_raw")
+    gcs.fail_next(503, times=99, match="trajectory.h5|mp4")
+    with pytest.raises(UnreachableError):
+        source(url, disk_cache={"dir": str(tmp_path)}).infos()

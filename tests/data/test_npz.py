@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gcs import Gcs
 from synthetic import draw_frame, synthetic_episode, synthetic_states
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
@@ -188,3 +189,12 @@ def test_an_episode_that_cannot_be_used_is_a_named_problem(tmp_path: Path, damag
 def test_a_folder_without_episodes_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no \.npz files"):
         source(tmp_path).infos()
+
+
+def test_a_folder_in_the_cloud_reads_as_here(tmp_path: Path, gcs: Gcs) -> None:
+    for name in ("one", "two"):
+        write(tmp_path / f"{name}.npz")
+    plain = source(gcs.upload(tmp_path, "bucket/own"))
+    assert [info.id for info in plain.infos()] == ["one", "two"]
+    np.testing.assert_array_equal(plain.read(1).states, STATES)
+    np.testing.assert_array_equal(plain.read(1).read_frames([3, 2]), FRAMES[[3, 2]])
