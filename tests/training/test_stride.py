@@ -1,0 +1,55 @@
+"""A stride that is auto is chosen once, by the base model, and belongs to the run from then on."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.run_folder import read_run_config
+
+Make = Callable[..., Config]
+
+
+def test_a_run_chooses_keeps_and_never_chooses_again(
+    make_config: Make, reporter: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = make_config(data__stride="auto", data__stride_candidates=[2, 3], training__steps=2)
+    folder = train(config, reporter)
+    chosen = json.loads((folder / "calibration.json").read_text())["stride"]
+    assert chosen in {2, 3}
+    assert read_run_config(folder).data.stride == chosen
+    assert any("Best: stride" in note for note in reporter.notes)
+
+    monkeypatch.setattr("vjepa2_ac.training.assembly.choose_stride", lambda *_: pytest.fail("chosen again"))
+    more = type(reporter)()
+    train(config, more)  # the same config, auto still
+    assert not [note for note in more.notes if "Best: stride" in note]
+
+
+def test_the_run_equals_one_that_was_told_the_stride(make_config: Make, reporter: Any, tmp_path: Path) -> None:
+    same: dict[str, Any] = {"data__stride_candidates": [2], "training__steps": 2}
+    chosen = train(make_config(run_dir=str(tmp_path / "a"), data__stride="auto", **same), reporter)
+    told = train(make_config(run_dir=str(tmp_path / "b"), data__stride=2, **same), reporter)
+    losses = [
+        [json.loads(line).get("loss") for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        for folder in (chosen, told)
+    ]
+    assert losses[0] == losses[1]
+
+
+def test_a_check_only_run_writes_no_choice(make_config: Make, reporter: Any) -> None:
+    config = make_config(data__stride="auto", data__stride_candidates=[2, 3])
+    folder = train(config, reporter, check_only=True)
+    assert not folder.exists()
+
+
+def test_another_number_than_the_chosen_one_is_another_config(make_config: Make, reporter: Any) -> None:
+    config = make_config(data__stride="auto", data__stride_candidates=[2], training__steps=2)
+    train(config, reporter)
+    with pytest.raises(InputError, match=r"data\.stride"):
+        train(make_config(data__stride=3, data__stride_candidates=[2], training__steps=2), reporter)
