@@ -44,7 +44,7 @@ def contents(source: RldsSource) -> Contents:
             frames = episode.read_frames(range(info.num_steps))
             velocities = episode.joint_velocities
             assert velocities is not None
-            found[info.id] = (info, episode.states, velocities, frames, episode.metadata["language"])
+            found[info.id] = (info, episode.states, velocities, frames, dict(episode.metadata))
         except InputError as error:
             found[info.id] = (error,)
     return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from typing import Any
 
 from vjepa2_ac import storage
@@ -183,9 +183,10 @@ class RldsSource:
             return make(shards, fields, self._features(), threads=config.connections, progress=progress)
 
         folder = cache_folder(config.disk_cache)
+        table = kept_or_built(config.disk_cache, key, build)
         return _Opened(
             shards,
-            kept_or_built(config.disk_cache, key, build),
+            replace(table, texts={"control_rate_hz": str(fields.control_rate_hz)}),
             Verified(folder / "index" / f"{key}.checked"),
             RemoteCache.at(folder, key, config.disk_cache.limit_gb),
         )

@@ -19,6 +19,7 @@ from vjepa2_ac.data.sources.tfrecord import HEADER_BYTES, RecordSpan, require_in
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import EpisodeInfo, Progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
@@ -65,29 +66,35 @@ def scan_shard(read: Read, shard: Shard, examine: Examine) -> Iterator[Found]:
     """Yield what is found of each record that a shard must hold; after damage that hides the others, a problem each."""
     offset = 0
     for number in range(shard.episodes):
+        if offset == shard.size:
+            yield from _missing(shard, number, f"the file ends after {number} records")
+            return
         try:
             span = span_at(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
+        except UnreachableError:
+            raise  # says nothing of the record
         except InputError as error:
             yield problem_of(error, _place(shard, number))
-            for hidden in range(number + 1, shard.episodes):
-                yield Problem(
-                    name=_place(shard, hidden),
-                    where=f"{shard.path}: record {hidden}",
-                    found=f"cannot be found behind the damage at byte {offset}",
-                    needed=f"{shard.episodes} records, says dataset_info.json",
-                    fix="Download the file again",
-                )
+            yield from _missing(shard, number + 1, f"cannot be found behind the damage at byte {offset}")
             return
         yield examine(read, span)
         offset = span.end
     if offset != shard.size:
-        yield Problem(
-            name=_place(shard, shard.episodes),
-            where=shard.path,
-            found=f"{shard.size - offset:,} bytes after the last record",
-            needed=f"{shard.episodes} records, says dataset_info.json",
-            fix="Download the file again",
-        )
+        yield _promise_broken(shard, shard.episodes, f"{shard.size - offset:,} bytes after the last record")
+
+
+def _missing(shard: Shard, first: int, found: str) -> Iterator[Problem]:
+    return (_promise_broken(shard, number, found) for number in range(first, shard.episodes))
+
+
+def _promise_broken(shard: Shard, number: int, found: str) -> Problem:
+    return Problem(
+        name=_place(shard, number),
+        where=f"{shard.path}: record {number}",
+        found=found,
+        needed=f"{shard.episodes} records, says dataset_info.json",
+        fix="Download the file again",
+    )
 
 
 def in_parallel(
