@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
@@ -23,15 +25,9 @@ _DEFLATE_LIMIT = 1040  # DEFLATE shortens a thousandfold at most: what claims mo
 _CHUNK_BYTES = 1 << 20
 _FIX = "Write the file again, with numpy.savez"
 _DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    ValueError,
-    EOFError,
-    KeyError,
-    NotImplementedError,
-    RuntimeError,
-    SyntaxError,
-)
+    zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError, SyntaxError, EOFError, KeyError, ValueError,
+    TypeError, OverflowError, MemoryError, NotImplementedError, RuntimeError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
