@@ -167,6 +167,17 @@ def test_the_episodes_are_looked_through_once(open_with: Any) -> None:
     assert len(third.reads) == 3, "another rule is another pass"
 
 
+def test_a_data_set_that_changed_is_looked_through_anew(tmp_path: Path) -> None:
+    def kept(rests: list[tuple[int, int]]) -> object:
+        states = resting(60, rests).astype(np.float32)
+        (tmp_path / "kitchen").mkdir(exist_ok=True)
+        np.savez(tmp_path / "kitchen/one.npz", states=states, frames=np.zeros((60, 8, 8, 3), np.uint8), fps_hz=15.0)
+        return open_dataset(DataConfig(source="npz", path=str(tmp_path), idle=MOTION, frames=3)).kept.of(0)
+
+    assert kept([(20, 35)]) == ((0, 10), (35, 50))
+    assert kept([(22, 37)]) == ((0, 12), (37, 50)), "another file of the same size and length"
+
+
 def test_a_share_of_idle_windows_stays_the_same_ones_each_time(open_with: Any) -> None:
     def some(share: float) -> set[tuple[int, int]]:
         return starts(open_with(restful([400] * 12), idle=MOTION.model_copy(update={"keep_share": share})))

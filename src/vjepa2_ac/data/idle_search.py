@@ -86,7 +86,7 @@ def find_ranges(
     """
     parts: dict[str, object] = {
         "found": "idle ranges",
-        "table": _fingerprint(table, config.path),
+        "table": _fingerprint(table),
         "data": _knobs_that_matter(config),
     }
     if config.idle.rule == "published":
@@ -189,15 +189,15 @@ def _checked(ranges: object, name: str, steps: int, path: str) -> list[tuple[int
     return pairs
 
 
-def _fingerprint(table: EpisodeTable, path: str) -> str:
-    """Name everything that the source found out, down to the place of each episode, and the files as they are now."""
-    digest = hashlib.sha256(json.dumps([vars(problem) for problem in table.problems]).encode())
+def _fingerprint(table: EpisodeTable) -> str:
+    """Name everything that the episodes depend on: the key of their index, or where none is kept, what is known."""
+    if "index" in table.texts:
+        return table.texts["index"]
+    digest = hashlib.sha256(json.dumps(dict(table.texts)).encode())
     columns = {name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)}
     for name, column in sorted({**columns, **table.locators}.items()):
         digest.update(name.encode())
         digest.update(np.ascontiguousarray(column).data)
-    files = [(file.name, file.size, file.version) for file in storage.list_files(path)]
-    digest.update(json.dumps([dict(table.texts), files]).encode())
     return digest.hexdigest()
 
 

@@ -9,7 +9,7 @@ import logging
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-_VERSION = 1  # of what is kept: another number makes all of it be found out again
+_VERSION = 2  # of what is kept: another number makes all of it be found out again
 
 
 @dataclass
@@ -62,8 +62,16 @@ def key_of(parts: Mapping[str, object]) -> str:
 
 
 def kept_or_built(config: DiskCacheConfig, key: str, build: Callable[[], EpisodeTable]) -> EpisodeTable:
-    """Return the table kept under a key; build and keep it where there is none, or a damaged one."""
-    return kept_or_made(config, key, build, to_bytes=EpisodeTable.to_bytes, from_bytes=EpisodeTable.from_bytes)
+    """Return the table kept under a key; build and keep it where there is none, or a damaged one.
+
+    The key is among the table's `texts`, as `index`: what else is found out of these episodes depends on it.
+    """
+
+    def build_marked() -> EpisodeTable:
+        table = build()
+        return replace(table, texts={**table.texts, "index": key})
+
+    return kept_or_made(config, key, build_marked, to_bytes=EpisodeTable.to_bytes, from_bytes=EpisodeTable.from_bytes)
 
 
 def kept_or_made(
