@@ -183,6 +183,24 @@ def test_only_row_groups_and_columns_of_the_episode_are_read(
     assert len(read) == 2, "row groups are kept"
 
 
+def test_a_row_group_of_several_episodes_is_decoded_once_on_a_machine(
+    episodes: list[Recorded], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = write_v30(tmp_path / "set", episodes, episodes_per_table=5)
+    cache = {"dir": str(tmp_path / "cache")}
+    before = [source_of(root, disk_cache=cache).read(number) for number in range(5)]
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("decoded again")
+
+    monkeypatch.setattr(pq.ParquetFile, "read_row_group", refuse)
+    source = source_of(root, disk_cache=cache)
+    for number in range(5):
+        np.testing.assert_array_equal(source.read(number).states, before[number].states)
+    with pytest.raises(AssertionError, match="decoded again"):
+        source_of(root, disk_cache={"dir": str(tmp_path / "another")}).infos()
+
+
 @pytest.mark.parametrize("pictures", ["png", "jpeg"])
 @pytest.mark.parametrize("write", [write_v30, write_v21])
 def test_pictures_may_be_in_the_table(

@@ -15,6 +15,7 @@ from vjepa2_ac.data.index import cache_folder, kept_or_built, key_of
 from vjepa2_ac.data.sources.lerobot_episodes import EpisodeRow, data_file, read_episodes, tables_of_episodes, video_file
 from vjepa2_ac.data.sources.lerobot_files import fingerprint, list_by_template
 from vjepa2_ac.data.sources.lerobot_index import check_rows, find_problems, row_of, table_of
+from vjepa2_ac.data.sources.lerobot_kept import KeptRows
 from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo, read_info
 from vjepa2_ac.data.sources.lerobot_parquet import ParquetRows
 from vjepa2_ac.data.sources.lerobot_pictures import StoredPictures, VideoPictures
@@ -97,7 +98,8 @@ class LeRobotSource:
 
     @cached_property
     def _parquet(self) -> ParquetRows:
-        return ParquetRows(self._open, wanted_columns(self._config.lerobot))
+        kept = KeptRows(self._kept, self._data_version)
+        return ParquetRows(self._open, wanted_columns(self._config.lerobot), kept)
 
     @cached_property
     def _kept(self) -> DiskCache:
@@ -116,12 +118,16 @@ class LeRobotSource:
     def _connections(self) -> int:
         return self._config.connections if self._is_far else 1
 
+    @property
+    def _data_version(self) -> str:
+        """What differs when a file of the data set does, or what is wanted of it."""
+        return self._table.texts["version"] if "_table" in self.__dict__ else self._version
+
     def _open(self, path: str) -> str | KeptFile:
         """Return what to open for a path: the path itself on this machine, a file of kept blocks far away."""
         if not storage.is_url(path):
             return path
-        version = self._table.texts["version"] if "_table" in self.__dict__ else self._version
-        return KeptFile(path, version=version, size=self._size(path), kept=self._kept)
+        return KeptFile(path, version=self._data_version, size=self._size(path), kept=self._kept)
 
     def _found_out(self, progress: Progress | None) -> EpisodeTable:
         info, config = self._info, self._config

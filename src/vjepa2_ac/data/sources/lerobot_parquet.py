@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Shaped
 
+from vjepa2_ac.data.sources.lerobot_kept import Columns, KeptRows
 from vjepa2_ac.data.sources.lerobot_ranges import KeptFile
 from vjepa2_ac.errors import InputError
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow import parquet
 
-Columns = Mapping[str, Shaped[np.ndarray, "rows _"]]
 Opener = Callable[[str], "str | KeptFile"]  # a path, or a file far away
 
 EPISODE = "episode_index"
@@ -44,9 +44,11 @@ class ParquetRows:
     Args:
         open_file: Gives what to open for a path.
         columns: Those that are wanted, where a file has them; the index of the episode is read in any case.
+        kept: Where rows stay on this machine that share their row group with those of other episodes.
     """
 
-    def __init__(self, open_file: Opener, columns: Sequence[str]) -> None:
+    def __init__(self, open_file: Opener, columns: Sequence[str], kept: KeptRows | None = None) -> None:
+        self._kept = kept
         self._open, self._columns = open_file, list(dict.fromkeys([EPISODE, *columns]))
         self._lock = threading.Lock()
         self._footers: OrderedDict[str, _Footer] = OrderedDict()
@@ -68,17 +70,21 @@ class ParquetRows:
             InputError: The file is missing or damaged, or a column holds something other than numbers.
             OSError: A file far away cannot be read.
         """
+        if self._kept is not None and (known := self._kept.read(path, episode)) is not None:
+            return known
+        parts, shared = [], False
         with _opened(self._open(path), path) as file:
             footer = self._footer(path, file)
-            parts = []
             for number, (first, last) in enumerate(zip(footer.first, footer.last, strict=True)):
                 if (first is None or first <= episode) and (last is None or episode <= last):
                     group = self._group(path, file, number)
-                    chosen = group[EPISODE][:, 0] == episode
+                    chosen = _places_of(group, episode)
                     parts.append({name: column[chosen] for name, column in group.items()})
-        if not parts:
-            return {}
-        return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+                    shared |= len(parts[-1][EPISODE]) < len(group[EPISODE])
+        rows = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
+        if self._kept is not None and shared:
+            self._kept.write(path, episode, rows)
+        return rows
 
     def pictures(self, path: str, column: str, episode: int) -> list[bytes]:
         """Return the encoded pictures of one episode from a column of {bytes, path}.
@@ -187,6 +193,13 @@ def _opened(opened: str | KeptFile, path: str) -> Iterator[parquet.ParquetFile]:
         raise InputError(
             where=path, found=f"damaged: {' '.join(reason)[:200]}", needed="a whole Parquet file", fix=_FIX
         ) from None
+
+
+def _places_of(group: Columns, episode: int) -> slice | Shaped[np.ndarray, " rows"]:
+    """Return the rows of an episode in a row group: as a slice where they stand together, as they should."""
+    places = np.flatnonzero(group[EPISODE][:, 0] == episode)
+    together = len(places) > 0 and places[-1] - places[0] == len(places) - 1
+    return slice(int(places[0]), int(places[-1]) + 1) if together else places
 
 
 def _footer_of(file: parquet.ParquetFile, path: str) -> _Footer:
