@@ -14,6 +14,7 @@ from recordings import write_mp4
 from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.data import video
 from vjepa2_ac.data.video import Clock, count_frames, frame_size, read_frames
+from vjepa2_ac.data.video_parts import Wanted
 from vjepa2_ac.errors import InputError
 
 STEPS = 40
@@ -88,7 +89,7 @@ def test_only_what_the_asked_pictures_need_is_decoded(tmp_path: Path, monkeypatc
     decoded: list[int] = []
     keep = video._Video._keep
 
-    def counted(self: video._Video, frames: Sequence[Any], wanted: video._Wanted) -> None:
+    def counted(self: video._Video, frames: Sequence[Any], wanted: Wanted) -> None:
         decoded.extend(frame.pts for frame in frames)
         keep(self, frames, wanted)
 

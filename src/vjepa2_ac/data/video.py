@@ -6,7 +6,6 @@ often wrong (DROID's), and pictures are stored in another order than they are sh
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vjepa2_ac import storage
+from vjepa2_ac.data.video_parts import QuietFile, Wanted
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import ByteReader
 
@@ -64,6 +64,9 @@ def read_frames(
     with _opened(file, where) as video:
         targets = video.targets_at(steps) if clock is None else video.targets_by(clock, steps)
         frames = video.decode(sorted(set(targets)), clock)
+        if len(sizes := {frame.shape for frame in frames.values()}) > 1:
+            found = f"pictures of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
+            raise InputError(where=where, found=found, needed="pictures of one size", fix=_FIX)
         return np.stack([frames[target] for target in targets])
 
 
@@ -97,18 +100,18 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
         with closing(storage.open_to_read(file)) as opened, _opened(opened, where) as video:
             yield video
         return
-    source = f"file:{file}" if isinstance(file, (str, Path)) else _Quiet(file)
+    source = f"file:{file}" if isinstance(file, (str, Path)) else QuietFile(file)
     try:
         with av.open(source, format=_DEMUXER, metadata_errors="replace") as container:
             yield _video_of(container, av.video.reformatter.VideoReformatter(), where)
     except (av.FFmpegError, InputError) as error:
-        if isinstance(source, _Quiet) and source.error is not None:
+        if isinstance(source, QuietFile) and source.error is not None:
             raise source.error from None
         if isinstance(error, InputError):
             raise
         found = f"cannot be read as a video: {error.strerror}"
         raise InputError(where=where, found=found, needed="a whole, undamaged MP4", fix=_FIX) from None
-    if isinstance(source, _Quiet) and source.error is not None:
+    if isinstance(source, QuietFile) and source.error is not None:
         raise source.error
 
 
@@ -126,34 +129,6 @@ def _video_of(container: InputContainer, converter: VideoReformatter, where: str
     stream.codec_context.thread_count = 1
     stream.codec_context.options = _STRICT
     return _Video(container, cast("VideoStream", stream), converter, where)
-
-
-class _Quiet:
-    """A file for libav that seems to end where reading fails: PyAV would print the error, and take it for damage."""
-
-    def __init__(self, file: Any) -> None:
-        self._file = file
-        self.error: Exception | None = None
-
-    def read(self, size: int) -> bytes:
-        """Return the next bytes, none after a failure."""
-        if self.error is None:
-            try:
-                return bytes(self._file.read(size))
-            except Exception as error:  # whatever it is, it is raised once libav has let go
-                self.error = error
-        return b""
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        """Go to an offset; what a damaged file has of these may be refused."""
-        try:
-            return int(self._file.seek(offset, whence))
-        except (OSError, ValueError):
-            return -1
-
-    def tell(self) -> int:
-        """Return the offset of the next byte."""
-        return int(self._file.tell())
 
 
 @dataclass(frozen=True)
@@ -196,6 +171,10 @@ class _Video:
             raise InputError(
                 where=self.where, found=f"{len(times)} pictures", needed=f"at least {max(steps) + 1}", fix=_FIX
             )
+        if len(set(times)) < len(times):
+            raise InputError(
+                where=self.where, found="pictures shown at the same time", needed="a time for each", fix=_FIX
+            )
         return [times[step] for step in steps]
 
     def targets_by(self, clock: Clock, steps: Sequence[int]) -> list[int]:
@@ -204,7 +183,7 @@ class _Video:
 
     def decode(self, targets: list[int], clock: Clock | None) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
         """Return the pictures shown at these ascending times; with a clock, the nearest within half a step."""
-        wanted = _Wanted(targets, 0 if clock is None else max(0, int(0.49 / clock.rate_hz / self._unit_s)))
+        wanted = Wanted(targets, 0 if clock is None else max(0, int(0.49 / clock.rate_hz / self._unit_s)))
         while (target := wanted.first) is not None:
             before = len(wanted.frames)
             self._decode_run(target, wanted)
@@ -218,12 +197,13 @@ class _Video:
                 )
         return wanted.frames
 
-    def _decode_run(self, target: int, wanted: _Wanted) -> None:
+    def _decode_run(self, target: int, wanted: Wanted) -> None:
         """Decode from the key frame before a target as long as going on costs less than the next seek."""
         decoder = self.stream.codec_context
         delay: int | None = None
         for packet in self._packets_before(target):
-            shown, decoded = int(packet.pts or 0), int(packet.dts or 0)
+            decoded = int(packet.dts or 0)
+            shown = decoded if packet.pts is None else int(packet.pts)
             delay = (
                 shown - decoded if delay is None else delay
             )  # of the key frame; the others of the file have the same
@@ -253,7 +233,7 @@ class _Video:
         place = self.stream.index_entries.search_timestamp(time, backward=True, any_frame=False)
         return int(self.stream.index_entries[place].timestamp) if place >= 0 else _START
 
-    def _keep(self, frames: Sequence[VideoFrame], wanted: _Wanted) -> None:
+    def _keep(self, frames: Sequence[VideoFrame], wanted: Wanted) -> None:
         for frame in frames:
             target = None if frame.pts is None else wanted.target_of(int(frame.pts))
             if target is None or target in wanted.frames:
@@ -267,41 +247,6 @@ class _Video:
     @property
     def _unit_s(self) -> float:
         return float(self.stream.time_base or 1)
-
-
-class _Wanted:
-    """Which pictures are still to be decoded?"""
-
-    def __init__(self, targets: list[int], tolerance: int) -> None:
-        self._targets, self._tolerance = targets, tolerance
-        self._fed: set[int] = set()
-        self.frames: dict[int, Any] = {}
-
-    @property
-    def first(self) -> int | None:
-        """The first time whose picture is missing."""
-        return next((target for target in self._targets if target not in self.frames), None)
-
-    @property
-    def next_to_feed(self) -> int | None:
-        """The first time whose packet the decoder has not been given."""
-        return next((target for target in self._targets if target not in self._fed), None)
-
-    def target_of(self, time: int) -> int | None:
-        """Return the target that is meant by a time, or None."""
-        place = bisect_left(self._targets, time - self._tolerance)
-        found = place < len(self._targets) and self._targets[place] <= time + self._tolerance
-        return self._targets[place] if found else None
-
-    def feed(self, time: int) -> None:
-        """Note that the decoder is given the packet of the picture that is shown at a time."""
-        target = self.target_of(time)
-        if target is not None:
-            self._fed.add(target)
-
-    def is_fed(self, target: int) -> bool:
-        """Return whether the decoder was given a target's packet."""
-        return target in self._fed
 
 
 def _library(where: str) -> Any:
