@@ -1,0 +1,166 @@
+"""The script for Google Cloud does what it is asked, once, and says what it would do."""
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from paths import ROOT
+
+SCRIPT = ROOT / "scripts" / "setup_gcp.sh"
+BUCKET = ("--bucket", "my-checkpoints", "--project", "my-project-123", "--region", "us-central1")
+LIST = "gcloud storage buckets list --project=my-project-123 --filter=name=my-checkpoints --format=value(location)"
+CREATE = (
+    "gcloud storage buckets create gs://my-checkpoints --project=my-project-123 --location=us-central1 "
+    "--uniform-bucket-level-access --public-access-prevention"
+)
+LOGIN = "gcloud auth application-default login"
+
+
+class Machine:
+    """A machine whose gcloud and curl only note how they were called; a created bucket is there afterwards."""
+
+    def __init__(self, folder: Path) -> None:
+        self.programs, self.calls_file, self.bucket = folder / "bin", folder / "calls", folder / "bucket"
+        self.programs.mkdir()
+        for name in ("bash", "cat"):
+            (self.programs / name).symlink_to(f"/bin/{name}")
+
+    def install(self, *names: str, create: str = "", status: int = 0) -> None:
+        """Install programs; `create` is what gcloud says when it cannot create a bucket."""
+        for name in names:
+            program = self.programs / name
+            refuse = f'echo "{create}" >&2; exit 1' if create else f'echo us-central1 >"{self.bucket}"'
+            program.write_text(
+                f'#!/bin/bash\necho "{name} $*" >>"{self.calls_file}"\n'
+                f'case "$*" in *"buckets list"*) [[ ! -e "{self.bucket}" ]] || cat "{self.bucket}" ;;\n'
+                f'*"buckets create"*) {refuse} ;; esac\nexit {status}\n'
+            )
+            program.chmod(0o755)
+
+    def run(self, *options: str) -> subprocess.CompletedProcess[str]:
+        environment = {"PATH": str(self.programs), "HOME": os.devnull}
+        return subprocess.run(
+            ["/bin/bash", str(SCRIPT), *options], env=environment, capture_output=True, text=True, check=False
+        )
+
+    @property
+    def calls(self) -> list[str]:
+        return self.calls_file.read_text().splitlines() if self.calls_file.exists() else []
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    return Machine(tmp_path)
+
+
+def test_a_dry_run_prints_every_command_and_runs_none_even_without_gcloud(machine: Machine) -> None:
+    done = machine.run("--dry-run", "--login", *BUCKET)
+    assert done.returncode == 0, done.stderr
+    commands = [line[2:].replace("\\", "") for line in done.stdout.splitlines() if line.startswith("+ ")]
+    assert [commands[0], *commands[2:]] == [LOGIN, LIST, CREATE]
+    assert commands[1].startswith("curl --head")
+    assert commands[1].endswith("/gresearch/robotics/droid/1.0.1/dataset_info.json")
+    machine.install("gcloud", "curl")
+    assert machine.run("--dry-run", "--login", *BUCKET).returncode == 0
+    assert machine.calls == []
+
+
+def test_without_options_only_droid_is_asked_for(machine: Machine) -> None:
+    machine.install("curl")
+    done = machine.run()
+    assert done.returncode == 0
+    assert "gcloud is not installed; only --login and --bucket need it. https://cloud" in done.stdout
+    assert "DROID can be read" in done.stdout
+    assert [call.split()[0] for call in machine.calls] == ["curl"]
+
+
+def test_login_happens_only_when_asked(machine: Machine) -> None:
+    machine.install("curl", "gcloud")
+    machine.run()
+    machine.run(*BUCKET)
+    assert LOGIN not in machine.calls
+    machine.run("--login")
+    assert machine.calls.count(LOGIN) == 1
+
+
+def test_a_bucket_is_created_once(machine: Machine) -> None:
+    machine.install("curl", "gcloud")
+    first, second = machine.run(*BUCKET), machine.run(*BUCKET)
+    assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr
+    assert "gs://my-checkpoints is created, private, in us-central1." in first.stdout
+    assert "gs://my-checkpoints is there already, in us-central1." in second.stdout
+    assert [call for call in machine.calls if "buckets" in call] == [LIST, CREATE, LIST]
+
+
+def test_a_bucket_elsewhere_stays_there(machine: Machine) -> None:
+    machine.install("curl", "gcloud")
+    machine.bucket.write_text("EU")
+    done = machine.run(*BUCKET)
+    assert done.returncode == 0
+    assert "is there already, in EU.\nIt stays there: a bucket cannot move to us-central1." in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("answer", "words"),
+    [
+        ("HTTPError 409: The requested bucket name is not available.", "belongs to someone else.*another name"),
+        ("HTTPError 403: billing is disabled", "could not be created:\n(?s:.*)HTTPError 403: billing is disabled"),
+    ],
+)
+def test_a_bucket_that_cannot_be_created_is_explained(machine: Machine, answer: str, words: str) -> None:
+    machine.install("curl", "gcloud", create=answer)
+    done = machine.run(*BUCKET)
+    assert done.returncode == 1
+    assert re.search(words, done.stderr)
+    assert not machine.bucket.exists()
+
+
+def test_what_fails_is_named(machine: Machine) -> None:
+    machine.install("curl", status=22)
+    done = machine.run()
+    assert (done.returncode, "DROID cannot be read from here" in done.stderr) == (1, True)
+    machine.install("curl")
+    for options in (["--login"], BUCKET):
+        done = machine.run(*options)
+        assert (done.returncode, "gcloud is not installed, and --login" in done.stderr) == (1, True)
+    machine.install("gcloud", status=1)
+    done = machine.run("--login")
+    assert (done.returncode, "the login did not succeed" in done.stderr) == (1, True)
+    done = machine.run(*BUCKET)
+    assert (done.returncode, "cannot be listed" in done.stderr) == (1, True)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--buckets", "a"], "unknown option: --buckets"),
+        (["word"], "unknown option: word"),
+        (["--bucket"], "--bucket needs a value"),
+        (["--bucket", "--project", "p"], "--bucket needs a value"),
+        (["--project", ""], "--project needs a value"),
+        (["--bucket", "my-checkpoints"], "belong together"),
+        (["--project", "my-project", "--region", "EU"], "belong together"),
+        (["--bucket", "gs://my", *BUCKET[2:]], "without gs://"),
+        (["--bucket", "My_Bucket", *BUCKET[2:]], "small letters"),
+        ([*BUCKET[:2], "--project", "My Project", *BUCKET[4:]], "the project's identifier"),
+        ([*BUCKET[:4], "--region", "us central; rm"], "such as us-central1"),
+    ],
+)
+def test_wrong_options_are_named_and_nothing_is_done(machine: Machine, options: list[str], words: str) -> None:
+    machine.install("curl", "gcloud")
+    done = machine.run(*options)
+    assert done.returncode == 2
+    assert words in done.stderr
+    assert "--help" in done.stderr
+    assert machine.calls == []
+
+
+def test_help_names_every_option(machine: Machine) -> None:
+    done = machine.run("--help")
+    assert done.returncode == 0
+    for option in ("--login", "--bucket", "--project", "--region", "--dry-run"):
+        assert option in done.stdout
+    assert os.access(SCRIPT, os.X_OK)
