@@ -1,11 +1,13 @@
-"""How many 16-frame clips of one camera come out of RLDS in a second, in one process?
+"""How fast and how lean are clips out of RLDS: against TFDS, with two workers, for an index of DROID's size?
 
     python benchmarks/loader.py [--path FOLDER] [--tfds-python /path/to/an/environment/bin/python]
 
-Random clips of random episodes, as in training. Ours decodes 16 frames of one camera; the baseline, in the same run and
-on the same records, decodes every frame of every camera, as a loader does that asks for whole episodes. With an
-interpreter that has tensorflow_datasets, the same number of clips is taken from TFDS too, one from each episode that it
-yields: with all pictures decoded, and with SkipDecoding and 16 frames decoded afterwards.
+One process, 16-frame clips of one camera, at random places of random episodes, as in training. Ours: the first clip of
+each episode on this machine, which checks the CRC of the record, and all later ones. The baselines, in the same run on
+the same records: decoding every frame of every camera; and TFDS in an interpreter that has tensorflow_datasets, with
+one thread as ours, nothing shuffled and nothing interleaved, with all pictures decoded and with SkipDecoding and 16
+frames decoded afterwards. TFDS reads in file order only: a clip costs it an episode. Its steps are taken from
+the episode in two ways (`batch` it and slice; `skip` and `take`), and the faster one counts.
 """
 
 from __future__ import annotations
@@ -15,33 +17,35 @@ import statistics
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import psutil
 import simplejpeg
+from drawn import draw_episodes
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.loader import clip_at
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.index import kept_or_built
+from vjepa2_ac.data.kept import KeptSteps, clip_starts
+from vjepa2_ac.data.loader import clip_at, training_loader
 from vjepa2_ac.data.sources.dataset_info import find_shards, index_shards
-from vjepa2_ac.data.sources.rlds import RldsSource
-from vjepa2_ac.data.sources.rlds_writer import (
-    CAMERAS,
-    DroidCommands,
-    DroidEpisode,
-    DroidMeasurements,
-    encode_jpeg,
-    write_droid_rlds,
-)
+from vjepa2_ac.data.sources.rlds_writer import write_droid_rlds
 from vjepa2_ac.data.sources.tfrecord import decode_example, read_record
+from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.windows import ClipOrder, windows_of
+from vjepa2_ac.episode import EpisodeInfo
+
+DROID_EPISODES = 95_658
 
 TFDS_SCRIPT = """
-import sys, time
+import random, sys, time
 import tensorflow as tf, tensorflow_datasets as tfds
 folder, skip = sys.argv[1], sys.argv[5] == "skip"
 clips, frames, stride = map(int, sys.argv[2:5])
-longest = int(sys.argv[6])
+steps_of_all = int(sys.argv[6])
+span = (frames - 1) * stride + 1
 tf.config.threading.set_intra_op_parallelism_threads(1)
 tf.config.threading.set_inter_op_parallelism_threads(1)
 builder = tfds.builder_from_directory(folder)
@@ -54,15 +58,22 @@ dataset = builder.as_dataset(split="train", decoders=decoders, read_config=confi
 options = tf.data.Options()
 options.threading.private_threadpool_size = 1
 episodes = iter(dataset.repeat().with_options(options))
-def clip():
-    for steps in next(episodes)["steps"].batch(longest):
-        pictures = steps["observation"][cameras[0]][: (frames - 1) * stride + 1 : stride]
+def clip(way):
+    first = random.randrange(steps_of_all - span + 1)
+    steps = next(episodes)["steps"]
+    steps = steps.batch(steps_of_all) if way == "batch" else steps.skip(first).take(span).batch(span)
+    for batch in steps:
+        pictures = batch["observation"][cameras[0]]
+        pictures = (pictures[first : first + span] if way == "batch" else pictures)[::stride]
         return tf.stack([tf.io.decode_jpeg(one) for one in pictures]).numpy() if skip else pictures.numpy()
-clip()
-start = time.perf_counter()
-for _ in range(clips):
-    assert clip().shape[0] == frames
-print((time.perf_counter() - start) / clips)
+seconds = []
+for way in ("batch", "take"):
+    clip(way)
+    start = time.perf_counter()
+    for _ in range(clips):
+        assert clip(way).shape[0] == frames
+    seconds.append((time.perf_counter() - start) / clips)
+print(min(seconds))
 """
 
 
@@ -70,52 +81,117 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--path", help="a data set in DROID's RLDS schema; default: one that is drawn for the purpose")
-    parser.add_argument("--clips", type=int, default=24, help="clips per measurement (default: %(default)s)")
+    parser.add_argument("--clips", type=int, default=48, help="clips per measurement (default: %(default)s)")
     parser.add_argument("--stride", type=int, default=4, help="control steps per model step (default: %(default)s)")
     parser.add_argument("--tfds-python", help="interpreter that can import tensorflow_datasets")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         path = arguments.path or str(write_droid_rlds(Path(scratch) / "droid", draw_episodes(), shards=4))
-        config = DataConfig(path=path, stride=arguments.stride, validation_share=0.0, test_share=0.0, workers=0)
-        measure(config, arguments.clips, arguments.tfds_python)
+        shares = {"validation_share": 0.0, "test_share": 0.0}
+        cache = {"dir": str(Path(scratch) / "cache")}
+        config = DataConfig(path=path, stride=arguments.stride, disk_cache=cache, workers=0, **shares)
+        measure_clips(config, arguments.clips, arguments.tfds_python)
+        measure_workers(config)
+        measure_index(config)
 
 
-def measure(config: DataConfig, clips: int, tfds_python: str | None) -> None:
+def measure_clips(config: DataConfig, clips: int, tfds_python: str | None) -> None:
     """Time every way of reading the same number of clips, and print clips per second and ratios."""
-    source, spans = RldsSource(config), index_shards(find_shards(config.path))
+    spans = index_shards(find_shards(config.path))
     start = time.perf_counter()
-    infos = source.infos()
-    order = ClipOrder(windows_of(infos, config, "train"), seed=0)
+    dataset = open_dataset(config)
+    order = ClipOrder(dataset.windows("train"), seed=0)
     taken = time.perf_counter() - start
-    print(f"{config.path}: {len(infos)} episodes, {len(order.windows)} clips, indexed in {taken:.3f} s")
+    print(f"{config.path}: {len(dataset.table)} episodes, {len(order.windows)} clips, indexed in {taken:.3f} s")
     print(f"{config.frames} frames at stride {config.stride}, {clips} random clips, medians (TFDS: mean):\n")
 
-    def ours(position: int) -> None:
-        forget_episodes(source)
-        clip_at(source, *order.window(position), config)
+    def later_reads(position: int) -> None:
+        clip_at(dataset, *order.window(position))
 
     def everything(position: int) -> None:
         episode, first = order.window(position)
         features = decode_example(read_record(spans[episode]), where="")
         for name in config.fields.cameras.values():
             frames = np.stack([simplejpeg.decode_jpeg(picture, fastdct=True) for picture in features[name][1]])
-            frames[first : first + config.clip_steps : config.stride].copy()
+            frames[first : first + config.clip_steps : config.model_stride].copy()
 
-    seconds = dict(zip(("every frame of every camera", "ours"), alternate(clips, everything, ours), strict=True))
+    always = open_dataset(config.model_copy(update={"check_crc": "always"}))  # every read is as a first one
+    for episode in range(len(spans)):
+        clip_at(dataset, episode, 0)
+    names = ("every frame of every camera", "ours, first read of a record", "ours")
+    ways = (everything, lambda position: clip_at(always, *order.window(position)), later_reads)
+    seconds = dict(zip(names, alternate(clips, *ways), strict=True))
     if tfds_python:
-        longest = max(info.num_steps for info in infos)
+        steps = int(dataset.table.num_steps.min())
         seconds |= {
-            "TFDS, full decode": run_tfds(tfds_python, config, clips, "full", longest),
-            "TFDS, SkipDecoding, then 16 frames": run_tfds(tfds_python, config, clips, "skip", longest),
+            "TFDS, full decode": run_tfds(tfds_python, config, clips, "full", steps),
+            "TFDS, SkipDecoding, then 16 frames": run_tfds(tfds_python, config, clips, "skip", steps),
         }
     print(f"{'':38}{'ms a clip':>12}{'clips/s':>10}{'ours is':>12}")
     for name, each in seconds.items():
         print(f"{name:38}{each * 1e3:12.1f}{1 / each:10.1f}{each / seconds['ours']:11.1f}x")
 
 
-def forget_episodes(source: RldsSource) -> None:
-    """Empty what a source keeps, so that every clip pays for its record."""
-    source.__dict__.update(source.__getstate__())
+def measure_workers(config: DataConfig, batch_size: int = 4, batches: int = 60) -> None:
+    """Print clips per second of one worker and of two, and the memory of one."""
+    speeds: dict[int, list[float]] = {1: [], 2: []}
+    largest = 0.0
+    for workers in (1, 2, 1, 2):
+        dataset = open_dataset(config.model_copy(update={"workers": workers}))
+        loader = training_loader(dataset, seed=0, batch_size=batch_size)
+        for _ in range(2 * workers):
+            next(loader)
+        start = time.perf_counter()
+        for _ in range(batches):
+            next(loader)
+        speeds[workers].append(batches * batch_size / (time.perf_counter() - start))
+        children = psutil.Process().children(recursive=True)
+        largest = max([largest, *(child.memory_info().rss / 1e6 for child in children)])
+        del loader
+    one, two = (max(speeds[workers]) for workers in (1, 2))
+    print(
+        f"\ntraining_loader, batches of {batch_size}, the better of two runs: 1 worker {one:.0f} clips/s, 2 workers",
+        end="",
+    )
+    print(f" {two:.0f} clips/s ({two / one:.2f}x); resident memory of a worker {largest:.0f} MB")
+
+
+def measure_index(config: DataConfig) -> None:
+    """Print what index and order of as many episodes as DROID has cost, opened from the cache."""
+    generator = np.random.default_rng(0)
+    steps = generator.integers(61, 520, DROID_EPISODES)
+    infos = [
+        EpisodeInfo(
+            f"gs://bucket/lab/success/2023-07-0{n % 9}/{n:08d}/recordings--trajectory_{n:08d}.h5", int(count), True
+        )
+        for n, count in enumerate(steps)
+    ]
+    columns = {"shard": np.int32, "record": np.int32, "offset": np.int64, "length": np.int64}
+    locators = {name: np.arange(DROID_EPISODES, dtype=kind) for name, kind in columns.items()}
+    kept_or_built(config.disk_cache, "synthetic", lambda: EpisodeTable.of(infos, locators=locators))
+    del infos
+    process = psutil.Process()
+    before, start = process.memory_info().rss, time.perf_counter()
+    table = kept_or_built(config.disk_cache, "synthetic", _never)
+    opened = time.perf_counter() - start
+    everyone = np.ones(len(table), bool)
+    kept = KeptSteps.whole(table, everyone)
+    order = ClipOrder(windows_of(table, everyone, clip_starts(table, kept, config), config, "train"), seed=0)
+    order.window(123_456)
+    taken, memory = time.perf_counter() - start, (process.memory_info().rss - before) / 1e6
+    print(
+        f"\nindex of {len(table):,} episodes: {opened:.2f} s; with the order of {len(order.windows):,} clips",
+        end="",
+    )
+    print(f" {taken:.2f} s and {memory:.0f} MB; the file has {_size_of(config):.1f} MB")
+
+
+def _never() -> EpisodeTable:
+    raise AssertionError("the index was not kept")
+
+
+def _size_of(config: DataConfig) -> float:
+    return (Path(str(config.disk_cache.dir)) / "index" / "synthetic.npz").stat().st_size / 1e6
 
 
 def alternate(count: int, *ways: Callable[[int], None]) -> list[float]:
@@ -129,41 +205,20 @@ def alternate(count: int, *ways: Callable[[int], None]) -> list[float]:
     return [statistics.median(taken) for taken in seconds]
 
 
-def run_tfds(python: str, config: DataConfig, clips: int, mode: str, longest: int) -> float:
+def run_tfds(python: str, config: DataConfig, clips: int, mode: str, steps: int) -> float:
     """Return the mean seconds per clip that TFDS needs, in the given interpreter."""
-    command = [python, "-c", TFDS_SCRIPT, config.path, str(clips), str(config.frames), str(config.stride), mode]
-    command.append(str(longest))
+    command = [
+        python,
+        "-c",
+        TFDS_SCRIPT,
+        config.path,
+        str(clips),
+        str(config.frames),
+        str(config.stride),
+        mode,
+        str(steps),
+    ]
     return float(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout.split()[-1])  # noqa: S603
-
-
-def draw_episodes(count: int = 12, steps: int = 290) -> Iterator[DroidEpisode]:
-    """Yield episodes as long as DROID's, of noise as smooth as a camera's picture: 180x320 JPEGs of 10 to 25 KB."""
-    generator = np.random.default_rng(0)
-    pictures = [encode_jpeg(draw_picture(generator), quality=quality) for quality in range(78, 94) for _ in range(4)]
-    sizes = sorted(len(picture) for picture in pictures)
-    print(f"JPEGs of {sizes[0] / 1e3:.0f} to {sizes[-1] / 1e3:.0f} KB, {count} episodes of {steps} steps, 3 cameras")
-    pose, gripper, joints = np.zeros((steps, 6)), np.zeros((steps, 1)), np.zeros((steps, 7))
-    for number in range(count):
-        folder = f"/data/success/episode_{number}"
-        yield DroidEpisode(
-            file_path=f"{folder}/trajectory.h5",
-            recording_folderpath=f"{folder}/recordings",
-            action=joints,
-            action_dict=DroidCommands(pose, pose, gripper, gripper, joints, joints),
-            observation=DroidMeasurements(pose, gripper, joints),
-            images={
-                camera: [pictures[place] for place in generator.integers(0, len(pictures), steps)] for camera in CAMERAS
-            },
-        )
-
-
-def draw_picture(generator: np.random.Generator) -> np.ndarray:
-    """Return a picture with detail of every size."""
-    picture = np.full((180, 320, 3), 128.0)
-    for cell in (1, 2, 4, 20, 60):
-        noise = generator.normal(0, 3 + cell**0.7, (180 // cell + 1, 320 // cell + 1, 3))
-        picture += noise.repeat(cell, axis=0).repeat(cell, axis=1)[:180, :320]
-    return picture.clip(0, 255).astype(np.uint8)
 
 
 if __name__ == "__main__":
