@@ -189,3 +189,16 @@ def test_without_pyav_the_way_to_install_it_is_named(tmp_path: Path, monkeypatch
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"pip install .*\[video\]"):
         read_frames(tmp_path / "a.mp4", [0], where="a")
+
+
+def test_pictures_that_are_moved_without_a_word_in_the_header_are_found_by_time(tmp_path: Path) -> None:
+    """A file of key frames alone needs no reordering to be decoded, yet may be shown in another order."""
+    shown = [1, 3, 2, 5, 4, 7, 6, 8]  # when each stored picture is shown
+    whole = every_frame(write_mp4(tmp_path / "whole.mp4", FRAMES[:8], gop=1))
+    with av.open(str(tmp_path / "whole.mp4")) as source, av.open(str(tmp_path / "moved.mp4"), "w") as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for number, packet in enumerate(list(source.demux(source.streams.video[0]))[:8]):
+            packet.pts, packet.dts, packet.stream = shown[number] * 1024, number * 1024, stream
+            target.mux(packet)
+    expected = whole[np.argsort(shown)]
+    np.testing.assert_array_equal(read_frames(tmp_path / "moved.mp4", range(8), where="a"), expected)
