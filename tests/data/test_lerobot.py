@@ -415,6 +415,12 @@ def test_a_column_that_a_file_lacks_is_named_with_those_it_has(copy: Path) -> No
     assert f"It has: episode_index, frame_index, timestamp, {STATE[1]}" in problem
 
 
+@pytest.mark.parametrize("column", ["action.joint_velocity", "is_episode_successful"])
+def test_a_column_that_the_set_promises_and_a_file_lacks_is_a_problem(column: str, copy: Path) -> None:
+    change_table(first_rows(copy), **{column: None})
+    assert f"no column {column}" in only_problem(copy)
+
+
 def spoiled_rows(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     rows = np.array(pq.read_table(first_rows(root)).column(STATE[0]).to_pylist(), np.float32)
     change_table(first_rows(root), **{STATE[0]: column_of(change(rows))})

@@ -144,6 +144,17 @@ def test_a_passing_fault_is_tried_again(hub: Hub, tmp_path: Path, monkeypatch: p
     assert not hub.faults
 
 
+def test_what_the_network_did_is_never_booked_as_a_broken_episode(
+    hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=2, first_wait_s=0.001))
+    hub.faults, hub.faulty = [503] * 2, "episode_000002.parquet"
+    source = source_of("v21", tmp_path, outcome="success", connections=1)
+    with pytest.raises(UnreachableError, match="episode_000002"):
+        source.infos()
+    assert len(source.infos()) == 5, "it is asked again"
+
+
 def test_a_data_set_that_is_not_there_says_how_to_log_in(hub: Hub, tmp_path: Path) -> None:
     assert hub.url
     with pytest.raises(InputError, match=r"hf://datasets/lab/nothing.*hf auth login.*HF_TOKEN"):
