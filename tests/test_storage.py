@@ -2,6 +2,7 @@
 
 import errno
 import hashlib
+from contextlib import closing
 from pathlib import Path
 
 import fsspec
@@ -125,8 +126,24 @@ def test_a_url_is_read_like_a_local_folder(folder: str) -> None:
     assert storage.read_bytes(file) == b"0123456789"
     assert storage.read_range(file, 3, 4) == b"3456"
     assert storage.read_range(file, 8, 4) == b"89"
-    with pytest.raises(FileNotFoundError):
-        storage.read_bytes(storage.join(folder, "c"))
+    assert storage.read_ranges(file, [(3, 4), (0, 1)]) == [b"3456", b"0"]
+    with pytest.raises(storage.ShortReadError, match="2 of 4 bytes at 8"):
+        storage.read_ranges(file, [(0, 1), (8, 4)])
+    assert [(info.name, info.size) for info in storage.list_files(folder)] == [("a", 0), ("b", 10)]
+    with closing(storage.open_to_read(file)) as opened:
+        opened.seek(4)
+        assert (opened.read(2), opened.read()) == (b"45", b"6789")
+    for read in (storage.read_bytes, storage.open_to_read, storage.file_size):
+        with pytest.raises(FileNotFoundError):
+            read(storage.join(folder, "c"))
+
+
+def test_a_file_that_changes_has_another_version(folder: str) -> None:
+    before = storage.list_files(folder)
+    assert storage.list_files(folder) == before
+    filesystem, file = fsspec.core.url_to_fs(storage.join(folder, "a"))
+    filesystem.pipe_file(file, b"")
+    assert [old.name for old, new in zip(before, storage.list_files(folder), strict=True) if old != new] == ["a"]
 
 
 def test_a_folder_that_is_not_there_has_no_files(tmp_path: Path) -> None:

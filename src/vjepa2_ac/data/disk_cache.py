@@ -66,15 +66,15 @@ class DiskCache:
             return
         partial = path.with_name(f".{path.name}.{os.getpid()}.{threading.get_ident()}{_PARTIAL}")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            if not path.parent.is_dir():
+                path.parent.mkdir(parents=True, exist_ok=True)
             with partial.open("wb") as file:
                 file.write(_HEADER.pack(_MAGIC, zlib.crc32(data), len(data)))
                 file.write(data)
             with self._ledger() as ledger:
                 total = self._make_room(ledger, path, size)
                 partial.replace(path)
-                os.ftruncate(ledger, 0)
-                os.pwrite(ledger, str(total + size).encode(), 0)
+                os.pwrite(ledger, b"%020d" % (total + size), 0)
         except OSError as error:
             with suppress(OSError):
                 partial.unlink()
@@ -99,9 +99,10 @@ class DiskCache:
     def _make_room(self, ledger: int, path: Path, size: int) -> int:
         """Delete the entry that is to be replaced, and others where the limit would be passed; return what is left."""
         replaced = _size_of(path)
-        path.unlink(missing_ok=True)
+        if replaced:
+            path.unlink(missing_ok=True)
         try:
-            total = int(os.pread(ledger, 32, 0)) - replaced
+            total = int(os.pread(ledger, 20, 0)) - replaced
         except ValueError:  # new or damaged
             return self._evict(self._limit - size)
         return total if total + size <= self._limit else self._evict(self._limit - size)
