@@ -18,6 +18,8 @@ from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.idle import idle_by_commands, idle_by_motion, kept_ranges, moving_ranges
 from vjepa2_ac.data.idle_search import FoundRanges
+from vjepa2_ac.data.kept import drawn
+from vjepa2_ac.data.loader import clip_at
 from vjepa2_ac.data.table import NotATableError, Problem
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
@@ -39,6 +41,13 @@ def test_commands_keep_what_openpi_keeps() -> None:
     for number in range(3):
         idle = idle_by_commands(golden[f"velocities_{number}"].astype(np.float64), COMMANDS)
         assert moving_ranges(idle, COMMANDS) == [tuple(pair) for pair in golden[f"ranges_{number}"].tolist()]
+
+
+def test_one_joint_that_changes_is_enough_to_move() -> None:
+    velocities = np.zeros((20, 7))
+    velocities[:, 4] = 0.0011 * np.arange(20)
+    assert not idle_by_commands(velocities, COMMANDS).any()
+    assert idle_by_commands(velocities * 0.9, COMMANDS).tolist() == [False] + [True] * 19
 
 
 def test_the_reference_set_keeps_what_openpi_keeps(shared: Path) -> None:
@@ -153,6 +162,8 @@ def test_an_episode_is_read_with_the_steps_that_clips_may_come_from(open_with: A
     assert open_with(source, idle=MOTION).needed_steps(0) == ((0, 10), (35, 50))
     assert open_with(source, idle=MOTION.model_copy(update={"keep_share": 0.5})).needed_steps(0) is None
     assert open_with(source).needed_steps(0) is None
+    clip_at(open_with(source, idle=MOTION), 2, 40)
+    assert source.reads[-1] == (2, None, ((0, 10), (35, 70)))
 
 
 def test_the_episodes_are_looked_through_once(open_with: Any) -> None:
@@ -189,6 +200,12 @@ def test_a_share_of_idle_windows_stays_the_same_ones_each_time(open_with: Any) -
     for share, kept in ((0.2, few), (0.6, many)):
         assert abs((len(kept) - len(none)) / idle - share) < 0.15
     assert some(0.2) == few
+    table = restful([400] * 12).infos()
+    assert few - none == {
+        (episode, start)
+        for episode, start in everything - none
+        if drawn(table.id_hash[[episode]], np.array([start]))[0] < 0.2
+    }
 
 
 def test_keeping_every_idle_window_is_the_same_order_as_no_filter(open_with: Any) -> None:
