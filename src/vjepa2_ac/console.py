@@ -107,7 +107,9 @@ class ConsoleReporter:
     def stepped(self, step: int, figures: Mapping[str, float]) -> None:
         """Move the bar."""
         if self._bar is not None:
-            words = f"loss {figures['loss']:.4f}  {figures['samples_per_second']:.1f} clips/s  {self._validation}"
+            fetched = f"  {figures['bytes_per_clip'] / 1e6:.2f} MB/clip" if "bytes_per_clip" in figures else ""
+            speed = f"{figures['samples_per_second']:.1f} clips/s{fetched}"
+            words = f"loss {figures['loss']:.4f}  {speed}  {self._validation}"
             self._bar.advance_to(step, words)
 
     def validated(self, step: int, errors: PredictionErrors) -> None:

@@ -38,8 +38,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, fl
     learning_rate = learning_rate_at(step, run.config.training)
     set_learning_rate(run.optimizer, learning_rate)
     taken = gradients(run, batches)
-    if taken.clips:
-        run.optimizer.step()
+    run.optimizer.step()  # without a clip there are no gradients, and nothing moves
     run.optimizer.zero_grad(set_to_none=True)
     return {
         "loss": taken.forced_loss + taken.rollout_loss,
