@@ -9,89 +9,32 @@ import itertools
 import multiprocessing
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.augment import draw
+from vjepa2_ac.data.clips import Wish, clip_at, collate, no_clips, read_clip
 from vjepa2_ac.data.dataset import Dataset, open_source
-from vjepa2_ac.data.exclusion import named, with_way_out
+from vjepa2_ac.data.exclusion import named
 from vjepa2_ac.data.kept import drawn
 from vjepa2_ac.data.table import EpisodeTable
-from vjepa2_ac.data.transforms import view
 from vjepa2_ac.data.windows import ClipOrder, Split, far_neighbours, spread
-from vjepa2_ac.episode import ACTION_DIM, STATE_DIM, Augmentation, Batch, Clip, Episode, Skipped
+from vjepa2_ac.episode import Augmentation, Batch, Clip, Skipped
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states, states_in_camera_frame
 from vjepa2_ac.remote import UnreachableError
 
 __all__ = ["batches_of", "clip_at", "collate", "open_source", "training_loader", "validation_batches"]
 
 _CLIPS_WORTH_WORKERS = 256  # fewer validation clips are read before the workers have started
-
-Augment = Callable[[int, int], Augmentation | None]  # from the height and width of a clip's frames
-
-
-def clip_at(
-    dataset: Dataset, episode: int, start: int, *, camera: str | None = None, augmentation: Augment | None = None
-) -> Clip:
-    """Return the clip that starts at a control step of an episode; decodes its frames only.
-
-    Args:
-        dataset: Where it comes from.
-        episode: Index into the data set's table.
-        start: First control step.
-        camera: Whose pictures; None: the config's (first) camera.
-        augmentation: Draws what is to be changed, once the size of the frames is known.
-
-    Raises:
-        InputError: The episode or one of the pictures cannot be read; says how to leave the episode out.
-    """
-    try:
-        return _clip_at(dataset, _Wish(episode, start, camera, augmentation))
-    except UnreachableError:
-        raise  # the network's fault, not the episode's
-    except InputError as error:
-        raise with_way_out(error, [dataset.table.identity(episode)]) from None
-
-
-def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
-    """Stack clips into a batch; it has camera poses if each of the clips has.
-
-    Raises:
-        InputError: The pictures of two clips differ in size.
-    """
-    first = clips[0]
-    for clip in clips:
-        if clip.frames.shape != first.frames.shape:
-            error = InputError(
-                where=f"episode {clip.episode_id}",
-                found=f"pictures of {'x'.join(map(str, clip.frames.shape[1:3]))} after the crop",
-                needed=f"{'x'.join(map(str, first.frames.shape[1:3]))}, as in episode {first.episode_id}",
-                fix="Train on episodes of one size, or set training.batch_size: 1",
-            )
-            raise with_way_out(error, [clip.episode_id])
-    extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
-    augmentations = tuple(clip.augmentation for clip in clips if clip.augmentation is not None)
-    return Batch(
-        frames=torch.from_numpy(np.stack([clip.frames for clip in clips])),
-        states=torch.from_numpy(np.stack([clip.states for clip in clips])),
-        actions=torch.from_numpy(np.stack([clip.actions for clip in clips])),
-        extrinsics=torch.from_numpy(np.stack(extrinsics)) if len(extrinsics) == len(clips) else None,
-        episode_ids=tuple(clip.episode_id for clip in clips),
-        starts=tuple(clip.start for clip in clips),
-        augmentations=augmentations,
-        bytes_fetched=bytes_fetched,
-    )
 
 
 def training_loader(
@@ -160,21 +103,11 @@ def _some_of(batches: Iterator[Batch], dataset: Dataset, split: Split) -> Iterat
         )
 
 
-@dataclass(frozen=True)
-class _Wish:
-    """A clip that is to be read."""
-
-    episode: int
-    start: int
-    camera: str | None
-    augmentation: Augment | None = None
-
-
 @runtime_checkable
 class _Wishes(Protocol):
     """Says which clip stands at a position; a pure function, the same in every worker."""
 
-    def at(self, position: int) -> _Wish: ...
+    def at(self, position: int) -> Wish: ...
 
 
 @dataclass(frozen=True)
@@ -184,12 +117,12 @@ class _TrainingClips:
     config: DataConfig
     order: ClipOrder
 
-    def at(self, position: int) -> _Wish:
+    def at(self, position: int) -> Wish:
         def augmentation(height: int, width: int) -> Augmentation | None:
             return draw(self.config.augment, height, width, seed=self.order.seed, position=position)
 
         cameras = self.config.cameras
-        return _Wish(*self.order.window(position), cameras[self.order.choice(position, len(cameras))], augmentation)
+        return Wish(*self.order.window(position), cameras[self.order.choice(position, len(cameras))], augmentation)
 
 
 @dataclass(frozen=True)
@@ -200,10 +133,10 @@ class _ChosenClips:
     table: EpisodeTable
     windows: list[tuple[int, int]]
 
-    def at(self, position: int) -> _Wish:
+    def at(self, position: int) -> Wish:
         episode, start = self.windows[position]
         number = drawn(self.table.id_hash[[episode]], np.array([start], np.int32))[0]
-        return _Wish(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
+        return Wish(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
 
 
 @dataclass(frozen=True)
@@ -229,7 +162,7 @@ class _Clips(TorchDataset[_Row]):
             clips = [one for one in read if isinstance(one, Clip)]
             skipped = tuple(one for one in read if isinstance(one, Skipped))
             fetched = storage.bytes_fetched() - before
-            return _Row(collate(clips, fetched) if clips else _no_clips(self.dataset.config.frames, fetched), skipped)
+            return _Row(collate(clips, fetched) if clips else no_clips(self.dataset.config.frames, fetched), skipped)
         except InputError as error:
             return error
 
@@ -245,61 +178,11 @@ class _Clips(TorchDataset[_Row]):
         if self.dataset.config.broken_episodes == "error":
             return clip_at(self.dataset, wish.episode, wish.start, camera=wish.camera, augmentation=wish.augmentation)
         try:
-            return _clip_at(self.dataset, wish)
+            return read_clip(self.dataset, wish)
         except UnreachableError:
             raise  # the network's fault, not the episode's
         except InputError as error:
             return Skipped(self.dataset.table.identity(wish.episode), str(error))
-
-
-def _clip_at(dataset: Dataset, wish: _Wish) -> Clip:
-    config = dataset.config
-    steps = range(wish.start, wish.start + config.clip_steps, config.model_stride)
-    recording = dataset.source.read(wish.episode, wish.camera, dataset.needed_steps(wish.episode))
-    frames = view(recording.read_frames(steps), config.crop)
-    states, extrinsics = _poses(recording, list(steps), in_camera_frame=config.pose_frame == "camera")
-    draw_change = wish.augmentation
-    return Clip(
-        frames=frames,
-        states=states.astype(np.float32),
-        actions=actions_from_states(states).astype(np.float32),
-        extrinsics=None if extrinsics is None else extrinsics.astype(np.float32),
-        episode_id=recording.info.id,
-        start=wish.start,
-        stride=config.model_stride,
-        augmentation=None if draw_change is None else draw_change(frames.shape[1], frames.shape[2]),
-    )
-
-
-def _poses(
-    recording: Episode, steps: list[int], *, in_camera_frame: bool
-) -> tuple[Float[np.ndarray, "time 7"], Float[np.ndarray, "time 6"] | None]:
-    """Return states and camera poses at some steps."""
-    states = recording.states[steps]
-    extrinsics = None if recording.extrinsics is None else recording.extrinsics[steps]
-    if not in_camera_frame:
-        return states, extrinsics
-    if extrinsics is None:
-        raise InputError(
-            where=f"episode {recording.info.id}",
-            found="no pose of the camera",
-            needed="one, for data.pose_frame: camera",
-            fix="Set data.pose_frame: base, or choose a camera that has one",
-        )
-    return states_in_camera_frame(states, extrinsics), extrinsics
-
-
-def _no_clips(frames: int, bytes_fetched: int) -> Batch:
-    """Return a micro-batch of which no clip could be read."""
-    return Batch(
-        frames=torch.zeros(0, frames, 1, 1, 3, dtype=torch.uint8),
-        states=torch.zeros(0, frames, STATE_DIM),
-        actions=torch.zeros(0, frames - 1, ACTION_DIM),
-        extrinsics=None,
-        episode_ids=(),
-        starts=(),
-        bytes_fetched=bytes_fetched,
-    )
 
 
 def _rows(first: int, length: int, distance: int) -> Iterator[list[int]]:
