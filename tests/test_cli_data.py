@@ -94,7 +94,7 @@ def test_index_shows_the_kept_one_without_reading_the_data(
     del droid
     monkeypatch.setattr("vjepa2_ac.data.index.EpisodeTable.to_bytes", lambda _: pytest.fail("built again"))
     assert main(["data", "index", config]) == 0
-    assert "reading the index" not in capsys.readouterr().out.split("8 episodes")[-1]
+    assert "looking through" not in capsys.readouterr().out.split("8 episodes")[-1]
 
 
 def test_inspect_prints_and_writes_figures_and_a_picture(config: str, tmp_path: Path, capsys: Printed) -> None:

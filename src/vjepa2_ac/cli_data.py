@@ -67,7 +67,7 @@ def _check(options: argparse.Namespace) -> int:
 
     config = load_config(options.config, options.overrides)
     wrong = 0
-    with _progress("reading the index") as progress:
+    with _progress("looking through the data set") as progress:
         findings = check_data(
             config.data,
             seed=config.seed,
@@ -97,7 +97,7 @@ def _index(options: argparse.Namespace) -> None:
 
     config = load_config(options.config, options.overrides).data
     started = time.perf_counter()
-    with _progress("reading the index") as progress, watched(rebuild=options.rebuild) as watch:
+    with _progress("looking through the data set") as progress, watched(rebuild=options.rebuild) as watch:
         dataset = open_dataset(config, progress=progress)
     for line in index_lines(dataset.table, watch, time.perf_counter() - started):
         console.print(line, markup=False)
@@ -126,7 +126,7 @@ def _inspect(options: argparse.Namespace) -> None:
 
     config = load_config(options.config, options.overrides)
     _make_folder(options.out)
-    with _progress("reading the index") as progress:
+    with _progress("looking through the data set") as progress:
         dataset = at_some_stride(open_dataset(config.data, progress=progress))
     if config.data.stride == "auto":
         console.print(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
@@ -137,7 +137,9 @@ def _inspect(options: argparse.Namespace) -> None:
     console.print(motion_table(inspection))
     console.print(f"For comparison: {RELEASED}.", markup=False)
     write_atomically(options.out / "inspect.json", json.dumps(inspection.as_dict(), indent=1).encode())
-    picture = picture_data_set(dataset, inspection, options.out / "contact_sheet.png", rows=options.rows)
+    path = options.out / "contact_sheet.png"
+    with _progress("reading pictures") as progress:
+        picture = picture_data_set(dataset, inspection, path, rows=options.rows, progress=progress)
     console.print(f"  {picture}\n  {options.out / 'inspect.json'}", markup=False)
 
 
@@ -162,7 +164,7 @@ def _calibrate(options: argparse.Namespace) -> None:
 
     config = load_config(options.config, options.overrides)
     _make_folder(options.out)
-    with _progress("reading the index") as indexing, _progress("measuring clips") as measuring:
+    with _progress("looking through the data set") as indexing, _progress("measuring clips") as measuring:
         calibration = calibrate_config(
             config,
             model=options.model,

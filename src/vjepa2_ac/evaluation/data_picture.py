@@ -10,20 +10,29 @@ import numpy as np
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.inspection import RELEASED_STEP_CM, Inspection, ReadEpisode, idle_runs
 from vjepa2_ac.data.transforms import crop_box
+from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
 
 _PLACES = 6000  # points of the map, at most
 
 
-def picture_data_set(dataset: Dataset, inspection: Inspection, path: Path, *, rows: int = 8) -> Path:
+def picture_data_set(
+    dataset: Dataset, inspection: Inspection, path: Path, *, rows: int = 8, progress: Progress | None = None
+) -> Path:
     """Write the contact sheet of a data set that was looked at; decodes the pictures that it shows and no others.
+
+    `progress` is told (episodes whose pictures were read, episodes shown).
 
     Raises:
         InputError: A picture cannot be read.
     """
     shown = _rows_of(inspection, rows)
     names = _short_names([dataset.table.identity(one.index) for one in shown])
-    strips = [_strip(dataset, one, name) for one, name in zip(shown, names, strict=True)]
+    strips = []
+    for one, name in zip(shown, names, strict=True):
+        strips.append(_strip(dataset, one, name))
+        if progress is not None:
+            progress(len(strips), len(shown))
     return plot_contact_sheet(sheet_of(inspection, strips), path)
 
 
