@@ -79,7 +79,7 @@ def calibrated(model: GoesOn, source: Tracks, **options: object) -> Calibration:
 
 @pytest.mark.parametrize("learned", [4, 8, 15])
 def test_the_stride_that_a_model_has_learned_is_found(learned: int) -> None:
-    found = calibrated(GoesOn(learned), Tracks([80] * 12, noise=0.1))
+    found = calibrated(GoesOn(learned), Tracks([80] * 20, noise=0.1))
     assert found.best.stride == learned
     assert found.is_certain
     assert "not certain" not in found.verdict()
@@ -121,11 +121,19 @@ def test_a_model_that_does_nothing_is_certain_of_nothing() -> None:
     assert "does it fit this data at all?" in found.verdict()
 
 
+def test_a_handful_of_episodes_gives_an_interval_but_no_certainty() -> None:
+    found = calibrated(GoesOn(8), Tracks([80] * 6, noise=0.1))
+    assert found.difference is not None
+    assert found.difference.high < 0
+    assert not found.is_certain
+    assert "not certain on" in found.verdict()
+
+
 def test_one_episode_gives_no_certainty() -> None:
     found = calibrated(GoesOn(8), Tracks([80]), split="train" if split_is_train() else "validation")
     assert found.best.stride == 8
     assert not found.is_certain
-    assert "one episode only" in found.verdict()
+    assert "not certain on 1 episodes" in found.verdict()
 
 
 def split_is_train() -> bool:

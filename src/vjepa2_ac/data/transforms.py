@@ -119,8 +119,3 @@ def _resized(frames: UInt8[Tensor, "count height width 3"], size: int) -> Float[
     return torch.nn.functional.interpolate(
         pixels, size=(size, size), mode="bilinear", align_corners=False, antialias=False
     )
-
-
-def crop(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time cropped_height cropped_width 3"]:
-    """Return `view(frames, "released")`."""
-    return view(frames)

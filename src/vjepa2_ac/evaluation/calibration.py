@@ -23,6 +23,7 @@ from vjepa2_ac.evaluation.metrics import Predictor, Ratio, one_step_errors, rati
 
 FRAMES = 8  # of a clip at most: as the released weights were trained, and short enough for the widest stride
 _EPISODES_NEEDED = 2  # for an interval
+_EPISODES_TO_BE_SURE = 10  # an interval that is drawn from fewer is too narrow
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,13 @@ class Calibration:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the best stride beats the next with its whole 95 % interval."""
-        return self.difference is not None and self.difference.has_interval and self.difference.high < 0
+        """Whether the best stride beats the next with its whole 95 % interval, over episodes enough."""
+        return (
+            self.difference is not None
+            and self.difference.has_interval
+            and self.difference.high < 0
+            and self.best.episodes >= _EPISODES_TO_BE_SURE
+        )
 
     def verdict(self) -> str:
         """Say in words which stride to take, and how sure that is."""
@@ -71,6 +77,7 @@ class Calibration:
         else:
             words += f"; {-self.difference.value:.3f} below stride {self.runner_up}"
             words += _interval(self.difference)
+            words += "" if self.is_certain else f": not certain on {self.best.episodes} episodes, try more"
         if best.ratio.value >= 1:
             words += ". At no stride is the model better than doing nothing: does it fit this data at all?"
         return words if words.endswith("?") else words + "."
@@ -107,10 +114,7 @@ _FIGURES = ("stride", "seconds_per_step", "error", "persistence", "moved_cm", "c
 
 
 def _interval(difference: Ratio) -> str:
-    if not difference.has_interval:
-        return ", from one episode only: not certain"
-    words = f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})"
-    return words if difference.high < 0 else f"{words}: not certain, try more clips or episodes"
+    return f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})" if difference.has_interval else ""
 
 
 def calibrate(
