@@ -15,7 +15,7 @@ from hub import Hub, serve_hub
 from lerobot_sets import CAMERAS, STATE, Recorded, change_info, numbers_of, recorded, write_v21, write_v30
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.lerobot import LeRobotSource
+from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError, retries
 

@@ -11,7 +11,7 @@ import pytest
 
 from lerobot_sets import recorded, write_v21, write_v30
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.lerobot import LeRobotSource
+from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.errors import InputError
 
 LENGTHS = (7, 9, 8)

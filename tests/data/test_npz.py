@@ -13,7 +13,7 @@ from gcs import Gcs
 from synthetic import draw_frame, synthetic_episode, synthetic_states
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.npz import NpzSource
+from vjepa2_ac.data.sources.npz.source import NpzSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
 

@@ -173,7 +173,7 @@ class DataConfig(Section):
     """Control steps per model step. Unsettled for the released weights: 4, 8 and 15 are candidates. auto: before the
     first step the model chooses among `stride_candidates` by its prediction error over persistence."""
     stride_candidates: tuple[PositiveInt, ...] | None = None
-    """Strides that `auto` and `data calibrate` try; null: 4, 8 and 15 at 15 control steps per second, scaled to others."""
+    """Strides that `auto` and `data calibrate` try; null: 4, 8, 15 at 15 control steps per second, scaled to others."""
     validation_share: Share = 0.05
     """Share of the episodes held out for validation, chosen by a hash of the episode's identity."""
     test_share: Share = 0.05
@@ -192,8 +192,8 @@ class DataConfig(Section):
     pose_frame: Literal["base", "camera"] = "base"
     """Frame of the poses: the robot's base (the released recipe), or the camera, where its extrinsics are known."""
     crop: Literal["released", "square", "letterbox"] = "released"
-    """What becomes of a picture that is not square. released: its centre at an aspect of 1.35 at most, squashed. square:
-    its central square (upstream's evaluation). letterbox: all of it, with black bars."""
+    """What becomes of a picture that is not square. released: its centre, 1.35 times as wide as high at most, squashed.
+    square: its central square (upstream's evaluation). letterbox: all of it, with black bars."""
     augment: AugmentConfig = AugmentConfig()
     """Random changes of training clips."""
     check_crc: Literal["once", "always", "never"] = "once"

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from vjepa2_ac.config.section import PositiveInt, Section, Share
+from vjepa2_ac.config.section import PositiveInt, Section
 
 
 class TrainingConfig(Section):

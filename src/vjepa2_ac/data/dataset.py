@@ -110,14 +110,14 @@ def open_source(config: DataConfig) -> EpisodeSource:
 
         return RldsSource(config)
     if config.source == "droid_raw":
-        from vjepa2_ac.data.sources.droid_raw import RawDroidSource
+        from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
 
         return RawDroidSource(config)
     if config.source == "lerobot":
-        from vjepa2_ac.data.sources.lerobot import LeRobotSource
+        from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 
         return LeRobotSource(config)
-    from vjepa2_ac.data.sources.npz import NpzSource
+    from vjepa2_ac.data.sources.npz.source import NpzSource
 
     return NpzSource(config)
 

@@ -14,6 +14,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from vjepa2_ac.config import DiskCacheConfig
+from vjepa2_ac.data.index import cache_folder
+
 logger = logging.getLogger(__name__)
 
 _HEADER = struct.Struct("<4sIQ")  # magic, CRC-32 of the data, its length
@@ -121,6 +124,11 @@ class DiskCache:
                 Path(path).unlink()
             total -= size
         return total
+
+
+def fetched_data(config: DiskCacheConfig) -> DiskCache:
+    """Return the cache of what was fetched, one for all sources and runs: so the limit is one, too."""
+    return DiskCache(cache_folder(config) / "fetched", int(config.limit_gb * 1e9))
 
 
 def _checked(content: bytes) -> bytes | None:

@@ -11,7 +11,7 @@ import json
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import overload
+from typing import Any, overload
 
 import numpy as np
 from jaxtyping import Int8, Int32, Int64, UInt8, UInt64
@@ -122,9 +122,9 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         """Return the table as a file's content, with checksums."""
         text = json.dumps({"problems": [vars(problem) for problem in self.problems], "texts": dict(self.texts)})
         file = io.BytesIO()
-        columns = {name: getattr(self, name) for name in _COLUMNS}
-        named = {f"locator.{name}": column for name, column in self.locators.items()}
-        np.savez(file, text=np.frombuffer(text.encode(), np.uint8), **columns, **named)
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _COLUMNS}
+        arrays |= {f"locator.{name}": column for name, column in self.locators.items()}
+        np.savez(file, text=np.frombuffer(text.encode(), np.uint8), **arrays)
         return file.getvalue()
 
     @classmethod

@@ -32,7 +32,7 @@ from jaxtyping import Float, Float64
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.npz_file import NpzFile
+from vjepa2_ac.data.sources.npz.file import NpzFile
 from vjepa2_ac.data.sources.states import require_plausible
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.errors import InputError

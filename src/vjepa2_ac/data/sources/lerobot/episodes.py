@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.lerobot_files import filled, list_by_template
-from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo
-from vjepa2_ac.data.sources.lerobot_parquet import Opener, read_table
+from vjepa2_ac.data.sources.lerobot.files import filled, list_by_template
+from vjepa2_ac.data.sources.lerobot.meta import DatasetInfo
+from vjepa2_ac.data.sources.lerobot.parquet import Opener, read_table
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, LeRobotFields
-from vjepa2_ac.data.sources.lerobot_files import require_template
+from vjepa2_ac.data.sources.lerobot.files import require_template
 from vjepa2_ac.errors import InputError
 
 INFO = "meta/info.json"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import logging
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import as_error
 from vjepa2_ac.data.index import kept_or_built, key_of
-from vjepa2_ac.data.sources.droid_folders import (
+from vjepa2_ac.data.sources.droid_raw.folders import (
     TRAJECTORY,
     VIDEOS,
     EpisodeFolder,
@@ -24,12 +23,12 @@ from vjepa2_ac.data.sources.droid_folders import (
     list_episode,
     success_of,
 )
-from vjepa2_ac.data.sources.droid_metadata import DroidMetadata
-from vjepa2_ac.data.sources.droid_trajectory import Trajectory, parse_trajectory
+from vjepa2_ac.data.sources.droid_raw.metadata import DroidMetadata
+from vjepa2_ac.data.sources.droid_raw.trajectory import Trajectory, parse_trajectory
+from vjepa2_ac.data.sources.episode_files import EpisodeFiles
 from vjepa2_ac.data.sources.folders import in_parallel
 from vjepa2_ac.data.sources.lines import line_of, pack_lines
 from vjepa2_ac.data.sources.states import require_plausible
-from vjepa2_ac.data.sources.whole_files import WholeFiles
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.data.video import count_frames, read_frames
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
@@ -56,7 +55,7 @@ class RawDroidSource:
 
     Nothing is read before the first call. `infos` reads every trajectory and the headers of the MP4s of the config's
     cameras, once; for data behind a URL it is not looked at again until folders come or go. An episode is known as
-    LAB/outcome/DATE/TIME (`droid_folders.identity_of`).
+    LAB/outcome/DATE/TIME (`folders.identity_of`).
 
     An MP4 holds one picture per control step, in order, whatever rate its header states, and may lack the last step's.
     """
@@ -64,7 +63,7 @@ class RawDroidSource:
     def __init__(self, config: DataConfig) -> None:
         self._config = config
         self._root = config.path
-        self._files = WholeFiles(config)
+        self._files = EpisodeFiles(config)
         self._table: EpisodeTable | None = None
 
     def infos(self, progress: Progress | None = None) -> EpisodeTable:
@@ -78,7 +77,7 @@ class RawDroidSource:
             self._table = self._indexed(progress)
         return self._table
 
-    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - files are kept whole
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - a video is fetched in blocks
         """Return one episode; of pictures, only those that are asked for are decoded.
 
         Raises:
@@ -219,7 +218,7 @@ class _VideoReader:
     path: str
     version: str
     pictures: Int[np.ndarray, " steps"]
-    files: WholeFiles | None  # where the MP4 is kept whole; None: what is needed is fetched each time
+    files: EpisodeFiles
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
         """Return the RGB pictures at these control steps, in this order.
@@ -232,10 +231,7 @@ class _VideoReader:
         if not steps or min(steps) < 0 or max(steps) >= len(self.pictures):
             raise ValueError(f"{self.path}: steps {list(steps)} of {len(self.pictures)}")
         places = self.pictures[list(steps)].tolist()
-        if self.files is None or not storage.is_url(self.path):
-            return read_frames(self.path, places, where=self.path)
-        data = self.files.read(self.path, version=self.version, where=self.path)
-        return read_frames(io.BytesIO(data), places, where=self.path)
+        return read_frames(self.files.open(self.path, version=self.version), places, where=self.path)
 
 
 def _twice(identity: str, where: str) -> Problem:

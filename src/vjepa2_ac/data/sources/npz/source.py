@@ -16,7 +16,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import as_error
 from vjepa2_ac.data.index import kept_or_built, key_of
 from vjepa2_ac.data.sources.folders import in_parallel, walk, within
-from vjepa2_ac.data.sources.npz_episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_pictures
+from vjepa2_ac.data.sources.npz.episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_pictures
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError

@@ -1,20 +1,29 @@
-"""How is a small file read whole, and not fetched twice when it lies elsewhere?"""
+"""How are an episode's files read, whole or in parts, and not fetched twice when they lie elsewhere?"""
 
 from __future__ import annotations
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.disk_cache import DiskCache
-from vjepa2_ac.data.index import cache_folder
+from vjepa2_ac.data.disk_cache import fetched_data
+from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.errors import InputError
 
 
-class WholeFiles:
-    """Reads files; those behind URLs are kept on this machine, within `data.disk_cache.limit_gb`."""
+class EpisodeFiles:
+    """Reads files; what is read of those behind URLs stays on this machine, within `data.disk_cache.limit_gb`."""
 
     def __init__(self, config: DataConfig) -> None:
-        folder = cache_folder(config.disk_cache) / "files"
-        self._cache = DiskCache(folder, int(config.disk_cache.limit_gb * 1e9))
+        self._cache = fetched_data(config.disk_cache)
+
+    def open(self, path: str, *, version: str) -> str | KeptFile:
+        """Return what to open to read parts of a file: the path itself on this machine, a file of kept blocks else.
+
+        Raises:
+            OSError: A file behind a URL is not there or cannot be reached.
+        """
+        if not storage.is_url(path):
+            return path
+        return KeptFile(path, version=version, size=storage.file_size(path), kept=self._cache)
 
     def read(self, path: str, *, version: str, where: str) -> bytes:
         """Return a whole file.

@@ -12,8 +12,8 @@ import simplejpeg
 from jaxtyping import UInt8
 
 from vjepa2_ac.data import video
-from vjepa2_ac.data.sources.lerobot_parquet import Opener
-from vjepa2_ac.data.sources.lerobot_ranges import KeptFile
+from vjepa2_ac.data.sources.kept_file import KeptFile
+from vjepa2_ac.data.sources.lerobot.parquet import Opener
 from vjepa2_ac.errors import InputError
 
 _JPEG = b"\xff\xd8"

@@ -10,17 +10,17 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.disk_cache import DiskCache
-from vjepa2_ac.data.index import cache_folder, kept_or_built, key_of
-from vjepa2_ac.data.sources.lerobot_episodes import EpisodeRow, data_file, read_episodes, tables_of_episodes, video_file
-from vjepa2_ac.data.sources.lerobot_files import fingerprint, list_by_template
-from vjepa2_ac.data.sources.lerobot_index import check_rows, find_problems, row_of, table_of
-from vjepa2_ac.data.sources.lerobot_kept import KeptRows
-from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo, read_info
-from vjepa2_ac.data.sources.lerobot_parquet import ParquetRows
-from vjepa2_ac.data.sources.lerobot_pictures import StoredPictures, VideoPictures
-from vjepa2_ac.data.sources.lerobot_ranges import KeptFile
-from vjepa2_ac.data.sources.lerobot_rows import EpisodeContent, content_of, wanted_columns
+from vjepa2_ac.data.disk_cache import DiskCache, fetched_data
+from vjepa2_ac.data.index import kept_or_built, key_of
+from vjepa2_ac.data.sources.kept_file import KeptFile
+from vjepa2_ac.data.sources.lerobot.episodes import EpisodeRow, data_file, read_episodes, tables_of_episodes, video_file
+from vjepa2_ac.data.sources.lerobot.files import fingerprint, list_by_template
+from vjepa2_ac.data.sources.lerobot.index import check_rows, find_problems, row_of, table_of
+from vjepa2_ac.data.sources.lerobot.kept import KeptRows
+from vjepa2_ac.data.sources.lerobot.meta import DatasetInfo, read_info
+from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
+from vjepa2_ac.data.sources.lerobot.pictures import StoredPictures, VideoPictures
+from vjepa2_ac.data.sources.lerobot.rows import EpisodeContent, content_of, wanted_columns
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.video import Clock
 from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
@@ -103,8 +103,7 @@ class LeRobotSource:
 
     @cached_property
     def _kept(self) -> DiskCache:
-        limit = int(self._config.disk_cache.limit_gb * 1e9)
-        return DiskCache(cache_folder(self._config.disk_cache) / "lerobot", limit)
+        return fetched_data(self._config.disk_cache)
 
     @cached_property
     def _size(self) -> Any:

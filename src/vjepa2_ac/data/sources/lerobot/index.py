@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.lerobot_episodes import EpisodeRow, VideoPlace, data_file, video_file
-from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo
+from vjepa2_ac.data.sources.lerobot.episodes import EpisodeRow, VideoPlace, data_file, video_file
+from vjepa2_ac.data.sources.lerobot.meta import DatasetInfo
 from vjepa2_ac.data.sources.states import zero_steps
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import EpisodeInfo, Progress

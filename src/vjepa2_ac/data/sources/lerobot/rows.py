@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from vjepa2_ac.config import LeRobotFields
-from vjepa2_ac.data.sources.lerobot_kept import Columns
-from vjepa2_ac.data.sources.lerobot_meta import DatasetInfo, missing
-from vjepa2_ac.data.sources.lerobot_parquet import EPISODE
-from vjepa2_ac.data.sources.lerobot_states import states_of
+from vjepa2_ac.data.sources.lerobot.kept import Columns
+from vjepa2_ac.data.sources.lerobot.meta import DatasetInfo, missing
+from vjepa2_ac.data.sources.lerobot.parquet import EPISODE
+from vjepa2_ac.data.sources.lerobot.states import states_of
 from vjepa2_ac.errors import InputError
 
 FRAME, TIME = "frame_index", "timestamp"

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Shaped
 
-from vjepa2_ac.data.sources.lerobot_kept import Columns, KeptRows
-from vjepa2_ac.data.sources.lerobot_ranges import KeptFile
+from vjepa2_ac.data.sources.kept_file import KeptFile
+from vjepa2_ac.data.sources.lerobot.kept import Columns, KeptRows
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:

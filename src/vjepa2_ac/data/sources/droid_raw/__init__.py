@@ -1,0 +1,1 @@
+"""DROID as it was recorded: trajectory.h5, metadata, MP4."""

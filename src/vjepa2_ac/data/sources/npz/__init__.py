@@ -1,0 +1,1 @@
+"""A folder of .npz episodes."""
