@@ -91,17 +91,20 @@ class ConsoleReporter:
     """Shows a training run."""
 
     def __init__(self) -> None:
+        self._looking = LateProgress("looking through the data set")
         self._bar: ProgressBar | None = None
-        self._total = 0
         self._validation = ""
 
     def note(self, text: str) -> None:
         """Say something once."""
         console.print(text)
 
+    def looked_through(self, done: int, total: int) -> None:
+        """Show how far a data set is looked through."""
+        self._looking(done, total)
+
     def started(self, done: int, total: int) -> None:
         """Begin the bar."""
-        self._total = total
         self._bar = ProgressBar("training", total, done)
 
     def stepped(self, step: int, figures: Mapping[str, float]) -> None:
@@ -125,6 +128,7 @@ class ConsoleReporter:
 
     def close(self) -> None:
         """Leave the terminal as it was."""
+        self._looking.close()
         if self._bar is not None:
             self._bar.close()
 

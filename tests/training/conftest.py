@@ -28,6 +28,8 @@ class SilentReporter:
     def note(self, text: str) -> None:
         self.notes.append(text)
 
+    def looked_through(self, done: int, total: int) -> None: ...
+
     def started(self, done: int, total: int) -> None: ...
 
     def stepped(self, step: int, figures: object) -> None:

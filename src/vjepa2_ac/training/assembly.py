@@ -16,7 +16,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader, validation_batches
 from vjepa2_ac.data.windows import Split
-from vjepa2_ac.episode import Batch, LatentBatch
+from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration import Calibration
 from vjepa2_ac.latents import encode_batch, extrinsics_for
@@ -49,14 +49,19 @@ class Run:
     calibration: Calibration | None = None  # where data.stride was auto and is now chosen
 
 
-def assemble(config: Config, note: Callable[[str], None]) -> Run:
+def assemble(config: Config, note: Callable[[str], None], looked_through: Progress | None = None) -> Run:
     """Open the data, load the model, attach the adapter, and take up the newest checkpoint. Cheap failures first.
+
+    Args:
+        config: The run.
+        note: Told what a person should know.
+        looked_through: Told how far the data set is looked through, where that was not done before.
 
     Raises:
         InputError: Something cannot be used.
     """
     accelerator = make_accelerator(config)
-    dataset = open_dataset(config.data)
+    dataset = open_dataset(config.data, progress=looked_through)
     world_model, calibration = None, None
     if config.data.stride == "auto":
         world_model = load_base(config.model, seed=config.seed).to(accelerator.device)

@@ -36,6 +36,10 @@ class Reporter(Protocol):
         """Say something once."""
         ...
 
+    def looked_through(self, done: int, total: int) -> None:
+        """So much of a data set that was not known before is looked through."""
+        ...
+
     def started(self, done: int, total: int) -> None:
         """The loop begins after `done` of `total` optimizer steps."""
         ...
@@ -70,7 +74,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False) -> Pa
 
 
 def _train(config: Config, reporter: Reporter, *, check_only: bool) -> Path:
-    run = assemble(config, reporter.note)
+    run = assemble(config, reporter.note, reporter.looked_through)
     config = run.config
     first = _validate(run, reporter) if run.state.step == 0 else None
     if first is not None:
