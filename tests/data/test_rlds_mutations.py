@@ -42,8 +42,7 @@ def contents(source: RldsSource) -> Contents:
         try:
             episode = source.read(number)
             frames = episode.read_frames(range(info.num_steps))
-            velocities = episode.joint_velocities
-            assert velocities is not None
+            velocities = np.zeros(0) if episode.joint_velocities is None else episode.joint_velocities
             found[info.id] = (info, episode.states, velocities, frames, dict(episode.metadata))
         except InputError as error:
             found[info.id] = (error,)
@@ -74,13 +73,13 @@ def mutated(data: bytes, generator: np.random.Generator) -> bytes:
 
 def outcome(source: RldsSource, true: Contents, file: str) -> str:
     """Return what came of a damaged file, having seen that it is one of what is allowed."""
-    start = time.perf_counter()
+    start = time.process_time()  # a busy machine is no hang
     refused = ""
     try:
         found, problems = contents(source), source.infos().problems
     except InputError as error:
         refused = str(error)
-    assert time.perf_counter() - start < LONGEST_S
+    assert time.process_time() - start < LONGEST_S
     if refused:
         assert file in refused or "shards are missing" in refused
         return "refused"

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vjepa2_ac.data.sources.example_index import NotAnExampleError, locate_features
+from vjepa2_ac.data.sources.example_index import NotAnExampleError, features_behind, locate_features
 from vjepa2_ac.data.sources.tfrecord import (
     decode_example,
     decode_feature,
@@ -126,6 +126,20 @@ def test_features_are_found_without_reading_the_others(features: dict) -> None:
         assert found_kind == kind
     decoded = decode_example(data[6:-5], where="")
     assert {name: list(values) for name, (_, values) in decoded.items()} == {n: v for n, (_, v) in features.items()}
+
+
+@settings(max_examples=50, deadline=None)
+@given(features=features, share=st.floats(0, 1))
+def test_what_is_found_from_the_end_lies_where_it_does(features: dict, share: float) -> None:
+    data = encode_example(features)
+    located = locate_features(reader_of(data), 0, len(data))
+    cut = int(share * len(data))
+    for place, name in enumerate(located):
+        behind = dict(list(located.items())[place:])
+        found = features_behind(name, data[cut:], cut)
+        assert found in ({}, behind)
+        if cut == 0 and data.count(name.encode()) == 1:
+            assert found == behind
 
 
 def test_bytes_that_are_no_example_are_refused() -> None:

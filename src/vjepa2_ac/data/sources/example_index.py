@@ -55,6 +55,32 @@ def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str,
             yield from _entries(read, features.offset, features.offset + features.length)
 
 
+def features_behind(name: str, piece: bytes, offset: int) -> dict[str, Located]:
+    """Return a feature and all those behind it, from the last bytes of an Example; nothing where it is not in there.
+
+    Nothing tells where an entry of the map begins but those before it. So the name is searched, and believed only if
+    the entries from there on fill the Example to its last byte.
+
+    Args:
+        name: The feature's.
+        piece: The Example's last bytes.
+        offset: Of these in the file.
+    """
+
+    def read(start: int, length: int) -> bytes:
+        return piece[start - offset : start - offset + length]
+
+    key = piece.rfind(name.encode())
+    for start in range(key - 3, max(-1, key - 14), -1):
+        try:
+            found = dict(_entries(read, offset + start, offset + len(piece))) if start >= 0 else {}
+        except NotAnExampleError:
+            continue
+        if next(iter(found), None) == name:
+            return found
+    return {}
+
+
 def locate_items(read: Read, feature: Located, count: int | None = None) -> tuple[list[int], list[int]]:
     """Return offsets and lengths of the texts or pictures of a feature that is a list of bytes; of the first `count`.
 

@@ -2,8 +2,9 @@
 
 A read costs tens of milliseconds, so many shards are read at once, and of a record no more is read than names it and
 tells its steps: its states are checked when it is read. TFDS writes the features of a record in a hash's order, another
-one in every process: the names of an episode lie before, between or behind its pictures. One read a record where they
-come first, three to five on the average of all orders. How many bytes one read takes is decided by a few records.
+one in every process: its names lie before, between or behind the pictures. Looked at are its head; its end, which comes
+with the head of the next record; then what lies between the pictures. That is one read a record where the names come
+first, three on the average of all orders. How many bytes one read takes is decided by a few records.
 """
 
 from __future__ import annotations
@@ -12,11 +13,10 @@ import logging
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import pairwise
 
 from vjepa2_ac.config import RldsFields
 from vjepa2_ac.data.sources.dataset_info import Shard
-from vjepa2_ac.data.sources.example_index import Located, NotAnExampleError, Read, iterate_features
+from vjepa2_ac.data.sources.example_index import Located, NotAnExampleError, Read, features_behind, iterate_features
 from vjepa2_ac.data.sources.record import Record, not_an_example
 from vjepa2_ac.data.sources.remote_file import RemoteFile
 from vjepa2_ac.data.sources.rlds_fields import STEP_FLAG, identity_of, info_of, num_steps_of, states_of
@@ -32,10 +32,12 @@ logger = logging.getLogger(__name__)
 
 FEWEST_IN_FLIGHT = 128  # reads of an index are small and wait for one another within a shard
 
-_SAMPLES = 8
+_SAMPLES = 16
+_PIECES = 8  # reads of a record that are kept: its end holds the head of the next
+_NAME_BYTES = 160  # more than a feature's name and headers take
 _SAMPLE_WINDOW = 1 << 16
-_WINDOWS = tuple(1 << power for power in range(10, 17))
-_ASSUMED_LATENCY_S, _ASSUMED_BYTES_PER_S = 0.04, 1e8
+_WINDOWS = tuple(1 << power for power in range(10, 16))
+_ASSUMED_LATENCY_S, _ASSUMED_REQUEST_S, _ASSUMED_BYTES_PER_S = 0.04, 5e-4, 1e8  # a request: of Python's own time
 _FLAGS = (STEP_FLAG, "steps/is_last", "steps/is_terminal")  # one byte a step, always
 
 
@@ -76,7 +78,7 @@ def index_remote(
         return _examine(read, span, fields, layout)
 
     def scan(shard: Shard) -> list[Found]:
-        return list(scan_shard(RemoteFile(shard, window=layout.window, kept=1), shard, examine))
+        return list(scan_shard(RemoteFile(shard, window=layout.window, kept=_PIECES), shard, examine))
 
     return table_of(shards, in_parallel(scan, shards, max(threads, FEWEST_IN_FLIGHT), progress))
 
@@ -103,17 +105,12 @@ def learn_layout(shards: Sequence[Shard], fields: RldsFields, cameras: Sequence[
     if not good:
         raise next(one for one in looked if isinstance(one, InputError))
     step_bytes = _step_bytes(good, fields)
-    wanted = frozenset(fields.identity)
-    places = [record.located for record, _ in good]
     seconds = {
-        window: sum(_reads(one, wanted, step_bytes.keys(), window) for one in places)
-        * (_ASSUMED_LATENCY_S + FEWEST_IN_FLIGHT * window / _ASSUMED_BYTES_PER_S)
-        for window in _WINDOWS
+        window: sum(_cost_s(record, fields, step_bytes.keys(), window) for record, _ in good) for window in _WINDOWS
     }
-    layout = Layout(step_bytes, min(seconds, key=seconds.__getitem__))
-    reads = sum(_reads(one, wanted, step_bytes.keys(), layout.window) for one in places) / len(places)
-    logger.info("about %.1f reads of %d KB for each episode", reads, layout.window >> 10)
-    return layout
+    window = min(seconds, key=seconds.__getitem__)
+    logger.info("the index is made with reads of %d KB", window >> 10)
+    return Layout(step_bytes, window)
 
 
 def _whole_record(shard: Shard, fields: RldsFields, cameras: Sequence[str]) -> tuple[Record, int]:
@@ -137,36 +134,43 @@ def _step_bytes(records: Iterable[tuple[Record, int]], fields: RldsFields) -> di
     return {name: int(width) for name, width in widths.items() if width >= 1 and width == int(width)}
 
 
-def _reads(places: dict[str, Located], wanted: Iterable[str], telling: Iterable[str], window: int) -> int:
-    """Count the reads of a window that lead to the identity of an episode and a feature that tells its steps."""
-    missing, steps_known = set(wanted), False
-    starts = [0, *(place.offset + place.length for place in places.values())]
-    reads, end = 1, min(place.offset for place in places.values()) + window
-    for (start, _), (name, place) in zip(pairwise([*starts, 0]), places.items(), strict=True):
-        if place.offset > end or (name in missing and place.offset + place.length > end):
-            reads, end = reads + 1, start + window
+def _cost_s(record: Record, fields: RldsFields, telling: Iterable[str], window: int) -> float:
+    """Return the seconds that it takes to find identity and steps with reads of a window: latency, and its bytes."""
+    reads = 0
+    places, wanted = record.located, frozenset(fields.identity)
+    first, last = min(place.offset for place in places.values()), max(sum(place) for place in places.values())
+    pieces: list[tuple[int, int]] = [(first, first + window)]
+
+    def is_read(start: int, end: int) -> bool:
+        return any(piece[0] <= start and end <= piece[1] for piece in pieces)
+
+    missing, steps_known, before = set(wanted), False, first
+    for name, place in places.items():
+        end = sum(place) if name in missing else place.offset
+        if not is_read(place.offset, end) and reads == 0:
+            pieces.append((last - window, last))  # together with the head of the next record
+            reads = 1
+            missing -= {one for one in missing if is_read(places[one].offset, sum(places[one]))}
+            if not missing and steps_known:
+                break
+        if not is_read(place.offset, end):
+            reads += 1
+            pieces.append((before, before + window))
         missing.discard(name)
         steps_known = steps_known or name in telling
+        before = sum(place)
         if steps_known and not missing:
             break
-    return reads
+    read_bytes = window * (1 + reads)
+    shared_s = max(1, reads) * _ASSUMED_REQUEST_S + read_bytes / _ASSUMED_BYTES_PER_S
+    return max(1, reads) * _ASSUMED_LATENCY_S + FEWEST_IN_FLIGHT * shared_s
 
 
 def _examine(read: Read, span: RecordSpan, fields: RldsFields, layout: Layout) -> Found:
-    """Hop until identity and steps are known."""
+    """Look at the record's head; if need be at its end, with the head of the next; then hop from one to the other."""
     name = place_of(span)
-    found: dict[str, Located] = {}
-    steps: int | None = None
     try:
-        try:
-            for feature, place in iterate_features(read, span.data_offset, span.length):
-                found[feature] = place
-                if steps is None:
-                    steps = layout.steps_in(feature, place.length)
-                if steps is not None and found.keys() >= set(fields.identity):
-                    break
-        except NotAnExampleError as error:
-            raise not_an_example(span, error) from None
+        found, steps = _search(read, span, fields, layout)
         record = Record(read, span, found)
         name = identity_of(record, fields)
         steps = num_steps_of(record, fields) if steps is None else steps
@@ -177,6 +181,29 @@ def _examine(read: Read, span: RecordSpan, fields: RldsFields, layout: Layout) -
     except InputError as error:
         return problem_of(error, name)
     return Row(info_of(name, steps), span)
+
+
+def _search(read: Read, span: RecordSpan, fields: RldsFields, layout: Layout) -> tuple[dict[str, Located], int | None]:
+    """Return features, the identity's among them, and the number of steps; of a record without them, all features."""
+    found: dict[str, Located] = {}
+    steps: int | None = None
+    end = span.data_offset + span.length
+    head_end, tail_start = span.offset + layout.window, max(span.data_offset, end - layout.window)
+    looked_at_end = False
+    try:
+        for feature, place in iterate_features(read, span.data_offset, span.length):
+            found[feature] = place
+            steps = layout.steps_in(feature, place.length) if steps is None else steps
+            if not looked_at_end and not found.keys() >= set(fields.identity) and sum(place) + _NAME_BYTES > head_end:
+                looked_at_end = True
+                tail = read(tail_start, end + layout.window - tail_start)[: end - tail_start]
+                for name in fields.identity:
+                    found |= features_behind(name, tail, tail_start) if name not in found else {}
+            if steps is not None and found.keys() >= set(fields.identity):
+                break
+    except NotAnExampleError as error:
+        raise not_an_example(span, error) from None
+    return found, steps
 
 
 def _payload(length: int | None) -> int | None:
