@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vjepa2_ac.data.sources.rlds_writer import (
+from vjepa2_ac.data.sources.rlds.writer import (
     CAMERAS,
     DroidCommands,
     DroidEpisode,

@@ -31,9 +31,9 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.index import kept_or_built
 from vjepa2_ac.data.kept import KeptSteps, clip_starts
 from vjepa2_ac.data.loader import clip_at, training_loader
-from vjepa2_ac.data.sources.dataset_info import find_shards, index_shards
-from vjepa2_ac.data.sources.rlds_writer import write_droid_rlds
-from vjepa2_ac.data.sources.tfrecord import decode_example, read_record
+from vjepa2_ac.data.sources.rlds.dataset_info import find_shards, index_shards
+from vjepa2_ac.data.sources.rlds.tfrecord import decode_example, read_record
+from vjepa2_ac.data.sources.rlds.writer import write_droid_rlds
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.windows import ClipOrder, windows_of
 from vjepa2_ac.episode import EpisodeInfo

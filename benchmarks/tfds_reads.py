@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import simplejpeg
 
-from vjepa2_ac.data.sources.dataset_info import find_shards, index_shards
-from vjepa2_ac.data.sources.tfrecord import decode_example, read_record
+from vjepa2_ac.data.sources.rlds.dataset_info import find_shards, index_shards
+from vjepa2_ac.data.sources.rlds.tfrecord import decode_example, read_record
 
 TFDS_SCRIPT = """
 import hashlib, json, sys

@@ -13,8 +13,9 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 
 # A room imports only rooms of a lower rank; rooms of one rank do not know each other.
 RANK = {
-    "__init__": 0, "errors": 0, "config": 1, "config_file": 1.5, "episode": 1, "geometry": 1, "remote": 0.5, "storage": 1,
-    "data": 2, "model": 2, "latents": 3, "planning": 4, "evaluation": 5, "training": 6, "simulation": 7,
+    "__init__": 0, "errors": 0, "remote": 0.5, "config": 1, "config_file": 1.5, "episode": 1, "geometry": 1,
+    "storage": 1, "data": 2, "model": 2, "latents": 3, "planning": 4, "evaluation": 5,
+    "training": 6, "simulation": 7,
     "console": 8, "console_data": 8.2, "cli_data": 8.5, "cli": 9,
 }  # fmt: skip
 
@@ -22,8 +23,8 @@ HOMES = {
     "peft": {"model/lora.py"},
     "transformers": {"model/encoder.py", "model/predictor.py"},
     "accelerate": {"training/"},
-    "google": {"data/sources/tfrecord.py"},
-    "google_crc32c": {"data/sources/tfrecord.py"},
+    "google": {"data/sources/rlds/tfrecord.py"},
+    "google_crc32c": {"data/sources/rlds/tfrecord.py"},
     "simplejpeg": {"data/"},
     "mujoco": {"simulation/"},
     "matplotlib": {"evaluation/plots.py", "evaluation/contact_sheet.py"},

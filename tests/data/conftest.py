@@ -8,7 +8,13 @@ from typing import Any
 import pytest
 
 from synthetic import write_synthetic_droid
-from vjepa2_ac.data.sources.tfrecord import decode_example, encode_example, index_records, read_record, write_record
+from vjepa2_ac.data.sources.rlds.tfrecord import (
+    decode_example,
+    encode_example,
+    index_records,
+    read_record,
+    write_record,
+)
 
 Features = dict[str, tuple[Any, Any]]
 

@@ -13,7 +13,7 @@ from synthetic import draw_frame, synthetic_episode
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.data.sources.rlds_writer import write_droid_rlds
+from vjepa2_ac.data.sources.rlds.writer import write_droid_rlds
 from vjepa2_ac.episode import Batch
 
 LENGTHS = (14, 17, 15, 12)

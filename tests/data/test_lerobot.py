@@ -30,9 +30,9 @@ from lerobot_sets import (
 from recordings import write_mp4
 from synthetic import synthetic_states, write_synthetic_droid
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
-from vjepa2_ac.data.sources.rlds import RldsSource
+from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
+from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.episode import Episode, EpisodeSource
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler

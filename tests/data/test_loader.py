@@ -24,7 +24,7 @@ from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import clip_at, collate, training_loader, validation_batches
-from vjepa2_ac.data.sources.tfrecord import index_records
+from vjepa2_ac.data.sources.rlds.tfrecord import index_records
 from vjepa2_ac.episode import Batch, Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states, apply_action, matrices_from_euler, states_in_camera_frame

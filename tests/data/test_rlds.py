@@ -16,9 +16,9 @@ import simplejpeg
 
 from synthetic import synthetic_episode, synthetic_states, write_synthetic_droid
 from vjepa2_ac.config import DataConfig, RldsFields
-from vjepa2_ac.data.sources.rlds import RldsSource
-from vjepa2_ac.data.sources.rlds_writer import CAMERAS, write_droid_rlds
-from vjepa2_ac.data.sources.tfrecord import index_records, write_record
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.rlds.tfrecord import index_records, write_record
+from vjepa2_ac.data.sources.rlds.writer import CAMERAS, write_droid_rlds
 from vjepa2_ac.data.table import Problem
 from vjepa2_ac.errors import InputError
 

@@ -13,8 +13,14 @@ import pytest
 from gcs import Gcs
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig, RldsFields
-from vjepa2_ac.data.sources.rlds import RldsSource
-from vjepa2_ac.data.sources.tfrecord import decode_example, encode_example, index_records, read_record, write_record
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.rlds.tfrecord import (
+    decode_example,
+    encode_example,
+    index_records,
+    read_record,
+    write_record,
+)
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
@@ -177,7 +183,7 @@ def test_only_the_pictures_of_needed_steps_are_kept(
 ) -> None:
     source = far(long)
     source.read(1, needed=[(10, 30)]).read_frames([12])
-    kept = size_of(tmp_path / "cache" / "episodes")
+    kept = size_of(tmp_path / "cache" / "fetched")
     gcs.forget()
     source.read(1, needed=[(10, 30)]).read_frames([10, 29])
     assert not gcs.requests
@@ -185,7 +191,7 @@ def test_only_the_pictures_of_needed_steps_are_kept(
     assert np.array_equal(outside, RldsSource(DataConfig(path=str(long))).read(1).read_frames([9, 30]))
     assert len(gcs.reads()) in {1, 2}
     source.read(2).read_frames([12])
-    assert kept < 0.5 * (size_of(tmp_path / "cache" / "episodes") - kept)
+    assert kept < 0.5 * (size_of(tmp_path / "cache" / "fetched") - kept)
 
 
 def size_of(folder: Path) -> int:

@@ -12,8 +12,8 @@ import pytest
 
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.rlds import RldsSource
-from vjepa2_ac.data.sources.tfrecord import index_records, read_record, write_record
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.rlds.tfrecord import index_records, read_record, write_record
 from vjepa2_ac.errors import InputError
 
 MUTATIONS = int(os.environ.get("VJEPA2_AC_MUTATIONS", "50"))  # of each kind; more in a longer run

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vjepa2_ac.data.sources.example_index import NotAnExampleError, features_behind, locate_features
-from vjepa2_ac.data.sources.tfrecord import (
+from vjepa2_ac.data.sources.rlds.example_index import NotAnExampleError, features_behind, locate_features
+from vjepa2_ac.data.sources.rlds.tfrecord import (
     decode_example,
     decode_feature,
     encode_example,

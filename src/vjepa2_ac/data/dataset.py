@@ -106,7 +106,7 @@ class Dataset:
 def open_source(config: DataConfig) -> EpisodeSource:
     """Return the source that `data.source` names; nothing is read yet."""
     if config.source == "rlds":
-        from vjepa2_ac.data.sources.rlds import RldsSource
+        from vjepa2_ac.data.sources.rlds.source import RldsSource
 
         return RldsSource(config)
     if config.source == "droid_raw":

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.data.sources.rlds_writer import (
+from vjepa2_ac.data.sources.rlds.writer import (
     CAMERAS,
     DroidCommands,
     DroidEpisode,

@@ -6,8 +6,8 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from vjepa2_ac.data.sources.dataset_info import Shard
-from vjepa2_ac.data.sources.example_index import Read
+from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.rlds.example_index import Read
 from vjepa2_ac.errors import InputError
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import UInt8
 
-from vjepa2_ac.data.sources.dataset_info import Shard
-from vjepa2_ac.data.sources.example_index import Located, NotAnExampleError, Read, locate_items
-from vjepa2_ac.data.sources.jpeg import decode_jpegs
-from vjepa2_ac.data.sources.shard_file import open_shard
+from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.rlds.example_index import Located, NotAnExampleError, Read, locate_items
+from vjepa2_ac.data.sources.rlds.jpeg import decode_jpegs
+from vjepa2_ac.data.sources.rlds.shard_file import open_shard
 from vjepa2_ac.errors import InputError
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.config import RldsFields
-from vjepa2_ac.data.sources.record import Record
+from vjepa2_ac.data.sources.rlds.record import Record
 from vjepa2_ac.data.sources.states import require_plausible, zero_steps
 from vjepa2_ac.episode import STATE_DIM, EpisodeInfo
 from vjepa2_ac.errors import InputError

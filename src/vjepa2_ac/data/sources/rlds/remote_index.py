@@ -15,14 +15,20 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from vjepa2_ac.config import RldsFields
-from vjepa2_ac.data.sources.dataset_info import Shard
-from vjepa2_ac.data.sources.example_index import Located, NotAnExampleError, Read, features_behind, iterate_features
-from vjepa2_ac.data.sources.record import Record, not_an_example
-from vjepa2_ac.data.sources.remote_file import RemoteFile
-from vjepa2_ac.data.sources.rlds_fields import STEP_FLAG, identity_of, info_of, num_steps_of, states_of
-from vjepa2_ac.data.sources.rlds_index import Found, Row, in_parallel, place_of, problem_of, scan_shard, table_of
+from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.rlds.example_index import (
+    Located,
+    NotAnExampleError,
+    Read,
+    features_behind,
+    iterate_features,
+)
+from vjepa2_ac.data.sources.rlds.fields import STEP_FLAG, identity_of, info_of, num_steps_of, states_of
+from vjepa2_ac.data.sources.rlds.index import Found, Row, in_parallel, place_of, problem_of, scan_shard, table_of
+from vjepa2_ac.data.sources.rlds.record import Record, not_an_example
+from vjepa2_ac.data.sources.rlds.remote_file import RemoteFile
+from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, RecordSpan, span_at
 from vjepa2_ac.data.sources.states import zero_steps
-from vjepa2_ac.data.sources.tfrecord import HEADER_BYTES, RecordSpan, span_at
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError

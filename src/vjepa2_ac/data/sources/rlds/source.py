@@ -10,10 +10,9 @@ from typing import Any
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, RldsFields
 from vjepa2_ac.data.index import cache_folder, kept_or_built, key_of
-from vjepa2_ac.data.sources.dataset_info import Shard, find_shards
-from vjepa2_ac.data.sources.example_index import Read
-from vjepa2_ac.data.sources.record import Record
-from vjepa2_ac.data.sources.rlds_fields import (
+from vjepa2_ac.data.sources.rlds.dataset_info import Shard, find_shards
+from vjepa2_ac.data.sources.rlds.example_index import Read
+from vjepa2_ac.data.sources.rlds.fields import (
     STEP_FLAG,
     identity_of,
     info_of,
@@ -22,13 +21,14 @@ from vjepa2_ac.data.sources.rlds_fields import (
     num_steps_of,
     states_of,
 )
-from vjepa2_ac.data.sources.rlds_index import index_local
-from vjepa2_ac.data.sources.rlds_pictures import LocalPictures, PicturesAt, wrong_count
-from vjepa2_ac.data.sources.rlds_remote import RemoteCache, RemoteEpisode, whole_record
-from vjepa2_ac.data.sources.rlds_remote_index import index_remote
-from vjepa2_ac.data.sources.shard_file import open_shard
-from vjepa2_ac.data.sources.tfrecord import RecordSpan, require_intact
-from vjepa2_ac.data.sources.verified import Verified
+from vjepa2_ac.data.sources.rlds.index import index_local
+from vjepa2_ac.data.sources.rlds.pictures import LocalPictures, PicturesAt, wrong_count
+from vjepa2_ac.data.sources.rlds.record import Record
+from vjepa2_ac.data.sources.rlds.remote_index import index_remote
+from vjepa2_ac.data.sources.rlds.remote_pictures import RemoteCache, RemoteEpisode, whole_record
+from vjepa2_ac.data.sources.rlds.shard_file import open_shard
+from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan, require_intact
+from vjepa2_ac.data.sources.rlds.verified import Verified
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError
@@ -182,13 +182,12 @@ class RldsSource:
         def build() -> EpisodeTable:
             return make(shards, fields, self._features(), threads=config.connections, progress=progress)
 
-        folder = cache_folder(config.disk_cache)
         table = kept_or_built(config.disk_cache, key, build)
         return _Opened(
             shards,
-            replace(table, texts={"control_rate_hz": str(fields.control_rate_hz)}),
-            Verified(folder / "index" / f"{key}.checked"),
-            RemoteCache.at(folder, key, config.disk_cache.limit_gb),
+            replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)}),
+            Verified(cache_folder(config.disk_cache) / "index" / f"{key}.checked"),
+            RemoteCache.of(config.disk_cache, key),
         )
 
 

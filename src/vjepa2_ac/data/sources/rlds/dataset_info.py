@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.tfrecord import RecordSpan, index_records
+from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan, index_records
 from vjepa2_ac.errors import InputError
 
 _INFO = "dataset_info.json"

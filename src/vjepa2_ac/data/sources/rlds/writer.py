@@ -17,9 +17,9 @@ import simplejpeg
 from jaxtyping import Float
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.jpeg import encode_jpeg
-from vjepa2_ac.data.sources.rlds_schema import dataset_info, droid_features
-from vjepa2_ac.data.sources.tfrecord import Kind, encode_example, write_record
+from vjepa2_ac.data.sources.rlds.jpeg import encode_jpeg
+from vjepa2_ac.data.sources.rlds.schema import dataset_info, droid_features
+from vjepa2_ac.data.sources.rlds.tfrecord import Kind, encode_example, write_record
 from vjepa2_ac.errors import InputError
 
 __all__ = ["CAMERAS", "DroidCommands", "DroidEpisode", "DroidMeasurements", "encode_jpeg", "write_droid_rlds"]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
-from vjepa2_ac.data.sources.example_index import (
+from vjepa2_ac.data.sources.rlds.example_index import (
     DELIMITED,
     FLOAT_LIST,
     INT64_LIST,
@@ -21,7 +21,7 @@ from vjepa2_ac.data.sources.example_index import (
     locate_items,
     packed_numbers,
 )
-from vjepa2_ac.data.sources.tfrecord import Kind, RecordSpan, decode_feature
+from vjepa2_ac.data.sources.rlds.tfrecord import Kind, RecordSpan, decode_feature
 from vjepa2_ac.errors import InputError
 
 

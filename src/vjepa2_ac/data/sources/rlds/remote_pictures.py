@@ -10,20 +10,21 @@ import json
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int64, UInt8
 
-from vjepa2_ac.data.disk_cache import DiskCache
-from vjepa2_ac.data.sources.dataset_info import Shard
-from vjepa2_ac.data.sources.example_index import Located, NotAnExampleError, Read, locate_items
-from vjepa2_ac.data.sources.jpeg import decode_jpegs, looks_like_jpeg
-from vjepa2_ac.data.sources.record import Record
-from vjepa2_ac.data.sources.remote_file import RemoteFile, read_in_parallel
-from vjepa2_ac.data.sources.rlds_pictures import require_steps, wrong_count
-from vjepa2_ac.data.sources.shard_file import unreadable
-from vjepa2_ac.data.sources.tfrecord import RecordSpan
+from vjepa2_ac.config import DiskCacheConfig
+from vjepa2_ac.data.disk_cache import DiskCache, fetched_data
+from vjepa2_ac.data.index import cache_folder
+from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.rlds.example_index import Located, NotAnExampleError, Read, locate_items
+from vjepa2_ac.data.sources.rlds.jpeg import decode_jpegs, looks_like_jpeg
+from vjepa2_ac.data.sources.rlds.pictures import require_steps, wrong_count
+from vjepa2_ac.data.sources.rlds.record import Record
+from vjepa2_ac.data.sources.rlds.remote_file import RemoteFile, read_in_parallel
+from vjepa2_ac.data.sources.rlds.shard_file import unreadable
+from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan
 from vjepa2_ac.episode import StepRanges
 from vjepa2_ac.errors import InputError
 
@@ -40,13 +41,13 @@ class RemoteCache:
     """What is kept on this machine of one data set."""
 
     key: str  # of the index: another one when the files are others
-    places: DiskCache
+    places: DiskCache  # of pictures in their files: small, without limit
     contents: DiskCache
 
     @classmethod
-    def at(cls, folder: Path, key: str, limit_gb: float) -> RemoteCache:
-        """Return the caches in a folder."""
-        return cls(key, DiskCache(folder / "places", _FOR_EVER), DiskCache(folder / "episodes", int(limit_gb * 1e9)))
+    def of(cls, config: DiskCacheConfig, key: str) -> RemoteCache:
+        """Return what is kept of the data set whose index has a key."""
+        return cls(key, DiskCache(cache_folder(config) / "places", _FOR_EVER), fetched_data(config))
 
 
 class RemoteEpisode:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.dataset_info import Shard
+from vjepa2_ac.data.sources.rlds.dataset_info import Shard
 
 _CHUNK_BYTES = 1 << 20  # long pieces are fetched in parallel chunks of this size
 

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from vjepa2_ac.config import RldsFields
-from vjepa2_ac.data.sources.dataset_info import Shard
-from vjepa2_ac.data.sources.example_index import Read
-from vjepa2_ac.data.sources.record import Record
-from vjepa2_ac.data.sources.rlds_fields import identity_of, info_of, num_steps_of, states_of
-from vjepa2_ac.data.sources.shard_file import open_shard
-from vjepa2_ac.data.sources.tfrecord import HEADER_BYTES, RecordSpan, require_intact, span_at
+from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.rlds.example_index import Read
+from vjepa2_ac.data.sources.rlds.fields import identity_of, info_of, num_steps_of, states_of
+from vjepa2_ac.data.sources.rlds.record import Record
+from vjepa2_ac.data.sources.rlds.shard_file import open_shard
+from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, RecordSpan, require_intact, span_at
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import EpisodeInfo, Progress
 from vjepa2_ac.errors import InputError

@@ -1,0 +1,1 @@
+"""RLDS data sets: TFRecord shards as TFDS writes them."""
