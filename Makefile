@@ -40,6 +40,7 @@ format: $(INSTALLED)
 
 bench: $(INSTALLED)  ## figures of this machine; each prints a ratio against a named baseline of the same run
 	$(BIN)/python benchmarks/loader.py
+	$(BIN)/python benchmarks/index.py
 	$(BIN)/python benchmarks/train_step.py
 
 clean:

@@ -1,4 +1,4 @@
-"""How fast and how lean are clips out of RLDS: against TFDS, with two workers, for an index of DROID's size?
+"""How fast and lean are clips: RLDS against TFDS, two workers, an index of DROID's size, MP4s against naive decoding?
 
     python benchmarks/loader.py [--path FOLDER] [--tfds-python /path/to/an/environment/bin/python]
 
@@ -7,7 +7,7 @@ each episode on this machine, which checks the CRC of the record, and all later 
 the same records: decoding every frame of every camera; and TFDS in an interpreter that has tensorflow_datasets, with
 one thread as ours, nothing shuffled and nothing interleaved, with all pictures decoded and with SkipDecoding and 16
 frames decoded afterwards. TFDS reads in file order only: a clip costs it an episode. Its steps are taken from
-the episode in two ways (`batch` it and slice; `skip` and `take`), and the faster one counts.
+the episode in two ways (`batch` it and slice; `skip` and `take`), and the faster one counts. Videos: see video.py.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import simplejpeg
+import video
 from drawn import draw_episodes
 
 from vjepa2_ac.config import DataConfig
@@ -94,6 +95,8 @@ def main() -> None:
         measure_clips(config, arguments.clips, arguments.tfds_python)
         measure_workers(config)
         measure_index(config)
+    print()
+    video.measure_all(arguments.clips // 4)
 
 
 def measure_clips(config: DataConfig, clips: int, tfds_python: str | None) -> None:

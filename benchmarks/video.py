@@ -11,6 +11,7 @@ in 12 or in 250, with and without B-frames), and like LeRobot's (320x180, a key 
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
 import tempfile
 import time
@@ -53,12 +54,16 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--clips", type=int, default=12, help="clips per measurement (default: %(default)s)")
-    arguments = parser.parse_args()
-    print(f"{FRAMES} frames at stride {STRIDE}, {arguments.clips} random clips, medians, one thread\n")
+    measure_all(parser.parse_args().clips)
+
+
+def measure_all(clips: int) -> None:
+    """Draw, measure and print every kind of video."""
+    os.environ.setdefault("SVT_LOG", "1")  # the AV1 encoder is talkative
+    print(f"{FRAMES} frames at stride {STRIDE} from MP4s, {clips} random clips, medians, one thread\n")
     with tempfile.TemporaryDirectory() as scratch:
         for recording in RECORDINGS:
-            path = draw(Path(scratch) / "video.mp4", recording)
-            measure(path, recording, arguments.clips)
+            measure(draw(Path(scratch) / "video.mp4", recording), recording, clips)
 
 
 def draw(path: Path, recording: Recording) -> Path:
