@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from memory_source import MemorySource
-from synthetic import write_synthetic_droid
+from synthetic import synthetic_states, write_synthetic_droid
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data import loader
@@ -305,6 +305,24 @@ def test_the_camera_of_a_validation_clip_stays(in_memory: Callable[..., Dataset]
 
     assert cameras() == cameras()
     assert len(set(cameras().values())) == 2  # the names of the exterior cameras are as long
+
+
+def test_idle_windows_that_stay_are_seen_by_every_camera(in_memory: Callable[..., Dataset]) -> None:
+    def still(_: int) -> np.ndarray:
+        return np.repeat(synthetic_states(1), 60, axis=0) + np.eye(60, 7) * 0.5  # moves in the first seven steps
+
+    knobs = {"camera": (CAMERAS[0], CAMERAS[2]), "validation_share": 0.5}
+    idle = {"rule": "motion", "keep_share": 0.3, "cut_last_steps": 0, "shortest_kept_steps": 2}
+    source = MemorySource([60] * 20, states=still)
+    dataset = in_memory(source, idle=idle, **knobs)
+    source.reads.clear()
+    windows = dataset.windows("validation")
+    kept = {(episode, start) for episode in range(20) for start in range(10)}
+    chosen = [windows[index] for index in range(len(windows)) if windows[index] not in kept]
+    list(loader.batches_of(dataset, chosen, batch_size=4))
+    cameras = [camera for _, camera, _ in source.reads]
+    assert len(cameras) > 50
+    assert 0.3 < cameras.count(CAMERAS[0]) / len(cameras) < 0.7
 
 
 def test_training_clips_are_changed_by_their_position_and_validation_clips_never(

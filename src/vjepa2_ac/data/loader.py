@@ -135,7 +135,8 @@ class _ChosenClips:
 
     def at(self, position: int) -> Wish:
         episode, start = self.windows[position]
-        number = drawn(self.table.id_hash[[episode]], np.array([start], np.int32))[0]
+        # Not the number by which idle windows were drawn: those that stay have a small one, and would share a camera.
+        number = drawn(~self.table.id_hash[[episode]], np.array([start], np.int32))[0]
         return Wish(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
 
 
