@@ -1,6 +1,10 @@
 """Waits grow, are not the same twice, and end."""
 
+import json
+import time
+
 import pytest
+from google.auth.exceptions import RefreshError
 
 from vjepa2_ac.remote import UnreachableError, retries
 from vjepa2_ac.remote.retries import RetryPolicy, persist
@@ -52,6 +56,9 @@ class StatusError(Exception):
         (ConnectionResetError("gone"), 3, "not reached in 3 attempts"),
         (TimeoutError(), 3, "the last: time-out"),
         (StatusError(503), 3, "HTTP 503: as another library says it"),
+        (json.JSONDecodeError("Unterminated string", '{"items": [{"na', 12), 3, "JSONDecodeError: Unterminated"),
+        (RefreshError("the login service is down", retryable=True), 3, "the login service is down"),
+        (RefreshError("invalid_grant: expired"), 1, "no permission.*expired.*Log in so"),
         (StatusError(403), 1, r"no permission \(HTTP 403"),
         (PermissionError("not yours"), 1, "no permission.*Log in so"),
         (OSError("Forbidden: https://somewhere\nno"), 1, r"no permission \(HTTP 403: Forbidden.*Log in so"),
@@ -70,3 +77,17 @@ def test_errors_of_any_library_are_told_apart(error: Exception, attempts: int, w
     assert len(calls) == attempts
     assert caught.value.__cause__ is error
     assert "\n" not in str(caught.value)
+
+
+def test_a_library_that_takes_long_over_each_attempt_is_not_asked_for_hours(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, calls = [0.0], []
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+
+    def action(timeout_s: float) -> None:
+        calls.append(timeout_s)
+        now[0] += 80.0  # as huggingface_hub does where nothing answers
+        raise ConnectionResetError
+
+    with pytest.raises(UnreachableError, match="not reached in 4 attempts over 320 s"):
+        persist("hf://a", action, policy=RetryPolicy(first_wait_s=0.0, total_s=300.0), access="")
+    assert len(calls) == 4

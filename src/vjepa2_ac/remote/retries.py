@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import re
 import secrets
@@ -29,13 +30,15 @@ class RetryPolicy:
     """How long something is tried: at most `attempts` times `timeout_s`, and the waits between.
 
     The waits double from the first to the longest. Half of each is chance, so that many processes do not come back at
-    the same moment.
+    the same moment. A library that cannot be cut off, or tries again by itself (huggingface_hub: six times), takes
+    longer over an attempt: none begins after `total_s`.
     """
 
     attempts: int = 8
     first_wait_s: float = 0.5
     longest_wait_s: float = 16.0
     timeout_s: float = 30.0
+    total_s: float = 300.0
 
     def __post_init__(self) -> None:
         if self.attempts < 1 or self.timeout_s <= 0:
@@ -78,9 +81,9 @@ def persist(where: str, action: Callable[[float], _T], *, policy: RetryPolicy, a
                 raise
             if not _passes(error):
                 raise _refused(where, error, access) from error
-            if failures == policy.attempts:
-                raise _given_up(where, error, failures, time.monotonic() - begin) from error
-            wait_s = policy.wait_s(failures)
+            wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
+            if failures == policy.attempts or seconds + wait_s > policy.total_s:
+                raise _given_up(where, error, failures, seconds) from error
             logger.info("%s: %s; trying again in %.1f s", where, _words(error), wait_s)
         time.sleep(wait_s)
     raise AssertionError("the last attempt returns or raises")
@@ -98,7 +101,8 @@ def status_of(error: BaseException) -> int | None:
 
 def _comes_from_outside(error: Exception) -> bool:
     """Tell failures of the world from mistakes of ours."""
-    return isinstance(error, OSError | ValueError | EOFError) or status_of(error) is not None or _is_of_network(error)
+    is_of_a_library = _is_of_network(error) or _is_of_google_login(error)
+    return isinstance(error, OSError | ValueError | EOFError) or status_of(error) is not None or is_of_a_library
 
 
 def _is_of_network(error: Exception) -> bool:
@@ -114,8 +118,10 @@ def _passes(error: Exception) -> bool:
     if status is not None:
         return status in _PASSING_STATUS
     if _is_of_google_login(error):
-        return type(error).__name__ == "TransportError"
-    return isinstance(error, TimeoutError | ConnectionError | EOFError | socket.gaierror) or _is_of_network(error)
+        return type(error).__name__ == "TransportError" or bool(getattr(error, "retryable", False))
+    # JSON: a listing that was cut short. What is wrong with JSON of the user's is found elsewhere.
+    kinds = TimeoutError | ConnectionError | EOFError | socket.gaierror | json.JSONDecodeError
+    return isinstance(error, kinds) or _is_of_network(error)
 
 
 def _refused(where: str, error: Exception, access: str) -> UnreachableError:
