@@ -214,7 +214,7 @@ def test_a_damaged_entry_of_the_cache_is_fetched_again(
     assert same(source.read(0), here.read(0), [3, 70])
     generator = np.random.default_rng(0)
     for file in (tmp_path / "cache").rglob("*"):
-        if file.is_file() and file.suffix != ".npz":
+        if file.is_file() and file.suffix != ".index":
             data = bytearray(file.read_bytes())
             data[generator.integers(len(data))] ^= 4
             file.write_bytes(data)

@@ -7,6 +7,7 @@ import hashlib
 import json
 import logging
 import os
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 _VERSION = 2  # of what is kept: another number makes all of it be found out again
+_CRC_BYTES = 4
 
 
 @dataclass
@@ -51,7 +53,7 @@ def cache_folder(config: DiskCacheConfig) -> Path:
     if config.dir is not None:
         return Path(config.dir).expanduser()
     if named := os.environ.get("VJEPA2_AC_CACHE"):
-        return Path(named)
+        return Path(named).expanduser()
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
 
 
@@ -82,21 +84,32 @@ def kept_or_made(
     to_bytes: Callable[[T], bytes],
     from_bytes: Callable[[bytes], T],
 ) -> T:
-    """Return what is kept under a key; make and keep it where there is none, or `from_bytes` raises NotATableError."""
-    path = cache_folder(config) / "index" / f"{key}.npz"
+    """Return what is kept under a key; make and keep it where there is none, or it is damaged.
+
+    It is damaged where it is not what was written, by a CRC, or `from_bytes` raises NotATableError.
+    """
+    path = cache_folder(config) / "index" / f"{key}.index"
     watch = _watch.get()
     if watch is not None:
         watch.files.append(path)
     try:
         if watch is None or not watch.rebuild:
-            return from_bytes(path.read_bytes())
+            return from_bytes(_checked(path.read_bytes()))
     except FileNotFoundError:
         pass
     except (OSError, NotATableError) as error:
         logger.warning("%s: cannot be used (%s); the index is built again", path, error)
     made = make()
+    content = to_bytes(made)
     try:
-        storage.write_atomically(path, to_bytes(made))
+        storage.write_atomically(path, zlib.crc32(content).to_bytes(_CRC_BYTES, "little") + content)
     except OSError as error:
         logger.warning("%s: cannot be written (%s); the index will be built again next time", path, error)
     return made
+
+
+def _checked(file: bytes) -> bytes:
+    crc, content = file[:_CRC_BYTES], file[_CRC_BYTES:]
+    if zlib.crc32(content).to_bytes(_CRC_BYTES, "little") != crc:
+        raise NotATableError("it is damaged")
+    return content
