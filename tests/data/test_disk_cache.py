@@ -49,6 +49,20 @@ def test_the_entry_used_longest_ago_goes_first(tmp_path: Path) -> None:
     assert [key for key in "abcde" if cache.read(key) is not None] == ["a", "d", "e"], "one more, for room"
 
 
+def test_a_folder_that_may_only_be_read_is_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    DiskCache(tmp_path, 1000).write("a", b"content")
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(os, "utime", refuse)
+    monkeypatch.setattr(Path, "open", lambda path, mode="r", **_: open(path, mode) if "w" not in mode else refuse())  # noqa: PTH123, SIM115 - what is replaced
+    cache = DiskCache(tmp_path, 1000)
+    cache.write("b", b"content")
+    assert cache.read("a") == b"content"
+    assert cache.read("b") is None
+
+
 @settings(max_examples=30, deadline=None)
 @given(writes=st.lists(st.tuples(st.integers(0, 9), st.integers(0, 700)), max_size=30))
 def test_the_limit_holds_after_every_write(

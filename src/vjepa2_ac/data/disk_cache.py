@@ -51,9 +51,10 @@ class DiskCache:
         path = self._path(key)
         try:
             content = path.read_bytes()
-            os.utime(path)
         except OSError:  # most often: not there
             return None
+        with suppress(OSError):  # evicted by now, or in a folder that may only be read
+            os.utime(path)
         data = _checked(content)
         if data is None:
             logger.warning("%s: damaged, fetched again", path)
