@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.broken import BrokenEpisodes
+from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection import (
     RELEASED_STEP_CM,
     ReadEpisode,
@@ -16,7 +18,9 @@ from vjepa2_ac.data.inspection import (
     motion_per_step,
     sample_of,
 )
+from vjepa2_ac.data.kept import KeptSteps
 from vjepa2_ac.data.windows import split_of
+from vjepa2_ac.errors import InputError
 
 
 def knobs(droid: Path, **changes: object) -> DataConfig:
@@ -82,6 +86,24 @@ def test_a_sample_is_drawn_from_those_that_take_part_and_is_always_the_same(droi
     assert sorted(sample_of(dataset, 10)) == np.flatnonzero(dataset.table.success == 0).tolist()
     assert sample_of(dataset, 1) == sample_of(dataset, 1)
     assert len(inspect_dataset(dataset, episodes=1).sample) == 1
+
+
+def in_memory(broken: frozenset[int], policy: str) -> Dataset:
+    config = DataConfig.model_validate({"path": "memory", "broken_episodes": policy, "frames": 3})
+    source = MemorySource([60] * 100, unreadable=broken)
+    table = source.infos()
+    return Dataset(config, source, table, KeptSteps.whole(table, np.ones(100, bool)), BrokenEpisodes(config, 100))
+
+
+def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplog: pytest.LogCaptureFixture) -> None:
+    dataset = in_memory(frozenset({7}), "skip")
+    assert len(inspect_dataset(dataset).sample) == 99
+    assert dataset.broken.names == ("episode 7",)
+    assert "memory: episode 7: damaged" in caplog.text
+    with pytest.raises(InputError, match="2 of 100 episodes are broken"):
+        inspect_dataset(in_memory(frozenset({7, 8}), "skip"))
+    with pytest.raises(InputError, match=r"memory: episode 7: damaged\..*add to data\.exclude: \[\"episode 7\"\]"):
+        inspect_dataset(in_memory(frozenset({7}), "error"))
 
 
 def test_the_figures_are_plain_values_and_stand_beside_what_is_known_of_the_released_weights(droid: Path) -> None:

@@ -68,7 +68,7 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
                 needed=f"{'x'.join(map(str, first.frames.shape[1:3]))}, as in episode {first.episode_id}",
                 fix="Train on episodes of one size, or set training.batch_size: 1",
             )
-            raise with_way_out(error, [clip.episode_id])
+            raise with_way_out(error, [clip.episode_id], skippable=False)
     extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
     augmentations = tuple(clip.augmentation for clip in clips if clip.augmentation is not None)
     return Batch(

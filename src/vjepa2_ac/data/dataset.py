@@ -214,4 +214,4 @@ def _require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episo
                 if config.source == "rlds"
                 else "",
             )
-            raise with_way_out(error, [table.identity(first)])
+            raise with_way_out(error, [table.identity(first)], skippable=False)

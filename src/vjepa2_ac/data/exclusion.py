@@ -37,17 +37,24 @@ def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " epis
     return taking_part
 
 
-def with_way_out(error: InputError, names: Sequence[str]) -> InputError:
-    """Return an error of one or more episodes that says, too, how to leave them out: ten of them, and how many more."""
+def with_way_out(error: InputError, names: Sequence[str], *, skippable: bool = True) -> InputError:
+    """Return an error of one or more episodes that says, too, how to leave them out: ten of them, and how many more.
+
+    Args:
+        error: What is wrong with the first of them.
+        names: Their identities.
+        skippable: Whether `data.broken_episodes: skip` would leave them out.
+    """
     others = f"{len(names) - 1} more cannot be used either. " if len(names) > 1 else ""
     fix = f"{error.fix.rstrip('.')}. " if error.fix else ""
     listed = json.dumps(list(names[:NAMED]), ensure_ascii=False)
     of_all = f" (the first {NAMED} of {len(names)})" if len(names) > NAMED else ""
+    skip = "set data.broken_episodes: skip, or " if skippable else ""
     return InputError(
         where=error.where,
         found=error.found,
         needed=error.needed,
-        fix=f"{others}{fix}To go on without, set data.broken_episodes: skip, or add{of_all} to data.exclude: {listed}",
+        fix=f"{others}{fix}To go on without, {skip}add{of_all} to data.exclude: {listed}",
     )
 
 

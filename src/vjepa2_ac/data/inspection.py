@@ -15,6 +15,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import RAW_CAMERAS
 from vjepa2_ac.data.dataset import Dataset, Removed
+from vjepa2_ac.data.exclusion import with_way_out
 from vjepa2_ac.data.idle import idle_by_motion
 from vjepa2_ac.data.windows import Split, in_split, spread
 from vjepa2_ac.episode import Episode, Progress
@@ -143,7 +144,7 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
         progress: Told (episodes read, episodes in all).
 
     Raises:
-        InputError: An episode of the sample cannot be read, and `data.broken_episodes` does not skip it.
+        InputError: An episode of the sample cannot be read, and `data.broken_episodes` does not skip it; or too many are.
     """
     sample = tuple(_read(dataset, sample_of(dataset, episodes), progress))
     idle = np.concatenate([idle_runs(one.states, dataset.config) for one in sample])
@@ -195,22 +196,24 @@ def idle_runs(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[
 
 
 def _read(dataset: Dataset, episodes: Sequence[int], progress: Progress | None) -> Iterator[ReadEpisode]:
-    def look(index: int) -> Episode | None:
+    def look(index: int) -> Episode | InputError:
         try:
             return dataset.source.read(index)
         except UnreachableError:
             raise
-        except InputError:
+        except InputError as error:
             if dataset.config.broken_episodes == "error":
-                raise
-            return None
+                raise with_way_out(error, [dataset.table.identity(index)]) from None
+            return error
 
     threads = dataset.config.connections if storage.is_url(dataset.config.path) else 1
     with ThreadPoolExecutor(threads) as pool:
         for done, (index, episode) in enumerate(zip(episodes, pool.map(look, episodes), strict=True), start=1):
             if progress is not None:
                 progress(done, len(episodes))
-            if episode is not None:
+            if isinstance(episode, InputError):
+                dataset.broken.met(dataset.table.identity(index), str(episode))
+            else:
                 yield ReadEpisode(index, np.asarray(episode.states, np.float64), tuple(dataset.kept.of(index)))
 
 
