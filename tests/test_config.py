@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from paths import ROOT
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, DataConfig, IdleConfig
 from vjepa2_ac.config_file import (
     _all_keys,
     changed_keys,
@@ -149,3 +149,17 @@ def test_every_knob_is_read_somewhere() -> None:
 def test_plain_values_are_plain() -> None:
     assert isinstance(config_as_dict(parse_config(MINIMAL, where=""))["adapter"]["targets"], list)
     assert Config.model_config["extra"] == "forbid"
+
+
+def test_a_place_of_data_may_name_the_home_and_end_in_a_slash(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/somewhere")
+    given = {
+        "~/data/": "/somewhere/data", "data//": "data", "/": "/", "a~b": "a~b",
+        "gs://bucket/droid/": "gs://bucket/droid", "hf://datasets/a/b": "hf://datasets/a/b",
+    }  # fmt: skip
+    for path, meant in given.items():
+        assert DataConfig(path=path).path == meant
+    ranges = {"rule": "published", "ranges": "~/ranges.json"}
+    assert DataConfig(path="d", idle=IdleConfig(**ranges)).idle.ranges == "/somewhere/ranges.json"
+    with pytest.raises(InputError, match=r"data\.path.*empty"):
+        parse_config(MINIMAL | {"data": {"path": " "}}, where="here")

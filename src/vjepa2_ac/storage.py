@@ -61,6 +61,11 @@ def join(folder: str | Path, name: str) -> str:
     return f"{str(folder).rstrip('/')}/{name}" if is_url(folder) else str(Path(folder) / name)
 
 
+def absolute(path: str | Path) -> str:
+    """Return the same path, whatever the working directory and through whatever links it was named; a URL as it is."""
+    return str(path) if is_url(path) else str(Path(path).resolve())
+
+
 def exists(path: str | Path) -> bool:
     """Return whether there is a file or folder."""
     return remote.exists(str(path)) if is_url(path) else Path(path).exists()

@@ -99,3 +99,17 @@ def test_every_form_moves_and_rests_at_the_same_steps(forms: Path, form: str) ->
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form_tells_its_control_rate(forms: Path, form: str) -> None:
     assert opened(forms, form).control_rate_hz == 15.0
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_set_is_looked_through_once_by_whatever_path_it_is_named(
+    forms: Path, form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "link").symlink_to(forms)
+    monkeypatch.chdir(forms)
+    tables = [
+        opened(root, form, disk_cache={"dir": str(tmp_path / "cache")}).table
+        for root in (forms, Path(), tmp_path / "link")
+    ]
+    assert [list(table) for table in tables] == [list(tables[0])] * 3
+    assert len(list((tmp_path / "cache/index").glob("*.index"))) == 1

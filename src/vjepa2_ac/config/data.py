@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import os
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from vjepa2_ac.config.section import PositiveInt, Section, Share
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 
 _STRIDES_AT_15_HZ = (4, 8, 15)
+
+
+def _place(path: str) -> str:
+    if not path.strip():
+        raise ValueError("empty; name a folder, or a URL")
+    return os.path.expanduser(path).rstrip("/") or "/"  # noqa: PTH111 - a URL is no Path
+
+
+Place = Annotated[str, AfterValidator(_place)]  # on this machine, where ~ is the user's home, or a URL
 
 
 class RldsFields(Section):
@@ -87,7 +97,7 @@ class IdleConfig(Section):
     rule: Literal["none", "published", "commands", "motion"] = "none"
     """none: keep all. published: ranges from a file. commands: openpi's rule on commanded joint velocities. motion: the
     same runs, found in the measured poses, for data sets without joint velocities."""
-    ranges: str | None = None
+    ranges: Place | None = None
     """For published: a JSON file, local or a URL, of {"recording_folderpath--file_path": [[start, end), ...]}."""
     keep_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """Share of the idle windows that stay all the same: a world model should see stillness too."""
@@ -155,7 +165,7 @@ class DataConfig(Section):
     source: Literal["rlds", "droid_raw", "lerobot", "npz"] = "rlds"
     """Form of the data set. rlds: TFRecord shards with a dataset_info.json, as TFDS writes them. droid_raw: DROID's
     folders with trajectory.h5 and MP4. lerobot: LeRobotDataset v2.1 or v3.0. npz: a folder of .npz episodes."""
-    path: str
+    path: Place
     """Folder of the data set: on this machine, or a URL such as gs://bucket/folder or hf://datasets/owner/name."""
     fields: RldsFields = RldsFields()
     """For rlds: names of the features."""

@@ -122,7 +122,7 @@ class RawDroidSource:
         if not storage.is_url(self._root):
             listed = [list_episode(self._root, folder) for folder in folders]
         knobs = {"cameras": config.cameras, "droid_raw": config.droid_raw, "pose_frame": config.pose_frame}
-        key = key_of({"source": "droid_raw", "path": self._root, **knobs, "listed": listed})
+        key = key_of({"source": "droid_raw", "path": storage.absolute(self._root), **knobs, "listed": listed})
         return kept_or_built(config.disk_cache, key, lambda: self._scan_all(folders, progress))
 
     def _scan_all(self, folders: list[str], progress: Progress | None) -> EpisodeTable:

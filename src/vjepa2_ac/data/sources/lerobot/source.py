@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import threading
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -140,11 +141,11 @@ class LeRobotSource:
         self._version = key_of(
             {
                 "source": "lerobot",
-                "path": config.path,
+                "path": storage.absolute(config.path),
                 "fields": config.lerobot.model_dump(),
                 "keys": keys,
                 "outcome": self._is_far and config.outcome != "all",
-                "info": repr(info),
+                "info": repr(replace(info, root="")),
                 "files": fingerprint(tables, files),
             }
         )

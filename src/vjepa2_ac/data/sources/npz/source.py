@@ -93,7 +93,7 @@ class NpzSource:
                 fix=FORMAT_HELP,
             )
         knobs = {"cameras": config.cameras, "pose_frame": config.pose_frame}
-        key = key_of({"source": "npz", "path": self._root, **knobs, "listed": listed})
+        key = key_of({"source": "npz", "path": storage.absolute(self._root), **knobs, "listed": listed})
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
         return kept_or_built(config.disk_cache, key, lambda: self._scan_all(ids, progress))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterable
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from vjepa2_ac import storage
@@ -170,11 +170,11 @@ class RldsSource:
         shards = tuple(find_shards(config.path))
         key = key_of({
             "source": "rlds",
-            "path": config.path,
+            "path": storage.absolute(config.path),
             "state": fields.state,
             "identity": fields.identity,
             "cameras": self._features(),
-            "shards": [astuple(shard) for shard in shards],
+            "shards": [(shard.name, shard.episodes, shard.size, shard.version) for shard in shards],
         })  # fmt: skip
 
         make = index_remote if storage.is_url(config.path) else index_local
