@@ -21,6 +21,9 @@ from vjepa2_ac.data.inspection import (
 from vjepa2_ac.data.kept import KeptSteps
 from vjepa2_ac.data.windows import split_of
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation import data_picture
+from vjepa2_ac.evaluation.contact_sheet import ContactSheet
+from vjepa2_ac.evaluation.data_picture import picture_data_set
 
 
 def knobs(droid: Path, **changes: object) -> DataConfig:
@@ -88,9 +91,9 @@ def test_a_sample_is_drawn_from_those_that_take_part_and_is_always_the_same(droi
     assert len(inspect_dataset(dataset, episodes=1).sample) == 1
 
 
-def in_memory(broken: frozenset[int], policy: str) -> Dataset:
+def in_memory(broken: frozenset[int], policy: str, pictureless: frozenset[int] = frozenset()) -> Dataset:
     config = DataConfig.model_validate({"path": "memory", "broken_episodes": policy, "frames": 3})
-    source = MemorySource([60] * 100, unreadable=broken)
+    source = MemorySource([60] * 100, unreadable=broken, pictureless=pictureless)
     table = source.infos()
     return Dataset(config, source, table, KeptSteps.whole(table, np.ones(100, bool)), BrokenEpisodes(config, 100))
 
@@ -104,6 +107,18 @@ def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplo
         inspect_dataset(in_memory(frozenset({7, 8}), "skip"))
     with pytest.raises(InputError, match=r"memory: episode 7: damaged\..*add to data\.exclude: \[\"episode 7\"\]"):
         inspect_dataset(in_memory(frozenset({7}), "error"))
+
+
+def test_a_broken_picture_is_left_out_of_the_contact_sheet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    sheets: list[ContactSheet] = []
+    monkeypatch.setattr(data_picture, "plot_contact_sheet", lambda sheet, path: sheets.append(sheet) or path)
+    dataset = in_memory(frozenset(), "skip", frozenset({7}))
+    picture_data_set(dataset, inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
+    assert len(sheets[0].strips) == 99
+    assert dataset.broken.names == ("episode 7",)
+    dataset = in_memory(frozenset(), "error", frozenset({7}))
+    with pytest.raises(InputError, match=r"pictures of episode 7: damaged\..*add to data\.exclude"):
+        picture_data_set(dataset, inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
 
 
 def test_the_figures_are_plain_values_and_stand_beside_what_is_known_of_the_released_weights(droid: Path) -> None:

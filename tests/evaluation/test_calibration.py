@@ -168,6 +168,25 @@ def test_clips_are_shortened_to_eight_frames_unless_told_otherwise() -> None:
     assert calibrate(GoesOn(4), encode, dataset_of(source)).frames == 4
 
 
+def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Damaged(Tracks):
+        def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
+            if index in damaged:
+                raise InputError(where=f"track {index}", found="damaged")
+            return super().read(index, camera, needed)
+
+    monkeypatch.setattr("vjepa2_ac.data.broken.MOST_BROKEN", 1.0)
+    monkeypatch.setattr(Dataset, "control_rate_hz", 15.0)
+    dataset = dataset_of(Damaged([80] * 20), broken_episodes="skip")
+    damaged = {int(dataset.windows("validation").episodes[0])}
+    found = calibrate(GoesOn(8), encode, dataset, clips=200, batch_size=1)
+    assert found.best.episodes == len(dataset.windows("validation").episodes) - 1
+    assert [one.clips for one in found.tried] == [found.tried[0].clips] * 3
+    damaged = set(range(20))
+    with pytest.raises(InputError, match="no clip that was tried can be read; broken episodes: track"):
+        calibrate(GoesOn(8), encode, dataset, batch_size=4)
+
+
 def test_progress_counts_every_clip_of_every_stride() -> None:
     told: list[tuple[int, int]] = []
     calibrated(GoesOn(4), Tracks([80] * 4), clips=10, progress=lambda done, total: told.append((done, total)))

@@ -18,6 +18,7 @@ from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.windows import Split, Windows, windows_of
 from vjepa2_ac.episode import EpisodeSource, Progress, StepRanges
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
@@ -95,6 +96,19 @@ class Dataset:
         """Control steps per second: what the source says of the whole set, or else of its first episode."""
         said = self.table.texts.get("control_rate_hz")
         return float(said) if said is not None else self.source.read(int(self.kept.episode[0])).control_rate_hz
+
+    def leave_out(self, episode: int, error: InputError) -> None:
+        """Do what `data.broken_episodes` says with an episode that cannot be read: take note of it, or stop.
+
+        Raises:
+            InputError: The error with the way out; or, too many are broken by now.
+        """
+        if isinstance(error, UnreachableError):
+            raise error  # the network's fault, not the episode's
+        name = self.table.identity(episode)
+        if self.config.broken_episodes == "error":
+            raise with_way_out(error, [name]) from None
+        self.broken.met(name, str(error))
 
     def needed_steps(self, episode: int) -> StepRanges | None:
         """Return the steps of an episode that clips may come from; None: all of them."""

@@ -15,12 +15,10 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import RAW_CAMERAS
 from vjepa2_ac.data.dataset import Dataset, Removed
-from vjepa2_ac.data.exclusion import with_way_out
 from vjepa2_ac.data.idle import idle_by_motion
 from vjepa2_ac.data.windows import Split, in_split, spread
 from vjepa2_ac.episode import Episode, Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.remote import UnreachableError
 
 PERCENTILES = (10, 50, 90, 99)
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -144,7 +142,7 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
         progress: Told (episodes read, episodes in all).
 
     Raises:
-        InputError: An episode of the sample cannot be read, and `data.broken_episodes` does not skip it; or too many are.
+        InputError: Episodes of the sample cannot be read, and `data.broken_episodes` does not leave them out.
     """
     sample = tuple(_read(dataset, sample_of(dataset, episodes), progress))
     idle = np.concatenate([idle_runs(one.states, dataset.config) for one in sample])
@@ -199,11 +197,7 @@ def _read(dataset: Dataset, episodes: Sequence[int], progress: Progress | None) 
     def look(index: int) -> Episode | InputError:
         try:
             return dataset.source.read(index)
-        except UnreachableError:
-            raise
         except InputError as error:
-            if dataset.config.broken_episodes == "error":
-                raise with_way_out(error, [dataset.table.identity(index)]) from None
             return error
 
     threads = dataset.config.connections if storage.is_url(dataset.config.path) else 1
@@ -212,7 +206,7 @@ def _read(dataset: Dataset, episodes: Sequence[int], progress: Progress | None) 
             if progress is not None:
                 progress(done, len(episodes))
             if isinstance(episode, InputError):
-                dataset.broken.met(dataset.table.identity(index), str(episode))
+                dataset.leave_out(index, episode)
             else:
                 yield ReadEpisode(index, np.asarray(episode.states, np.float64), tuple(dataset.kept.of(index)))
 

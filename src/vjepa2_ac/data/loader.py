@@ -66,24 +66,25 @@ def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size
     """
     windows = dataset.windows(split)
     chosen = [windows[index] for index in far_neighbours(spread(len(windows), clips))]
-    return _some_of(batches_of(dataset, chosen, batch_size=batch_size), dataset, split)
+    return batches_of(dataset, chosen, batch_size=batch_size)
 
 
 def batches_of(dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int) -> Iterator[Batch]:
     """Yield the clips that start at these (episode, first control step), in this order, in batches.
 
-    A batch may be smaller, or empty, where `data.broken_episodes` is skip. Many clips are read by workers.
+    Where `data.broken_episodes` is skip, a batch may be smaller; none is empty. Many clips are read by workers.
 
     Raises:
-        InputError: A clip cannot be read.
+        InputError: A clip cannot be read; or, by policy, none of them.
     """
     count = len(windows)
     rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
     workers = dataset.config.workers if count >= _CLIPS_WORTH_WORKERS else 0
-    return _batches(_Clips(dataset, _ChosenClips(dataset.config, dataset.table, list(windows))), iter(rows), workers)
+    clips = _Clips(dataset, _ChosenClips(dataset.config, dataset.table, list(windows)))
+    return _some_of(_batches(clips, iter(rows), workers), dataset)
 
 
-def _some_of(batches: Iterator[Batch], dataset: Dataset, split: Split) -> Iterator[Batch]:
+def _some_of(batches: Iterator[Batch], dataset: Dataset) -> Iterator[Batch]:
     """Yield the batches that hold clips.
 
     Raises:
@@ -97,7 +98,7 @@ def _some_of(batches: Iterator[Batch], dataset: Dataset, split: Split) -> Iterat
     if empty:
         raise InputError(
             where=f"data.path: {dataset.config.path}",
-            found=f"no {split} clip that was tried can be read; broken episodes: {named(dataset.broken.names)}",
+            found=f"no clip that was tried can be read; broken episodes: {named(dataset.broken.names)}",
             needed="at least one",
             fix="Mend or fetch these episodes again, or add them to data.exclude",
         )

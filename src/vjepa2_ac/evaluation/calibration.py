@@ -177,8 +177,6 @@ class _Measured:
 
     @classmethod
     def joined(cls, parts: Sequence[_Measured]) -> _Measured:
-        if not parts:
-            raise ValueError("no clips to measure on")
         return cls(
             errors=np.concatenate([part.errors for part in parts]),
             persistence=np.concatenate([part.persistence for part in parts]),
@@ -209,8 +207,6 @@ class _Measured:
 
 def _measure(model: Predictor, encode: Callable[[Batch], LatentBatch], batches: Iterator[Batch]) -> Iterator[_Measured]:
     for batch in batches:
-        if not batch.starts:  # none of its clips could be read
-            continue
         with torch.no_grad():
             errors, persistence = one_step_errors(model, encode(batch))
         moved_cm = batch.actions[..., :3].norm(dim=-1).flatten().numpy().astype(np.float64) * 100

@@ -11,6 +11,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.inspection import RELEASED_STEP_CM, Inspection, ReadEpisode, idle_runs
 from vjepa2_ac.data.transforms import crop_box
 from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
 
 _PLACES = 6000  # points of the map, at most
@@ -24,15 +25,18 @@ def picture_data_set(
     `progress` is told (episodes whose pictures were read, episodes shown).
 
     Raises:
-        InputError: A picture cannot be read.
+        InputError: A picture cannot be read, and `data.broken_episodes` does not leave its episode out.
     """
     shown = _rows_of(inspection, rows)
     names = _short_names([dataset.table.identity(one.index) for one in shown])
     strips = []
-    for one, name in zip(shown, names, strict=True):
-        strips.append(_strip(dataset, one, name))
+    for done, (one, name) in enumerate(zip(shown, names, strict=True), start=1):
+        try:
+            strips.append(_strip(dataset, one, name))
+        except InputError as error:
+            dataset.leave_out(one.index, error)
         if progress is not None:
-            progress(len(strips), len(shown))
+            progress(done, len(shown))
     return plot_contact_sheet(sheet_of(inspection, strips), path)
 
 
