@@ -74,6 +74,7 @@ def test_all_errors_are_reported_at_once_with_their_paths() -> None:
         ("training.steps=1.5", "valid integer"),
         ("adapter.dropout=1.0", "less than 1"),
         ("data.camera=third_eye", "exterior_1_left"),
+        ("data.stride_candidates=[]", "at least 1 item"),
         ("training.rollout_steps=16", "data.frames of at least 17"),
         ("training.warmup_steps=200000", "exceed steps"),
         ("training.decay_steps=5", "warmup_stable_decay"),

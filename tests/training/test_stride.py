@@ -48,6 +48,12 @@ def test_a_check_only_run_writes_no_choice(make_config: Make, reporter: Any) -> 
     assert not folder.exists()
 
 
+def test_a_model_that_has_learned_nothing_is_not_asked(make_config: Make, reporter: Any) -> None:
+    config = make_config(data__stride="auto", model__base=None, model__random={}, adapter__kind="none")
+    with pytest.raises(InputError, match=r"learned nothing.*Set data\.stride to a number"):
+        train(config, reporter)
+
+
 def test_another_number_than_the_chosen_one_is_another_config(make_config: Make, reporter: Any) -> None:
     config = make_config(data__stride="auto", data__stride_candidates=[2], training__steps=2)
     train(config, reporter)

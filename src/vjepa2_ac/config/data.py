@@ -182,7 +182,7 @@ class DataConfig(Section):
     stride: PositiveInt | Literal["auto"] = 4
     """Control steps per model step. Unsettled for the released weights: 4, 8 and 15 are candidates. auto: before the
     first step the model chooses among `stride_candidates` by its prediction error over persistence."""
-    stride_candidates: tuple[PositiveInt, ...] | None = None
+    stride_candidates: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] | None = None
     """Strides that `auto` and `data calibrate` try; null: 4, 8, 15 at 15 control steps per second, scaled to others."""
     validation_share: Share = 0.05
     """Share of the episodes held out for validation, chosen by a hash of the episode's identity."""

@@ -27,7 +27,7 @@ from vjepa2_ac.training.checkpoint import RunState, newest_checkpoint, read_stat
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer
 from vjepa2_ac.training.run_folder import CHECKPOINTS
-from vjepa2_ac.training.stride import choose_stride, with_stride
+from vjepa2_ac.training.stride import choose_stride, require_learned, with_stride
 
 ADAPTER = "adapter"
 OPTIMIZER = "optimizer.pt"
@@ -61,6 +61,8 @@ def assemble(config: Config, note: Callable[[str], None], looked_through: Progre
         InputError: Something cannot be used.
     """
     accelerator = make_accelerator(config)
+    if config.data.stride == "auto":
+        require_learned(config.model)
     dataset = open_dataset(config.data, progress=looked_through)
     world_model, calibration = None, None
     if config.data.stride == "auto":

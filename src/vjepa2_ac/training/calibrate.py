@@ -8,14 +8,13 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Progress
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration import Calibration
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.assembly import make_accelerator
 from vjepa2_ac.training.run_folder import CONFIG
 from vjepa2_ac.training.runs import load_run
-from vjepa2_ac.training.stride import calibrate_model
+from vjepa2_ac.training.stride import calibrate_model, require_learned
 
 
 def calibrate_config(
@@ -55,11 +54,5 @@ def _load(config: Config, model: str | None) -> WorldModel:
     if model is not None and (Path(model) / CONFIG).is_file():
         return load_run(Path(model)).world_model
     chosen = config.model if model is None else config.model.model_copy(update={"base": model, "random": None})
-    if chosen.base is None:
-        raise InputError(
-            where="model.random",
-            found="a model that has learned nothing",
-            needed="one that can say which stride it was trained at",
-            fix="Name one with --model or model.base, or set data.stride to a number",
-        )
+    require_learned(chosen)
     return load_base(chosen, seed=config.seed)

@@ -8,10 +8,11 @@ from pathlib import Path
 import torch
 from accelerate import Accelerator
 
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration import Calibration, calibrate
 from vjepa2_ac.latents import encode_batch
 from vjepa2_ac.model.world_model import WorldModel
@@ -47,6 +48,21 @@ def choose_stride(
     for line in calibration.lines():
         note(line)
     return calibration
+
+
+def require_learned(model: ModelConfig) -> None:
+    """Refuse to ask a model that is drawn at random.
+
+    Raises:
+        InputError: It is.
+    """
+    if model.base is None:
+        raise InputError(
+            where="model.random",
+            found="a model that has learned nothing",
+            needed="one that can say which stride it was trained at",
+            fix="Set data.stride to a number, or name another model with model.base (data calibrate: --model)",
+        )
 
 
 def calibrate_model(
