@@ -108,6 +108,14 @@ def test_the_camera_with_the_fewest_pictures_sets_the_steps(tmp_path: Path) -> N
     assert [raw.infos()[0].num_steps, len(raw.read(0, "left").states)] == [STEPS - 1, STEPS - 1]
 
 
+@pytest.mark.parametrize("right", [STEPS - 2, STEPS + 2])
+def test_every_camera_must_have_a_picture_for_every_step(tmp_path: Path, right: int) -> None:
+    write(tmp_path, pictures={LEFT: FRAMES[LEFT][:-1], RIGHT: (FRAMES[RIGHT] * 2)[:right]})
+    assert source(tmp_path).infos()[0].num_steps == STEPS - 1
+    with pytest.raises(InputError, match=f"24 steps, but {right} pictures in {RIGHT}.mp4"):
+        source(tmp_path, camera=("left", "right")).infos()
+
+
 def test_steps_without_an_operator_are_dropped_with_their_pictures_or_kept(tmp_path: Path) -> None:
     skipped = [0, 5, 6]
     kept = np.setdiff1d(np.arange(STEPS), skipped)
@@ -247,9 +255,52 @@ def test_a_tree_in_the_cloud_reads_as_here(tree: Path, gcs: Gcs, tmp_path: Path)
     np.testing.assert_array_equal(episode.states, same.states)
     np.testing.assert_array_equal(episode.read_frames([3, 20]), same.read_frames([3, 20]))
     gcs.forget()
-    again = source(url, disk_cache={"dir": str(tmp_path)}).read(1)
-    np.testing.assert_array_equal(again.read_frames([7]), same.read_frames([7]))
-    assert gcs.reads() == []  # all of it is kept
+    infos = pickle.loads(pickle.dumps(raw))  # noqa: S301 - our own
+    np.testing.assert_array_equal(infos.read(1).read_frames([7]), same.read_frames([7]))
+    assert gcs.requests == []  # all of it is kept, and how long it is
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An episode whose video is megabytes: noise does not compress."""
+    chance = np.random.default_rng(0)
+    noise = [chance.integers(0, 256, (144, 256, 3), np.uint8) for _ in range(3)]
+    root = tmp_path_factory.mktemp("noisy")
+    write_raw_droid(root / PLACE, synthetic_states(90), pictures={LEFT: noise * 30}, gop=10)
+    return root
+
+
+def test_a_clip_of_a_video_in_the_cloud_fetches_much_less_than_the_video(noisy: Path, gcs: Gcs, tmp_path: Path) -> None:
+    raw = source(gcs.upload(noisy, "bucket/raw"), disk_cache={"dir": str(tmp_path)})
+    raw.infos()
+    whole = (noisy / PLACE / MP4).stat().st_size
+    assert whole > 2_000_000
+    assert gcs.bytes_read(".mp4") < whole / 4, "the index reads headers"
+    gcs.forget()
+    frames = raw.read(0).read_frames([40, 44, 48])
+    assert 0 < gcs.bytes_read(".mp4") < whole / 3
+    np.testing.assert_array_equal(frames, source(noisy).read(0).read_frames([40, 44, 48]))
+
+
+@pytest.mark.parametrize("kept", [0.0, 1.0])
+def test_a_network_that_fails_within_a_video_is_neither_damage_nor_silence(
+    noisy: Path, gcs: Gcs, tmp_path: Path, kept: float
+) -> None:
+    raw = source(gcs.upload(noisy, "bucket/raw"), disk_cache={"dir": str(tmp_path), "limit_gb": kept})
+    frames = raw.read(0).read_frames
+    gcs.fail_next(503, times=5, match="download.*mp4")
+    with pytest.raises(UnreachableError, match="not reached in 5 attempts"):
+        frames([40, 44])
+    np.testing.assert_array_equal(frames([40, 44]), source(noisy).read(0).read_frames([40, 44]))
+
+
+def test_a_video_in_the_cloud_that_became_shorter_is_no_picture(noisy: Path, gcs: Gcs, tmp_path: Path) -> None:
+    raw = source(gcs.upload(noisy, "bucket/raw"), disk_cache={"dir": str(tmp_path)})
+    frames = raw.read(0).read_frames
+    frames([0])
+    gcs.put(f"bucket/raw/{PLACE}/{MP4}", (noisy / PLACE / MP4).read_bytes()[:900_000])
+    with pytest.raises((InputError, OSError), match=f"{LEFT}.mp4"):
+        frames([80])
 
 
 def test_a_network_that_is_down_is_not_a_broken_episode(tree: Path, gcs: Gcs, tmp_path: Path) -> None:

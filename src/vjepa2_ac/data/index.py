@@ -22,7 +22,7 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-_VERSION = 2  # of what is kept: another number makes all of it be found out again
+_VERSION = 3  # of what is kept: another number makes all of it be found out again
 _CRC_BYTES = 4
 
 

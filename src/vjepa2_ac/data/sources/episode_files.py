@@ -18,12 +18,21 @@ class EpisodeFiles:
     def open(self, path: str, *, version: str) -> str | KeptFile:
         """Return what to open to read parts of a file: the path itself on this machine, a file of kept blocks else.
 
+        Args:
+            path: Local path or URL.
+            version: What tells apart the contents that the file has had; its size is asked for once for each.
+
         Raises:
             OSError: A file behind a URL is not there or cannot be reached.
         """
         if not storage.is_url(path):
             return path
-        return KeptFile(path, version=version, size=storage.file_size(path), kept=self._cache)
+        key = f"size {path} {version}"
+        size = self._cache.read(key)
+        if size is None:
+            size = str(storage.file_size(path)).encode()
+            self._cache.write(key, size)
+        return KeptFile(path, version=version, size=int(size), kept=self._cache)
 
     def read(self, path: str, *, version: str, where: str) -> bytes:
         """Return a whole file.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Int, UInt8
@@ -47,7 +47,7 @@ class _Place:
     folder: str
     metadata: str
     version: str
-    pictures: int  # of the camera that has the fewest
+    pictures: dict[str, int]  # how many each of the config's cameras has, by serial number
 
 
 class RawDroidSource:
@@ -161,7 +161,7 @@ class RawDroidSource:
             place = self._place_of(listed, identity)
             metadata = self._metadata(place)
             serials = tuple(metadata.serial(camera) for camera in self._config.cameras)
-            place = _Place(place.folder, place.metadata, place.version, self._count(place, listed, serials))
+            place = replace(place, pictures=self._counted(place, listed, serials))
             steps = len(self._trajectory(place, serials).states)
         except UnreachableError:
             raise  # the network's fault, not the episode's
@@ -175,19 +175,19 @@ class RawDroidSource:
             missing = TRAJECTORY if not listed.has_trajectory else "metadata_*.json"
             where = self._path(listed.path, "")
             raise InputError(where=where, found=f"episode {identity} has no {missing}", needed="one", fix=_FIX)
-        return _Place(listed.path, listed.metadata, key_of({"files": listed}), 0)
+        return _Place(listed.path, listed.metadata, key_of({"files": listed}), {})
 
-    def _count(self, place: _Place, listed: EpisodeFolder, serials: tuple[str, ...]) -> int:
-        """Return how many pictures every camera has."""
-        counts = []
+    def _counted(self, place: _Place, listed: EpisodeFolder, serials: tuple[str, ...]) -> dict[str, int]:
+        """Return how many pictures each camera has."""
+        counts = {}
         for serial in serials:
             path = self._path(place, f"{VIDEOS}/{serial}.mp4")
             if not any(video.name == f"{serial}.mp4" for video in listed.videos):
                 there = ", ".join(video.name for video in listed.videos) or "none"
                 needed = f"the MP4 that {place.metadata} or data.camera names; there are {there}"
                 raise InputError(where=path, found="no such file", needed=needed, fix=_FIX)
-            counts.append(count_frames(path, where=path))
-        return min(counts)
+            counts[serial] = count_frames(path, where=path)
+        return counts
 
     def _metadata(self, place: _Place) -> DroidMetadata:
         path = self._path(place, place.metadata)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,17 +42,18 @@ class Trajectory:
         )
 
 
-def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], pictures: int) -> Trajectory:
+def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], pictures: Mapping[str, int]) -> Trajectory:
     """Read the content of a trajectory.h5.
 
     Args:
         data: The whole file.
         where: The file, as an error names it.
         serials: Cameras whose poses are wanted; one without any has None.
-        pictures: How many the MP4 holds: as many as there are steps, or one more or less.
+        pictures: How many each MP4 holds: as many as there are steps, or one more or less. The steps that have a
+            picture in every one are returned.
 
     Raises:
-        InputError: Not HDF5, damaged, without what is needed, or of another length than the MP4.
+        InputError: Not HDF5, damaged, without what is needed, or of another length than an MP4.
     """
     h5py = _library(where)
     try:
@@ -63,14 +64,12 @@ def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], picture
         found = f"{len(data)} bytes that cannot be read as HDF5 ({str(error)[:200]})"
         raise InputError(where=where, found=found, needed="an undamaged trajectory.h5", fix=_FIX) from None
     steps = len(trajectory.states)
-    if abs(steps - pictures) > 1:
-        raise InputError(
-            where=where,
-            found=f"{steps} steps, but {pictures} pictures in {' or '.join(f'{serial}.mp4' for serial in serials)}",
-            needed="a picture for every step; the last one may be missing",
-            fix=_FIX,
-        )
-    return trajectory.at(np.arange(min(steps, pictures)))
+    for serial, count in pictures.items():
+        if abs(steps - count) > 1:
+            found = f"{steps} steps, but {count} pictures in {serial}.mp4"
+            needed = "a picture for every step; the last one may be missing"
+            raise InputError(where=where, found=found, needed=needed, fix=_FIX)
+    return trajectory.at(np.arange(min(steps, *pictures.values())))
 
 
 @dataclass(frozen=True)
