@@ -80,6 +80,15 @@ def file_size(path: str | Path) -> int:
     return remote.file_size(str(path)) if is_url(path) else Path(path).stat().st_size
 
 
+def file_version(path: str | Path) -> str:
+    """Return a word for a file's content that differs when the content does, as far as that is known without reading.
+
+    Raises:
+        OSError: There is no such file, or it cannot be read.
+    """
+    return remote.file_version(str(path)) if is_url(path) else str(Path(path).stat().st_mtime_ns)
+
+
 @dataclass(frozen=True)
 class FileInfo:
     """What a listing says of a file."""

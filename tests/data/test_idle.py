@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gcs import Gcs
 from memory_source import MemorySource
 from paths import GOLDEN
 from synthetic import synthetic_states
@@ -285,6 +286,14 @@ def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, 
     assert starts(dataset) == {(1, start) for start in (*range(8), *range(20, 36))}
     other = open_with(source, **published(tmp_path, {"episode 1": [[0, 13]]}))
     assert other.kept.of(1) == ((0, 13),), "a changed list is read anew"
+
+
+def test_a_changed_list_of_the_same_length_is_read_anew_from_a_bucket(open_with: Any, gcs: Gcs) -> None:
+    def kept(end: int) -> object:
+        url = gcs.put("robots/ranges.json", json.dumps({"episode 1": [[0, end]]}).encode())
+        return open_with(restful(), idle=IdleConfig(rule="published", ranges=url)).kept.of(1)
+
+    assert [kept(12), kept(13)] == [((0, 12),), ((0, 13),)]
 
 
 BAD_LISTS = {

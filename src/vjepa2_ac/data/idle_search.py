@@ -10,7 +10,6 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Int32
@@ -210,6 +209,6 @@ def _knobs_that_matter(config: DataConfig) -> dict[str, object]:
 def _version(path: str) -> list[object]:
     """Tell one content of the list from another without reading it, as far as that goes."""
     try:
-        return [path, storage.file_size(path), None if storage.is_url(path) else Path(path).stat().st_mtime_ns]
+        return [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
     except OSError:
         return [path]

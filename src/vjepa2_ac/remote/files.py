@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
@@ -57,6 +57,16 @@ def file_size(url: str) -> int:
     return _persist(url, lambda timeout_s: size_of(url, timeout_s))
 
 
+def file_version(url: str) -> str:
+    """Return the server's own word for a file's content, another for another content; empty where it has none.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        UnreachableError: It cannot be reached.
+    """
+    return _version_of(_call(url, "info"))
+
+
 def list_folder(url: str) -> list[Entry]:
     """Return what is in a folder, sorted by name: one listing, a call for each of its pages.
 
@@ -69,7 +79,7 @@ def list_folder(url: str) -> list[Entry]:
             name=str(found["name"]).rstrip("/").rsplit("/", 1)[-1],
             is_file=found["type"] == "file",
             size=int(found.get("size") or 0),
-            version=next((str(found[key]) for key in _VERSION_KEYS if found.get(key) is not None), ""),
+            version=_version_of(found),
         )
         for found in _call(url, "ls", detail=True, refresh=True)
     ]
@@ -143,6 +153,10 @@ def _threads(process: int) -> ThreadPoolExecutor:  # noqa: ARG001 - threads do n
 
 def _call(url: str, method: str, **arguments: Any) -> Any:
     return _persist(url, lambda timeout_s: ask(url, method, timeout_s, **arguments))
+
+
+def _version_of(found: Mapping[str, Any]) -> str:
+    return next((str(found[key]) for key in _VERSION_KEYS if found.get(key) is not None), "")
 
 
 def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
