@@ -186,6 +186,30 @@ def test_an_episode_that_cannot_be_used_is_a_named_problem(tmp_path: Path, damag
             source(tmp_path / "alone").infos()
 
 
+def test_an_episode_has_one_name_whatever_links_lead_to_its_folder(tmp_path: Path) -> None:
+    write(tmp_path / "set/küche/one.npz")
+    write(tmp_path / "elsewhere/two.npz")
+    (tmp_path / "set/küche/back").symlink_to(tmp_path / "set")
+    (tmp_path / "set/again").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "set/first").symlink_to(tmp_path / "elsewhere")
+    assert [info.id for info in source(tmp_path / "set").infos()] == ["again/two", "küche/one"]
+
+
+@pytest.mark.parametrize("name", ["\udcff.npz", "\udcff/one.npz"])
+def test_a_name_that_is_no_text_is_refused(tmp_path: Path, name: str) -> None:
+    write(tmp_path / name)
+    with pytest.raises(InputError, match=r"udcff.*UTF-8"):
+        source(tmp_path).infos()
+
+
+def test_an_identity_may_be_long_and_of_any_letters(tmp_path: Path) -> None:
+    name = "/".join(["ü字é" * 20] * 3)
+    write(tmp_path / f"{name}.npz")
+    made, kept = source(tmp_path).infos(), source(tmp_path).infos()
+    assert [info.id for info in made] == [info.id for info in kept] == [name]
+    assert kept.find(name) == 0
+
+
 def test_a_folder_without_episodes_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no \.npz files"):
         source(tmp_path).infos()

@@ -7,9 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 from vjepa2_ac import storage
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
 
-DEEPEST = 8  # folders below the data set's: a link that leads back up is not followed for ever
+DEEPEST = 8  # folders below the data set's
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -18,10 +19,13 @@ Result = TypeVar("Result")
 def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
     """Yield all files, with their folder relative to `root`; names that begin with a dot are left out.
 
+    A folder to which several links lead is gone through once: its files would be episodes of several names.
+
     Raises:
         OSError: A folder cannot be listed.
+        InputError: A name is not UTF-8.
     """
-    folders = [""]
+    folders, known = [""], {storage.absolute(root)}
     for _ in range(DEEPEST):
         below: list[str] = []
         for folder, (files, names) in zip(
@@ -29,7 +33,9 @@ def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
         ):
             yield from ((folder, file) for file in files if not file.name.startswith("."))
             below += [within(folder, name) for name in names]
-        folders = below
+        places = {storage.absolute(storage.join(root, folder)): folder for folder in reversed(below)}
+        folders = sorted(folder for place, folder in places.items() if place not in known)
+        known |= places.keys()
 
 
 def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
@@ -37,11 +43,14 @@ def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
 
     Raises:
         OSError: It cannot be listed.
+        InputError: A name is not UTF-8.
     """
     place = storage.join(root, folder) if folder else root
-    files = storage.list_files(place)
+    files, names = storage.list_files(place), storage.list_names(place)
+    for name in names:
+        _require_text(name, place)
     known = {file.name for file in files}
-    return files, [name for name in storage.list_names(place) if name not in known and not name.startswith(".")]
+    return files, [name for name in names if name not in known and not name.startswith(".")]
 
 
 def within(folder: str, name: str) -> str:
@@ -55,3 +64,9 @@ def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], conne
         return [function(item) for item in items]
     with ThreadPoolExecutor(max_workers=connections) as pool:
         return list(pool.map(function, items))
+
+
+def _require_text(name: str, place: str) -> None:
+    """Refuse what cannot be written down, as the identity of an episode must be."""
+    if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
+        raise InputError(where=place, found=f"the name {name!r}", needed="names in UTF-8", fix="Rename it")
