@@ -43,11 +43,7 @@ def inspection_lines(inspection: Inspection) -> list[str]:
         f"{name} {windows:,} clips in {inspection.episodes_of[name]:,} episodes"
         for name, windows in inspection.windows_of.items()
     )
-    removed = ", ".join(
-        f"{one.name} {one.episodes:,} episodes, {one.steps:,} steps"
-        for one in inspection.removed
-        if one.episodes or one.steps
-    )
+    removed = ", ".join(f"{one.name} {one}" for one in inspection.removed if one.episodes or one.steps)
     rows = {
         "data set": f"{config.path} ({config.source})",
         "episodes": f"{len(inspection.lengths):,} ({inspection.broken:,} broken)",

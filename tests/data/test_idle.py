@@ -218,8 +218,14 @@ def test_keeping_every_idle_window_is_the_same_order_as_no_filter(open_with: Any
 def test_an_episode_that_stands_still_all_the_time_gives_idle_windows_only(open_with: Any) -> None:
     source = MemorySource([60, 60], states=lambda index: resting(60, [(1, 60)] if index else []))
     assert {episode for episode, _ in starts(open_with(source, idle=MOTION))} == {0}
-    shared = open_with(source, idle=MOTION.model_copy(update={"keep_share": 0.5}))
-    assert {episode for episode, _ in starts(shared)} == {0, 1}
+    some = MOTION.model_copy(update={"keep_share": 0.5})
+    shared = open_with(source, idle=some)
+    assert {episode for episode, _ in starts(shared)} == {0, 1} == set(shared.episodes.tolist())
+    assert str(shared.removed[-1]).startswith("0 episodes, 70 steps, ")
+    assert str(shared.removed[-1]).endswith(" clips (50% of the clips from these stay)")
+    still = MemorySource([60], states=lambda _: resting(60, [(1, 60)]))
+    assert 10 < len(open_with(still, idle=some).windows("train")) < 46
+    assert open_with(still, idle=some).control_rate_hz == 15.0
     with pytest.raises(InputError, match=r"none of 1 episodes is left \(left out: idle 1\)"):
         open_with(MemorySource([60], states=lambda _: resting(60, [(1, 60)])), idle=MOTION)
 
@@ -281,7 +287,7 @@ def test_published_ranges_are_taken_by_identity(open_with: Any, tmp_path: Path, 
     source = restful()
     dataset = open_with(source, **published(tmp_path, ranges))
     assert [dataset.kept.of(episode) for episode in range(3)] == [(), ((0, 12), (20, 40)), ()]
-    assert "knows 2 of the 3 episodes; the other 1 are left out" in caplog.text
+    assert "knows 2 of the 3 episodes; the other 1 count as idle" in caplog.text
     assert source.reads == []
     assert starts(dataset) == {(1, start) for start in (*range(8), *range(20, 36))}
     other = open_with(source, **published(tmp_path, {"episode 1": [[0, 13]]}))

@@ -98,7 +98,8 @@ class IdleConfig(Section):
     """none: keep all. published: ranges from a file. commands: openpi's rule on commanded joint velocities. motion: the
     same runs, found in the measured poses, for data sets without joint velocities."""
     ranges: Place | None = None
-    """For published: a JSON file, local or a URL, of {"recording_folderpath--file_path": [[start, end), ...]}."""
+    """For published: a JSON file, local or a URL, of {"recording_folderpath--file_path": [[start, end), ...]}. Episodes
+    that it does not name count as idle."""
     keep_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """Share of the idle windows that stay all the same: a world model should see stillness too."""
     velocity_change_rad_s: Annotated[float, Field(gt=0.0)] = 1e-3

@@ -85,9 +85,7 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
     config = dataset.config
     for one in dataset.removed:
         if one.episodes or one.steps or one.windows:
-            clips = "" if one.windows is None else f", {one.windows:,} clips"
-            removed = f"{one.episodes:,} episodes, {one.steps:,} steps{clips} are left out"
-            yield Finding("warning" if one.name == "broken" else "ok", f"filter {one.name}", removed)
+            yield Finding("warning" if one.name == "broken" else "ok", f"filter {one.name}", f"left out: {one}")
     for problem in dataset.table.problems[:3]:
         yield Finding("warning", "broken episode", f"{problem.where}: {problem.found}")
     splits: tuple[tuple[Split, float], ...] = (

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Int
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import BrokenEpisodes
@@ -31,6 +31,12 @@ class Removed:
     episodes: int  # of which no step is left
     steps: int  # of episodes that could be read
     windows: int | None  # clips; None while data.stride is auto
+    stays: float = 0.0  # share of the clips from these steps that stay all the same (data.idle.keep_share)
+
+    def __str__(self) -> str:
+        clips = "" if self.windows is None else f", {self.windows:,} clips"
+        stays = f" ({self.stays:.0%} of the clips from these stay)" if self.stays else ""
+        return f"{self.episodes:,} episodes, {self.steps:,} steps{clips}{stays}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +81,7 @@ class Dataset:
                 before[0] - after[0] + unread,
                 before[1] - after[1],
                 before[2] - after[2] if self.config.stride != "auto" else None,
+                self.config.idle.keep_share if name == "idle" else 0.0,
             )
             for (name, _, unread), before, after in pairs
         )
@@ -85,7 +92,15 @@ class Dataset:
         if self.config.stride != "auto":
             starts = self._starts if kept is self.kept else clip_starts(self.table, kept, self.config)
             windows = starts.windows
-        return len(np.unique(kept.episode)), kept.steps, windows
+        episodes = self.episodes if kept is self.kept else np.unique(kept.episode)
+        return len(episodes), kept.steps, windows
+
+    @property
+    def episodes(self) -> Int[np.ndarray, " episodes"]:
+        """The episodes that clips may come from."""
+        if self.config.idle.rule != "none" and self.config.idle.keep_share > 0:
+            return np.flatnonzero(self.kept.taking_part)
+        return np.unique(self.kept.episode)
 
     @cached_property
     def _starts(self) -> Starts:
@@ -95,7 +110,7 @@ class Dataset:
     def control_rate_hz(self) -> float:
         """Control steps per second: what the source says of the whole set, or else of its first episode."""
         said = self.table.texts.get("control_rate_hz")
-        return float(said) if said is not None else self.source.read(int(self.kept.episode[0])).control_rate_hz
+        return float(said) if said is not None else self.source.read(int(self.episodes[0])).control_rate_hz
 
     def leave_out(self, episode: int, error: InputError) -> None:
         """Do what `data.broken_episodes` says with an episode that cannot be read: take note of it, or stop.
@@ -162,7 +177,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
         kept = _kept_of(ranges, table, taking_part, broken)
         _say_how_many_are_listed(ranges, table, config)
     dataset = Dataset(config, source, table, kept, broken)
-    if not len(kept.episode):
+    if not len(dataset.episodes):
         raise _nothing_left(dataset)
     logger.info("%s: %d episodes take part, %d steps of them", config.path, kept.taking_part.sum(), kept.steps)
     return dataset
@@ -207,7 +222,7 @@ def _say_how_many_are_listed(found: FoundRanges, table: EpisodeTable, config: Da
         return
     logger.log(
         logging.INFO if found.listed == len(table) else logging.WARNING,
-        "%s: knows %d of the %d episodes; the other %d are left out",
+        "%s: knows %d of the %d episodes; the other %d count as idle",
         config.idle.ranges, found.listed, len(table), len(table) - found.listed,
     )  # fmt: skip
 
