@@ -452,6 +452,29 @@ def test_skipping_does_not_depend_on_workers_nor_on_where_a_run_resumed(
     assert "not a JPEG" in caplog.text
 
 
+def test_with_every_knob_on_neither_workers_nor_resuming_change_a_bit(
+    spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
+        features["steps/observation/exterior_image_1_left"][1][3] = b"GIF89a"
+
+    monkeypatch.setattr("vjepa2_ac.data.broken.MOST_BROKEN", 0.2)
+    config = config_of(
+        spoiled(spoil), validation_share=0.0, broken_episodes="skip", camera=CAMERAS, crop="letterbox",
+        idle={"rule": "motion", "keep_share": 0.5, "shortest_kept_steps": 2, "cut_last_steps": 6},
+        augment={"crop_scale": (0.3, 1.0), "brightness": 0.4},
+    )  # fmt: skip
+    alone = take(40, config)
+    assert sum(len(batch.starts) for batch in alone) < 80
+    for found, start in (
+        (take(40, config.model_copy(update={"workers": 2})), 0),
+        (take(10, config, start_position=60), 30),
+        (take(10, config.model_copy(update={"workers": 1}), start_position=60), 30),
+    ):
+        assert_same(found, alone[start : start + len(found)])
+        assert [one.augmentations for one in found] == [one.augmentations for one in alone[start : start + len(found)]]
+
+
 def test_clips_of_a_set_that_lies_elsewhere_are_read_several_at_once(in_memory: Callable[..., Dataset]) -> None:
     meeting = threading.Barrier(4, timeout=30)
 
