@@ -110,6 +110,18 @@ def test_broken_episodes_met_later_count_once_each() -> None:
         ledger.met("d", "d is damaged")
 
 
+def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> None:
+    def resumed(**knobs: Any) -> BrokenEpisodes:
+        ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip", **knobs), 300)
+        ledger.recall({name: f"{name} is damaged" for name in "abc"})
+        return ledger
+
+    resumed().met("a", "a is damaged")
+    with pytest.raises(InputError, match=r"4 of 300 episodes are broken: a, b, c, d\. The first, a: a is damaged\."):
+        resumed().met("d", "d is damaged")
+    resumed(exclude=("b",)).met("d", "d is damaged")
+
+
 def test_excluding_what_there_is_not_is_refused(open_with: Open) -> None:
     with pytest.raises(InputError, match=r"data\.exclude: not the identity of any episode: elsewhere\."):
         open_with(MemorySource([10], problems=problems(1)), exclude=("elsewhere", "bad 0"))

@@ -14,6 +14,10 @@ from safetensors.torch import load_file
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_as_yaml
+from vjepa2_ac.data import loader
+from vjepa2_ac.data.clips import Wish
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.training.assembly import assemble, batches_from
@@ -239,6 +243,22 @@ def test_bf16_runs_and_keeps_what_is_trained_in_float32(make_config: object, rep
     config: Config = make_config(training__precision="bf16", model__dtype="bfloat16", training__steps=2)
     train(config, reporter)
     assert all(value.dtype == torch.float32 for value in trained_weights(Path(config.run_dir)).values())
+
+
+def test_a_resumed_run_still_counts_the_broken_episodes_that_it_met(make_config, reporter, monkeypatch) -> None:
+    read, config = loader.read_clip, make_config(training__steps=2, data__broken_episodes="skip")
+    bad = next(batches_from(assemble(config, reporter.note), 0)).episode_ids[0]
+
+    def read_some(dataset: Dataset, wish: Wish) -> Clip:
+        if dataset.table.identity(wish.episode) == bad:
+            raise InputError(where="here", found="damaged")
+        return read(dataset, wish)
+
+    monkeypatch.setattr("vjepa2_ac.data.broken.MOST_BROKEN", 0.2)
+    monkeypatch.setattr(loader, "read_clip", read_some)
+    train(config, reporter)
+    monkeypatch.setattr(loader, "read_clip", read)
+    assert assemble(config, reporter.note).dataset.broken.reasons == {bad: "here: damaged."}
 
 
 def test_an_episode_may_be_left_out_within_a_run(make_config, reporter) -> None:

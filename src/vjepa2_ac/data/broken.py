@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.exclusion import named, with_way_out
@@ -32,6 +32,11 @@ class BrokenEpisodes:
         return len(self._reasons)
 
     @property
+    def reasons(self) -> dict[str, str]:
+        """The broken episodes and what is wrong with each, in the order in which they were met."""
+        return dict(self._reasons)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """The broken episodes, in the order in which they were met."""
         return tuple(self._reasons)
@@ -53,6 +58,11 @@ class BrokenEpisodes:
             as_error(problems[0]),
         )  # fmt: skip
         self._refuse_too_many()
+
+    def recall(self, reasons: Mapping[str, str]) -> None:
+        """Count what a run met before it was resumed: the share that may be broken is that of the whole run."""
+        excluded = frozenset(self._config.exclude)
+        self._reasons = {name: why for name, why in reasons.items() if name not in excluded} | self._reasons
 
     def met(self, name: str, reason: str) -> None:
         """Take note of an episode that a clip could not be read from.

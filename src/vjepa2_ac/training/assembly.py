@@ -78,6 +78,7 @@ def assemble(config: Config, note: Callable[[str], None], looked_through: Progre
     world_model.to(accelerator.device)
     optimizer = make_optimizer(world_model, config.training)
     state = _take_up(config, world_model, optimizer, note)
+    dataset.broken.recall(state.broken)
     objective, optimizer = accelerator.prepare(Objective(world_model, config.training.rollout_steps), optimizer)
     return Run(config, accelerator, world_model, objective, optimizer, dataset, state, calibration)
 

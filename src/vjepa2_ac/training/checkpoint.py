@@ -11,8 +11,8 @@ import json
 import logging
 import re
 import shutil
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError
@@ -30,6 +30,7 @@ class RunState:
     """Where a run stands. Data order, learning rate and random numbers are functions of the step."""
 
     step: int  # optimizer steps done
+    broken: Mapping[str, str] = field(default_factory=dict)  # episodes that clips could not be read from, and why
 
 
 def checkpoint_name(step: int) -> str:
