@@ -16,6 +16,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as opening
 from vjepa2_ac.data.broken import BrokenEpisodes
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.idle_search import FoundRanges
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.errors import InputError
 
@@ -174,9 +175,24 @@ def droid_sized() -> EpisodeTable:
     )
 
 
-def test_a_set_of_droids_size_is_opened_in_two_seconds_and_fifty_megabytes(open_with: Open, tmp_path: Path) -> None:
-    kept = tmp_path / "table"
-    kept.write_bytes(droid_sized().to_bytes())
+def two_ranges_each(table: EpisodeTable) -> FoundRanges:
+    """Return ranges with rests between them: a quarter of the steps, as in DROID."""
+    count, steps = len(table), table.num_steps
+    start, end = (np.zeros(2 * count, np.int32) for _ in range(2))
+    start[1::2], end[0::2], end[1::2] = steps * 0.4, steps * 0.3, steps * 0.85
+    return FoundRanges(np.repeat(np.arange(count, dtype=np.int32), 2), start, end, listed=count)
+
+
+@pytest.mark.parametrize("idle", [{}, {"rule": "motion"}, {"rule": "motion", "keep_share": 0.2}])
+def test_a_set_of_droids_size_is_opened_in_two_seconds_and_fifty_megabytes(
+    open_with: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, idle: dict[str, Any]
+) -> None:
+    kept, ranges = tmp_path / "table", tmp_path / "ranges"
+    table = droid_sized()
+    kept.write_bytes(table.to_bytes())
+    ranges.write_bytes(two_ranges_each(table).to_bytes())
+    monkeypatch.setattr(opening, "find_ranges", lambda *_: FoundRanges.from_bytes(ranges.read_bytes()))
+    del table
 
     class Kept:
         def infos(self, progress: object = None) -> EpisodeTable:
@@ -187,10 +203,10 @@ def test_a_set_of_droids_size_is_opened_in_two_seconds_and_fifty_megabytes(open_
 
     tracemalloc.start()
     began = time.perf_counter()
-    windows = open_with(Kept(), outcome="success", stride=4, frames=16).windows("train")
+    windows = open_with(Kept(), outcome="success", stride=4, frames=16, idle=idle).windows("train")
     seconds = time.perf_counter() - began
     size, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert len(windows) > 15e6
+    assert len(windows) > (8e6 if idle else 15e6)
     assert size < 50e6
     assert seconds < 2

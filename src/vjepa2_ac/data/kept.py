@@ -37,7 +37,7 @@ class KeptSteps:
 
     def of(self, episode: int) -> StepRanges:
         """Return the ranges of one episode."""
-        first, last = np.searchsorted(self.episode, [episode, episode + 1])
+        first, last = np.searchsorted(self.episode, np.array([episode, episode + 1], np.int32))
         return tuple(zip(self.start[first:last].tolist(), self.end[first:last].tolist(), strict=True))
 
     @property
