@@ -1,9 +1,9 @@
 """How are files listed, read, written and hashed, on this machine and behind URLs?
 
-A path is local, or a URL such as `gs://bucket/folder` (see remote). What an OSError says of a file is true of the file:
-it is not there, it ends too soon, the disk cannot read it. What a network does is none of that. It is tried again, and
-in the end raises `remote.UnreachableError`: an InputError that must never be booked as a broken episode. Whoever makes
-problems of InputErrors lets that one pass first.
+A path is local, or a URL such as `gs://bucket/folder` (see remote). That a file is not there, or ends too soon, is true
+of the file. What a network does is not: it is tried again, and in the end a `remote.UnreachableError`; neither is what
+the system has against a file (see `unreadable`). That is an InputError that must never be booked as a broken episode:
+whoever makes problems of InputErrors lets it pass first.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import BinaryIO, Protocol, runtime_checkable
 
 from vjepa2_ac import remote
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 
 _HASH_CHUNK_BYTES = 1 << 20
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
@@ -28,6 +29,9 @@ _UNWRITABLE = _FULL | {
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG,
     errno.EINVAL, errno.ELOOP,
 }  # fmt: skip
+
+
+_ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG})
 
 
 class ShortReadError(OSError):
@@ -127,6 +131,24 @@ def open_to_read(path: str | Path) -> ByteReader:
         OSError: There is no such file, or it cannot be read.
     """
     return remote.open_to_read(str(path)) if is_url(path) else Path(path).open("rb")
+
+
+def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -> InputError:
+    """Return what to tell the user of a file that is not there, that ends too soon, or that the system does not give.
+
+    The last (no permission, too many open files, a disk that went away) says nothing of what is in the file, and leaves
+    no trace in it when it has passed: it is an UnreachableError, which nobody keeps.
+
+    Args:
+        where: The file, and its episode.
+        error: What the system said.
+        needed: What should be there.
+        fix: The way out where it is the file.
+    """
+    if isinstance(error, ShortReadError) or error.errno in _ABSENT:
+        return InputError(where=where, found=f"cannot be read: {error.strerror or error}", needed=needed, fix=fix)
+    found = f"cannot be read: {error.strerror or error}"
+    return UnreachableError(where=where, found=found, needed=needed, fix="Check its permissions, and the disk")
 
 
 def read_bytes(path: str | Path) -> bytes:

@@ -1,6 +1,12 @@
 """One trajectory in every form gives the same clips in the same order."""
 
+import errno
 import itertools
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +21,7 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.sources.rlds.writer import write_droid_rlds
 from vjepa2_ac.episode import Batch
+from vjepa2_ac.remote import UnreachableError
 
 LENGTHS = (14, 17, 15, 12)
 SIZE = (36, 64)
@@ -113,3 +120,41 @@ def test_a_set_is_looked_through_once_by_whatever_path_it_is_named(
     ]
     assert [list(table) for table in tables] == [list(tables[0])] * 3
     assert len(list((tmp_path / "cache/index").glob("*.index"))) == 1
+
+
+@contextmanager
+def refused(folder: Path) -> Iterator[None]:
+    """Let the files of a folder be there, and not be read."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    root = os.geteuid() == 0
+    try:
+        for path in files:
+            path.chmod(0)
+        if root:  # to whom no file is refused
+            os.seteuid(65534)
+        yield
+    finally:
+        if root:
+            os.seteuid(0)
+        for path in files:
+            path.chmod(0o644)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_file_that_the_system_refuses_is_named_and_its_episode_not_called_broken(
+    forms: Path, form: str, tmp_path: Path
+) -> None:
+    shutil.copytree(forms / form, tmp_path / form)
+    for folder in (tmp_path, *tmp_path.parents):  # nobody may go through them, while the test pretends to be nobody
+        if folder.owner() == forms.owner() and folder.is_relative_to(tempfile.gettempdir()):
+            folder.chmod(0o755)
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new").chmod(0o777)
+    before, new = ({"dir": str(tmp_path / name), "limit_gb": 0.0} for name in ("before", "new"))
+    source = opened(tmp_path, form, disk_cache=before).source
+    frames = source.read(0).read_frames
+    with refused(tmp_path / form):
+        for action in (lambda: source.read(0), lambda: frames([0]), lambda: opened(tmp_path, form, disk_cache=new)):
+            with pytest.raises(UnreachableError, match=f"{os.strerror(errno.EACCES)}.*permissions"):
+                action()
+    assert len(opened(tmp_path, form, disk_cache=new).table) == len(LENGTHS)

@@ -100,6 +100,8 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
         with closing(storage.open_to_read(file)) as opened, _opened(opened, where) as video:
             yield video
         return
+    if isinstance(file, (str, Path)):
+        _require_readable(file, where)
     source = f"file:{file}" if isinstance(file, (str, Path)) else QuietFile(file)
     try:
         with av.open(source, format=_DEMUXER, metadata_errors="replace") as container:
@@ -113,6 +115,14 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
         raise InputError(where=where, found=found, needed="a whole, undamaged MP4", fix=_FIX) from None
     if isinstance(source, QuietFile) and source.error is not None:
         raise source.error
+
+
+def _require_readable(path: str | Path, where: str) -> None:
+    """Let the system say what it has against a local file, before libav says it in words for damage."""
+    try:
+        storage.open_to_read(path).close()
+    except OSError as error:
+        raise storage.unreadable(where, error, needed="a whole, undamaged MP4", fix=_FIX) from None
 
 
 def _video_of(container: InputContainer, converter: VideoReformatter, where: str) -> _Video:

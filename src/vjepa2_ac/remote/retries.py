@@ -54,7 +54,7 @@ DEFAULT = RetryPolicy()  # fails within a minute where errors come at once, with
 
 
 class UnreachableError(InputError):
-    """Data that lies elsewhere cannot be had now. Nothing is known of the data itself: never call it broken."""
+    """Data cannot be had now. Nothing is known of the data itself: never call it broken."""
 
 
 def persist(where: str, action: Callable[[float], _T], *, policy: RetryPolicy, access: str) -> _T:

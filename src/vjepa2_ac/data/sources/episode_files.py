@@ -43,7 +43,7 @@ class EpisodeFiles:
             where: The file and its episode, as an error names them.
 
         Raises:
-            InputError: There is no such file, or a local one cannot be read.
+            InputError: There is no such file; an UnreachableError where a local one cannot be read.
             OSError: A file behind a URL cannot be read.
         """
         if not storage.is_url(path):
@@ -64,4 +64,4 @@ def _read(path: str, where: str) -> bytes:
     except OSError as error:
         if storage.is_url(path):
             raise
-        raise InputError(where=where, found=f"cannot be read: {error.strerror}") from None
+        raise storage.unreadable(where, error) from None

@@ -113,7 +113,7 @@ def read_info(root: str) -> DatasetInfo:
 
     Raises:
         InputError: There is no data set, it is of another version, or the file is damaged.
-        OSError: It cannot be read.
+        UnreachableError: It cannot be read.
     """
     where = storage.join(root, INFO)
     try:
@@ -125,6 +125,8 @@ def read_info(root: str) -> DatasetInfo:
             needed="a LeRobot data set",
             fix=_WAY_TO_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos",
         ) from None
+    except OSError as error:
+        raise storage.unreadable(where, error) from None
     try:
         content = dict(json.loads(data))
         _require_version(where, content.get("codebase_version"))

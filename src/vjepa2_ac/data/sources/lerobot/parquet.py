@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Shaped
 
+from vjepa2_ac import storage
 from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.data.sources.lerobot.kept import Columns, KeptRows
 from vjepa2_ac.errors import InputError
@@ -187,8 +188,8 @@ def _opened(opened: str | KeptFile, path: str) -> Iterator[parquet.ParquetFile]:
     except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError) as error:
         if isinstance(opened, KeptFile) and opened.failure is not None:
             raise opened.failure from None
-        if isinstance(error, OSError) and error.errno is not None:
-            raise  # of the operating system, not of the file's content
+        if isinstance(error, OSError) and error.errno is not None:  # of the system, not of the file's content
+            raise storage.unreadable(path, error, fix=_FIX) from None
         reason = str(error).strip().splitlines()[:1]
         raise InputError(
             where=path, found=f"damaged: {' '.join(reason)[:200]}", needed="a whole Parquet file", fix=_FIX

@@ -101,9 +101,14 @@ def opened_npz(path: str) -> Iterator[NpzFile]:
     except OSError as error:
         if storage.is_url(path):
             raise
-        raise InputError(where=path, found=f"cannot be read: {error.strerror}") from None
-    with closing(file):
-        yield NpzFile(file, path)
+        raise storage.unreadable(path, error) from None
+    try:
+        with closing(file):
+            yield NpzFile(file, path)
+    except OSError as error:
+        if storage.is_url(path):
+            raise
+        raise storage.unreadable(path, error) from None
 
 
 def require_pictures(file: NpzFile, camera: str, steps: int, path: str) -> None:

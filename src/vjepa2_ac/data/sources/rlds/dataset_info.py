@@ -83,7 +83,9 @@ def _read_info(folder: str, where: str) -> dict[str, Any]:
             needed=f"a folder with {_INFO}",
             fix="Set data.path to the data set; docs/QUICKSTART.md says how to get DROID",
         ) from None
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise storage.unreadable(where, error) from None
+    except ValueError as error:
         raise InputError(where=where, found=f"cannot be read ({error})", needed="JSON as TFDS writes it") from None
     if not isinstance(info, dict):
         raise InputError(where=where, found="JSON of another kind", needed="a description as TFDS writes it")

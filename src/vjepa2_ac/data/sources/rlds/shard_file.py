@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard
 from vjepa2_ac.data.sources.rlds.example_index import Read
 from vjepa2_ac.errors import InputError
@@ -42,4 +43,4 @@ def open_shard(shard: Shard) -> Iterator[Read]:
 
 def unreadable(shard: Shard, error: OSError) -> InputError:
     """Return what to tell the user of a file that the system refuses to read."""
-    return InputError(where=shard.path, found=f"cannot be read ({error})", needed="a TFRecord file")
+    return storage.unreadable(shard.path, error, needed="a TFRecord file")
