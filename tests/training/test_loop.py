@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -265,5 +266,7 @@ def test_an_episode_may_be_left_out_within_a_run(make_config, reporter) -> None:
     config = make_config(training__steps=2)
     train(config, reporter)
     broken = next(batches_from(assemble(config, reporter.note), 0)).episode_ids[0]
+    assert not any("data has changed" in note for note in reporter.notes)
     train(make_config(training__steps=2, data__exclude=[broken]), reporter)
-    assert "Going on from" in reporter.notes[-1]
+    assert "Going on from" in reporter.notes[-2]
+    assert re.search("The data has changed: [0-9]+ training clips instead of [0-9]+", reporter.notes[-1])

@@ -79,6 +79,11 @@ def assemble(config: Config, note: Callable[[str], None], looked_through: Progre
     optimizer = make_optimizer(world_model, config.training)
     state = _take_up(config, world_model, optimizer, note)
     dataset.broken.recall(state.broken)
+    if state.windows not in {None, len(dataset.windows("train"))}:
+        note(
+            f"The data has changed: {len(dataset.windows('train')):,} training clips instead of {state.windows:,}."
+            " From here on their order is another, and some may be seen twice in this epoch or not at all."
+        )
     objective, optimizer = accelerator.prepare(Objective(world_model, config.training.rollout_steps), optimizer)
     return Run(config, accelerator, world_model, objective, optimizer, dataset, state, calibration)
 

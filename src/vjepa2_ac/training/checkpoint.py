@@ -31,6 +31,7 @@ class RunState:
 
     step: int  # optimizer steps done
     broken: Mapping[str, str] = field(default_factory=dict)  # episodes that clips could not be read from, and why
+    windows: int | None = None  # clips of an epoch: with another number, their order is another
 
 
 def checkpoint_name(step: int) -> str:

@@ -111,7 +111,7 @@ def _loop(run: Run, folder: Path, journal: Journal, reporter: Reporter) -> None:
             errors = _validate(run, reporter)
             journal.write("validation", step, validation_figures(errors))
         if step % config.checkpoint.every == 0 or last:
-            run.state = RunState(step, run.dataset.broken.reasons)
+            run.state = RunState(step, run.dataset.broken.reasons, len(run.dataset.windows("train")))
             save_checkpoint(run, folder)
 
 
