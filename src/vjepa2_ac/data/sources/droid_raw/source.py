@@ -12,7 +12,7 @@ from jaxtyping import Int, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.broken import as_error
+from vjepa2_ac.data.broken import as_error, as_problem
 from vjepa2_ac.data.index import kept_or_built, key_of
 from vjepa2_ac.data.sources.droid_raw.folders import (
     TRAJECTORY,
@@ -166,7 +166,7 @@ class RawDroidSource:
         except UnreachableError:
             raise  # the network's fault, not the episode's
         except InputError as error:
-            return Problem(identity, error.where, error.found, error.needed, error.fix)
+            return as_problem(error, identity)
         success = success_of(identity) if metadata.success is None else metadata.success
         return EpisodeInfo(identity, steps, success), place
 

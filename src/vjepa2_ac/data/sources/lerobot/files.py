@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 from vjepa2_ac import storage
+from vjepa2_ac.data.sources.folders import in_parallel
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
 
@@ -61,8 +61,7 @@ def list_by_template(root: str, template: str, key: str = "", *, connections: in
             found = [f"{folder}{name}/" for folder, inside in zip(found, names, strict=True) for name in inside]
         else:
             found = [f"{folder}{part}/" for folder in found]
-    with ThreadPoolExecutor(max_workers=connections) as pool:
-        listings = list(pool.map(lambda folder: storage.list_files(storage.join(root, folder)), found))
+    listings = in_parallel(lambda folder: storage.list_files(storage.join(root, folder)), found, connections)
     files = {
         f"{folder}{info.name}": info
         for folder, infos in zip(found, listings, strict=True)

@@ -10,10 +10,11 @@ from dataclasses import replace
 import numpy as np
 
 from vjepa2_ac import storage
+from vjepa2_ac.data.broken import as_problem
 from vjepa2_ac.data.sources.lerobot.episodes import EpisodeRow, VideoPlace, data_file, video_file
 from vjepa2_ac.data.sources.lerobot.meta import DatasetInfo
 from vjepa2_ac.data.sources.states import zero_steps
-from vjepa2_ac.data.table import EpisodeTable, Problem
+from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.episode import EpisodeInfo, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
@@ -96,7 +97,7 @@ def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], tex
         locators[f"{key}.start_s"] = np.array([place.start_s for place in places], np.float64)
     return EpisodeTable.of(
         [EpisodeInfo(row.id, row.length, row.success) for row in usable],
-        problems=[_problem(row, problems[row.index]) for row in _all(rows, problems)],
+        problems=[as_problem(problems[row.index], row.id) for row in rows if row.index in problems],
         locators=locators,
         texts={"tasks": json.dumps(tasks), **texts},
     )
@@ -119,10 +120,6 @@ def row_of(table: EpisodeTable, place: int) -> EpisodeRow:
             for key in keys
         },
     )
-
-
-def _all(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError]) -> list[EpisodeRow]:
-    return [row for row in rows if row.index in problems]
 
 
 def _checked(row: EpisodeRow, check: Check) -> tuple[EpisodeRow, InputError | None]:
@@ -165,7 +162,3 @@ def _require_usable(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: S
                 needed=f"{row.length / info.fps:.3f} s",
                 fix="Leave the episode out",
             )
-
-
-def _problem(row: EpisodeRow, error: InputError) -> Problem:
-    return Problem(name=row.id, where=error.where, found=error.found, needed=error.needed, fix=error.fix)

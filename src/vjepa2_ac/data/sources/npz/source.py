@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.broken import as_error
+from vjepa2_ac.data.broken import as_error, as_problem
 from vjepa2_ac.data.index import kept_or_built, key_of
 from vjepa2_ac.data.sources.folders import in_parallel, walk, within
 from vjepa2_ac.data.sources.npz.episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_pictures
@@ -124,7 +124,7 @@ class NpzSource:
         except UnreachableError:
             raise  # the network's fault, not the episode's
         except InputError as error:
-            return Problem(identity, error.where, error.found, error.needed, error.fix)
+            return as_problem(error, identity)
 
     def _other_rate(self, identity: str, rate: float, others: float) -> Problem:
         needed = f"{others:g}, as in most episodes: strides count control steps"

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vjepa2_ac.config import RldsFields
+from vjepa2_ac.data.broken import as_error, as_problem
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard
 from vjepa2_ac.data.sources.rlds.example_index import Read
 from vjepa2_ac.data.sources.rlds.fields import identity_of, info_of, num_steps_of, states_of
@@ -74,7 +75,7 @@ def scan_shard(read: Read, shard: Shard, examine: Examine) -> Iterator[Found]:
         except UnreachableError:
             raise  # says nothing of the record
         except InputError as error:
-            yield problem_of(error, _place(shard, number))
+            yield as_problem(error, _place(shard, number))
             yield from _missing(shard, number + 1, f"cannot be found behind the damage at byte {offset}")
             return
         yield examine(read, span)
@@ -135,8 +136,7 @@ def table_of(shards: Sequence[Shard], found: Iterator[list[Found]]) -> EpisodeTa
             rows.append(one)
             numbers.append(number)
     if not rows:
-        one = problems[0]
-        raise InputError(where=one.where, found=one.found, needed=one.needed, fix=one.fix)
+        raise as_error(problems[0])
     spans = [row.span for row in rows]
     logger.info("%d episodes in %d shards; %d cannot be used", len(rows), len(shards), len(problems))
     return EpisodeTable.of(
@@ -156,11 +156,6 @@ def place_of(span: RecordSpan) -> str:
     return f"{span.path.replace(chr(92), '/').rsplit('/', 1)[-1]}: record {span.number}"
 
 
-def problem_of(error: InputError, name: str) -> Problem:
-    """Return an error as a row of the table's problems."""
-    return Problem(name=name, where=error.where, found=error.found, needed=error.needed, fix=error.fix)
-
-
 def _examine(read: Read, span: RecordSpan, fields: RldsFields, cameras: Sequence[str]) -> Found:
     """Look at identity, steps, states and the presence of the pictures."""
     name = place_of(span)
@@ -171,7 +166,7 @@ def _examine(read: Read, span: RecordSpan, fields: RldsFields, cameras: Sequence
         steps = num_steps_of(record, fields)
         states_of(record, fields, steps, f"{span} ({name})")
     except InputError as error:
-        return problem_of(_damage_or(error, read, span), name)
+        return as_problem(_damage_or(error, read, span), name)
     return Row(info_of(name, steps), span)
 
 

@@ -15,6 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from vjepa2_ac.config import RldsFields
+from vjepa2_ac.data.broken import as_problem
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard
 from vjepa2_ac.data.sources.rlds.example_index import (
     Located,
@@ -24,7 +25,7 @@ from vjepa2_ac.data.sources.rlds.example_index import (
     iterate_features,
 )
 from vjepa2_ac.data.sources.rlds.fields import STEP_FLAG, identity_of, info_of, num_steps_of, states_of
-from vjepa2_ac.data.sources.rlds.index import Found, Row, in_parallel, place_of, problem_of, scan_shard, table_of
+from vjepa2_ac.data.sources.rlds.index import Found, Row, in_parallel, place_of, scan_shard, table_of
 from vjepa2_ac.data.sources.rlds.record import Record, not_an_example
 from vjepa2_ac.data.sources.rlds.remote_file import RemoteFile
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, RecordSpan, span_at
@@ -185,7 +186,7 @@ def _examine(read: Read, span: RecordSpan, fields: RldsFields, layout: Layout) -
     except UnreachableError:
         raise  # says nothing of the record
     except InputError as error:
-        return problem_of(error, name)
+        return as_problem(error, name)
     return Row(info_of(name, steps), span)
 
 
