@@ -24,7 +24,7 @@ Level = Literal["ok", "warning", "error"]
 _DARK = 8  # of 255: mean of pictures that show next to nothing
 _STILL_CM, _FAR_CM = 0.2, 30.0  # medians of |dxyz| per model step that are worth a word
 _REACH_M = 1.6  # beyond the reach of common arms
-_LONGEST = 200  # letters of a reason
+_LONGEST = 300  # letters of a reason
 _NARROW = 0.2  # a gripper that never closes further may be given in metres
 
 
@@ -97,13 +97,17 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
         except InputError as error:
             if split == "train":
                 raise
-            level: Level = "error" if split == "validation" else "warning" if share else "ok"
-            yield Finding(level, split, f"{error.found[:_LONGEST]}. {error.fix}")
+            level: Level = "error" if split == "validation" or share else "ok"  # training opens every split it is given
+            yield Finding(level, split, f"{_shortened(error.found)}. {error.fix}")
             continue
         episodes = len(np.unique(windows.episodes))
         short = f"; {len(windows.short):,} episodes are too short" if len(windows.short) else ""
         clip = f"clips of {config.frames} frames at stride {config.stride}"
         yield Finding("ok", split, f"{len(windows):,} {clip} in {episodes:,} episodes{short}")
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST].rsplit(' ', 1)[0]} …"
 
 
 def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int, clock: Callable[[], float]) -> Iterator[Finding]:
