@@ -103,6 +103,13 @@ def test_overrides_reach_nested_keys_and_read_numbers_as_people_write_them(tmp_p
     assert config.data.fields.gripper == "openness"
 
 
+@pytest.mark.parametrize("written", ["22008760", '"22008760"'])
+def test_the_serial_number_of_a_camera_needs_no_quotes(tmp_path: Path, written: str) -> None:
+    path = write(tmp_path, yaml.safe_dump(MINIMAL))
+    for camera in (f"data.camera={written}", f"data.camera=[{written}]"):
+        assert load_config(path, ["data.source=droid_raw", camera]).data.cameras == ("22008760",)
+
+
 def test_a_key_given_twice_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="given twice"):
         load_config(write(tmp_path, "run_dir: a\nrun_dir: b\n"))

@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from vjepa2_ac.config.section import PositiveInt, Section, Share
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
+
+# A serial number is a name, also where YAML takes it for a number.
+_CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
 _STRIDES_AT_15_HZ = (4, 8, 15)
 
@@ -174,7 +177,7 @@ class DataConfig(Section):
     """For droid_raw: what is kept."""
     lerobot: LeRobotFields = LeRobotFields()
     """For lerobot: names and conventions of the columns."""
-    camera: str | tuple[str, ...] | None = None
+    camera: _CameraName | tuple[_CameraName, ...] | None = None
     """Which camera the model sees; of several, one is drawn for each clip. null: the source's first, for DROID the left
     exterior camera, which the released weights saw. rlds, lerobot: a name in `cameras`. droid_raw: left, right, wrist,
     ext1, ext2 or a serial number. npz: the name of an array of pictures."""
