@@ -192,7 +192,7 @@ class _Video:
         return [round((clock.start_s + step / clock.rate_hz) / self._unit_s) for step in steps]
 
     def decode(self, targets: list[int], clock: Clock | None) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
-        """Return the pictures shown at these ascending times; with a clock, the nearest within half a step."""
+        """Return the pictures shown at these ascending times; with a clock, the first within half a step of each."""
         wanted = Wanted(targets, 0 if clock is None else max(0, int(0.49 / clock.rate_hz / self._unit_s)))
         while (target := wanted.first) is not None:
             before = len(wanted.frames)

@@ -57,12 +57,11 @@ class RemoteEpisode:
         shard: Its file.
         span: Its place in the file.
         cache: What is kept of its data set.
-        number: Of the episode in the index.
     """
 
-    def __init__(self, shard: Shard, span: RecordSpan, cache: RemoteCache, number: int) -> None:
+    def __init__(self, shard: Shard, span: RecordSpan, cache: RemoteCache) -> None:
         self._shard, self._span, self._cache = shard, span, cache
-        self._key = f"{cache.key} {number}"
+        self._key = f"{cache.key} {shard.name} {span.offset}"  # whatever place an index made anew gives it
 
     def record(self, whole: Sequence[str], texts: Sequence[str]) -> Record:
         """Return the record with some features here, those of them that it has.

@@ -125,7 +125,7 @@ class RldsSource:
             self._check(record, read, span, info.num_steps, {feature}, where)
             pictures: FrameReader = PicturesAt(read, record.located[feature], info.num_steps, f"{where}: {feature}")
         else:
-            remote = RemoteEpisode(shard, span, opened.cache, index)
+            remote = RemoteEpisode(shard, span, opened.cache)
             numbers = [*fields.identity, *fields.state, STEP_FLAG, fields.joint_velocity]
             record = remote.record([name for name in numbers if name], [fields.language] if fields.language else [])
             record.require([feature])
