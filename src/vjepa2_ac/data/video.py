@@ -18,6 +18,7 @@ from jaxtyping import UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.data.video_parts import QuietFile, Wanted
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 from vjepa2_ac.storage import ByteReader
 
 if TYPE_CHECKING:
@@ -263,7 +264,8 @@ def _library(where: str) -> Any:
     try:
         import av
     except ImportError:
-        raise InputError(
+        # Unreachable: it says nothing of the episode, which is not broken.
+        raise UnreachableError(
             where=where,
             found="PyAV, which decodes video, is not installed",
             fix='pip install -c constraints.txt -e ".[video]"',

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Float64, Int
 
 from vjepa2_ac.data.sources.states import zero_steps
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 
 _POSE = "observation/robot_state/cartesian_position"
 _GRIPPER = "observation/robot_state/gripper_position"
@@ -130,7 +131,8 @@ def _library(where: str) -> Any:
     try:
         import h5py
     except ImportError:
-        raise InputError(
+        # Unreachable: it says nothing of the episode, which is not broken.
+        raise UnreachableError(
             where=where,
             found="h5py, which reads trajectory.h5, is not installed",
             fix='pip install -c constraints.txt -e ".[raw]"',

@@ -16,6 +16,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.data.sources.lerobot.kept import Columns, KeptRows
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -256,7 +257,8 @@ def _library(where: str) -> tuple[Any, Any]:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError:
-        raise InputError(
+        # Unreachable: it says nothing of the episode, which is not broken.
+        raise UnreachableError(
             where=where,
             found="pyarrow, which reads LeRobot data sets, is not installed",
             fix='pip install -c constraints.txt -e ".[lerobot]"',
