@@ -149,3 +149,11 @@ def test_a_file_that_changes_has_another_version(folder: str) -> None:
 def test_a_folder_that_is_not_there_has_no_files(tmp_path: Path) -> None:
     assert storage.list_names(tmp_path / "none") == []
     assert storage.list_names("memory://none-at-all") == []
+
+
+def test_a_full_disk_says_of_which_file(tmp_path: Path) -> None:
+    with (
+        pytest.raises(OSError, match=r"No space left on device: '.*figures\.json'"),
+        storage.atomic_writer(tmp_path / "figures.json"),
+    ):
+        raise OSError(errno.ENOSPC, "No space left on device")

@@ -222,3 +222,17 @@ def test_a_folder_in_the_cloud_reads_as_here(tmp_path: Path, gcs: Gcs) -> None:
     assert [info.id for info in plain.infos()] == ["one", "two"]
     np.testing.assert_array_equal(plain.read(1).states, STATES)
     np.testing.assert_array_equal(plain.read(1).read_frames([3, 2]), FRAMES[[3, 2]])
+
+
+def test_of_a_file_in_the_cloud_nothing_is_fetched_twice(tmp_path: Path, gcs: Gcs) -> None:
+    write(tmp_path / "set" / "one.npz")
+    plain = source(gcs.upload(tmp_path / "set", "bucket/own"), disk_cache={"dir": str(tmp_path / "cache")})
+    plain.read(0).read_frames([3])
+    gcs.forget()
+    again = source("gs://bucket/own", disk_cache={"dir": str(tmp_path / "cache")})
+    np.testing.assert_array_equal(again.read(0).read_frames([3]), FRAMES[[3]])
+    assert not gcs.reads()
+    write(tmp_path / "set" / "one.npz", frames=FRAMES[::-1])
+    gcs.upload(tmp_path / "set", "bucket/own")
+    changed = source("gs://bucket/own", disk_cache={"dir": str(tmp_path / "cache")})
+    np.testing.assert_array_equal(changed.read(0).read_frames([3]), FRAMES[::-1][[3]])

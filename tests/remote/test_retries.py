@@ -91,3 +91,22 @@ def test_a_library_that_takes_long_over_each_attempt_is_not_asked_for_hours(monk
     with pytest.raises(UnreachableError, match="not reached in 4 attempts over 320 s"):
         persist("hf://a", action, policy=RetryPolicy(first_wait_s=0.0, total_s=300.0), access="")
     assert len(calls) == 4
+
+
+def test_a_network_that_stays_away_is_spoken_of_once(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def action(_timeout_s: float) -> None:
+        raise ConnectionResetError("gone")
+
+    def spoken(attempts: int) -> int:
+        caplog.clear()
+        policy = RetryPolicy(attempts=attempts, first_wait_s=0.0, longest_wait_s=0.0)
+        with pytest.raises(UnreachableError):
+            persist("gs://a/b", action, policy=policy, access="")
+        return sum(record.levelname == "WARNING" for record in caplog.records)
+
+    monkeypatch.setattr(retries, "_last_said", [float("-inf")])
+    assert spoken(attempts=3) == 0  # two failures are nothing
+    assert spoken(attempts=6) == 1
+    assert spoken(attempts=6) == 0  # said already

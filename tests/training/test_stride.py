@@ -42,6 +42,17 @@ def test_the_run_equals_one_that_was_told_the_stride(make_config: Make, reporter
     assert losses[0] == losses[1]
 
 
+def test_only_a_stride_at_which_the_runs_own_clips_fit_is_chosen(make_config: Make, reporter: Any) -> None:
+    # 24 steps hold 12 frames at stride 2 only, though the 8 frames of a calibration at stride 3, too.
+    config = make_config(data__stride="auto", data__stride_candidates=[2, 3], data__frames=12, training__steps=1)
+    assert read_run_config(train(config, reporter)).data.stride == 2
+    assert "  stride 3: not possible: no clip of 12 frames fits" in reporter.notes
+    with pytest.raises(InputError, match="shorter than a clip"):
+        train(
+            make_config(data__stride="auto", data__stride_candidates=[3], data__frames=12, run_dir="unused"), reporter
+        )
+
+
 def test_a_check_only_run_writes_no_choice(make_config: Make, reporter: Any) -> None:
     config = make_config(data__stride="auto", data__stride_candidates=[2, 3])
     folder = train(config, reporter, check_only=True)

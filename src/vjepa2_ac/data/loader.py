@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 import multiprocessing
 import os
+import signal
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -223,6 +224,7 @@ def _end_with_the_run(_worker: int) -> None:
     run = multiprocessing.parent_process()
     if run is None:
         raise ValueError("not in a worker")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which ends its workers
 
     def watch() -> None:
         run.join()

@@ -23,6 +23,8 @@ _PASSING_STATUS = frozenset({408, 425, 429, *range(500, 600)})
 _NO_ACCESS = frozenset({401, 403, 407})
 _ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 _LONGEST_WORDS = 300
+_FAILURES_UNSAID = 3
+_SAID_EVERY_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -84,9 +86,21 @@ def persist(where: str, action: Callable[[float], _T], *, policy: RetryPolicy, a
             wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
             if failures == policy.attempts or seconds + wait_s > policy.total_s:
                 raise _given_up(where, error, failures, seconds) from error
-            logger.info("%s: %s; trying again in %.1f s", where, _words(error), wait_s)
+            _say(failures, "%s: %s; trying again in %.1f s", where, _words(error), wait_s)
         time.sleep(wait_s)
     raise AssertionError("the last attempt returns or raises")
+
+
+def _say(failures: int, text: str, *arguments: object) -> None:
+    """Log a failure; aloud when it is the third of a call, and no more than once in half a minute."""
+    now = time.monotonic()
+    aloud = failures >= _FAILURES_UNSAID and now - _last_said[0] > _SAID_EVERY_S
+    if aloud:
+        _last_said[0] = now
+    logger.log(logging.WARNING if aloud else logging.INFO, text, *arguments)
+
+
+_last_said = [-_SAID_EVERY_S]
 
 
 def status_of(error: BaseException) -> int | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
@@ -44,10 +44,36 @@ def choose_stride(
         InputError: As `calibrate`.
     """
     note("data.stride is auto: measuring the model at each candidate stride")
-    calibration = calibrate_model(world_model, dataset, config, accelerator, clips=config.validation.clips)
+    strides = strides_that_fit(dataset)
+    for stride in set(dataset.config.strides_to_try(dataset.control_rate_hz)).difference(strides):
+        note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
+    calibration = calibrate_model(
+        world_model, dataset, config, accelerator, clips=config.validation.clips, strides=strides
+    )
     for line in calibration.lines():
         note(line)
     return calibration
+
+
+def strides_that_fit(dataset: Dataset) -> list[int]:
+    """Return the candidates at which a run's own clips, which may be longer than a calibration's, fit into episodes.
+
+    Raises:
+        InputError: There is none.
+    """
+    fitting, first_error = [], None
+    for stride in dataset.config.strides_to_try(dataset.control_rate_hz):
+        view = dataset.with_stride(stride)
+        try:
+            view.windows("train")
+            view.windows("validation")
+        except InputError as error:
+            first_error = first_error or error
+        else:
+            fitting.append(stride)
+    if not fitting and first_error is not None:
+        raise first_error
+    return fitting
 
 
 def require_learned(model: ModelConfig) -> None:
@@ -73,6 +99,7 @@ def calibrate_model(
     *,
     clips: int,
     split: Split = "validation",
+    strides: Sequence[int] = (),
     frames: int | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -92,6 +119,7 @@ def calibrate_model(
             encode,
             dataset,
             split=split,
+            strides=strides,
             frames=frames,
             clips=clips,
             batch_size=config.validation.batch_size,

@@ -84,7 +84,7 @@ class LeRobotSource:
             info=info,
             states=content.states,
             read_frames=self._pictures(row, key, where),
-            control_rate_hz=self._config.lerobot.fps or self._info.fps,
+            control_rate_hz=self._control_rate_hz,
             joint_velocities=content.joint_velocities,
             metadata={"language": task} if task else {},
         )
@@ -92,6 +92,10 @@ class LeRobotSource:
     @cached_property
     def _info(self) -> DatasetInfo:
         return read_info(self._config.path)
+
+    @property
+    def _control_rate_hz(self) -> float:
+        return self._config.lerobot.fps or self._info.fps
 
     @cached_property
     def _tasks(self) -> list[str]:
@@ -172,7 +176,8 @@ class LeRobotSource:
             rows = sorted(unusable + checked, key=lambda row: row.index)
         if not rows:
             raise InputError(where=info.where, found="no episodes", needed="a data set with episodes")
-        table = table_of(rows, problems, {"version": self._version})
+        texts = {"version": self._version, "control_rate_hz": str(self._control_rate_hz)}
+        table = table_of(rows, problems, texts)
         logger.info("%s: %d episodes, %d steps", info.root, len(table), int(table.num_steps.sum()))
         return table
 

@@ -32,6 +32,7 @@ from jaxtyping import Float, Float64
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.data.sources.npz.file import NpzFile
 from vjepa2_ac.data.sources.states import require_plausible
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
@@ -52,13 +53,19 @@ class NpzEpisode:
     joint_velocities: Float[np.ndarray, "steps joints"] | None
 
 
-def read_episode(path: str, cameras: Sequence[str], config: DataConfig) -> NpzEpisode:
+def read_episode(opened: str | KeptFile, path: str, cameras: Sequence[str], config: DataConfig) -> NpzEpisode:
     """Read all of a file but the pictures, whose shape is checked.
+
+    Args:
+        opened: What to open to read: the path, or a file far away.
+        path: Of the file, for messages.
+        cameras: Whose pictures must be there.
+        config: Whether camera poses must be, too.
 
     Raises:
         InputError: It is no episode, or cannot be a robot's.
     """
-    with opened_npz(path) as file:
+    with opened_npz(opened, path) as file:
         arrays = _Arrays(file, path)
         states = arrays.numbers("states", (None, STATE_DIM))
         steps = len(states)
@@ -87,27 +94,18 @@ def read_episode(path: str, cameras: Sequence[str], config: DataConfig) -> NpzEp
 
 
 @contextmanager
-def opened_npz(path: str) -> Iterator[NpzFile]:
+def opened_npz(opened: str | KeptFile, path: str) -> Iterator[NpzFile]:
     """Open an .npz file to read from.
 
     Raises:
-        InputError: It is missing, or no .npz file, or a local one cannot be read.
-        OSError: A file behind a URL cannot be read.
+        InputError: It is missing, or no .npz file; an UnreachableError where it cannot be read.
     """
     try:
-        file = storage.open_to_read(path)
+        with closing(storage.open_to_read(opened) if isinstance(opened, str) else opened) as file:
+            yield NpzFile(file, path)
     except FileNotFoundError:
         raise InputError(where=path, found="no such file", fix="Put it back, or leave the episode out") from None
     except OSError as error:
-        if storage.is_url(path):
-            raise
-        raise storage.unreadable(path, error) from None
-    try:
-        with closing(file):
-            yield NpzFile(file, path)
-    except OSError as error:
-        if storage.is_url(path):
-            raise
         raise storage.unreadable(path, error) from None
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import itertools
 import logging
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import UInt8
@@ -15,7 +16,9 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import as_error, as_problem
 from vjepa2_ac.data.index import kept_or_built, key_of
+from vjepa2_ac.data.sources.episode_files import EpisodeFiles
 from vjepa2_ac.data.sources.folders import in_parallel, walk, within
+from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.data.sources.npz.episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_pictures
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
@@ -30,12 +33,15 @@ _SUFFIX = ".npz"
 class NpzSource:
     """The episodes of a folder of .npz files, in the order of their paths; a path without .npz is the identity.
 
-    Nothing is read before the first call. `infos` reads all of every file but the pictures.
+    Nothing is read before the first call. `infos` reads all of every file but the pictures. What is fetched of files
+    behind URLs stays on this machine.
     """
 
     def __init__(self, config: DataConfig) -> None:
         self._config = config
         self._root = config.path
+        self._files = EpisodeFiles(config)
+        self._version = ""  # of all files together: the key of the index
         self._table: EpisodeTable | None = None
 
     def infos(self, progress: Progress | None = None) -> EpisodeTable:
@@ -49,7 +55,7 @@ class NpzSource:
             self._table = self._indexed(progress)
         return self._table
 
-    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is kept
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - files are fetched in blocks
         """Return one episode; of its pictures, only those that are asked for are read.
 
         Raises:
@@ -59,7 +65,7 @@ class NpzSource:
         info = self.infos()[index]
         path = self._path(info.id)
         camera = camera or self._config.cameras[0]
-        found = read_episode(path, (camera,), self._config)
+        found = read_episode(self._opened(path), path, (camera,), self._config)
         if len(found.states) != info.num_steps:
             raise InputError(
                 where=path,
@@ -70,7 +76,7 @@ class NpzSource:
         return Episode(
             info=info,
             states=found.states,
-            read_frames=_PictureReader(path, camera, info.num_steps),
+            read_frames=_PictureReader(partial(self._opened, path), path, camera, info.num_steps),
             control_rate_hz=found.fps_hz,
             extrinsics=found.extrinsics[camera],
             joint_velocities=found.joint_velocities,
@@ -93,9 +99,9 @@ class NpzSource:
                 fix=FORMAT_HELP,
             )
         knobs = {"cameras": config.cameras, "pose_frame": config.pose_frame}
-        key = key_of({"source": "npz", "path": storage.absolute(self._root), **knobs, "listed": listed})
+        self._version = key_of({"source": "npz", "path": storage.absolute(self._root), **knobs, "listed": listed})
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
-        return kept_or_built(config.disk_cache, key, lambda: self._scan_all(ids, progress))
+        return kept_or_built(config.disk_cache, self._version, lambda: self._scan_all(ids, progress))
 
     def _scan_all(self, ids: list[str], progress: Progress | None) -> EpisodeTable:
         counter = itertools.count(1)
@@ -120,7 +126,8 @@ class NpzSource:
 
     def _scan(self, identity: str) -> NpzEpisode | Problem:
         try:
-            return read_episode(self._path(identity), self._config.cameras, self._config)
+            path = self._path(identity)
+            return read_episode(self._opened(path), path, self._config.cameras, self._config)
         except UnreachableError:
             raise  # the network's fault, not the episode's
         except InputError as error:
@@ -130,6 +137,9 @@ class NpzSource:
         needed = f"{others:g}, as in most episodes: strides count control steps"
         return Problem(identity, f"{self._path(identity)}: fps_hz", f"{rate:g}", needed, "Resample the episode")
 
+    def _opened(self, path: str) -> str | KeptFile:
+        return self._files.open(path, version=self._version)
+
     def _path(self, identity: str) -> str:
         return storage.join(self._root, identity + _SUFFIX)
 
@@ -138,6 +148,7 @@ class NpzSource:
 class _PictureReader:
     """Reads the pictures of one camera that are asked for."""
 
+    opened: Callable[[], str | KeptFile]
     path: str
     camera: str
     steps: int
@@ -152,6 +163,6 @@ class _PictureReader:
         """
         if not steps or min(steps) < 0 or max(steps) >= self.steps:
             raise ValueError(f"{self.path}: steps {list(steps)} of {self.steps}")
-        with opened_npz(self.path) as file:
+        with opened_npz(self.opened(), self.path) as file:
             require_pictures(file, self.camera, self.steps, self.path)
             return np.asarray(file.rows(self.camera, steps))
