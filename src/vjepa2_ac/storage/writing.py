@@ -1,0 +1,122 @@
+"""How are local files written so that nobody ever sees half of one?"""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import shutil
+from collections.abc import Iterator, Set
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import BinaryIO
+
+from vjepa2_ac.errors import InputError
+
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
+_UNWRITABLE = _FULL | {
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOENT, errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG,
+    errno.EINVAL, errno.ELOOP,
+}  # fmt: skip
+
+
+@contextmanager
+def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
+    """Open a local file that appears under its name, whole, when the block ends, and not at all when it fails.
+
+    Missing folders are made. The bytes are on the disk (fsync) before the file gets its name.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    # Of this writer alone: others may be threads, or processes of the same number in another container.
+    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(target)
+    except BaseException as error:
+        with suppress(FileNotFoundError):
+            temporary.unlink()
+        if isinstance(error, OSError) and error.filename is None:  # a full disk does not say of what
+            error.filename = str(target)
+        raise
+    sync(target.parent)
+
+
+def write_atomically(path: str | Path, data: bytes | str) -> None:
+    """Write a local file so that it is never seen in part; text is written as UTF-8."""
+    with atomic_writer(path) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
+
+
+@contextmanager
+def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
+    """Give an empty local folder to fill, whose files go to `folder` when the block ends, and nowhere when it fails.
+
+    A new folder appears whole. One that is there stays itself (it may be the working directory, or mounted) and keeps
+    its other files: the old manifest goes first and the new one comes last, so with a manifest the folder is whole.
+
+    Args:
+        folder: Where the files go; missing folders are made.
+        manifest: Name of the file without which the folder does not count.
+
+    Raises:
+        InputError: The folder cannot be made or written, or the disk is full.
+    """
+    with user_can_write(folder):
+        target = Path(folder).resolve()
+        there = target.is_dir()
+        partial = (target if there else target.parent) / f".{target.name}.{os.getpid()}.partial"
+        if target.exists() and not there:
+            raise NotADirectoryError(errno.ENOTDIR, "it is a file")
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+    try:
+        with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's own
+            yield partial
+        with user_can_write(folder):
+            if there:
+                _move_into(target, partial, manifest)
+            else:
+                partial.replace(target)
+            sync(target if there else target.parent)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+@contextmanager
+def user_can_write(path: str | Path, errors: Set[int] = _UNWRITABLE) -> Iterator[None]:
+    """Say in the user's words that a local path cannot be written, or that the disk is full.
+
+    Raises:
+        InputError: In place of an OSError of one of these numbers; other errors pass.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in errors:
+            raise
+        full = error.errno in _FULL
+        fix = "Free some space, or name a place on another disk" if full else "Name a place that can be written"
+        raise InputError(where=str(path), found=f"cannot be written: {error.strerror}", fix=fix) from None
+
+
+def _move_into(target: Path, partial: Path, manifest: str) -> None:
+    (target / manifest).unlink(missing_ok=True)
+    files = [path.relative_to(partial) for path in partial.rglob("*") if path.is_file()]
+    for file in sorted(files, key=lambda file: file == Path(manifest)):
+        (target / file).parent.mkdir(parents=True, exist_ok=True)
+        (partial / file).replace(target / file)
+    shutil.rmtree(partial)
+
+
+def sync(path: str | Path) -> None:
+    """Make the bytes of a local file, or the names in a local folder, survive a power cut."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
