@@ -1,15 +1,17 @@
-"""The loss is the official one."""
+"""The loss is the official one, and the other distances and weights are what they say."""
 
 import json
 
 import pytest
 import torch
+from pydantic import ValidationError
 from safetensors.torch import load_file
 
 from paths import GOLDEN
-from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.config import ModelSizes, TrainingConfig
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.weights import load_official
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.loss import Objective, prediction_losses
 
 
@@ -26,8 +28,8 @@ def test_losses_equal_the_official_code(name: str) -> None:
     assert losses.teacher_forcing.item() == pytest.approx(expected["loss_teacher_forcing"], rel=1e-5)
     assert losses.rollout.item() == pytest.approx(expected["loss_rollout"], rel=1e-5)
     assert losses.total.item() == pytest.approx(expected["loss"], rel=1e-5)
-    forced, rollout = Objective(model, expected["auto_steps"])(batch)
-    assert (forced + rollout).item() == losses.total.item()
+    forced, rollout = Objective(model, TrainingConfig(rollout_steps=expected["auto_steps"]))(batch)
+    assert (forced.item(), rollout.item()) == (losses.teacher_forcing.item(), losses.rollout.item())
 
 
 def sizes_of(config: dict[str, int]) -> ModelSizes:
@@ -57,3 +59,68 @@ def test_a_rollout_longer_than_the_clip_is_refused() -> None:
     batch = LatentBatch(torch.zeros(1, 3, 16, 48), torch.zeros(1, 3, 7), torch.zeros(1, 2, 7), None, ("a",), (0,))
     with pytest.raises(ValueError, match="needs 4 frames"):
         prediction_losses(model, batch, 3)
+
+
+def reference() -> tuple[WorldModel, LatentBatch]:
+    expected = json.loads((GOLDEN / "model" / "tiny.json").read_text())
+    tensors = load_file(GOLDEN / "model" / "tiny.io.safetensors")
+    latents = tensors["features"].unflatten(1, (expected["frames"], -1))
+    batch = LatentBatch(latents, tensors["states"], tensors["actions"], None, ("a", "b"), (0, 0))
+    return load_official(GOLDEN / "model" / "tiny.pt", sizes_of(expected["config"])), batch
+
+
+def plain_distance(training: TrainingConfig, predicted: torch.Tensor, true: torch.Tensor) -> float:
+    """One element after the other, as the definitions are written."""
+    beta, total = training.smooth_l1_beta, 0.0
+    for difference in (predicted - true).abs().flatten().tolist():
+        if training.loss == "l1":
+            total += difference
+        elif training.loss == "l2":
+            total += difference**2
+        else:
+            total += difference**2 / (2 * beta) if difference < beta else difference - beta / 2
+    return total / predicted.numel()
+
+
+@pytest.mark.parametrize(
+    "knobs",
+    [
+        {"loss": "l1"},
+        {"loss": "l2"},
+        {"loss": "smooth_l1"},
+        {"loss": "smooth_l1", "smooth_l1_beta": 0.25},
+        {"rollout_steps": 3, "teacher_forcing_weight": 0.5, "rollout_weight": 2.0},
+        {"loss": "l2", "rollout_steps": 1, "teacher_forcing_weight": 0.0},
+        {"rollout_weight": 0.0},
+    ],
+)
+def test_every_distance_and_weight_equals_a_plain_computation(knobs: dict[str, object]) -> None:
+    model, batch = reference()
+    training = TrainingConfig.model_validate(knobs)
+    frames, steps = batch.latents.shape[1], training.rollout_steps
+    with torch.no_grad():
+        forced = model.predict(batch.latents[:, :-1], batch.actions, batch.states[:, :-1])
+        rolled = batch.latents[:, :1]
+        for time in range(1, steps + 1):
+            following = model.predict(rolled, batch.actions[:, :time], batch.states[:, :time])[:, -1:]
+            rolled = torch.cat([rolled, following], dim=1)
+        found = Objective(model, training)(batch)
+    assert frames > steps
+    teacher = plain_distance(training, forced, batch.latents[:, 1:])
+    rollout = plain_distance(training, rolled[:, 1:], batch.latents[:, 1 : steps + 1])
+    assert found[0].item() == pytest.approx(teacher * training.teacher_forcing_weight, rel=1e-5)
+    assert found[1].item() == pytest.approx(rollout * training.rollout_weight, rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("knobs", "complaint"),
+    [
+        ({"teacher_forcing_weight": 0.0, "rollout_weight": 0.0}, "both 0"),
+        ({"rollout_weight": -1.0}, "greater than or equal to 0"),
+        ({"loss": "huber"}, "'l1', 'l2' or 'smooth_l1'"),
+        ({"smooth_l1_beta": 0.5}, "belongs to loss smooth_l1, not l1"),
+    ],
+)
+def test_a_loss_that_makes_no_sense_is_refused(knobs: dict[str, object], complaint: str) -> None:
+    with pytest.raises(ValidationError, match=complaint):
+        TrainingConfig.model_validate(knobs)

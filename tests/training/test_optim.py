@@ -1,9 +1,11 @@
 """Learning rates and parameter groups."""
 
 import json
+from itertools import pairwise
 
 import pytest
 import torch
+from pydantic import ValidationError
 
 from paths import GOLDEN
 from vjepa2_ac.config import TrainingConfig
@@ -33,6 +35,25 @@ def test_cosine_rises_linearly_to_the_peak_and_falls_to_the_end() -> None:
     assert learning_rate_at(100, training) == pytest.approx(1e-5)
     rates = [learning_rate_at(step, training) for step in range(10, 101)]
     assert rates == sorted(rates, reverse=True)
+
+
+def test_linear_rises_to_the_peak_and_falls_in_a_straight_line() -> None:
+    training = TrainingConfig(
+        steps=100, warmup_steps=10, learning_rate=1e-3, final_learning_rate=1e-5, schedule="linear"
+    )
+    assert [learning_rate_at(step, training) for step in (5, 10)] == pytest.approx([5e-4, 1e-3])
+    rates = [learning_rate_at(step, training) for step in range(10, 101)]
+    falls = [before - after for before, after in pairwise(rates)]
+    assert falls == pytest.approx([(1e-3 - 1e-5) / 90] * 90)
+    assert rates[-1] == pytest.approx(1e-5)
+
+
+def test_constant_rises_to_the_peak_and_stays() -> None:
+    training = TrainingConfig(steps=100, warmup_steps=10, learning_rate=1e-3, schedule="constant")
+    assert learning_rate_at(5, training) == pytest.approx(5e-4)
+    assert {learning_rate_at(step, training) for step in range(10, 101)} == {1e-3}
+    with pytest.raises(ValidationError, match="leave final_learning_rate out"):
+        TrainingConfig(schedule="constant", final_learning_rate=1e-5)
 
 
 def test_a_schedule_without_warmup_starts_near_the_peak() -> None:

@@ -20,10 +20,19 @@ class TrainingConfig(Section):
     """Micro-batches per optimizer step."""
     rollout_steps: Annotated[int, Field(ge=1, le=64)] = 2
     """Predictions of the rollout loss; the first is the teacher-forced one, each further one is fed back."""
+    loss: Literal["l1", "l2", "smooth_l1"] = "l1"
+    """Distance of predicted and true latents: absolute (released), squared, or squared below smooth_l1_beta only."""
+    smooth_l1_beta: Annotated[float, Field(gt=0.0)] = 1.0
+    """Below this difference smooth_l1 is squared, above it is absolute; smooth_l1 only."""
+    teacher_forcing_weight: Annotated[float, Field(ge=0.0)] = 1.0
+    """What the teacher-forced loss is multiplied by, in the sum and in metrics.jsonl."""
+    rollout_weight: Annotated[float, Field(ge=0.0)] = 1.0
+    """What the rollout loss is multiplied by, in the sum and in metrics.jsonl; 0 saves its computation."""
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-4
     """Peak learning rate."""
-    schedule: Literal["cosine", "warmup_stable_decay"] = "cosine"
-    """cosine: linear warm-up, then half a cosine. warmup_stable_decay: linear warm-up, constant, linear decay."""
+    schedule: Literal["cosine", "warmup_stable_decay", "linear", "constant"] = "cosine"
+    """All begin with a linear warm-up. Then cosine: half a cosine to the end. linear: a straight line to the end.
+    warmup_stable_decay: constant, and a linear decay at the end. constant: the peak for good."""
     warmup_steps: Annotated[int, Field(ge=0)] = 1_000
     """Optimizer steps of the linear warm-up."""
     decay_steps: Annotated[int, Field(ge=0)] = 0
@@ -31,7 +40,7 @@ class TrainingConfig(Section):
     start_learning_rate: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """Where the warm-up starts."""
     final_learning_rate: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """Where the schedule ends."""
+    """Where the schedule ends; constant has no such place."""
     weight_decay: Annotated[float, Field(ge=0.0, le=1.0)] = 0.04
     """AdamW's decay; biases and norms are exempt."""
     betas: tuple[Annotated[float, Field(ge=0.0, lt=1.0)], Annotated[float, Field(ge=0.0, lt=1.0)]] = (0.9, 0.999)
@@ -57,6 +66,16 @@ class TrainingConfig(Section):
             )
         if self.decay_steps and self.schedule != "warmup_stable_decay":
             raise ValueError(f"decay_steps belongs to schedule warmup_stable_decay, not {self.schedule}")
+        if self.schedule == "constant" and self.final_learning_rate:
+            raise ValueError("schedule constant stays at learning_rate: leave final_learning_rate out")
+        return self
+
+    @model_validator(mode="after")
+    def _loss_fits(self) -> TrainingConfig:
+        if not self.teacher_forcing_weight + self.rollout_weight:
+            raise ValueError("teacher_forcing_weight and rollout_weight are both 0: nothing would be learned")
+        if self.loss != "smooth_l1" and self.smooth_l1_beta != 1.0:
+            raise ValueError(f"smooth_l1_beta belongs to loss smooth_l1, not {self.loss}")
         return self
 
 

@@ -84,7 +84,7 @@ def assemble(config: Config, note: Callable[[str], None], looked_through: Progre
             f"The data has changed: {len(dataset.windows('train')):,} training clips instead of {state.windows:,}."
             " From here on their order is another, and some may be seen twice in this epoch or not at all."
         )
-    objective, optimizer = accelerator.prepare(Objective(world_model, config.training.rollout_steps), optimizer)
+    objective, optimizer = accelerator.prepare(Objective(world_model, config.training), optimizer)
     return Run(config, accelerator, world_model, objective, optimizer, dataset, state, calibration)
 
 

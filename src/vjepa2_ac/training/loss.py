@@ -1,20 +1,26 @@
-"""How wrong are the predictions? Teacher forcing plus a short rollout, L1 on normalised latents."""
+"""How wrong are the predictions? Teacher forcing plus a short rollout, on normalised latents."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import mse_loss, smooth_l1_loss
 
+from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.world_model import WorldModel
+
+Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, a mean over all elements
 
 
 @dataclass(frozen=True)
 class Losses:
-    """The two parts of the loss; each is the mean absolute difference over all elements."""
+    """The two parts of the loss; each is a mean over all elements."""
 
     teacher_forcing: Float[Tensor, ""]
     rollout: Float[Tensor, ""]
@@ -35,23 +41,41 @@ class Objective(nn.Module):
     Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/train.py, forward_predictions and loss_fn.
     """
 
-    def __init__(self, world_model: WorldModel, rollout_steps: int) -> None:
+    def __init__(self, world_model: WorldModel, training: TrainingConfig) -> None:
         super().__init__()
         self.world_model = world_model
-        self.rollout_steps = rollout_steps
+        self.weights = (training.teacher_forcing_weight, training.rollout_weight)
+        self.rollout_steps = training.rollout_steps if training.rollout_weight else 1  # what counts for nothing: free
+        self.distance = distance_of(training)
 
     def forward(self, batch: LatentBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
-        """Return (teacher forcing, rollout): plain tensors, which DDP and Accelerate pass through."""
-        losses = prediction_losses(self.world_model, batch, self.rollout_steps)
-        return losses.teacher_forcing, losses.rollout
+        """Return (teacher forcing, rollout), each times its weight, so that the loss is their sum.
+
+        They are plain tensors, which DDP and Accelerate pass through.
+        """
+        losses = prediction_losses(self.world_model, batch, self.rollout_steps, self.distance)
+        forced_weight, rollout_weight = self.weights
+        return losses.teacher_forcing * forced_weight, losses.rollout * rollout_weight
 
 
-def prediction_losses(world_model: WorldModel, batch: LatentBatch, rollout_steps: int) -> Losses:
-    """Return both parts of the loss of one batch.
+def distance_of(training: TrainingConfig) -> Distance:
+    """Return the distance that `training.loss` names."""
+    if training.loss == "l1":
+        return mean_absolute_difference
+    if training.loss == "l2":
+        return mean_squared_difference
+    return partial(smooth_absolute_difference, beta=training.smooth_l1_beta)
+
+
+def prediction_losses(
+    world_model: WorldModel, batch: LatentBatch, rollout_steps: int, distance: Distance | None = None
+) -> Losses:
+    """Return both parts of the loss of one batch, without weights; the distance is L1 unless given.
 
     Raises:
         ValueError: A rollout longer than the clip.
     """
+    distance = distance or mean_absolute_difference
     latents, actions, states, extrinsics = batch.latents, batch.actions, batch.states, batch.extrinsics
     if rollout_steps >= latents.shape[1]:
         raise ValueError(f"a rollout of {rollout_steps} steps needs {rollout_steps + 1} frames, got {latents.shape[1]}")
@@ -65,8 +89,8 @@ def prediction_losses(world_model: WorldModel, batch: LatentBatch, rollout_steps
         further = world_model.rollout(context, actions[:, :rollout_steps], states[:, :rollout_steps], camera)
         rolled = torch.cat([rolled, further], dim=1)
     return Losses(
-        teacher_forcing=mean_absolute_difference(forced, latents[:, 1:]),
-        rollout=mean_absolute_difference(rolled, latents[:, 1 : rollout_steps + 1]),
+        teacher_forcing=distance(forced, latents[:, 1:]),
+        rollout=distance(rolled, latents[:, 1 : rollout_steps + 1]),
     )
 
 
@@ -75,3 +99,17 @@ def mean_absolute_difference(
 ) -> Float[Tensor, ""]:
     """Return the L1 distance, computed in float32."""
     return (predicted.float() - true.float()).abs().mean()
+
+
+def mean_squared_difference(
+    predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"]
+) -> Float[Tensor, ""]:
+    """Return the squared L2 distance, computed in float32."""
+    return mse_loss(predicted.float(), true.float())
+
+
+def smooth_absolute_difference(
+    predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"], beta: float
+) -> Float[Tensor, ""]:
+    """Return d**2 / (2 * beta) where a difference d is below beta, and d - beta / 2 above, computed in float32."""
+    return smooth_l1_loss(predicted.float(), true.float(), beta=beta)

@@ -43,9 +43,13 @@ def learning_rate_at(step: int, training: TrainingConfig) -> float:
     start, peak, final = training.start_learning_rate, training.learning_rate, training.final_learning_rate
     if step <= training.warmup_steps:
         return start + (peak - start) * step / training.warmup_steps
+    if training.schedule == "constant":
+        return peak
+    done = min(1.0, (step - training.warmup_steps) / max(1, training.steps - training.warmup_steps))
     if training.schedule == "cosine":
-        done = (step - training.warmup_steps) / max(1, training.steps - training.warmup_steps)
-        return final + (peak - final) * 0.5 * (1.0 + math.cos(math.pi * min(1.0, done)))
+        return final + (peak - final) * 0.5 * (1.0 + math.cos(math.pi * done))
+    if training.schedule == "linear":
+        return peak + (final - peak) * done
     first_decay = training.steps - training.decay_steps
     if step <= first_decay:
         return peak
