@@ -138,17 +138,27 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _add_export(commands: _Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(commands, "export", _export, "Write a run's model, adapter merged in, as one folder.")
+    parser = _command(
+        commands, "export", _export, "Write a run's model, adapter merged in, or its adapter, for others to use."
+    )
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a run")
-    parser.add_argument("folder", metavar="FOLDER", type=Path, help="where to; `model.base` takes it")
+    parser.add_argument("folder", metavar="FOLDER", type=Path, help="where to, new or empty; official: or a .pt file")
+    parser.add_argument(
+        "--to",
+        choices=["merged", "official", "hub"],
+        default="merged",
+        help="merged: a folder that `model.base` takes. official: one .pt by Meta's names, for the official code."
+        " hub: the adapter in PEFT's format with a model card, ready to upload",
+    )
 
 
 def _export(options: argparse.Namespace) -> None:
     from vjepa2_ac.console import console
-    from vjepa2_ac.training.runs import export_run
+    from vjepa2_ac.training.export import export_run
 
-    export_run(options.run, options.folder)
-    console.print(f"The merged model is in {options.folder}")
+    written = export_run(options.run, options.folder, options.to)
+    what = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}
+    console.print(f"The {what[options.to]} is in {written}")
 
 
 def _add_config(commands: _Commands[argparse.ArgumentParser]) -> None:

@@ -180,6 +180,15 @@ def test_saved_and_loaded_it_is_the_same(
     assert trainable_report(other).trained == 0
 
 
+def test_a_loaded_adapter_predicts_without_dropout(fresh: Fresh, inputs, tmp_path: Path) -> None:
+    model, loaded = fresh(), fresh()
+    add_adapter(model, LORA.model_copy(update={"dropout": 0.5}), seed=0)
+    train(model, inputs)
+    save_trained(model, tmp_path)
+    load_trained(loaded, tmp_path)
+    assert torch.equal(predict(loaded, inputs), predict(model, inputs))
+
+
 @both_kinds
 def test_loaded_into_the_adapter_that_is_on_it_is_not_wrapped_twice(
     fresh: Fresh, inputs, tmp_path: Path, config: AdapterConfig

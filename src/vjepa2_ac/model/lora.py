@@ -174,7 +174,8 @@ def _wrap(model: WorldModel, config: LoraConfig) -> None:
     base = model.predictor_fingerprint()
     checkpointing = model.base_predictor.gradient_checkpointing
     model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
-    model.predictor = get_peft_model(model.predictor, config)
+    training = model.predictor.training
+    model.predictor = get_peft_model(model.predictor, config).train(training)  # PEFT's dropout begins switched on
     model.set_gradient_checkpointing(checkpointing)
     model.adaptation = Adaptation("lora", base, model.encoder_fingerprint())
     for layer in _lora_layers(model):

@@ -1,4 +1,4 @@
-"""What can be done with a run that was trained? Load its model, evaluate it, export it."""
+"""What can be done with a run that was trained? Load its model, evaluate it."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from vjepa2_ac.evaluation.evaluate import Evaluation, evaluate
 from vjepa2_ac.evaluation.plots import plot_evaluation
 from vjepa2_ac.evaluation.report import evaluation_as_dict
 from vjepa2_ac.model.load import load_base
-from vjepa2_ac.model.lora import load_trained, merge_adapter
+from vjepa2_ac.model.lora import load_trained
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.assembly import ADAPTER, make_accelerator
 from vjepa2_ac.training.checkpoint import newest_checkpoint
 from vjepa2_ac.training.run_folder import CHECKPOINTS, read_run_config
+
+EVALUATION, PLOT = "evaluation.json", "evaluation.png"
 
 
 @dataclass(frozen=True)
@@ -76,20 +78,7 @@ def evaluate_run(folder: Path, *, split: Split, clips: int) -> tuple[Evaluation,
             encode_chunk=config.model.encode_chunk,
             seconds_per_step=dataset.config.model_stride / dataset.control_rate_hz,
         )
-    figures = folder / "evaluation.json"
+    figures = folder / EVALUATION
     about = {"checkpoint": str(run.checkpoint), "split": split, **evaluation_as_dict(evaluation)}
     write_atomically(figures, json.dumps(about, indent=1).encode())
-    return evaluation, [plot_evaluation(evaluation, folder / "evaluation.png"), figures]
-
-
-def export_run(folder: Path, destination: Path) -> None:
-    """Merge a run's adapter into its base, in float32, and write the model as one folder.
-
-    Raises:
-        InputError: As `load_run`; or the destination exists.
-    """
-    if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
-        raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
-    run = load_run(folder)
-    merge_adapter(run.world_model)
-    run.world_model.save_pretrained(destination)
+    return evaluation, [plot_evaluation(evaluation, folder / PLOT), figures]

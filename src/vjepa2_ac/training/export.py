@@ -1,0 +1,151 @@
+"""How does a trained run leave the house? As one merged model, as Meta's checkpoint, or as an adapter for the Hub."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from safetensors import safe_open
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.lora import merge_adapter, trainable_report
+from vjepa2_ac.model.trained_folder import LORA_WEIGHTS
+from vjepa2_ac.model.weights import to_official
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.storage import atomic_writer, folder_writer, user_can_write, write_atomically
+from vjepa2_ac.training.assembly import ADAPTER
+from vjepa2_ac.training.checkpoint import read_state
+from vjepa2_ac.training.model_card import AdapterFacts, model_card
+from vjepa2_ac.training.run_folder import read_run_config
+from vjepa2_ac.training.runs import EVALUATION, PLOT, TrainedRun, load_run
+
+Form = Literal["merged", "official", "hub"]
+
+OFFICIAL_NAME = "vjepa2-ac.pt"  # in a folder; a destination that ends in .pt is the file itself
+CARD = "README.md"
+_PEFT_CONFIG = "adapter_config.json"
+
+
+def export_run(folder: Path, destination: Path, form: Form = "merged") -> Path:
+    """Write what a run has learnt for others to use, whole or not at all.
+
+    An adapter is merged in float32, then cast to the type of the base's weights (`model.dtype`).
+
+    Args:
+        folder: The run.
+        destination: A new or empty folder; for official also a file ending in `.pt`, which must not be there.
+        form: merged: the model as a folder, which `model.base` takes. official: one `.pt` by Meta's own names, q, k
+            and v fused, for the official code. hub: the adapter in PEFT's format with a model card, ready to upload.
+
+    Returns:
+        The file or folder that was written.
+
+    Raises:
+        InputError: As `load_run`; the destination is occupied or cannot be written; hub: the run has no adapter, or
+            its `evaluation.json` is damaged.
+    """
+    _check_free(destination)
+    config = read_run_config(folder)
+    if form == "hub":
+        _check_adapter(folder, config)
+        evaluation = _read_evaluation(folder)
+        _write_hub(load_run(folder), folder, destination, evaluation)
+        return destination
+    model = load_run(folder).world_model
+    merge_adapter(model)
+    if form == "merged":
+        model.save_pretrained(destination)
+        return destination
+    path = destination if destination.suffix == ".pt" else destination / OFFICIAL_NAME
+    _write_official(model, path)
+    return path
+
+
+def _check_free(destination: Path) -> None:
+    """See that nothing is at a destination, and that it can be written. Changes nothing."""
+    with user_can_write(destination):
+        if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
+            raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
+        existing = next(path for path in (destination, *destination.absolute().parents) if path.exists())
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+
+
+def _check_adapter(folder: Path, config: Config) -> None:
+    if config.adapter.kind != "lora":
+        raise InputError(
+            where=str(folder),
+            found=f"a run without an adapter (adapter.kind: {config.adapter.kind})",
+            needed="one with adapter.kind: lora, for --to hub",
+            fix="Export the whole model with --to merged or --to official",
+        )
+
+
+def _write_official(model: WorldModel, path: Path) -> None:
+    with user_can_write(path), atomic_writer(path) as file:
+        try:
+            torch.save(to_official(model), file)
+        except RuntimeError as error:  # torch's own word for a write that failed
+            if isinstance(error.__context__, OSError):
+                raise error.__context__ from None
+            raise
+
+
+def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dict[str, Any] | None) -> None:
+    """Copy the adapter of a checkpoint, which load_run has seen to be whole, and put the card beside it."""
+    plot = folder / PLOT if evaluation is not None and (folder / PLOT).is_file() else None
+    adapter = run.checkpoint / ADAPTER
+    try:
+        card = model_card(run.config, _facts(run, folder, evaluation, plot))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise _damaged(folder, f"figures that cannot be used ({error!r})") from None
+    with folder_writer(destination, _PEFT_CONFIG) as fresh:
+        for path in (*sorted(adapter.iterdir()), *([plot] if plot else [])):
+            shutil.copyfile(path, fresh / path.name)
+        if evaluation is not None:
+            write_atomically(fresh / EVALUATION, json.dumps(evaluation, indent=1))
+        write_atomically(fresh / CARD, card)
+
+
+def _facts(run: TrainedRun, folder: Path, evaluation: dict[str, Any] | None, plot: Path | None) -> AdapterFacts:
+    adaptation = run.world_model.adaptation
+    if adaptation is None:
+        raise RuntimeError("a run that was loaded has been adapted")
+    with safe_open(run.checkpoint / ADAPTER / LORA_WEIGHTS, framework="pt") as file:
+        shapes = [file.get_slice(name).get_shape() for name in file.keys()]  # noqa: SIM118  # no iterator
+    trained = sum(torch.Size(shape).numel() for shape in shapes)
+    return AdapterFacts(
+        name=folder.resolve().name,
+        steps=read_state(run.checkpoint).step,
+        checkpoint=run.checkpoint.name,
+        trained=str(trainable_report(run.world_model)._replace(trained=trained)),
+        base_predictor=adaptation.base,
+        base_encoder=adaptation.encoder,
+        evaluation=evaluation,
+        plot=plot.name if plot else None,
+    )
+
+
+def _read_evaluation(folder: Path) -> dict[str, Any] | None:
+    """Return what `evaluate` wrote, the checkpoint by its name alone; None where it was never run."""
+    try:
+        evaluation = json.loads((folder / EVALUATION).read_text(encoding="utf-8"))
+        return {**evaluation, "checkpoint": Path(evaluation["checkpoint"]).name}
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        raise _damaged(folder, f"cannot be read ({error!r})") from None
+
+
+def _damaged(folder: Path, found: str) -> InputError:
+    return InputError(
+        where=str(folder / EVALUATION),
+        found=found,
+        needed="what `vjepa2-ac evaluate` writes",
+        fix=f"Write it again with `vjepa2-ac evaluate {folder}`, or delete it",
+    )

@@ -1,0 +1,164 @@
+"""What should one read who finds an adapter on the Hub? A model card: base, data, training, figures, how to use it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from vjepa2_ac import __version__
+from vjepa2_ac.config import Config
+from vjepa2_ac.config_file import config_as_yaml
+
+_FRONT = """---
+library_name: peft
+pipeline_tag: robotics
+tags:
+- v-jepa-2-ac
+- world-model
+- lora
+---
+"""
+_NOT_EVALUATED = (
+    "**Not evaluated**: there was no `evaluation.json` in the run when this card was written. Nothing is known of how"
+    " good this adapter is."
+)
+
+
+@dataclass(frozen=True)
+class AdapterFacts:
+    """What a card tells of an adapter besides the settings of its run."""
+
+    name: str
+    steps: int  # optimizer steps done
+    checkpoint: str  # name of the checkpoint that is exported
+    trained: str  # how many parameters, in words
+    base_predictor: str  # fingerprints
+    base_encoder: str
+    evaluation: Mapping[str, Any] | None  # what `vjepa2-ac evaluate` wrote
+    plot: str | None  # name of the file beside the card
+
+
+def model_card(config: Config, facts: AdapterFacts) -> str:
+    """Return the README.md of an adapter, in Markdown, with the Hub's front matter.
+
+    Raises:
+        KeyError: The evaluation lacks a figure; likewise TypeError where one is of another kind.
+    """
+    parts = [
+        f"{_FRONT}\n# {facts.name}: a LoRA adapter for V-JEPA 2-AC",
+        f"Written by vjepa2-ac {__version__} from `{facts.checkpoint}` of the run.",
+        _base(config, facts),
+        _data(config),
+        _training(config, facts),
+        _results(facts),
+        _use(config),
+        f"## Every setting\n\n```yaml\n{config_as_yaml(config.model_copy(update={'run_dir': facts.name}))}```",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _base(config: Config, facts: AdapterFacts) -> str:
+    return _list(
+        "Base",
+        {
+            "base": f"`{config.model.base}`, frozen, in {config.model.dtype}",
+            "fingerprint of its predictor": f"`{facts.base_predictor}`",
+            "fingerprint of its encoder": f"`{facts.base_encoder}`",
+        },
+    )
+
+
+def _data(config: Config) -> str:
+    data = config.data
+    return _list(
+        "Data",
+        {
+            "source": f"{data.source}, `{data.path}`",
+            "camera": ", ".join(f"`{name}`" for name in data.cameras),
+            "clips": f"{data.frames} frames, one every {data.stride} control steps (the stride)",
+            "crop": data.crop,
+            "poses": f"in the frame of the {data.pose_frame}",
+            "held out": f"{data.validation_share:.0%} of the episodes for validation, {data.test_share:.0%} for test",
+        },
+    )
+
+
+def _training(config: Config, facts: AdapterFacts) -> str:
+    training, adapter = config.training, config.adapter
+    return _list(
+        "Training",
+        {
+            "steps": f"{facts.steps:,} of {training.steps:,} planned",
+            "clips per step": f"batch {training.batch_size} x accumulation {training.accumulation} on each device",
+            "learning rate": f"{training.learning_rate:g}, {training.schedule}",
+            "warm-up": f"{training.warmup_steps:,} steps",
+            "loss": f"teacher forcing + rollout of {training.rollout_steps} steps",
+            "weight decay": f"{training.weight_decay:g}",
+            "precision": training.precision,
+            "seed": f"{config.seed}",
+            "adapter": f"rank {adapter.rank}, alpha {adapter.alpha:g}, dropout {adapter.dropout:g}, "
+            + ("rsLoRA" if adapter.rslora else "plain scale"),
+            "layers": ", ".join(f"`{target}`" for target in adapter.targets),
+            "trained parameters": facts.trained,
+        },
+    )
+
+
+def _results(facts: AdapterFacts) -> str:
+    """Return what was measured, and of which checkpoint: it may be an older one."""
+    if facts.evaluation is None:
+        return f"## Results\n\n{_NOT_EVALUATED}"
+    measured = facts.evaluation
+    lines = ["## Results", "", measured["verdict"], ""]
+    if measured["checkpoint"] != facts.checkpoint:
+        lines += [f"**Measured on another checkpoint**: `{measured['checkpoint']}`, not `{facts.checkpoint}`.", ""]
+    about = (
+        f"Split {measured['split']}: {measured['clips']} clips of {measured['episodes']} episodes. Error of the rollout"
+        " over that of copying the first frame (1: as good as doing nothing), with a 95 % interval over episodes:"
+    )
+    lines += [about, "", *_table(measured)]
+    return "\n".join(lines) + (f"\n\n![Error by horizon]({facts.plot})" if facts.plot else "")
+
+
+def _table(measured: Mapping[str, Any]) -> list[str]:
+    models = measured["models"]
+    columns = [models[name]["rollout_over_persistence"] for name in models]
+    rows = [
+        f"| {(step + 1) * measured['seconds_per_step']:.2f} s | " + " | ".join(_ratio(one) for one in ratios) + " |"
+        for step, ratios in enumerate(zip(*columns, strict=True))
+    ]
+    return [f"| ahead | {' | '.join(models)} |", f"|---{'|---' * len(models)}|", *rows]
+
+
+def _ratio(ratio: Mapping[str, Any]) -> str:
+    interval = "" if ratio["low"] is None else f" [{ratio['low']:.3f}, {ratio['high']:.3f}]"
+    return f"{ratio['value']:.3f}{interval}"
+
+
+def _use(config: Config) -> str:
+    base = config.model.model_dump(mode="json", include={"base", "sizes", "dtype"}, exclude_defaults=True)
+    return f"""## Use
+
+With vjepa2-ac, which checks that the base is the one it was trained on:
+
+```python
+from vjepa2_ac.config import ModelConfig
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.lora import load_trained
+
+model = load_base(ModelConfig.model_validate({base!r}), seed=0)
+load_trained(model, "FOLDER")  # the folder of this card
+```
+
+With PEFT alone, on the predictor of that base:
+
+```python
+from peft import PeftModel
+
+predictor = PeftModel.from_pretrained(load_base(ModelConfig.model_validate({base!r}), seed=0).predictor, "FOLDER")
+```"""
+
+
+def _list(title: str, entries: Mapping[str, str]) -> str:
+    return f"## {title}\n\n" + "\n".join(f"- {name}: {value}" for name, value in entries.items())
