@@ -11,13 +11,18 @@ from pathlib import Path
 
 from vjepa2_ac import __version__
 from vjepa2_ac.cli_data import add_data, count
+from vjepa2_ac.cli_doctor import add_doctor
 from vjepa2_ac.errors import InputError
 
 Handler = Callable[[argparse.Namespace], int | None]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return its status: 0 done, 1 a check failed, 2 something given cannot be used, 130 broken off."""
+    """Run a command; return its status.
+
+    0 done, 1 a check failed, 2 something given cannot be used, 75 a training run was asked to stop and can go on,
+    130 broken off.
+    """
     parser = _parser()
     options, rest = parser.parse_known_args(arguments)
     if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
@@ -58,6 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_train(commands)
     _add_evaluate(commands)
     add_data(commands)
+    add_doctor(commands)
     _add_export(commands)
     _add_config(commands)
     _add_download(commands)
@@ -77,7 +83,13 @@ def _command(
 
 
 def _add_train(commands: _Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(commands, "train", _train, "Train an adapter (or the whole predictor) as a config says.")
+    parser = _command(
+        commands,
+        "train",
+        _train,
+        "Train an adapter (or the whole predictor) as a config says. SIGTERM, SIGINT or SIGUSR1: finish the step, write"
+        " a checkpoint, end with status 75; the same command goes on from there. A second signal: end at once.",
+    )
     parser.add_argument("config", metavar="CONFIG", help="a YAML config, or with --resume the folder of a run")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as training.learning_rate=3e-4")
     parser.add_argument("--resume", action="store_true", help="go on with the run in the folder CONFIG")
@@ -86,10 +98,11 @@ def _add_train(commands: _Commands[argparse.ArgumentParser]) -> None:
     )
 
 
-def _train(options: argparse.Namespace) -> None:
+def _train(options: argparse.Namespace) -> int:
     from vjepa2_ac.config_file import load_config
     from vjepa2_ac.console import ConsoleReporter, console
     from vjepa2_ac.training.loop import train
+    from vjepa2_ac.training.preemption import EXIT_STATUS, StoppedError
     from vjepa2_ac.training.run_folder import read_run_config
 
     path = Path(options.config)
@@ -105,10 +118,14 @@ def _train(options: argparse.Namespace) -> None:
     reporter = ConsoleReporter()
     try:
         folder = train(config, reporter, check_only=options.check)
+    except StoppedError as stopped:
+        print(stopped, file=sys.stderr)
+        return EXIT_STATUS
     finally:
         reporter.close()
     if not options.check:
         console.print(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
+    return 0
 
 
 def _add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:

@@ -2,12 +2,16 @@
 
 import errno
 import logging
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.checkpoint import (
+    CheckpointClock,
     RunState,
     checkpoint_name,
     damage,
@@ -102,3 +106,46 @@ def test_a_new_checkpoint_replaces_the_damaged_ones_after_it(tmp_path: Path) -> 
     path = write(tmp_path, 20, keep=2)
     assert sorted(tmp_path.iterdir()) == [older, path]
     assert newest_checkpoint(tmp_path) == path
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_best_stays_besides_the_newest_until_there_is_a_better_one(tmp_path: Path) -> None:
+    for step, error in [(10, 0.9), (20, 0.7), (30, 0.8), (40, float("nan")), (50, 0.7)]:
+        before = newest_checkpoint(tmp_path)
+        state = replace(read_state(before), step=step) if before else RunState(step)
+        write_checkpoint(tmp_path, state.measured(error), write_weights, keep=2)
+    assert names(tmp_path) == [checkpoint_name(20), checkpoint_name(40), checkpoint_name(50)]
+    state = read_state(newest_checkpoint(tmp_path))
+    assert (state.best_step, state.best_error) == (20, 0.7)
+    write_checkpoint(tmp_path, replace(state, step=60).measured(0.6), write_weights, keep=2)
+    assert names(tmp_path) == [checkpoint_name(50), checkpoint_name(60)]
+
+
+def test_a_best_checkpoint_that_somebody_removed_is_not_waited_for(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path, RunState(10).measured(0.5), write_weights, keep=2)
+    newest = write_checkpoint(tmp_path, RunState(20, best_step=10, best_error=0.5), write_weights, keep=2)
+    shutil.rmtree(tmp_path / checkpoint_name(10))
+    assert read_state(newest) == RunState(20)
+
+
+def test_a_state_from_before_the_best_was_kept_is_still_read(tmp_path: Path) -> None:
+    path = write(tmp_path, 20)
+    (path / "state.json").write_text('{"step": 20, "broken": {}, "windows": 7}')
+    assert read_state(path) == RunState(20, {}, 7)
+
+
+def test_a_checkpoint_is_due_by_steps_and_by_minutes_since_the_last() -> None:
+    now = [0.0]
+    clock = CheckpointClock(CheckpointConfig(every=10, every_minutes=2.0), lambda: now[0])
+    assert [step for step in range(1, 21) if clock.is_due(step)] == [10, 20]
+    now[0] = 119.0
+    assert not clock.is_due(3)
+    now[0] = 120.0
+    assert clock.is_due(3)
+    clock.restart()
+    assert not clock.is_due(4)
+    now[0] = 1e9
+    assert not CheckpointClock(CheckpointConfig(every_minutes=None), lambda: now[0]).is_due(1)

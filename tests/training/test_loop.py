@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
 
+from same_run import assert_same_run, figures, trained_weights
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_as_yaml
 from vjepa2_ac.data import loader
@@ -21,36 +21,12 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.load import load_base
+from vjepa2_ac.training import loop
 from vjepa2_ac.training.assembly import assemble, batches_from
-from vjepa2_ac.training.checkpoint import newest_checkpoint
-from vjepa2_ac.training.journal import read_journal
+from vjepa2_ac.training.checkpoint import checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.runs import load_run
 from vjepa2_ac.training.step import step_seed, training_step
-
-TIMINGS = {"samples_per_second"}
-
-
-def trained_weights(run: Path) -> dict[str, torch.Tensor]:
-    return load_file(newest_checkpoint(run / "checkpoints") / "adapter" / "adapter_model.safetensors")
-
-
-def optimizer_state(run: Path) -> dict:
-    return torch.load(newest_checkpoint(run / "checkpoints") / "optimizer.pt", weights_only=True)["state"]
-
-
-def figures(run: Path) -> list[dict]:
-    return [{k: v for k, v in row.items() if k not in TIMINGS} for row in read_journal(run / "metrics.jsonl")]
-
-
-def assert_same_run(one: Path, other: Path) -> None:
-    first, second = trained_weights(one), trained_weights(other)
-    assert first.keys() == second.keys()
-    assert all(torch.equal(first[key], second[key]) for key in first)
-    for key, moments in optimizer_state(one).items():
-        for name, value in moments.items():
-            assert torch.equal(value, optimizer_state(other)[key][name]), (key, name)
-    assert figures(one) == figures(other)
 
 
 class KilledError(Exception):
@@ -83,6 +59,37 @@ def test_the_number_of_loader_workers_changes_nothing(make_config, reporter, tmp
     train(make_config(run_dir=str(tmp_path / "none"), training__steps=2), reporter)
     train(make_config(run_dir=str(tmp_path / "two"), training__steps=2, data__workers=2), reporter)
     assert_same_run(tmp_path / "none", tmp_path / "two")
+
+
+def test_how_often_a_run_is_measured_and_saved_changes_nothing(make_config, reporter, tmp_path) -> None:
+    train(make_config(run_dir=str(tmp_path / "seldom"), validation__every=6, checkpoint__every=6), reporter)
+    often = make_config(run_dir=str(tmp_path / "often"), validation__every=1, checkpoint__every_minutes=1e-9)
+    train(often, reporter)
+    assert len(list((tmp_path / "often/checkpoints").iterdir())) > len(
+        list((tmp_path / "seldom/checkpoints").iterdir())
+    )
+    rows = {(row["kind"], row["step"]): row for row in figures(tmp_path / "often")}
+    assert all(rows[row["kind"], row["step"]] == row for row in figures(tmp_path / "seldom"))
+    one, other = trained_weights(tmp_path / "seldom"), trained_weights(tmp_path / "often")
+    assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+def test_the_best_by_validation_is_written_kept_and_remembered(make_config, reporter, tmp_path, monkeypatch) -> None:
+    def measured(errors: object) -> dict:
+        del errors
+        return {"rollout_over_persistence_last": next(values)}
+
+    monkeypatch.setattr(loop, "validation_figures", measured)
+    config = make_config(validation__every=1, checkpoint__every=100, checkpoint__keep=1)
+    values = iter([0.1, 0.9, 0.7, 0.8, 0.75])  # the first is the base's
+    with pytest.raises(KilledError):
+        train(config, dying_reporter(type(reporter)(), 5))
+    values = iter([0.71, 0.8, 0.9, 0.72])
+    train(config, reporter)
+    folder = tmp_path / "run/checkpoints"
+    assert [path.name for path in sorted(folder.iterdir())] == [checkpoint_name(2), checkpoint_name(6)]
+    state = read_state(newest_checkpoint(folder))
+    assert (state.best_step, state.best_error) == (2, 0.7)
 
 
 def test_another_seed_is_another_run(make_config, reporter, tmp_path) -> None:

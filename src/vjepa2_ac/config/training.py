@@ -95,8 +95,12 @@ class CheckpointConfig(Section):
 
     every: PositiveInt = 1_000
     """Optimizer steps between checkpoints."""
+    every_minutes: Annotated[float, Field(gt=0.0)] | None = 15.0
+    """Minutes after which a checkpoint is written in any case; null: by steps alone."""
     keep: PositiveInt = 5
     """How many of the newest checkpoints stay."""
+    keep_best: bool = True
+    """Write one after the validation that went best (rollout error over persistence at the last horizon); it stays."""
 
 
 class TrackingConfig(Section):

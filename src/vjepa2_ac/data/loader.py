@@ -10,9 +10,10 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import forkserver, resource_tracker
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -40,7 +41,7 @@ _CLIPS_WORTH_WORKERS = 256  # fewer validation clips are read before the workers
 
 def training_loader(
     dataset: Dataset, *, seed: int, batch_size: int, start_position: int = 0, rank: int = 0, world_size: int = 1
-) -> Iterator[Batch]:
+) -> Generator[Batch, None, None]:
     """Yield the micro-batches of one rank, without end, from any position of the run at once.
 
     The run is one row of clips. Micro-batch m of rank r holds the `batch_size` clips from position
@@ -193,11 +194,12 @@ def _rows(first: int, length: int, distance: int) -> Iterator[list[int]]:
         yield list(range(start, start + length))
 
 
-def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int) -> Iterator[Batch]:
+def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int) -> Generator[Batch, None, None]:
     # A fork server has no threads: a plain fork may hang in OpenMP or CUDA, and Python warns of it.
     context = multiprocessing.get_context("forkserver") if workers else None
     if context is not None:
         context.set_forkserver_preload([__name__])
+        _start_servers_deaf()
     loader = DataLoader(
         clips,
         batch_sampler=positions,
@@ -208,12 +210,35 @@ def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int) -> Ite
         worker_init_fn=_end_with_the_run if workers else None,
         prefetch_factor=clips.dataset.config.prefetch if workers else None,
     )
-    for row in loader:
-        if isinstance(row, InputError):
-            raise row
-        for one in row.skipped:  # noted here, when its turn has come: whatever workers there are, at the same step
-            clips.dataset.broken.met(one.episode_id, one.reason)
-        yield row.batch
+    others = set(multiprocessing.active_children())
+    rows = iter(loader)
+    ours = set(multiprocessing.active_children()) - others
+    try:
+        for row in rows:
+            if isinstance(row, InputError):
+                raise row
+            for one in row.skipped:  # noted here, when its turn has come: whatever workers there are, at the same step
+                clips.dataset.broken.met(one.episode_id, one.reason)
+            yield row.batch
+    finally:
+        del rows  # asks the workers to end, and waits a while
+        for worker in ours:
+            if worker.is_alive():  # busy with a clip that does not come; it is deaf to SIGTERM
+                worker.kill()
+
+
+def _start_servers_deaf() -> None:
+    """Start the processes that workers come from with the signals blocked that ask a run to stop, also in workers.
+
+    Who signals the whole process group, as a terminal, `timeout` and Slurm do, means the run: it needs its workers to
+    finish the step, and ends them.
+    """
+    for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the first one clears the mask
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGUSR1})
+        try:
+            start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end_with_the_run(_worker: int) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -112,7 +112,7 @@ def make_accelerator(config: Config) -> Accelerator:
     return Accelerator(mixed_precision=precision, cpu=config.training.device == "cpu")
 
 
-def batches_from(run: Run, step: int) -> Iterator[Batch]:
+def batches_from(run: Run, step: int) -> Generator[Batch, None, None]:
     """Yield the micro-batches of this process that come after `step` optimizer steps."""
     training = run.config.training
     micro_batches_done = step * training.accumulation

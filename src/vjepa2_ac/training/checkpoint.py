@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import re
 import shutil
+import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import sha256_of_file, sync
 
@@ -32,6 +35,36 @@ class RunState:
     step: int  # optimizer steps done
     broken: Mapping[str, str] = field(default_factory=dict)  # episodes that clips could not be read from, and why
     windows: int | None = None  # clips of an epoch: with another number, their order is another
+    best_step: int | None = None  # the validation that went best, where checkpoint.keep_best is set
+    best_error: float | None = None
+
+    def measured(self, error: float) -> RunState:
+        """Return the state after a validation at its step: another one only where that went better than any before."""
+        if not math.isfinite(error) or (self.best_error is not None and error >= self.best_error):
+            return self
+        return replace(self, best_step=self.step, best_error=error)
+
+
+class CheckpointClock:
+    """Says when the next checkpoint is due: by optimizer steps, and by minutes since the last one.
+
+    Args:
+        config: How often.
+        now_s: Tells the time, in seconds since whenever.
+    """
+
+    def __init__(self, config: CheckpointConfig, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._config, self._now_s, self._last_s = config, now_s, now_s()
+
+    def is_due(self, step: int) -> bool:
+        """Return whether a checkpoint is due after a step."""
+        minutes = self._config.every_minutes
+        by_time = minutes is not None and self._now_s() - self._last_s >= 60.0 * minutes
+        return by_time or step % self._config.every == 0
+
+    def restart(self) -> None:
+        """A checkpoint was written now."""
+        self._last_s = self._now_s()
 
 
 def checkpoint_name(step: int) -> str:
@@ -40,13 +73,13 @@ def checkpoint_name(step: int) -> str:
 
 
 def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path], None], *, keep: int) -> Path:
-    """Write a checkpoint whole or not at all, then remove all but the newest `keep`.
+    """Write a checkpoint whole or not at all, then remove all but the newest `keep` and the best.
 
     Args:
         folder: The run's checkpoint folder.
         state: Where the run stands.
         write_files: Writes weights and optimizer state into the folder it is given.
-        keep: How many checkpoints stay.
+        keep: How many of the newest checkpoints stay; that of `state.best_step` stays besides.
 
     Raises:
         InputError: The folder cannot be written (full disk, no permission). Older checkpoints stay as they are.
@@ -71,7 +104,7 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
             found=f"the checkpoint cannot be written ({error.strerror or error})",
             fix="Older checkpoints are untouched: make room or pass another run_dir, then resume",
         ) from error
-    _prune(folder, keep)
+    _prune(folder, keep, state.best_step)
     return final
 
 
@@ -111,8 +144,11 @@ def damage(checkpoint: Path) -> str | None:
 
 
 def read_state(checkpoint: Path) -> RunState:
-    """Return where the run stood when the checkpoint was written."""
-    return RunState(**json.loads((checkpoint / STATE).read_text()))
+    """Return where the run stood when the checkpoint was written; a best one that is not there any more is no best."""
+    state = RunState(**json.loads((checkpoint / STATE).read_text()))
+    if state.best_step is None or (checkpoint.parent / checkpoint_name(state.best_step)).is_dir():
+        return state
+    return replace(state, best_step=None, best_error=None)
 
 
 def _listed(folder: Path) -> list[Path]:
@@ -132,8 +168,10 @@ def _seal(folder: Path) -> None:
     sync(folder)
 
 
-def _prune(folder: Path, keep: int) -> None:
+def _prune(folder: Path, keep: int, best_step: int | None) -> None:
     for path in folder.glob(".writing-*"):
         shutil.rmtree(path, ignore_errors=True)
+    best = None if best_step is None else checkpoint_name(best_step)
     for path in _listed(folder)[:-keep]:
-        shutil.rmtree(path)
+        if path.name != best:
+            shutil.rmtree(path)

@@ -10,6 +10,7 @@ import contextlib
 import json
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -17,15 +18,19 @@ import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.loader import validation_batches
+from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, prediction_errors, ratios_by_horizon
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, save_checkpoint
-from vjepa2_ac.training.checkpoint import RunState
+from vjepa2_ac.training.checkpoint import CheckpointClock
 from vjepa2_ac.training.journal import Journal
+from vjepa2_ac.training.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.training.run_folder import check_run_folder, open_run_folder
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.stride import CALIBRATION, with_settled_stride
+
+BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: the longest look ahead is what planning leans on
 
 
 @runtime_checkable
@@ -66,6 +71,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False) -> Pa
 
     Raises:
         InputError: Something the user gave cannot be used; raised before the first step wherever that can be known.
+        StoppedError: A signal asked the run to stop between its first and last step; see `training.preemption`.
     """
     config = with_settled_stride(config)
     check_run_folder(config)
@@ -94,25 +100,52 @@ def _train(config: Config, reporter: Reporter, *, check_only: bool) -> Path:
 
 
 def _loop(run: Run, folder: Path, journal: Journal, reporter: Reporter) -> None:
-    config, training = run.config, run.config.training
-    batches = batches_from(run, run.state.step)
+    training = run.config.training
     reporter.started(run.state.step, training.steps)
-    for step in range(run.state.step + 1, training.steps + 1):
-        started = time.perf_counter()
-        figures = training_step(run, batches, step)
-        clips = training.batch_size * training.accumulation - figures.get("clips_left_out", 0.0)
-        figures["samples_per_second"] = clips / (time.perf_counter() - started)
-        reporter.stepped(step, figures)
-        last = step == training.steps
-        if step % training.log_every == 0 or last:
-            journal.write("train", step, figures)
-        run.state = RunState(step)
-        if step % config.validation.every == 0 or last:
-            errors = _validate(run, reporter)
-            journal.write("validation", step, validation_figures(errors))
-        if step % config.checkpoint.every == 0 or last:
-            run.state = RunState(step, run.dataset.broken.reasons, len(run.dataset.windows("train")))
-            save_checkpoint(run, folder)
+    clock = CheckpointClock(run.config.checkpoint)
+    with stop_on_signals() as stop, contextlib.closing(batches_from(run, run.state.step)) as batches:
+        for step in range(run.state.step + 1, training.steps + 1):
+            figures = _timed_step(run, batches, step)
+            reporter.stepped(step, figures)
+            last = step == training.steps
+            if step % training.log_every == 0 or last:
+                journal.write("train", step, figures)
+            run.state = replace(run.state, step=step)
+            is_best = _validate_if_due(run, journal, reporter)
+            stopped_by = stop.reason  # read once: a signal after this waits for the next step
+            if clock.is_due(step) or is_best or stopped_by or last:
+                _save(run, folder)
+                clock.restart()
+            if stopped_by and not last:
+                raise StoppedError(folder, step, stopped_by)
+
+
+def _timed_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, float]:
+    started = time.perf_counter()
+    figures = training_step(run, batches, step)
+    training = run.config.training
+    clips = training.batch_size * training.accumulation - figures.get("clips_left_out", 0.0)
+    figures["samples_per_second"] = clips / (time.perf_counter() - started)
+    return figures
+
+
+def _validate_if_due(run: Run, journal: Journal, reporter: Reporter) -> bool:
+    """Measure and note, where it is time to; return whether no earlier measurement was as good."""
+    step, config = run.state.step, run.config
+    if step % config.validation.every != 0 and step != config.training.steps:
+        return False
+    figures = validation_figures(_validate(run, reporter))
+    journal.write("validation", step, figures)
+    if not config.checkpoint.keep_best:
+        return False
+    before = run.state
+    run.state = before.measured(figures[BEST_BY])
+    return run.state != before
+
+
+def _save(run: Run, folder: Path) -> None:
+    run.state = replace(run.state, broken=run.dataset.broken.reasons, windows=len(run.dataset.windows("train")))
+    save_checkpoint(run, folder)
 
 
 def validation_figures(errors: PredictionErrors) -> dict[str, Any]:

@@ -1,0 +1,76 @@
+"""Was the run asked to stop? SIGTERM, SIGINT (Ctrl-C) and SIGUSR1 ask; the loop stops where it can go on from.
+
+The first signal is noted: the loop finishes its optimizer step, and the validation that is due after it, writes a
+checkpoint and raises `StoppedError`. The command line then exits with `EXIT_STATUS`. A second signal means now: it does
+what it would do without this file, which ends the process; checkpoints are whole or absent, whenever that happens.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+EXIT_STATUS = 75  # sysexits.h, EX_TEMPFAIL: the same command goes on
+
+
+class StoppedError(Exception):
+    """A run stopped because it was asked to; its checkpoint is written, and the same command goes on from there.
+
+    Args:
+        folder: The run's folder.
+        step: Optimizer steps done.
+        reason: The name of the signal.
+    """
+
+    def __init__(self, folder: Path, step: int, reason: str) -> None:
+        self.folder, self.step, self.reason = folder, step, reason
+        super().__init__(f"{reason}: stopped after step {step:,}; the same command goes on from there")
+
+
+class StopRequest:
+    """Says whether a signal has asked to stop, and which.
+
+    Args:
+        same_within_s: Another signal so soon is the same wish: `timeout` and some launchers signal the process and its
+            group, which gets two to the process.
+    """
+
+    def __init__(self, same_within_s: float) -> None:
+        self.reason: str | None = None
+        self._same_within_s = same_within_s
+        self._came_at = 0.0
+
+    def take(self, number: int, _frame: FrameType | None) -> None:
+        """Note a first signal; let a second one do what it does by default."""
+        if self.reason is None:
+            self.reason, self._came_at = signal.Signals(number).name, time.monotonic()
+        elif time.monotonic() - self._came_at >= self._same_within_s:
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+
+
+@contextlib.contextmanager
+def stop_on_signals(*, same_within_s: float = 0.5) -> Iterator[StopRequest]:
+    """Note signals instead of dying of them, as long as the context lasts; afterwards they do what they did before.
+
+    Outside the main thread, where Python takes no signals, and for signals that the process was started to ignore
+    (`nohup`, a shell's `&`), nothing is changed.
+    """
+    request = StopRequest(same_within_s)
+    if threading.current_thread() is not threading.main_thread():
+        yield request
+        return
+    taken = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, request.take) for number in taken}
+    try:
+        yield request
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
