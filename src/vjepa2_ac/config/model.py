@@ -102,4 +102,17 @@ class AdapterConfig(Section):
     """Dropout before the adapter's first matrix, in training only."""
     targets: tuple[str, ...] = ("q", "k", "v", "o", "fc1", "fc2")
     """Linear layers of the predictor that get an adapter, by the last part of their name; besides the defaults:
-    predictor_embed, predictor_proj, action_encoder, state_encoder."""
+    predictor_embed, predictor_proj, action_encoder, state_encoder. Or sets: attention (q, k, v, o), mlp (fc1, fc2),
+    all (every linear layer)."""
+    modules_to_save: tuple[Literal["action_encoder", "state_encoder"], ...] = ()
+    """Input heads that are trained whole, beside the adapter."""
+    dora: bool = False
+    """Train the length of each row of a weight apart from its direction (DoRA, arXiv 2402.09353)."""
+    init: Literal["default", "gaussian", "pissa"] = "default"
+    """Where an adapter starts. default, gaussian: first matrix random, second zero. pissa: at the largest singular
+    values of the weights (arXiv 2404.02948). PEFT's other ways need data, or change what the base predicts."""
+    rank_pattern: dict[str, Annotated[int, Field(ge=1, le=1024)]] = {}
+    """Other ranks for some targets: {fc1: 32, blocks.0.attn.q: 4}, by the end of a layer's name or a regular
+    expression for it; the first that matches counts."""
+    alpha_pattern: dict[str, Annotated[float, Field(gt=0.0)]] = {}
+    """Other alphas for some targets, in the same way."""

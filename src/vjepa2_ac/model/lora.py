@@ -2,23 +2,50 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
 from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
 from peft.tuners.lora import LoraLayer
-from torch import Tensor, nn
+from torch import Tensor
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.trained_folder import FULL_WEIGHTS, LORA_WEIGHTS, read_kind, read_weights, write_trained
+from vjepa2_ac.model.adapter_layers import lora_arguments
+from vjepa2_ac.model.adapter_start import (
+    draw_first_matrices,
+    measure_magnitudes,
+    original_weights,
+    principal_parts,
+    set_original_weights,
+    start_from,
+)
+from vjepa2_ac.model.trained_folder import (
+    FULL_WEIGHTS,
+    LORA_WEIGHTS,
+    PRINCIPAL_PARTS,
+    read_kind,
+    read_weights,
+    write_trained,
+)
 from vjepa2_ac.model.world_model import Adaptation, WorldModel, base_weights
 
-_COMPARED = ("r", "lora_alpha", "use_rslora", "target_modules", "use_dora", "bias", "modules_to_save")
+_COMPARED = (
+    "r",
+    "lora_alpha",
+    "use_rslora",
+    "target_modules",
+    "use_dora",
+    "bias",
+    "modules_to_save",
+    "rank_pattern",
+    "alpha_pattern",
+    "init_lora_weights",
+)
 
 
 class TrainableReport(NamedTuple):
@@ -43,10 +70,11 @@ class TrainableReport(NamedTuple):
 def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     """Make a model trainable: its predictor gets an adapter, or all of it is trained. What is trained is float32.
 
-    A fresh adapter changes nothing: its second matrix is zero; the first is decided by the seed.
+    A fresh adapter changes nothing: its second matrix is zero; the first is decided by the seed. With `init: pissa` it
+    is a part of the weights, taken off them, which comes to the same up to rounding.
 
     Raises:
-        InputError: A target matches no layer.
+        InputError: A target matches no layer, or another knob does not fit the predictor.
         ValueError: The model has been adapted already.
     """
     if model.adaptation is not None:
@@ -54,22 +82,13 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     if config.kind == "none":
         _train_everything(model)
         return
-    _check_targets(model.predictor, config.targets)
-    lora = LoraConfig(
-        r=config.rank,
-        lora_alpha=config.alpha,
-        use_rslora=config.rslora,
-        lora_dropout=config.dropout,
-        target_modules=list(config.targets),
-        bias="none",
-    )
-    _wrap(model, lora)
-    generator = torch.Generator().manual_seed(seed)
-    for layer in _lora_layers(model):
-        first = layer.lora_A["default"].weight
-        fresh = torch.empty(first.shape)
-        nn.init.kaiming_uniform_(fresh, a=math.sqrt(5), generator=generator)
-        first.data.copy_(fresh)
+    _wrap(model, LoraConfig(**lora_arguments(model.predictor, config, unused=_unused(model))))
+    layers = _lora_layers(model)
+    if config.init == "pissa":
+        _start_from_principal_parts(model, principal_parts(layers))
+    else:
+        draw_first_matrices(layers, config.init, torch.Generator().manual_seed(seed))
+    measure_magnitudes(layers)
 
 
 def trainable_report(model: WorldModel) -> TrainableReport:
@@ -92,7 +111,7 @@ def save_trained(model: WorldModel, folder: str | Path) -> None:
     """
     adaptation, folder = _adaptation(model), Path(folder)
     if adaptation.kind == "lora":
-        write_trained(folder, adaptation, _lora_weights(model))
+        write_trained(folder, adaptation, _lora_weights(model))  # and PiSSA's principal parts
         _lora_config(model).save_pretrained(str(folder))
     else:
         write_trained(folder, adaptation, model.predictor.state_dict())
@@ -127,7 +146,11 @@ def base_only(model: WorldModel) -> Iterator[None]:
         yield
         return
     trained = [(value, value.requires_grad) for value in model.predictor.parameters()]
-    switch = _lora_off(model) if model.adaptation.kind == "lora" else _start_weights(model, model.adaptation)
+    switch = (
+        _lora_off(model, model.adaptation)
+        if model.adaptation.kind == "lora"
+        else _start_weights(model, model.adaptation)
+    )
     try:
         with switch:
             yield
@@ -159,32 +182,39 @@ def _train_everything(model: WorldModel) -> None:
     _set_trainable(model, trainable=True)
 
 
-def _check_targets(predictor: nn.Module, targets: tuple[str, ...]) -> None:
-    linear = {name.rsplit(".", 1)[-1] for name, layer in predictor.named_modules() if isinstance(layer, nn.Linear)}
-    unknown = [target for target in targets if target not in linear]
-    if unknown or not targets:
-        raise InputError(
-            where="adapter.targets",
-            found=", ".join(unknown) + " matches no layer of the predictor" if unknown else "no target",
-            needed=f"some of {', '.join(sorted(linear))}",
-        )
-
-
 def _wrap(model: WorldModel, config: LoraConfig) -> None:
     base = model.predictor_fingerprint()
     checkpointing = model.base_predictor.gradient_checkpointing
     model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
+    init, config.init_lora_weights = config.init_lora_weights, True  # or PEFT cuts PiSSA out of the base, in its type
     training = model.predictor.training
     model.predictor = get_peft_model(model.predictor, config).train(training)  # PEFT's dropout begins switched on
+    config.init_lora_weights = init
     model.set_gradient_checkpointing(checkpointing)
     model.adaptation = Adaptation("lora", base, model.encoder_fingerprint())
-    for layer in _lora_layers(model):
-        layer.lora_A.float()
-        layer.lora_B.float()
+    for name, value in model.predictor.named_parameters():
+        if _is_trained(name):
+            value.data = value.data.float()
 
 
-def _lora_layers(model: WorldModel) -> list[Any]:
-    return [layer for layer in model.predictor.modules() if isinstance(layer, LoraLayer)]
+def _is_trained(name: str) -> bool:
+    return ".lora_" in name or ".modules_to_save." in name
+
+
+def _unused(model: WorldModel) -> tuple[str, ...]:
+    return () if model.sizes.predictor.use_extrinsics else ("extrinsics_encoder",)
+
+
+def _start_from_principal_parts(model: WorldModel, parts: dict[str, Tensor]) -> None:
+    adaptation, layers = _adaptation(model), _lora_layers(model)
+    start = adaptation.start or original_weights(layers)
+    start_from(layers, start, parts)
+    model.adaptation = replace(adaptation, start=start, principal=parts)
+
+
+def _lora_layers(model: WorldModel) -> dict[str, Any]:
+    found = model.base_predictor.named_modules()
+    return {name: layer for name, layer in found if isinstance(layer, LoraLayer)}
 
 
 def _lora_weights(model: WorldModel) -> dict[str, Tensor]:
@@ -206,9 +236,8 @@ def _adaptation(model: WorldModel) -> Adaptation:
 
 def _set_trainable(model: WorldModel, trainable: bool) -> None:
     lora = isinstance(model.predictor, PeftModel)
-    unused = () if model.sizes.predictor.use_extrinsics else ("extrinsics_encoder.",)
     for name, value in model.predictor.named_parameters():
-        chosen = ".lora_" in name if lora else not name.startswith(unused)
+        chosen = _is_trained(name) if lora else name.split(".", 1)[0] not in _unused(model)
         value.requires_grad_(trainable and chosen)
 
 
@@ -218,7 +247,15 @@ def _load_lora(model: WorldModel, folder: Path) -> None:
         _wrap(model, config)
     else:
         _check_same_adapter(_lora_config(model), config, where=str(folder))
-    set_peft_model_state_dict(model.predictor, read_weights(folder / LORA_WEIGHTS, _lora_weights(model)))
+    weights = read_weights(folder / LORA_WEIGHTS, _lora_weights(model))
+    if config.init_lora_weights == "pissa":
+        shapes = {
+            f"{name}.{matrix}": getattr(layer, matrix)["default"].weight
+            for name, layer in _lora_layers(model).items()
+            for matrix in ("lora_A", "lora_B")
+        }
+        _start_from_principal_parts(model, read_weights(folder / PRINCIPAL_PARTS, shapes))
+    set_peft_model_state_dict(model.predictor, weights)
 
 
 def _read_lora_config(folder: Path) -> Any:
@@ -232,7 +269,10 @@ def _read_lora_config(folder: Path) -> Any:
 
 def _check_same_adapter(own: Any, other: Any, *, where: str) -> None:
     for key in _COMPARED:
-        found, needed = (sorted(v) if isinstance(v, set) else v for v in (getattr(other, key), getattr(own, key)))
+        found, needed = (
+            sorted(value) if isinstance(value, set | list) else value
+            for value in (getattr(other, key), getattr(own, key))
+        )
         if found != needed:
             raise InputError(where=where, found=f"an adapter with {key} {found}", needed=f"{needed}, as the model has")
 
@@ -244,9 +284,17 @@ def _load_everything(model: WorldModel, folder: Path) -> None:
     model.predictor.load_state_dict(weights)
 
 
-def _lora_off(model: WorldModel) -> Any:
+@contextmanager
+def _lora_off(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
     predictor: Any = model.predictor
-    return predictor.disable_adapter()
+    layers = _lora_layers(model) if adaptation.start else {}  # PiSSA's: their own weights are not the base's
+    now = {name: layer.get_base_layer().weight.detach().clone() for name, layer in layers.items()}
+    set_original_weights(layers, adaptation.start or {})
+    try:
+        with predictor.disable_adapter():
+            yield
+    finally:
+        set_original_weights(layers, now)
 
 
 @contextmanager

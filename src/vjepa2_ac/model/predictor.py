@@ -157,11 +157,11 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
                 f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
             )
         dtype = self.predictor_embed.weight.dtype
-        conditions = [self.action_encoder(actions.to(dtype)), self.state_encoder(states.to(dtype))]
+        conditions = [_in_own_type(self.action_encoder, actions), _in_own_type(self.state_encoder, states)]
         if extrinsics is not None:
             conditions.append(self.extrinsics_encoder(extrinsics.to(dtype)))
         patches = self.predictor_embed(latents.to(dtype))
-        tokens = torch.cat([torch.stack(conditions, dim=2), patches], dim=2)
+        tokens = torch.cat([torch.stack(conditions, dim=2).to(patches.dtype), patches], dim=2)
         return tokens.flatten(1, 2), TokenLayout(latents.shape[1], self.grid, conditioning=len(conditions))
 
     def _init_weights(self, module: nn.Module) -> None:
@@ -172,3 +172,8 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
     def is_gradient_checkpointing(self) -> bool:
         """Whether blocks are computed again in the backward pass; PEFT asks, and transformers' own answer warns."""
         return self.gradient_checkpointing
+
+
+def _in_own_type(layer: Any, values: Tensor) -> Tensor:
+    """Apply a layer that may be trained, and so be float32, in a predictor of another type."""
+    return layer(values.to(layer.weight.dtype))  # type: ignore[no-any-return]  # PEFT may be around it, untyped

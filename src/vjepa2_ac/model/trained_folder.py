@@ -17,6 +17,7 @@ from vjepa2_ac.model.world_model import Adaptation, WorldModel
 CARD = "vjepa2_ac.json"
 LORA_WEIGHTS = "adapter_model.safetensors"  # PEFT's name
 FULL_WEIGHTS = "predictor.safetensors"
+PRINCIPAL_PARTS = "pissa_start.safetensors"  # what an adapter of init pissa started from, and the base then lacks
 
 
 def write_trained(folder: Path, adaptation: Adaptation, weights: dict[str, Tensor]) -> None:
@@ -25,6 +26,8 @@ def write_trained(folder: Path, adaptation: Adaptation, weights: dict[str, Tenso
     whole = {key: value.detach().to("cpu").contiguous() for key, value in weights.items()}
     name = LORA_WEIGHTS if adaptation.kind == "lora" else FULL_WEIGHTS
     save_file(whole, folder / name, metadata={"format": "pt"})
+    if adaptation.principal is not None:
+        save_file(adaptation.principal, folder / PRINCIPAL_PARTS, metadata={"format": "pt"})
     card = {"kind": adaptation.kind, "base_predictor": adaptation.base, "encoder": adaptation.encoder}
     (folder / CARD).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 

@@ -28,7 +28,8 @@ class Adaptation:
     kind: str  # as in config.AdapterConfig: lora, or none when every weight is trained
     base: str  # fingerprint of the predictor it started from
     encoder: str  # fingerprint of the encoder whose latents it learns from
-    start: dict[str, Tensor] | None = None  # kind none: the weights it started from
+    start: dict[str, Tensor] | None = None  # weights it started from: all (kind none), or the adapted ones (PiSSA)
+    principal: dict[str, Tensor] | None = None  # PiSSA: the matrices that were taken off those weights
 
 
 class WorldModel(nn.Module):
@@ -206,9 +207,9 @@ def fingerprint(weights: Mapping[str, Tensor]) -> str:
 def base_weights(predictor: nn.Module) -> dict[str, Tensor]:
     """Return the weights of a predictor by their plain names, without those of an adapter."""
     return {
-        name.replace(".base_layer.", "."): value
+        name.replace(".base_layer.", ".").replace(".original_module.", "."): value
         for name, value in predictor.state_dict().items()
-        if ".lora_" not in name
+        if ".lora_" not in name and ".modules_to_save." not in name
     }
 
 
