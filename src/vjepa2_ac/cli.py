@@ -96,6 +96,9 @@ def _add_train(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--check", action="store_true", help="do everything that can fail and stop before the first step"
     )
+    parser.add_argument(
+        "--allow-config-change", action="store_true", help="go on with the run in run_dir though its config is another"
+    )
 
 
 def _train(options: argparse.Namespace) -> int:
@@ -117,7 +120,7 @@ def _train(options: argparse.Namespace) -> int:
     config = read_run_config(path) if options.resume else load_config(path, options.overrides)
     reporter = ConsoleReporter()
     try:
-        folder = train(config, reporter, check_only=options.check)
+        folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
     except StoppedError as stopped:
         print(stopped, file=sys.stderr)
         return EXIT_STATUS

@@ -212,6 +212,24 @@ def test_a_folder_of_another_config_is_refused_and_names_the_key(make_config, re
         train(make_config(training__learning_rate=2e-3), reporter)
 
 
+def test_another_config_on_purpose_is_written_and_what_changes_is_said(make_config, reporter) -> None:
+    train(make_config(), reporter)
+    changed = make_config(training__steps=8, training__learning_rate=2e-3)
+    train(changed, reporter, check_only=True, allow_config_change=True)
+    folder = Path(changed.run_dir)
+    assert (folder / "config.yaml").read_text() != config_as_yaml(changed), "--check writes nothing"
+    train(changed, reporter, allow_config_change=True)
+    said = ["training.learning_rate: 0.001 -> 0.002", "training.steps: 6 -> 8"]
+    assert [note for note in reporter.notes if "config changes" in note][-2:] == [
+        f"The config changes: {s}" for s in said
+    ]
+    assert (folder / "config.yaml").read_text() == config_as_yaml(changed)
+    starts = json.loads((folder / "environment.json").read_text())
+    assert [start.get("config_changes") for start in starts] == [None, said]
+    assert reporter.steps == [*range(1, 7), 7, 8]
+    train(changed, reporter)
+
+
 def test_workers_and_logging_may_change_within_a_run(make_config, reporter) -> None:
     train(make_config(), reporter)
     train(make_config(data__workers=1, checkpoint__keep=2, training__log_every=5), reporter)

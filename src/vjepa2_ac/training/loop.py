@@ -26,7 +26,7 @@ from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, sav
 from vjepa2_ac.training.checkpoint import CheckpointClock
 from vjepa2_ac.training.journal import Journal
 from vjepa2_ac.training.preemption import StoppedError, stop_on_signals
-from vjepa2_ac.training.run_folder import check_run_folder, open_run_folder
+from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open_run_folder
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.stride import CALIBRATION, with_settled_stride
 
@@ -58,13 +58,14 @@ class Reporter(Protocol):
         ...
 
 
-def train(config: Config, reporter: Reporter, *, check_only: bool = False) -> Path:
+def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
     """Train as the config says, from the newest checkpoint of its run folder if there is one.
 
     Args:
         config: The run.
         reporter: Shows progress.
         check_only: Do everything that can fail, and stop before the first step and before anything is written.
+        allow_config_change: Go on with this config where the run folder has another one, and say what changes.
 
     Returns:
         The folder of the run.
@@ -74,22 +75,25 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False) -> Pa
         StoppedError: A signal asked the run to stop between its first and last step; see `training.preemption`.
     """
     config = with_settled_stride(config)
-    check_run_folder(config)
+    check_run_folder(config, allow_config_change=allow_config_change)
     with _out_of_memory_explained():
-        return _train(config, reporter, check_only=check_only)
+        return _train(config, reporter, check_only=check_only, allow_config_change=allow_config_change)
 
 
-def _train(config: Config, reporter: Reporter, *, check_only: bool) -> Path:
+def _train(config: Config, reporter: Reporter, *, check_only: bool, allow_config_change: bool) -> Path:
     run = assemble(config, reporter.note, reporter.looked_through)
     config = run.config
     first = _validate(run, reporter) if run.state.step == 0 else None
     if first is not None:
         _refuse_weak_base(config, first)
+    if allow_config_change:
+        for line in config_changes(config):
+            reporter.note(f"The config changes: {line}")
     if check_only:
         gradients(run, batches_from(run, run.state.step))
         reporter.note("Everything is in place: data, model, validation and gradients were tried; nothing was written.")
         return Path(config.run_dir)
-    folder = open_run_folder(config)
+    folder = open_run_folder(config, allow_config_change=allow_config_change)
     if run.calibration is not None:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
     with Journal(folder, first_step=run.state.step, tensorboard=config.tracking.tensorboard) as journal:

@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config_file import changed_keys, config_as_yaml, load_config
+from vjepa2_ac.config_file import changed_keys, config_as_dict, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import write_atomically
 
@@ -46,8 +46,12 @@ _FREE_TO_CHANGE = (
 )
 
 
-def check_run_folder(config: Config) -> None:
+def check_run_folder(config: Config, *, allow_config_change: bool = False) -> None:
     """See that the run's folder is free, or belongs to this very config, and can be written. Changes nothing.
+
+    Args:
+        config: The run.
+        allow_config_change: A run of another config is to go on with this one.
 
     Raises:
         InputError: The folder is a file, somebody else's, of another config, or not writable.
@@ -56,7 +60,8 @@ def check_run_folder(config: Config) -> None:
     if folder.exists() and not folder.is_dir():
         raise InputError(where=str(folder), found="a file", needed="a folder for the run", fix="Set another run_dir")
     if (folder / CONFIG).exists():
-        _refuse_another_config(folder, config)
+        if not allow_config_change:
+            _refuse_another_config(folder, config)
     elif folder.exists() and any(folder.iterdir()):
         raise InputError(
             where=str(folder),
@@ -67,21 +72,38 @@ def check_run_folder(config: Config) -> None:
     _check_writable(folder)
 
 
-def open_run_folder(config: Config) -> Path:
+def open_run_folder(config: Config, *, allow_config_change: bool = False) -> Path:
     """Create the run's folder, or go on in it, and note this start's versions.
+
+    Args:
+        config: The run.
+        allow_config_change: Go on with this config where the folder has another, and note what changed with this start.
 
     Raises:
         InputError: As `check_run_folder`.
     """
-    check_run_folder(config)
+    check_run_folder(config, allow_config_change=allow_config_change)
     folder = Path(config.run_dir)
     (folder / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
-    if not (folder / CONFIG).exists():
-        write_atomically(folder / CONFIG, config_as_yaml(config).encode())
+    start = {"seed": config.seed, **environment()}
+    if (changes := config_changes(config)) and allow_config_change:
+        start["config_changes"] = changes
     path = folder / ENVIRONMENT
     starts = _earlier_starts(path)
-    write_atomically(path, json.dumps([*starts, {"seed": config.seed, **environment()}], indent=1).encode())
+    write_atomically(path, json.dumps([*starts, start], indent=1).encode())
+    if allow_config_change or not (folder / CONFIG).exists():
+        write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     return folder
+
+
+def config_changes(config: Config) -> list[str]:
+    """Return a line per setting in which a config differs from that of the run in its folder: key, old, new value."""
+    folder = Path(config.run_dir)
+    if not (folder / CONFIG).is_file():
+        return []
+    old = read_run_config(folder)
+    keys = [key for key in changed_keys(old, config) if key != "run_dir"]
+    return [f"{key}: {_setting(old, key)} -> {_setting(config, key)}" for key in keys]
 
 
 def read_run_config(folder: Path) -> Config:
@@ -119,6 +141,13 @@ def _earlier_starts(path: Path) -> list[object]:
     return starts if isinstance(starts, list) else []
 
 
+def _setting(config: Config, dotted_key: str) -> str:
+    value: object = config_as_dict(config)
+    for part in dotted_key.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    return json.dumps(value)
+
+
 def _refuse_another_config(folder: Path, config: Config) -> None:
     differing = [key for key in changed_keys(read_run_config(folder), config) if not key.startswith(_FREE_TO_CHANGE)]
     if differing:
@@ -126,7 +155,8 @@ def _refuse_another_config(folder: Path, config: Config) -> None:
             where=str(folder),
             found=f"a run of another config; it differs in {', '.join(differing)}",
             needed="the same config, to go on with it",
-            fix=f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`",
+            fix=f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`; where"
+            " the change is meant, add --allow-config-change",
         )
 
 
