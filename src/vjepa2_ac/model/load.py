@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from vjepa2_ac.config import ModelConfig
+from vjepa2_ac.config import ModelConfig, ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.folder import CONFIG, check_sizes, read_sizes
 from vjepa2_ac.model.weights import load_official
@@ -43,6 +43,20 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
             fix="`vjepa2-ac download` fetches the official checkpoint to checkpoints/vjepa2-ac-vitg.pt",
         )
     return load_official(path, config.sizes, dtype=dtype)
+
+
+def base_sizes(config: ModelConfig) -> ModelSizes:
+    """Return the sizes of the model that `load_base` would give, without reading a weight.
+
+    Of an official `.pt`, or where nothing is there yet, they are those of `model.sizes`.
+
+    Raises:
+        InputError: There is a folder, but it is not a world model.
+    """
+    if config.random is not None or config.base is None:
+        return config.random or config.sizes
+    path = _builtin(config.base) if config.base.startswith(_BUILTIN) else Path(config.base)
+    return read_sizes(path) if path.is_dir() else config.sizes
 
 
 def _builtin(name: str) -> Path:

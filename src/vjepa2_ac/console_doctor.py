@@ -1,0 +1,68 @@
+"""How does a run's memory look in a terminal? The lines of doctor."""
+
+from __future__ import annotations
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.training.memory import ALLOWANCE, GIGABYTE, MemoryEstimate
+
+UNTESTED = (
+    "This is arithmetic. What autograd keeps was compared with PyTorch on a CPU; the total has not been compared with"
+    " a GPU's measured peak yet."
+)
+
+
+def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
+    """Return one line for every part, then both totals."""
+    training, counts = config.training, estimate.parameters
+    clips = f"{training.batch_size} clips of {config.data.frames} frames"
+    fed_back = training.rollout_steps - 1 if estimate.rollout else 0
+    parts = [
+        ("encoder, frozen", estimate.encoder_weights, f"{counts.encoder:,} weights in {config.model.dtype}"),
+        (
+            "predictor, frozen", estimate.predictor_weights,
+            f"{counts.predictor:,} weights" if estimate.predictor_weights else "none: all of it is trained",
+        ),
+        ("trained", estimate.trained, f"{counts.trained:,} weights in float32"),
+        ("gradients", estimate.gradients, "float32"),
+        ("optimizer", estimate.moments, "AdamW's two moments, float32"),
+        ("latents", estimate.latents, f"{clips}, float32"),
+        ("encoder, at work", estimate.encoding, f"{config.model.encode_chunk} frames at once; before the predictor"),
+        ("predictor, teacher forcing", estimate.teacher_forcing, "kept for the backward pass, without checkpointing"),
+        ("predictor, rollout", estimate.rollout, f"{fed_back} further passes, without checkpointing"),
+        ("losses", estimate.losses, "without checkpointing"),
+        ("all three, checkpointed", estimate.checkpointed, "instead: inputs of blocks, and one block computed again"),
+        ("bfloat16 copies", estimate.cast_cache, "of trained weights"),
+        ("temporaries", estimate.temporaries, "a guess: four tensors as wide as the MLP"),
+        ("CUDA, cuBLAS, holes", ALLOWANCE, "an allowance, not computed"),
+    ]  # fmt: skip
+    lines = [f"  {name:<28}{size / GIGABYTE:8.3f} GB  {about}" for name, size, about in parts]
+    for checkpointing, word in ((False, "without"), (True, "with")):
+        chosen = "  <- this config" if checkpointing == estimate.checkpointing else ""
+        total = estimate.total(checkpointing=checkpointing) / GIGABYTE
+        lines.append(f"  peak {word + ' checkpointing':<23}{total:8.3f} GB{chosen}")
+    return [*lines, *_not_counted(config), UNTESTED]
+
+
+def verdict(needed: int, available: int, gpu: str, knobs: list[str] | None) -> str:
+    """Return whether the run fits, or what to change.
+
+    Args:
+        needed: Bytes at the peak.
+        available: Bytes that the GPU has.
+        gpu: What to call it.
+        knobs: What to turn so that it fits, or None where nothing helps.
+    """
+    room = f"{gpu}, {available / GIGABYTE:.1f} GB"
+    if needed <= available:
+        return f"It fits on {room}, with {(available - needed) / GIGABYTE:.1f} GB to spare."
+    short = f"It does not fit on {room}: {(needed - available) / GIGABYTE:.1f} GB too much."
+    if knobs is None:
+        return f"{short} No knob makes it fit: it needs a larger GPU or a smaller model."
+    return f"{short} It would with {', '.join(knobs)}."
+
+
+def _not_counted(config: Config) -> list[str]:
+    adapter = config.adapter
+    knobs = {"dora": adapter.dora, "rank_pattern": adapter.rank_pattern, "modules_to_save": adapter.modules_to_save}
+    used = [f"adapter.{name}" for name, value in knobs.items() if value and adapter.kind == "lora"]
+    return [f"Not counted, so that it needs more or less than this: {', '.join(used)}."] if used else []
