@@ -1,6 +1,9 @@
 """Learning rates and parameter groups."""
 
+import importlib.util
+import io
 import json
+import sys
 from itertools import pairwise
 
 import pytest
@@ -9,6 +12,7 @@ from pydantic import ValidationError
 
 from paths import GOLDEN
 from vjepa2_ac.config import TrainingConfig
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.optim import learning_rate_at, make_optimizer, parameter_groups
 
 
@@ -76,3 +80,43 @@ def test_weight_decay_spares_biases_and_norms_and_frozen_weights_are_left_out() 
     assert exempt["weight_decay"] == 0.0
     optimizer = make_optimizer(module, TrainingConfig(betas=(0.8, 0.9)))
     assert optimizer.defaults["betas"] == (0.8, 0.9)
+
+
+with_bitsandbytes = pytest.mark.skipif(
+    importlib.util.find_spec("bitsandbytes") is None, reason="bitsandbytes (extra 8bit) is not installed"
+)
+
+
+def take_steps(module: torch.nn.Linear, optimizer: torch.optim.Optimizer, seeds: range) -> None:
+    for seed in seeds:
+        inputs = torch.randn(5, 128, generator=torch.Generator().manual_seed(seed))
+        module(inputs).square().mean().backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+
+@with_bitsandbytes
+def test_the_8_bit_optimizer_resumes_exactly_and_spares_biases() -> None:
+    training = TrainingConfig(optimizer="adamw_8bit", learning_rate=1e-2)
+    module, resumed = torch.nn.Linear(128, 64), torch.nn.Linear(128, 64)
+    optimizer = make_optimizer(module, training)
+    assert [group["weight_decay"] for group in optimizer.param_groups] == [0.04, 0.0]
+    assert optimizer.param_groups[1]["params"] == [module.bias]
+    take_steps(module, optimizer, range(3))
+    assert optimizer.state[module.weight]["state1"].dtype == torch.uint8
+    kept = io.BytesIO()
+    torch.save(optimizer.state_dict(), kept)
+    resumed.load_state_dict(module.state_dict())
+    again = make_optimizer(resumed, training)
+    again.load_state_dict(torch.load(io.BytesIO(kept.getvalue()), weights_only=True, map_location="cpu"))
+    take_steps(module, optimizer, range(3, 6))
+    take_steps(resumed, again, range(3, 6))
+    assert torch.equal(module.weight, resumed.weight)
+    assert torch.equal(module.bias, resumed.bias)
+
+
+def test_an_8_bit_optimizer_without_its_library_names_the_way_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "bitsandbytes", None)
+    monkeypatch.setitem(sys.modules, "bitsandbytes.optim", None)
+    with pytest.raises(InputError, match=r"bitsandbytes is not installed.*\.\[8bit\]"):
+        make_optimizer(torch.nn.Linear(2, 2), TrainingConfig(optimizer="adamw_8bit"))

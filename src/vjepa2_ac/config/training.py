@@ -41,6 +41,8 @@ class TrainingConfig(Section):
     """Where the warm-up starts."""
     final_learning_rate: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """Where the schedule ends; constant has no such place."""
+    optimizer: Literal["adamw", "adamw_8bit"] = "adamw"
+    """adamw_8bit keeps the moments of matrices of 4,096 elements and more in 8 bits: bitsandbytes, extra 8bit."""
     weight_decay: Annotated[float, Field(ge=0.0, le=1.0)] = 0.04
     """AdamW's decay; biases and norms are exempt."""
     betas: tuple[Annotated[float, Field(ge=0.0, lt=1.0)], Annotated[float, Field(ge=0.0, lt=1.0)]] = (0.9, 0.999)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import nn
 
 from vjepa2_ac.config import TrainingConfig
+from vjepa2_ac.errors import InputError
 
 
 def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, object]]:
@@ -23,11 +25,27 @@ def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, o
     return [group for group in groups if group["params"]]
 
 
-def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.AdamW:
-    """Return AdamW over what is trained. The learning rate is set anew before every step."""
-    return torch.optim.AdamW(
-        parameter_groups(module, training.weight_decay), lr=training.learning_rate, betas=training.betas
-    )
+def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.Optimizer:
+    """Return the optimizer over what is trained. The learning rate is set anew before every step.
+
+    Raises:
+        InputError: It needs a library that is not installed.
+    """
+    rule = torch.optim.AdamW if training.optimizer == "adamw" else _adamw_8bit()
+    groups = parameter_groups(module, training.weight_decay)
+    return rule(groups, lr=training.learning_rate, betas=training.betas)
+
+
+def _adamw_8bit() -> Any:
+    try:
+        from bitsandbytes.optim import AdamW8bit
+    except ImportError:
+        raise InputError(
+            where="training.optimizer",
+            found="adamw_8bit, but bitsandbytes is not installed",
+            fix='Run pip install -c constraints.txt -e ".[8bit]", or set training.optimizer=adamw',
+        ) from None
+    return AdamW8bit
 
 
 def learning_rate_at(step: int, training: TrainingConfig) -> float:
