@@ -5,14 +5,16 @@ The batch at a place of the run is a pure function of the seed and that place. W
 
 from __future__ import annotations
 
+import atexit
 import itertools
 import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import forkserver, resource_tracker
 from typing import Any, Protocol, runtime_checkable
 
@@ -213,6 +215,8 @@ def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int) -> Gen
     others = set(multiprocessing.active_children())
     rows = iter(loader)
     ours = set(multiprocessing.active_children()) - others
+    at_exit = partial(_end, ours)
+    atexit.register(at_exit)  # multiprocessing's own way is SIGTERM, and to wait for those that are deaf to it
     try:
         for row in rows:
             if isinstance(row, InputError):
@@ -222,9 +226,15 @@ def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int) -> Gen
             yield row.batch
     finally:
         del rows  # asks the workers to end, and waits a while
-        for worker in ours:
-            if worker.is_alive():  # busy with a clip that does not come; it is deaf to SIGTERM
-                worker.kill()
+        _end(ours)
+        atexit.unregister(at_exit)
+
+
+def _end(workers: Iterable[multiprocessing.process.BaseProcess]) -> None:
+    """End workers that did not when they were asked: busy with a clip that does not come, and deaf to SIGTERM."""
+    for worker in workers:
+        if worker.is_alive():
+            worker.kill()
 
 
 def _start_servers_deaf() -> None:
