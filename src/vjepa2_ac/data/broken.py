@@ -9,9 +9,6 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.exclusion import named, with_way_out
 from vjepa2_ac.data.table import Problem
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.remote import UnreachableError
-
-__all__ = ["BrokenEpisodes", "UnreachableError", "as_error", "as_problem"]
 
 logger = logging.getLogger(__name__)
 

@@ -6,13 +6,14 @@ import json
 import logging
 import threading
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.disk_cache import DiskCache, fetched_data
+from vjepa2_ac.data.disk_cache import fetched_data
 from vjepa2_ac.data.index import kept_or_built, key_of
+from vjepa2_ac.data.sources.episode_files import EpisodeFiles
 from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.data.sources.lerobot.episodes import EpisodeRow, data_file, read_episodes, tables_of_episodes, video_file
 from vjepa2_ac.data.sources.lerobot.files import fingerprint, list_by_template
@@ -29,8 +30,6 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
 
 logger = logging.getLogger(__name__)
-
-_SIZES_KEPT = 1024
 
 
 class LeRobotSource:
@@ -103,16 +102,12 @@ class LeRobotSource:
 
     @cached_property
     def _parquet(self) -> ParquetRows:
-        kept = KeptRows(self._kept, self._data_version)
+        kept = KeptRows(fetched_data(self._config.disk_cache), self._data_version)
         return ParquetRows(self._open, wanted_columns(self._config.lerobot), kept)
 
     @cached_property
-    def _kept(self) -> DiskCache:
-        return fetched_data(self._config.disk_cache)
-
-    @cached_property
-    def _size(self) -> Any:
-        return lru_cache(_SIZES_KEPT)(storage.file_size)
+    def _files(self) -> EpisodeFiles:
+        return EpisodeFiles(self._config)
 
     @property
     def _is_far(self) -> bool:
@@ -128,10 +123,7 @@ class LeRobotSource:
         return self._table.texts["version"] if "_table" in self.__dict__ else self._version
 
     def _open(self, path: str) -> str | KeptFile:
-        """Return what to open for a path: the path itself on this machine, a file of kept blocks far away."""
-        if not storage.is_url(path):
-            return path
-        return KeptFile(path, version=self._data_version, size=self._size(path), kept=self._kept)
+        return self._files.open(path, version=self._data_version)
 
     def _found_out(self, progress: Progress | None) -> EpisodeTable:
         info, config = self._info, self._config
