@@ -16,6 +16,7 @@ from typing import Any, overload
 import numpy as np
 from jaxtyping import Int8, Int32, Int64, UInt8, UInt64
 
+from vjepa2_ac.data.lines import line_of, pack_lines
 from vjepa2_ac.episode import EpisodeInfo
 
 _UNKNOWN = -1
@@ -65,15 +66,14 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         """Make a table; one that is given is returned as it is."""
         if isinstance(infos, EpisodeTable):
             return infos
-        ids = [info.id.encode() for info in infos]
+        ids = [info.id for info in infos]
         rank = np.empty(len(ids), np.int32)
-        rank[sorted(range(len(ids)), key=lambda number: infos[number].id)] = np.arange(len(ids), dtype=np.int32)
+        rank[sorted(range(len(ids)), key=ids.__getitem__)] = np.arange(len(ids), dtype=np.int32)
         return cls(
             num_steps=np.array([info.num_steps for info in infos], np.int32),
             success=np.array([_UNKNOWN if info.success is None else info.success for info in infos], np.int8),
-            id_ends=np.cumsum([len(name) for name in ids], dtype=np.int64),
-            id_bytes=np.frombuffer(b"".join(ids), np.uint8),
-            id_hash=np.array([identity_hash(info.id) for info in infos], np.uint64),
+            **pack_lines("id", ids),
+            id_hash=np.array([identity_hash(name) for name in ids], np.uint64),
             id_rank=rank,
             problems=tuple(problems),
             locators=dict(locators or {}),
@@ -108,8 +108,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
 
     def identity(self, index: int) -> str:
         """Return the identity of one episode."""
-        start = int(self.id_ends[index - 1]) if index else 0
-        return self.id_bytes[start : int(self.id_ends[index])].tobytes().decode()
+        return line_of("id", {"id_ends": self.id_ends, "id_bytes": self.id_bytes}, index)
 
     def find(self, identity: str) -> int | None:
         """Return the place of an episode, or None where no episode is called so."""

@@ -14,6 +14,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import as_error, as_problem
 from vjepa2_ac.data.index import kept_or_built, key_of
+from vjepa2_ac.data.lines import line_of, pack_lines
 from vjepa2_ac.data.sources.droid_raw.folders import (
     TRAJECTORY,
     VIDEOS,
@@ -27,7 +28,6 @@ from vjepa2_ac.data.sources.droid_raw.metadata import DroidMetadata
 from vjepa2_ac.data.sources.droid_raw.trajectory import Trajectory, parse_trajectory
 from vjepa2_ac.data.sources.episode_files import EpisodeFiles
 from vjepa2_ac.data.sources.folders import in_parallel
-from vjepa2_ac.data.sources.lines import line_of, pack_lines
 from vjepa2_ac.data.sources.states import require_plausible
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.data.video import count_frames, read_frames
