@@ -33,10 +33,15 @@ class RunState:
     """Where a run stands. Data order, learning rate and random numbers are functions of the step."""
 
     step: int  # optimizer steps done
+    run_id: str = ""  # a random name that stays with the run for good, wherever it goes on; empty before its first start
+    clips_done: int = 0  # place in the row of clips of the whole run
+    clips_per_step: int | None = None  # of all processes together
+    processes: int = 1
     broken: Mapping[str, str] = field(default_factory=dict)  # episodes that clips could not be read from, and why
     windows: int | None = None  # clips of an epoch: with another number, their order is another
     best_step: int | None = None  # the validation that went best, where checkpoint.keep_best is set
     best_error: float | None = None
+    loss_scale: Mapping[str, float] | None = None  # of fp16: state of the gradient scaler
 
     def measured(self, error: float) -> RunState:
         """Return the state after a validation at its step: another one only where that went better than any before."""
