@@ -1,0 +1,94 @@
+"""One process at a time trains in a folder, and a dead one never stands in the way."""
+
+import errno
+import fcntl
+import logging
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.training.run_lock import LOCK, RunLock
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from vjepa2_ac.training.run_lock import RunLock
+lock = RunLock(Path(sys.argv[1]))
+lock.take()
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def holder(folder: Path) -> subprocess.Popen:
+    """Start a process that holds the lock of a folder."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "held\n"
+    return process
+
+
+def test_a_folder_in_use_is_refused_and_its_process_named_until_it_is_killed(tmp_path: Path) -> None:
+    with holder(tmp_path / "run") as process:
+        with (
+            RunLock(tmp_path / "run") as lock,
+            pytest.raises(InputError, match=rf"being trained right now, by process {process.pid} on .+, since 20"),
+        ):
+            lock.take()
+        process.send_signal(signal.SIGKILL)
+        assert process.wait(timeout=60) == -signal.SIGKILL
+    with RunLock(tmp_path / "run") as lock:
+        lock.take()
+        assert f'"process": {os.getpid()}' in (tmp_path / "run" / LOCK).read_text()
+
+
+def test_within_a_process_too_it_is_held_once_and_given_back(tmp_path: Path) -> None:
+    with RunLock(tmp_path) as lock:
+        lock.take()
+        lock.take()
+        with RunLock(tmp_path) as other, pytest.raises(InputError, match="being trained right now"):
+            other.take()
+        with RunLock(tmp_path) as other, pytest.raises(InputError, match="being trained right now"):
+            other.take()
+    with RunLock(tmp_path) as lock:
+        lock.take()
+
+
+def test_a_lock_that_nobody_took_leaves_no_trace(tmp_path: Path) -> None:
+    with RunLock(tmp_path / "run"):
+        pass
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_unreadable_signature_is_another_process(tmp_path: Path) -> None:
+    with RunLock(tmp_path) as lock:
+        lock.take()
+        (tmp_path / LOCK).write_text("")
+        with RunLock(tmp_path) as other, pytest.raises(InputError, match="by another process"):
+            other.take()
+
+
+@pytest.mark.parametrize("number", [errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS])
+def test_a_file_system_without_locks_costs_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, number: int
+) -> None:
+    def refuse(file: object, operation: int) -> None:
+        del file, operation
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with caplog.at_level(logging.WARNING), RunLock(tmp_path) as lock:
+        lock.take()
+    assert "has no locks" in caplog.text
+
+
+def test_a_folder_that_cannot_be_made_is_the_users_to_mend(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder")
+    with RunLock(tmp_path / "file" / "run") as lock, pytest.raises(InputError, match="cannot be written"):
+        lock.take()
