@@ -130,12 +130,12 @@ def _with_own_tables(attn: Any) -> Callable[..., Tensor]:
     forward = attn.forward
     uncached = positions.rotary_tables.__wrapped__
 
-    def again(tokens: Tensor, tables: positions.RotaryTables, tokens_per_step: int, kind: str) -> Tensor:
+    def again(tokens: Tensor, tables: positions.RotaryTables, tokens_per_step: int, *how: Any) -> Any:
         conditioning = 2
         grid = round((tokens_per_step - conditioning) ** 0.5)
         layout = positions.TokenLayout(tokens.shape[1] // tokens_per_step, grid, conditioning)
         head_dim = tables.cosine.shape[-1]
-        return forward(tokens, uncached(layout, head_dim, tokens.device), tokens_per_step, kind)
+        return forward(tokens, uncached(layout, head_dim, tokens.device), tokens_per_step, *how)
 
     return again
 

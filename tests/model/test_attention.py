@@ -37,11 +37,23 @@ def test_ways_agree_in_bfloat16_to_its_rounding() -> None:
         torch.testing.assert_close(found, expected, rtol=2e-2, atol=4e-2)
 
 
+@pytest.mark.parametrize("kind", ["per_step", "dense"])
+def test_the_last_steps_alone_see_what_they_see_among_all(kind: AttentionKind) -> None:
+    query, key, value = (x.detach() for x in drawn())
+    whole = block_causal_attention(query, key, value, PER_STEP, "dense")
+    last = block_causal_attention(query[:, :, 2 * PER_STEP :], key, value, PER_STEP, kind)
+    torch.testing.assert_close(last, whole[:, :, 2 * PER_STEP :], rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.filterwarnings("ignore:flex_attention called without torch.compile")  # eager on purpose: no compiler here
 def test_flex_gives_the_output_of_the_dense_mask() -> None:
     inputs = [value.detach() for value in drawn()]
     found = block_causal_attention(*inputs, PER_STEP, "flex")
-    torch.testing.assert_close(found, block_causal_attention(*inputs, PER_STEP, "dense"), rtol=1e-5, atol=1e-6)
+    whole = block_causal_attention(*inputs, PER_STEP, "dense")
+    torch.testing.assert_close(found, whole, rtol=1e-5, atol=1e-6)
+    query, key, value = inputs
+    last = block_causal_attention(query[:, :, 2 * PER_STEP :], key, value, PER_STEP, "flex")
+    torch.testing.assert_close(last, whole[:, :, 2 * PER_STEP :], rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="FlexAttention has gradients on CUDA only")
@@ -94,3 +106,9 @@ def test_a_sequence_of_broken_steps_is_refused() -> None:
     query = torch.zeros(1, 1, 11, 16)
     with pytest.raises(ValueError, match="not a whole number of steps"):
         block_causal_attention(query, query, query, PER_STEP)
+
+
+def test_queries_without_a_key_of_their_own_are_refused() -> None:
+    query, key = torch.zeros(1, 1, 10, 16), torch.zeros(1, 1, 5, 16)
+    with pytest.raises(ValueError, match="10 queries would look at 5 keys"):
+        block_causal_attention(query, key, key, PER_STEP)

@@ -40,6 +40,12 @@ def test_tables_are_computed_once_per_shape() -> None:
     assert rotary_tables(TokenLayout(2, 3, 2), 12, CPU) is rotary_tables(TokenLayout(2, 3, 2), 12, CPU)
 
 
+def test_a_later_start_is_the_rest_of_a_longer_sequence() -> None:
+    whole, rest = rotary_tables(TokenLayout(4, 3, 2), 12, CPU), rotary_tables(TokenLayout(3, 3, 2, start=1), 12, CPU)
+    for longer, later in zip(whole, rest, strict=True):
+        torch.testing.assert_close(later, longer[11:])
+
+
 def test_tables_made_in_inference_mode_can_be_trained_with() -> None:
     with torch.inference_mode():
         tables = rotary_tables(TokenLayout(2, 5, 1), 12, CPU)

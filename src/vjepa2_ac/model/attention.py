@@ -1,5 +1,7 @@
 """Who may look at whom? Block-causal attention: a token of step t sees every token of steps up to t.
 
+There may be more keys than queries: the queries are then those of the last steps.
+
 Three exact ways to compute it:
     dense     one attention with a mask: the plain reference
     per_step  one attention per step, on the keys up to it, without a mask: computes about half as much
@@ -27,8 +29,8 @@ _FLEX_STEPS = 4  # at least: what is worth a compilation
 
 def block_causal_attention(
     query: Float[Tensor, "batch heads sequence head_dim"],
-    key: Float[Tensor, "batch heads sequence head_dim"],
-    value: Float[Tensor, "batch heads sequence head_dim"],
+    key: Float[Tensor, "batch heads keys head_dim"],
+    value: Float[Tensor, "batch heads keys head_dim"],
     tokens_per_step: int,
     kind: AttentionKind = "auto",
 ) -> Float[Tensor, "batch heads sequence head_dim"]:
@@ -39,10 +41,13 @@ def block_causal_attention(
     planning, and the short ones at the start of a rollout are not worth it.
 
     Raises:
-        ValueError: The sequence is not a whole number of steps, or the kind is unknown.
+        ValueError: A sequence is not a whole number of steps, fewer keys than queries are given, or an unknown kind.
     """
-    if query.shape[2] % tokens_per_step:
-        raise ValueError(f"a sequence of {query.shape[2]} tokens is not a whole number of steps of {tokens_per_step}")
+    for length in (query.shape[2], key.shape[2]):
+        if length % tokens_per_step:
+            raise ValueError(f"a sequence of {length} tokens is not a whole number of steps of {tokens_per_step}")
+    if key.shape[2] < query.shape[2]:
+        raise ValueError(f"{query.shape[2]} queries would look at {key.shape[2]} keys: each token has a key of its own")
     if kind == "auto":
         steps = query.shape[2] // tokens_per_step
         kind = best_kind(query.device, query.shape[-1], steps, gradients=torch.is_grad_enabled())
@@ -58,7 +63,7 @@ def best_kind(device: torch.device, head_dim: int, steps: int, *, gradients: boo
 
 
 def _dense(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
-    mask = _dense_mask(query.shape[2] // tokens_per_step, tokens_per_step, query.device)
+    mask = _dense_mask(key.shape[2] // tokens_per_step, tokens_per_step, query.device)[-query.shape[2] :]
     return scaled_dot_product_attention(query, key, value, attn_mask=mask)
 
 
@@ -66,13 +71,13 @@ def _per_step(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -
     # Slices of keys are views: nothing is copied, and nothing more is kept for the backward pass than key and value.
     seen = [
         scaled_dot_product_attention(part, key[:, :, :part_end], value[:, :, :part_end])
-        for part_end, part in _steps_with_end(query, tokens_per_step)
+        for part_end, part in _steps_with_end(query, key.shape[2] - query.shape[2], tokens_per_step)
     ]
     return seen[0] if len(seen) == 1 else torch.cat(seen, dim=2)
 
 
 def _flex(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
-    mask = _flex_mask(query.shape[2], tokens_per_step, query.device)
+    mask = _flex_mask(query.shape[2], key.shape[2], tokens_per_step, query.device)
     attend = _flex_attention(query.device.type == "cuda")
     return attend(query, key, value, block_mask=mask)  # type: ignore[no-any-return]  # torch.compile has no types
 
@@ -84,9 +89,9 @@ _IMPLEMENTATIONS: dict[str, Callable[[Tensor, Tensor, Tensor, int], Tensor]] = {
 }
 
 
-def _steps_with_end(query: Tensor, tokens_per_step: int) -> list[tuple[int, Tensor]]:
+def _steps_with_end(query: Tensor, before: int, tokens_per_step: int) -> list[tuple[int, Tensor]]:
     parts = torch.split(query, tokens_per_step, dim=2)
-    return [((step + 1) * tokens_per_step, part) for step, part in enumerate(parts)]
+    return [(before + (step + 1) * tokens_per_step, part) for step, part in enumerate(parts)]
 
 
 @lru_cache(maxsize=8)
@@ -97,16 +102,17 @@ def _dense_mask(steps: int, tokens_per_step: int, device: torch.device) -> Bool[
 
 
 @lru_cache(maxsize=16)
-def _flex_mask(length: int, tokens_per_step: int, device: torch.device) -> Any:
+def _flex_mask(queries: int, keys: int, tokens_per_step: int, device: torch.device) -> Any:
     from torch.nn.attention.flex_attention import create_block_mask
 
+    before = keys - queries
     with torch.inference_mode(False):
         return create_block_mask(
-            lambda _batch, _head, query, key: query // tokens_per_step >= key // tokens_per_step,
+            lambda _batch, _head, query, key: (before + query) // tokens_per_step >= key // tokens_per_step,
             None,
             None,
-            length,
-            length,
+            queries,
+            keys,
             device=device,
         )
 

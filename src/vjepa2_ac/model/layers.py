@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
@@ -39,14 +40,18 @@ class Attention(nn.Module):
         tables: RotaryTables,
         tokens_per_step: int,
         kind: AttentionKind = "auto",
-    ) -> Float[Tensor, "batch sequence width"]:
-        """Return what each token gathers from the tokens of its own and earlier steps."""
+        keep: int = 0,
+        *past: Float[Tensor, "2 batch heads _ head_dim"],
+    ) -> tuple[Float[Tensor, "batch sequence width"], Float[Tensor, "2 batch heads keep head_dim"] | None]:
+        """Return what each token gathers from the tokens of its own and earlier steps, and what `Block` says."""
         query, key, value = (project(tokens).unflatten(-1, (self.heads, -1)) for project in (self.q, self.k, self.v))
         query, key = rotate(query, tables), rotate(key, tables)
-        gathered = block_causal_attention(
-            query.transpose(1, 2), key.transpose(1, 2), value.transpose(1, 2), tokens_per_step, kind
-        )
-        return self.o(gathered.transpose(1, 2).flatten(2))  # type: ignore[no-any-return]  # nn.Module is untyped
+        query, key, value = (part.transpose(1, 2) for part in (query, key, value))
+        kept = torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None  # a copy: the rest can be freed
+        if past:
+            key, value = torch.cat((*past, torch.stack((key, value))), dim=3)
+        gathered = block_causal_attention(query, key, value, tokens_per_step, kind)
+        return self.o(gathered.transpose(1, 2).flatten(2)), kept
 
 
 class Mlp(nn.Module):
@@ -66,6 +71,9 @@ class Mlp(nn.Module):
 class Block(nn.Module):
     """Attention and MLP, each on normalised tokens, each added to what came in.
 
+    A block keeps nothing itself, for gradient checkpointing computes it twice: what it knows of earlier steps is given
+    to it, and what later steps shall know is returned.
+
     Args:
         layer: Which block this is, from 1.
     """
@@ -83,10 +91,23 @@ class Block(nn.Module):
         tables: RotaryTables,
         tokens_per_step: int,
         kind: AttentionKind = "auto",
-    ) -> Float[Tensor, "batch sequence width"]:
-        """Return the tokens after this block."""
-        tokens = tokens + self.attn(self.norm1(tokens), tables, tokens_per_step, kind)
-        return tokens + self.mlp(self.norm2(tokens))  # type: ignore[no-any-return]  # nn.Module is untyped
+        keep: int = 0,
+        *past: Float[Tensor, "2 batch heads _ head_dim"],
+    ) -> tuple[Float[Tensor, "batch sequence width"], Float[Tensor, "2 batch heads keep head_dim"] | None]:
+        """Return the tokens after this block, and a copy of the keys and values of the first `keep` tokens, if any.
+
+        Args:
+            tokens: Tokens of whole steps.
+            tables: Their positions.
+            tokens_per_step: How many make a step.
+            kind: How to compute attention.
+            keep: How many tokens' keys and values to return; keys are rotated already.
+            past: What earlier calls returned, in their order: the tokens come after these, and see them. One argument
+                each, for checkpointing knows of tensors among its arguments only.
+        """
+        gathered, kept = self.attn(self.norm1(tokens), tables, tokens_per_step, kind, keep, *past)
+        tokens = tokens + gathered
+        return tokens + self.mlp(self.norm2(tokens)), kept
 
 
 def initialise(module: nn.Module, generator: Generator | None = None) -> None:

@@ -20,6 +20,7 @@ class TokenLayout:
     steps: int
     grid: int
     conditioning: int = 0
+    start: int = 0  # the first step's place in time
 
     @property
     def tokens_per_step(self) -> int:
@@ -80,5 +81,6 @@ def _places(layout: TokenLayout, device: torch.device) -> Float32[Tensor, "seque
     grid = torch.arange(layout.grid, dtype=torch.float32, device=device)
     patches = torch.cartesian_prod(grid, grid)
     space = torch.cat([torch.zeros(layout.conditioning, 2, device=device), patches]).repeat(layout.steps, 1)
-    time = torch.arange(layout.steps, dtype=torch.float32, device=device).repeat_interleave(layout.tokens_per_step)
+    steps = torch.arange(layout.start, layout.start + layout.steps, dtype=torch.float32, device=device)
+    time = steps.repeat_interleave(layout.tokens_per_step)
     return torch.cat([time[:, None], space], dim=-1)

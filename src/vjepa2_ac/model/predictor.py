@@ -14,6 +14,7 @@ from transformers import PreTrainedConfig, PreTrainedModel
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.episode import ACTION_DIM, EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.model.attention import AttentionKind
+from vjepa2_ac.model.key_value_cache import KeyValueCache
 from vjepa2_ac.model.layers import NORM_EPSILON, Block, hidden_width, initialise
 from vjepa2_ac.model.positions import TokenLayout, rotary_tables
 
@@ -104,21 +105,39 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         actions: Float[Tensor, "batch time 7"],
         states: Float[Tensor, "batch time 7"],
         extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
+        keep: int | None = None,
     ) -> Float[Tensor, "batch time tokens dim"]:
         """Return, at each step, the prediction of the next step's latents, not yet normalised.
 
         Inputs of any float type are cast to the weights' type.
 
+        Args:
+            latents: Latents of consecutive steps.
+            actions: The action of each.
+            states: The state of each.
+            extrinsics: The camera of each, where the model uses it.
+            cache: The given steps come after those in the cache, and see them; then they are added to it.
+            keep: How many of the given steps are added, from the first; None: all of them.
+
         Raises:
             ValueError: The tokens do not belong to the image size, or extrinsics are missing or unasked for.
         """
-        tokens, layout = self._assemble(latents, actions, states, extrinsics)
+        tokens, layout = self._assemble(latents, actions, states, extrinsics, cache)
         tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
-        for block in self.blocks:
+        how = (tables, layout.tokens_per_step, self.attention)
+        kept_tokens = 0 if cache is None else layout.tokens_per_step * _kept_steps(layout.steps, keep)
+        added: list[Tensor] = []
+        for index, block in enumerate(self.blocks):
+            past = () if cache is None else cache.layer(index)
             if self.gradient_checkpointing and torch.is_grad_enabled():
-                tokens = checkpoint(block, tokens, tables, layout.tokens_per_step, self.attention, use_reentrant=False)
+                tokens, kept = checkpoint(block, tokens, *how, kept_tokens, *past, use_reentrant=False)
             else:
-                tokens = block(tokens, tables, layout.tokens_per_step, self.attention)
+                tokens, kept = block(tokens, *how, kept_tokens, *past)
+            if kept is not None:
+                added.append(kept)
+        if cache is not None and added:
+            cache.append(added)
         patches = rearrange(tokens, "batch (time token) width -> batch time token width", time=layout.steps)[
             :, :, layout.conditioning :
         ]
@@ -144,7 +163,12 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             self.predictor_proj.weight.copy_(self.predictor_embed.weight.T)
 
     def _assemble(
-        self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None
+        self,
+        latents: Tensor,
+        actions: Tensor,
+        states: Tensor,
+        extrinsics: Tensor | None,
+        cache: KeyValueCache | None = None,
     ) -> tuple[Tensor, TokenLayout]:
         """Return the sequence of tokens, step by step, and how it is laid out."""
         if latents.shape[2] != self.grid**2:
@@ -162,7 +186,8 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             conditions.append(self.extrinsics_encoder(extrinsics.to(dtype)))
         patches = self.predictor_embed(latents.to(dtype))
         tokens = torch.cat([torch.stack(conditions, dim=2).to(patches.dtype), patches], dim=2)
-        return tokens.flatten(1, 2), TokenLayout(latents.shape[1], self.grid, conditioning=len(conditions))
+        start = 0 if cache is None else cache.tokens // tokens.shape[2]
+        return tokens.flatten(1, 2), TokenLayout(latents.shape[1], self.grid, len(conditions), start)
 
     def _init_weights(self, module: nn.Module) -> None:
         """Initialise one module: what transformers calls for weights that a checkpoint lacks."""
@@ -172,6 +197,10 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
     def is_gradient_checkpointing(self) -> bool:
         """Whether blocks are computed again in the backward pass; PEFT asks, and transformers' own answer warns."""
         return self.gradient_checkpointing
+
+
+def _kept_steps(steps: int, keep: int | None) -> int:
+    return steps if keep is None else min(keep, steps)
 
 
 def _in_own_type(layer: Any, values: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.model.attention import AttentionKind
 from vjepa2_ac.model.encoder import Encoder
 from vjepa2_ac.model.folder import ENCODER, PREDICTOR, load_safetensors, read_sizes, write_folder
+from vjepa2_ac.model.key_value_cache import KeyValueCache
 from vjepa2_ac.model.predictor import ActionConditionedPredictor, PredictorConfig
 
 
@@ -143,9 +144,16 @@ class WorldModel(nn.Module):
         actions: Float[Tensor, "batch time 7"],
         states: Float[Tensor, "batch time 7"],
         extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
+        keep: int | None = None,
     ) -> Float[Tensor, "batch time tokens dim"]:
-        """Return, at each step, the prediction of the next step's latents from the given ones (teacher forcing)."""
-        return _normalise(self.predictor(latents, actions, states, extrinsics))
+        """Return, at each step, the prediction of the next step's latents from the given ones (teacher forcing).
+
+        With a cache the given steps come after those in it; the first `keep` of them are added to it (None: all).
+        """
+        if cache is None:
+            return _normalise(self.predictor(latents, actions, states, extrinsics))
+        return _normalise(self.predictor(latents, actions, states, extrinsics, cache=cache, keep=keep))
 
     def rollout(
         self,
@@ -153,6 +161,7 @@ class WorldModel(nn.Module):
         actions: Float[Tensor, "batch time 7"],
         states: Float[Tensor, "batch time 7"],
         extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
     ) -> Float[Tensor, "batch steps tokens dim"]:
         """Return predictions of the steps after the context, each fed back to make the next.
 
@@ -161,18 +170,25 @@ class WorldModel(nn.Module):
         them. Actions and states are the true ones throughout. A context need not be true: to go on from a
         prediction that is already known, append it to the context.
 
+        The context is computed at once, then one step at a time: keys and values are kept. With a cache, context,
+        actions and states come after the steps in it; it is left as it is, so that many rollouts can start from it.
+
         Raises:
             ValueError: There are fewer actions than context latents.
         """
         first, last = context.shape[1], actions.shape[1]
         if last < first:
             raise ValueError(f"{last} actions do not reach the end of a context of {first} latents")
-        latents = context
-        for time in range(first, last + 1):
-            camera = None if extrinsics is None else extrinsics[:, :time]
-            following = self.predict(latents, actions[:, :time], states[:, :time], camera)[:, -1:]
-            latents = torch.cat([latents.to(following.dtype), following], dim=1)
-        return latents[:, first:]
+        cache = KeyValueCache() if cache is None else cache.copy()
+        latents, start = context, 0
+        predicted = []
+        for end in range(first, last + 1):
+            camera = None if extrinsics is None else extrinsics[:, start:end]
+            keep = None if end < last else 0  # nothing comes after the last
+            following = self.predict(latents, actions[:, start:end], states[:, start:end], camera, cache, keep)
+            latents, start = following[:, -1:], end
+            predicted.append(latents)
+        return torch.cat(predicted, dim=1)
 
     def set_gradient_checkpointing(self, enabled: bool) -> None:
         """Choose whether predictor blocks are computed again in the backward pass instead of being kept."""

@@ -13,6 +13,7 @@ from torch.nn.functional import mse_loss, smooth_l1_loss
 
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.model.key_value_cache import KeyValueCache
 from vjepa2_ac.model.world_model import WorldModel
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, a mean over all elements
@@ -72,6 +73,10 @@ def prediction_losses(
 ) -> Losses:
     """Return both parts of the loss of one batch, without weights; the distance is L1 unless given.
 
+    Both parts begin with the first step: the rollout reuses the keys and values that teacher forcing computed of it,
+    and computes one new step for each further prediction. Loss and gradients are those of computing all of it again.
+    With dropout both parts share the masks of the first step, which changes the expectation of neither.
+
     Raises:
         ValueError: A rollout longer than the clip.
     """
@@ -81,12 +86,13 @@ def prediction_losses(
         raise ValueError(f"a rollout of {rollout_steps} steps needs {rollout_steps + 1} frames, got {latents.shape[1]}")
     states = states[:, :-1]
     extrinsics = None if extrinsics is None else extrinsics[:, :-1]
-    forced = world_model.predict(latents[:, :-1], actions, states, extrinsics)
+    cache = KeyValueCache() if rollout_steps > 1 else None
+    forced = world_model.predict(latents[:, :-1], actions, states, extrinsics, cache, keep=1)
     rolled = forced[:, :1]
     if rollout_steps > 1:
-        context = torch.cat([latents[:, :1], rolled], dim=1)
-        camera = None if extrinsics is None else extrinsics[:, :rollout_steps]
-        further = world_model.rollout(context, actions[:, :rollout_steps], states[:, :rollout_steps], camera)
+        rest = slice(1, rollout_steps)
+        camera = None if extrinsics is None else extrinsics[:, rest]
+        further = world_model.rollout(rolled, actions[:, rest], states[:, rest], camera, cache)
         rolled = torch.cat([rolled, further], dim=1)
     return Losses(
         teacher_forcing=distance(forced, latents[:, 1:]),

@@ -1,0 +1,51 @@
+"""What do later steps need to know of earlier ones? Keys and values of every layer, computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+class KeyValueCache:
+    """The keys (rotated) and values of steps that a predictor has seen, in every layer; empty at first.
+
+    Gradients flow through it into the passes that filled it. It stays in the pieces that it was filled in: a block puts
+    them together while it computes, so that with gradient checkpointing no step is kept twice.
+    """
+
+    def __init__(self) -> None:
+        self._pieces: tuple[tuple[Tensor, ...], ...] = ()  # of each layer
+
+    @property
+    def tokens(self) -> int:
+        """How many tokens have gone by."""
+        return sum(piece.shape[3] for piece in self._pieces[0]) if self._pieces else 0
+
+    def layer(self, index: int) -> tuple[Float[Tensor, "2 batch heads _ head_dim"], ...]:
+        """Return the keys and values of a layer, piece by piece."""
+        return self._pieces[index] if self._pieces else ()
+
+    def append(self, added: Sequence[Float[Tensor, "2 batch heads tokens head_dim"]]) -> None:
+        """Add keys and values of further tokens, one piece for every layer."""
+        before = self._pieces or ((),) * len(added)
+        self._pieces = tuple((*pieces, piece) for pieces, piece in zip(before, added, strict=True))
+
+    def copy(self) -> KeyValueCache:
+        """Return a cache that grows by itself; no tensor is copied."""
+        other = KeyValueCache()
+        other._pieces = self._pieces
+        return other
+
+    def expanded(self, samples: int) -> KeyValueCache:
+        """Return a cache of one start for many samples that go on from it; no tensor is copied.
+
+        Raises:
+            RuntimeError: It holds more than one start.
+        """
+        other = KeyValueCache()
+        other._pieces = tuple(
+            tuple(piece.expand(-1, samples, -1, -1, -1) for piece in pieces) for pieces in self._pieces
+        )
+        return other
