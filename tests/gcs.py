@@ -7,7 +7,7 @@ import http.client
 import json
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +34,7 @@ class Request:
     start: int  # of the bytes that were asked for
     status: int  # 0: the connection was cut before
     sent: int  # bytes of the body
+    received: int = 0  # bytes of the request's body
 
 
 @dataclass
@@ -104,6 +105,20 @@ class Gcs:
     def reads(self, end: str = "") -> list[Request]:
         """Return the requests for bytes of objects whose "bucket/name" ends so."""
         return [request for request in self.requests if request.object.endswith(end) and request.object]
+
+    def uploads(self) -> list[Request]:
+        """Return the requests that brought bytes of objects."""
+        return [request for request in self.requests if request.target.startswith("POST /upload/")]
+
+    def bytes_received(self) -> int:
+        """Return how many bytes of objects came in, with what is around them."""
+        return sum(request.received for request in self.uploads())
+
+    def names(self, bucket: str) -> list[str]:
+        """Return the names of all objects, asked past the proxy."""
+        with closing(http.client.HTTPConnection(LOOPBACK, self._port, timeout=10)) as connection:
+            connection.request("GET", f"/storage/v1/b/{bucket}/o?maxResults=1000")
+            return sorted(item["name"] for item in json.loads(connection.getresponse().read()).get("items", []))
 
     def bytes_read(self, end: str = "") -> int:
         """Return how many bytes of such objects were sent."""
@@ -197,10 +212,12 @@ class _Proxy:
             if gcs.latency_s:
                 await asyncio.sleep(gcs.latency_s)
             failure = gcs._failure_of(target)
+            if failure is None and target.startswith("DELETE /upload/"):
+                failure = 499  # as Google answers to whoever gives an upload up; the emulator does not know it
             if failure == "hang":
                 await reader.read()
             status, answer, sent = await self._result(failure, head, body)
-            gcs.requests.append(Request(target, _object_of(address), _start_of(head), status, sent))
+            gcs.requests.append(Request(target, _object_of(address), _start_of(head), status, sent, len(body)))
         finally:
             gcs._count(-1)
         writer.write(answer)
@@ -215,25 +232,30 @@ class _Proxy:
             return 0, b"", 0
         if isinstance(failure, int):
             message = json.dumps({"error": {"code": failure, "message": "made to fail by a test"}}).encode()
-            return failure, _message(f"HTTP/1.1 {failure} Failed", "application/json", message), len(message)
+            return (
+                failure,
+                _message(f"HTTP/1.1 {failure} Failed", {"Content-Type": "application/json"}, message),
+                len(message),
+            )
         async with self._one_at_a_time:
-            status_line, kind, data = await self._ask_emulator(head, body)
+            status_line, headers, data = await self._ask_emulator(head, body)
         status, half = int(status_line.split()[1]), data[: len(data) // 2]
         if failure == "short":
-            return status, _message(status_line, kind, half), len(half)
-        answer = _message(status_line, kind, data)
+            return status, _message(status_line, headers, half), len(half)
+        answer = _message(status_line, headers, data)
         if failure == "cut":
             return status, answer[: len(answer) - len(data) + len(half)], len(half)
         return status, answer, len(data)
 
-    async def _ask_emulator(self, head: bytes, body: bytes) -> tuple[str, str, bytes]:
+    async def _ask_emulator(self, head: bytes, body: bytes) -> tuple[str, dict[str, str], bytes]:
         reader, writer = await asyncio.open_connection(LOOPBACK, self._gcs._port, limit=1 << 20)
         try:
             writer.write(head + body)
             head, data = await _read_message(reader)
         finally:
             writer.close()
-        return head.split(b"\r\n", 1)[0].decode().replace("HTTP/1.0", "HTTP/1.1"), _header(head, "Content-Type"), data
+        headers = {name: _header(head, name) for name in ("Content-Type", "Location", "Range")}
+        return head.split(b"\r\n", 1)[0].decode().replace("HTTP/1.0", "HTTP/1.1"), headers, data
 
 
 async def _read_message(reader: asyncio.StreamReader) -> tuple[bytes, bytes]:
@@ -242,8 +264,9 @@ async def _read_message(reader: asyncio.StreamReader) -> tuple[bytes, bytes]:
     return head, await reader.readexactly(int(_header(head, "Content-Length") or 0))
 
 
-def _message(status_line: str, kind: str, data: bytes) -> bytes:
-    return f"{status_line}\r\nContent-Type: {kind}\r\nContent-Length: {len(data)}\r\n\r\n".encode() + data
+def _message(status_line: str, headers: Mapping[str, str], data: bytes) -> bytes:
+    lines = [status_line, *(f"{name}: {value}" for name, value in headers.items() if value)]
+    return "\r\n".join([*lines, f"Content-Length: {len(data)}", "", ""]).encode() + data
 
 
 def _header(head: bytes, name: str) -> str:

@@ -1,4 +1,4 @@
-"""How is data read that lies elsewhere, when networks fail now and then? `files` reads, `retries` does not give up."""
+"""How is data read and written elsewhere, when networks fail? `files`, `uploads`; `retries` does not give up."""
 
 from vjepa2_ac.remote.files import (
     Entry,
@@ -11,18 +11,24 @@ from vjepa2_ac.remote.files import (
     read_range,
     read_ranges,
 )
-from vjepa2_ac.remote.retries import RetryPolicy, UnreachableError
+from vjepa2_ac.remote.retries import RefusedError, RetryPolicy, UnreachableError, quietly
+from vjepa2_ac.remote.uploads import file_sizes, remove_file, upload_file
 
 __all__ = [
     "Entry",
+    "RefusedError",
     "RetryPolicy",
     "UnreachableError",
     "bytes_fetched",
     "exists",
     "file_size",
+    "file_sizes",
     "file_version",
     "list_folder",
     "open_to_read",
+    "quietly",
     "read_range",
     "read_ranges",
+    "remove_file",
+    "upload_file",
 ]

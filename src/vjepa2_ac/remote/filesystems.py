@@ -14,6 +14,7 @@ GOOGLE = frozenset({"gs", "gcs"})
 _LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
 _EMULATOR = "STORAGE_EMULATOR_HOST"
 _MACHINE = Path("/sys/class/dmi/id/product_name")
+_PIECE_BYTES = 16 << 20  # of an upload; it is read while reads of others wait
 
 
 def ask(url: str, method: str, timeout_s: float, **arguments: Any) -> Any:
@@ -24,12 +25,52 @@ def ask(url: str, method: str, timeout_s: float, **arguments: Any) -> Any:
         InputError: The library is not installed, or there is none.
     """
     filesystem = _filesystem(url)
-    path = filesystem._strip_protocol(url)
+    return _once(filesystem, method, timeout_s, filesystem._strip_protocol(url), **arguments)
+
+
+def send(source: Path, url: str, timeout_s: float) -> None:
+    """Write a file of this machine to a URL, once; folders are made where the place has such things.
+
+    Raises:
+        Exception: Whatever the library raises.
+        InputError: As `ask`.
+    """
+    filesystem = _filesystem(url, writing=True)
+    pieces = {"chunksize": _PIECE_BYTES} if _protocol(url) == "gs" else {}
+    _once(filesystem, "put_file", timeout_s, str(source), filesystem._strip_protocol(url), **pieces)
+
+
+def discard(url: str, timeout_s: float) -> None:
+    """Remove the file of a URL, once.
+
+    Raises:
+        Exception: Whatever the library raises.
+        InputError: As `ask`.
+    """
+    filesystem = _filesystem(url, writing=True)
+    _once(filesystem, "rm_file", timeout_s, filesystem._strip_protocol(url))
+
+
+def sizes_below(url: str, timeout_s: float) -> dict[str, int]:
+    """Return the sizes of all files below a folder by their paths from there, asked once and not remembered.
+
+    Raises:
+        Exception: Whatever the library raises.
+        InputError: As `ask`.
+    """
+    filesystem = _filesystem(url)
+    filesystem.invalidate_cache()
+    root = filesystem._strip_protocol(url).rstrip("/") + "/"
+    found = _once(filesystem, "find", timeout_s, root, detail=True)
+    return {name.removeprefix(root): int(about.get("size") or 0) for name, about in found.items() if name != root}
+
+
+def _once(filesystem: Any, method: str, timeout_s: float, *arguments: Any, **options: Any) -> Any:
     if not filesystem.async_impl:
-        return getattr(filesystem, method)(path, **arguments)
+        return getattr(filesystem, method)(*arguments, **options)
     from fsspec.asyn import sync
 
-    return sync(filesystem.loop, getattr(filesystem, f"_{method}"), path, timeout=timeout_s, **arguments)
+    return sync(filesystem.loop, getattr(filesystem, f"_{method}"), *arguments, timeout=timeout_s, **options)
 
 
 def size_of(url: str, timeout_s: float) -> int:
@@ -81,8 +122,10 @@ _filesystems: dict[tuple[object, ...], Any] = {}
 _opening = threading.Lock()
 
 
-def _filesystem(url: str) -> Any:
+def _filesystem(url: str, *, writing: bool = False) -> Any:
     """Return the file system of a URL: one for all threads of a process, where fsspec would give one to each.
+
+    Who only reads asks for no more than that: there are logins that may not write.
 
     Raises:
         InputError: The library for it is not installed, or there is none.
@@ -91,6 +134,8 @@ def _filesystem(url: str) -> Any:
     with _opening:
         kind = _kind(url, protocol)
         options: dict[str, Any] = kind._get_kwargs_from_urls(url)
+        if protocol == "gs":
+            options["access"] = "read_write" if writing else "read_only"
         key = (os.getpid(), protocol, repr(sorted(options.items())), os.environ.get(_EMULATOR))
         if key not in _filesystems:
             _filesystems[key] = (
@@ -114,7 +159,7 @@ def _kind(url: str, protocol: str) -> Any:
         return fsspec.get_filesystem_class(protocol)
     except ImportError as error:
         fix = 'Install it: pip install -c constraints.txt -e ".[gcs]"' if protocol == "gs" else str(error)
-        raise InputError(where=url, found=f"the library that reads {protocol}:// is not installed", fix=fix) from None
+        raise InputError(where=url, found=f"the library for {protocol}:// is not installed", fix=fix) from None
     except ValueError:
         known = "a folder of this machine, or gs://, hf://, s3://"
         raise InputError(where=url, found=f"nothing reads {protocol}://", needed=known) from None
@@ -124,7 +169,7 @@ def _google(kind: Any, options: dict[str, Any]) -> Any:
     """Open Google's without its own retries: six for each of ours, of up to half a minute together."""
     once = getattr(kind._request, "__wrapped__", kind._request)
     kind = type(kind.__name__, (kind,), {"_request": once})
-    options = {"access": "read_only", "use_listings_cache": False, **options}
+    options = {"use_listings_cache": False, **options}
     who = google_token()
     if who == "cloud":  # a machine may have no account of its own
         try:

@@ -8,7 +8,9 @@ import re
 import secrets
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -19,7 +21,8 @@ logger = logging.getLogger(__name__)
 _T = TypeVar("_T")
 
 _NETWORK_LIBRARIES = frozenset({"aiohttp", "requests", "httpx", "httpx2", "httpcore", "httpcore2", "urllib3"})
-_PASSING_STATUS = frozenset({408, 425, 429, *range(500, 600)})
+# 499 is Google's answer to giving up an upload of which a piece failed; gcsfs shows it in place of that failure.
+_PASSING_STATUS = frozenset({408, 425, 429, 499, *range(500, 600)})
 _NO_ACCESS = frozenset({401, 403, 407})
 _ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
 _LONGEST_WORDS = 300
@@ -59,18 +62,24 @@ class UnreachableError(InputError):
     """Data cannot be had now. Nothing is known of the data itself: never call it broken."""
 
 
-def persist(where: str, action: Callable[[float], _T], *, policy: RetryPolicy, access: str) -> _T:
+class RefusedError(UnreachableError):
+    """A server, or a disk, says no, and will say no again: no permission, no such bucket."""
+
+
+def persist(where: str, action: Callable[[float], _T], *, policy: RetryPolicy, access: str, doing: str = "read") -> _T:
     """Return what an action returns, trying again while its failures are of a kind that passes.
 
     Args:
-        where: What is read, for messages.
+        where: What is read or written, for messages.
         action: Called with the seconds that it may take.
         policy: How often to try, and how long.
         access: The way out where permission is missing, as a sentence.
+        doing: "read" or "written", for messages.
 
     Raises:
         OSError: There is no such file, or it is a folder, or the other way round.
-        UnreachableError: Permission is missing, what failed does not pass, or it did not pass in time.
+        UnreachableError: What failed did not pass in time; a RefusedError where permission is missing, or it does not
+            pass.
     """
     begin = time.monotonic()
     for failures in range(1, policy.attempts + 1):
@@ -82,7 +91,7 @@ def persist(where: str, action: Callable[[float], _T], *, policy: RetryPolicy, a
             if not _comes_from_outside(error):
                 raise
             if not _passes(error):
-                raise _refused(where, error, access) from error
+                raise _refused(where, error, access, doing) from error
             wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
             if failures == policy.attempts or seconds + wait_s > policy.total_s:
                 raise _given_up(where, error, failures, seconds) from error
@@ -91,10 +100,23 @@ def persist(where: str, action: Callable[[float], _T], *, policy: RetryPolicy, a
     raise AssertionError("the last attempt returns or raises")
 
 
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Log failures that are tried again below warnings, in this thread: for whoever can do without what he asks for."""
+    token = _quiet.set(True)
+    try:
+        yield
+    finally:
+        _quiet.reset(token)
+
+
+_quiet = ContextVar("_quiet", default=False)
+
+
 def _say(failures: int, text: str, *arguments: object) -> None:
     """Log a failure; aloud when it is the third of a call, and no more than once in half a minute."""
     now = time.monotonic()
-    aloud = failures >= _FAILURES_UNSAID and now - _last_said[0] > _SAID_EVERY_S
+    aloud = failures >= _FAILURES_UNSAID and now - _last_said[0] > _SAID_EVERY_S and not _quiet.get()
     if aloud:
         _last_said[0] = now
     logger.log(logging.WARNING if aloud else logging.INFO, text, *arguments)
@@ -138,10 +160,10 @@ def _passes(error: Exception) -> bool:
     return isinstance(error, kinds) or _is_of_network(error)
 
 
-def _refused(where: str, error: Exception, access: str) -> UnreachableError:
+def _refused(where: str, error: Exception, access: str, doing: str) -> RefusedError:
     if status_of(error) in _NO_ACCESS or _is_of_google_login(error):
-        return UnreachableError(where=where, found=f"no permission ({_words(error)})", fix=access)
-    return UnreachableError(where=where, found=f"cannot be read ({_words(error)})", fix="Check the address")
+        return RefusedError(where=where, found=f"no permission ({_words(error)})", fix=access)
+    return RefusedError(where=where, found=f"cannot be {doing} ({_words(error)})", fix="Check the address")
 
 
 def _given_up(where: str, error: Exception, attempts: int, seconds: float) -> UnreachableError:

@@ -20,6 +20,7 @@ from vjepa2_ac.storage.reading import (
     sha256_of_file,
     unreadable,
 )
+from vjepa2_ac.storage.transfer import download, file_sizes, place, remove, remove_folder, try_writing, upload
 from vjepa2_ac.storage.writing import atomic_writer, folder_writer, sync, user_can_write, write_atomically
 
 __all__ = [
@@ -29,8 +30,10 @@ __all__ = [
     "absolute",
     "atomic_writer",
     "bytes_fetched",
+    "download",
     "exists",
     "file_size",
+    "file_sizes",
     "file_version",
     "folder_writer",
     "is_url",
@@ -38,12 +41,17 @@ __all__ = [
     "list_files",
     "list_names",
     "open_to_read",
+    "place",
     "read_bytes",
     "read_range",
     "read_ranges",
+    "remove",
+    "remove_folder",
     "sha256_of_file",
     "sync",
+    "try_writing",
     "unreadable",
+    "upload",
     "user_can_write",
     "write_atomically",
 ]

@@ -1,0 +1,131 @@
+"""How do files get to another place and back: to a folder of this machine, or a URL that can be written?
+
+Whatever keeps a file from getting there is a `RefusedError` where it does not pass by itself, and else an
+`UnreachableError`.
+"""
+
+from __future__ import annotations
+
+import errno
+import secrets
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from vjepa2_ac import remote
+from vjepa2_ac.remote import RefusedError, UnreachableError
+from vjepa2_ac.storage.reading import is_url, join
+from vjepa2_ac.storage.writing import atomic_writer
+
+_AWAY = frozenset(
+    {errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC}
+)
+_PIECE_BYTES = 32 << 20
+
+
+def place(path: str) -> str:
+    """Return the one name of a folder: an absolute path, also for `file://`, or a URL; no slash behind it."""
+    path = path.removeprefix("file://")
+    return path.rstrip("/") if is_url(path) else str(Path(path).expanduser().resolve())
+
+
+def upload(source: Path, target: str) -> None:
+    """Copy a file of this machine to another place, over whatever is there; never seen by halves.
+
+    Raises:
+        FileNotFoundError: There is no such file on this machine.
+        UnreachableError: It cannot be written; a RefusedError where that will not pass.
+    """
+    if is_url(target):
+        return remote.upload_file(source, target)
+    with source.open("rb") as file, _explained(target), atomic_writer(target) as copy:
+        shutil.copyfileobj(file, copy)
+    return None
+
+
+def download(source: str, target: Path) -> None:
+    """Copy a file from another place to this machine; it appears whole, and is on the disk.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        OSError: It cannot be read, or the copy not be written.
+        UnreachableError: The other place cannot be reached.
+    """
+    if not is_url(source):
+        with Path(source).open("rb") as file, atomic_writer(target) as copy:
+            shutil.copyfileobj(file, copy)
+        return
+    size = remote.file_size(source)
+    with atomic_writer(target) as copy:
+        for start in range(0, size, _PIECE_BYTES):
+            copy.write(remote.read_range(source, start, min(_PIECE_BYTES, size - start)))
+
+
+def remove(path: str) -> None:
+    """Remove a file at another place; it may be gone already.
+
+    Raises:
+        UnreachableError: It cannot be removed; a RefusedError where that will not pass.
+    """
+    if is_url(path):
+        return remote.remove_file(path)
+    with _explained(path):
+        Path(path).unlink(missing_ok=True)
+    return None
+
+
+def remove_folder(folder: str, *, first: str) -> None:
+    """Remove all files below a folder, the one without which it does not count before the others.
+
+    Raises:
+        UnreachableError: It cannot be removed; a RefusedError where that will not pass.
+    """
+    remove(join(folder, first))
+    for name in file_sizes(folder):
+        remove(join(folder, name))
+    if not is_url(folder) and Path(folder).exists():
+        with _explained(folder):
+            shutil.rmtree(folder)
+
+
+def file_sizes(folder: str) -> dict[str, int]:
+    """Return the sizes of all files below a folder by their paths from there; none where there is no such folder.
+
+    Raises:
+        UnreachableError: It cannot be listed; a RefusedError where that will not pass.
+    """
+    if is_url(folder):
+        return remote.file_sizes(folder)
+    with _explained(folder):
+        files = [path for path in Path(folder).rglob("*") if path.is_file()]
+        return {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+
+
+def try_writing(folder: str) -> None:
+    """Find out whether a place can be written and removed from: do it. Nothing stays there.
+
+    Raises:
+        UnreachableError: It cannot be written now; a RefusedError where that will not pass.
+    """
+    if not is_url(folder):
+        existing = next(path for path in (Path(folder), *Path(folder).parents) if path.exists())
+        with _explained(folder), tempfile.TemporaryFile(dir=existing):
+            return
+    trial = join(folder, f".write-check-{secrets.token_hex(8)}")
+    with tempfile.TemporaryDirectory() as here:
+        source = Path(here) / "trial"
+        source.write_bytes(b"This file of vjepa2-ac may be removed.\n")
+        upload(source, trial)
+    remove(trial)
+
+
+@contextmanager
+def _explained(path: str) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        kind = UnreachableError if error.errno in _AWAY else RefusedError
+        found = f"cannot be written: {error.strerror or error}"
+        raise kind(where=path, found=found, fix="Check its permissions, and the disk") from error
