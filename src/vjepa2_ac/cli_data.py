@@ -135,7 +135,8 @@ def _inspect(options: argparse.Namespace) -> None:
     for line in inspection_lines(inspection):
         console.print(line, markup=False)
     console.print(motion_table(inspection))
-    console.print(f"For comparison: {RELEASED}.", markup=False)
+    if inspection.is_pose:
+        console.print(f"For comparison: {RELEASED}.", markup=False)
     write_atomically(options.out / "inspect.json", json.dumps(inspection.as_dict(), indent=1).encode())
     path = options.out / "contact_sheet.png"
     with _progress("reading pictures") as progress:

@@ -6,9 +6,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from vjepa2_ac.console import console
-from vjepa2_ac.data.check import Finding
+from vjepa2_ac.data.finding import Finding
 from vjepa2_ac.data.index import Watch
-from vjepa2_ac.data.inspection import Inspection
+from vjepa2_ac.data.inspection import PERCENTILES, Inspection
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.evaluation.calibration import Calibration
 
@@ -36,9 +36,7 @@ def inspection_lines(inspection: Inspection) -> list[str]:
     success = inspection.success_share
     known = int((inspection.success >= 0).sum())
     shortest, low, median, high, longest = inspection.length_percentiles
-    gripper, config = inspection.range_of(6), inspection.config
-    limits = [(axis, *inspection.range_of(column)) for column, axis in enumerate("xyz")]
-    places = ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in limits)
+    config = inspection.config
     splits = ", ".join(
         f"{name} {windows:,} clips in {inspection.episodes_of[name]:,} episodes"
         for name, windows in inspection.windows_of.items()
@@ -55,11 +53,27 @@ def inspection_lines(inspection: Inspection) -> list[str]:
         "left out": removed or "nothing",
         "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
         "sample": f"{len(inspection.sample):,} episodes, for what follows",
+        **(_pose_rows(inspection) if inspection.is_pose else _vector_rows(inspection)),
+    }
+    return [f"{name:<16}{text}" for name, text in rows.items()]
+
+
+def _pose_rows(inspection: Inspection) -> dict[str, str]:
+    gripper = inspection.range_of(6)
+    limits = [(axis, *inspection.range_of(column)) for column, axis in enumerate("xyz")]
+    places = ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in limits)
+    return {
         "standing still": f"{inspection.still_share:.1%} of the steps, by the measured motion",
         "position": f"{places} m",
         "gripper": f"{gripper[0]:.2f} to {gripper[1]:.2f} (0 open, 1 closed)",
     }
-    return [f"{name:<16}{text}" for name, text in rows.items()]
+
+
+def _vector_rows(inspection: Inspection) -> dict[str, str]:
+    config, widths = inspection.config, inspection.widths
+    ranges = ", ".join(f"{low:.2f} to {high:.2f}" for low, high in inspection.ranges)
+    how = f", joined by {config.join_actions}" if config.join_actions else ""
+    return {"states": f"{widths.state} numbers: {ranges}", "actions": f"{widths.action} numbers, {config.actions}{how}"}
 
 
 def _lasting(hours: float) -> str:
@@ -67,7 +81,9 @@ def _lasting(hours: float) -> str:
 
 
 def motion_table(inspection: Inspection) -> Table:
-    """Return the percentiles of the motion per model step at several strides."""
+    """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
+    if not inspection.is_pose:
+        return _change_table(inspection)
     table = Table(title="Motion per model step: 10 / 50 / 90 / 99 %", title_justify="left")
     for name in ("stride", "seconds", "moves by (cm)", "turns by (degrees)"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -75,6 +91,16 @@ def motion_table(inspection: Inspection) -> Table:
         figures = (one.percentiles("moved_cm"), one.percentiles("turned_deg"))
         cells = (" / ".join(f"{value:.1f}" for value in values) or "no step fits" for values in figures)
         table.add_row(str(one.stride), f"{one.seconds:.2f}", *cells)
+    return table
+
+
+def _change_table(inspection: Inspection) -> Table:
+    table = Table(title="Change per model step: 10 / 50 / 90 / 99 %", title_justify="left")
+    for name in ("stride", "seconds", "the number that changes most (% of its range)"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for one in inspection.changes:
+        cell = " / ".join(f"{value:.1f}" for value in one.percentiles(PERCENTILES)) or "no step fits"
+        table.add_row(str(one.stride), f"{one.seconds:.2f}", cell)
     return table
 
 
@@ -89,9 +115,10 @@ def calibration_table(calibration: Calibration) -> Table:
         table.add_column(name, justify="right", no_wrap=True)
     for one in calibration.tried:
         mark = " <" if one is calibration.best else ""
+        moved = "" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
         table.add_row(
             f"{one.stride}{mark}", f"{one.seconds_per_step:.2f}", str(one.ratio), f"{one.error:.4f}",
-            f"{one.persistence:.4f}", f"{one.moved_cm:.1f} cm", str(one.clips), str(one.episodes),
+            f"{one.persistence:.4f}", moved, str(one.clips), str(one.episodes),
         )  # fmt: skip
     for stride, reason in calibration.impossible.items():
         table.add_row(str(stride), "", f"not possible: {escape(reason)}")

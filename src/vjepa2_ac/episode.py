@@ -8,11 +8,12 @@ Axes
     tokens   patches of one frame, row by row (256 at 256 px)
     dim      width of a latent (1408 for ViT-g)
 
-State (7 numbers): x, y, z in metres; roll, pitch, yaw in radians, as extrinsic xyz Euler angles; gripper closedness,
-    0 open .. 1 closed. All in the robot base frame; the point is the flange, not the finger tip. States are *measured*.
+State (7 numbers, a pose): x, y, z in metres; roll, pitch, yaw in radians, as extrinsic xyz Euler angles; gripper
+    closedness, 0 open .. 1 closed. All in the robot base frame; the point is the flange, not the finger tip. States are
+    *measured*. With `data.states: vector` a state is whatever numbers the source has, state_dim of them.
 
-Action (7 numbers): what carries a state to the next *model* step's state: metres, extrinsic xyz Euler angles of
-    R[t+1] @ R[t].T, and the change of closedness. See `geometry.actions_from_states`.
+Action (7 numbers, of poses): what carries a state to the next *model* step's state: metres, extrinsic xyz Euler angles
+    of R[t+1] @ R[t].T, and the change of closedness. See `geometry.actions_from_states`. Of vectors: `data.actions`.
 
 Extrinsics (6 numbers): the camera in the robot base frame: x, y, z, roll, pitch, yaw.
 
@@ -23,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -33,9 +34,19 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int], None]  # done, total
 
-STATE_DIM = 7
+STATE_DIM = 7  # of a pose
 ACTION_DIM = 7
 EXTRINSICS_DIM = 6
+
+
+class Widths(NamedTuple):
+    """How many numbers a state and an action have."""
+
+    state: int
+    action: int
+
+
+POSE_WIDTHS = Widths(STATE_DIM, ACTION_DIM)
 
 
 @runtime_checkable
@@ -61,12 +72,15 @@ class Episode:
     """One demonstration: states of every control step, and pictures of one camera that are read when asked for."""
 
     info: EpisodeInfo
-    states: Float[np.ndarray, "steps 7"]
+    states: Float[np.ndarray, "steps state_dim"]
     read_frames: FrameReader
     control_rate_hz: float
     extrinsics: Float[np.ndarray, "steps 6"] | None = None  # of the camera
     joint_velocities: Float[np.ndarray, "steps joints"] | None = None  # *commanded*, radians per second
     metadata: Mapping[str, str] = field(default_factory=dict)  # language instruction and the like; never interpreted
+    commands: Float[np.ndarray, "steps action_dim"] | None = (
+        None  # recorded actions, where `data.actions` asks for them
+    )
 
 
 @dataclass(frozen=True)
@@ -92,8 +106,8 @@ class Clip:
     """A window of an episode at the model's step length; frames are cropped, not yet resized."""
 
     frames: UInt8[np.ndarray, "time height width 3"]
-    states: Float32[np.ndarray, "time 7"]
-    actions: Float32[np.ndarray, "time-1 7"]
+    states: Float32[np.ndarray, "time state_dim"]
+    actions: Float32[np.ndarray, "time-1 action_dim"]
     extrinsics: Float32[np.ndarray, "time 6"] | None
     episode_id: str
     start: int  # first control step
@@ -106,8 +120,8 @@ class Batch:
     """Clips stacked for the device; pixels stay uint8 until they are there."""
 
     frames: UInt8[Tensor, "batch time height width 3"]
-    states: Float32[Tensor, "batch time 7"]
-    actions: Float32[Tensor, "batch time-1 7"]
+    states: Float32[Tensor, "batch time state_dim"]
+    actions: Float32[Tensor, "batch time-1 action_dim"]
     extrinsics: Float32[Tensor, "batch time 6"] | None
     episode_ids: tuple[str, ...]
     starts: tuple[int, ...]
@@ -120,8 +134,8 @@ class LatentBatch:
     """What training, evaluation and planning see: layer-normalised latents in place of pixels."""
 
     latents: Float[Tensor, "batch time tokens dim"]
-    states: Float[Tensor, "batch time 7"]
-    actions: Float[Tensor, "batch time-1 7"]
+    states: Float[Tensor, "batch time state_dim"]
+    actions: Float[Tensor, "batch time-1 action_dim"]
     extrinsics: Float[Tensor, "batch time 6"] | None
     episode_ids: tuple[str, ...]
     starts: tuple[int, ...]

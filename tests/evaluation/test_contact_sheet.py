@@ -18,7 +18,7 @@ def strip(colour: tuple[int, int, int] = (200, 30, 40), *, steps: int = 30, size
         success=True,
         frames=np.full((count, *size, 3), colour, np.uint8),
         steps=np.linspace(0, steps - 1, count).astype(np.int64),
-        speed_cm_s=np.linspace(0, 20, steps),
+        speed=np.linspace(0, 20, steps),
         closedness=np.linspace(0, 1, steps),
         shaded=((0, 2),),
         seen=crop_box(*size),
@@ -28,7 +28,7 @@ def strip(colour: tuple[int, int, int] = (200, 30, 40), *, steps: int = 30, size
 def sheet(*strips: Strip, **changes: object) -> ContactSheet:
     values: dict[str, object] = {
         "title": "a set", "facts": ("one", "two " * 100), "strips": strips, "control_rate_hz": 15.0,
-        "lengths_s": np.array([2.0]), "moved_cm": {4: np.array([1.0, 2.0]), 15: np.zeros(0)}, "reference_cm": 12.9,
+        "lengths_s": np.array([2.0]), "moved": {4: np.array([1.0, 2.0]), 15: np.zeros(0)}, "reference": 12.9,
         "places_m": np.zeros((3, 3)), "shaded_means": "standing still",
     }  # fmt: skip
     return ContactSheet(**(values | changes))  # type: ignore[arg-type]

@@ -33,7 +33,10 @@ class RldsFields(Section):
         "steps/observation/cartesian_position",
         "steps/observation/gripper_position",
     )
-    """Features that give, joined, the 7 numbers of the *measured* state (legend: episode.py)."""
+    """Features that give, joined, the 7 numbers of the *measured* state (legend: episode.py); for `states: vector` any
+    numbers."""
+    action: tuple[str, ...] = ("steps/action",)
+    """For `actions: recorded`: features that give, joined, the *commanded* action of each control step."""
     gripper: Literal["closedness", "openness"] = "closedness"
     """What the last number of the state is: 0 open .. 1 closed (DROID), or 0 closed .. 1 open (BridgeData)."""
     identity: tuple[str, ...] = ("episode_metadata/recording_folderpath", "episode_metadata/file_path")
@@ -65,9 +68,13 @@ class LeRobotFields(Section):
     """Where a LeRobot data set keeps what the model needs; the defaults are those of DROID's ports."""
 
     state: tuple[str, ...] = ("observation.state.cartesian_position", "observation.state.gripper_position")
-    """Columns whose values, joined, hold position, rotation and gripper of the *measured* state."""
+    """Columns whose values, joined, hold position, rotation and gripper of the *measured* state; for `states: vector`
+    any numbers."""
+    action: tuple[str, ...] = ("action",)
+    """For `actions: recorded`: columns that give, joined, the *commanded* action of each control step."""
     select: tuple[Annotated[int, Field(ge=0)], ...] | None = None
-    """Which of the joined numbers, in this order, are x, y, z, the rotation's 3 or 4, the gripper; null: all."""
+    """Which of the joined numbers, in this order, are x, y, z, the rotation's 3 or 4, the gripper; for `states: vector`
+    which are the state; null: all."""
     rotation: Literal["euler_xyz", "quaternion_wxyz", "quaternion_xyzw"] = "euler_xyz"
     """How the rotation is written: extrinsic xyz Euler angles in radians, or a unit quaternion, w first or last."""
     gripper_open: float = 0.0
@@ -181,6 +188,15 @@ class DataConfig(Section):
     """Which camera the model sees; of several, one is drawn for each clip. null: the source's first, for DROID the left
     exterior camera, which the released weights saw. rlds, lerobot: a name in `cameras`. droid_raw: left, right, wrist,
     ext1, ext2 or a serial number. npz: the name of an array of pictures."""
+    states: Literal["pose", "vector"] = "pose"
+    """What a state is. pose: 7 numbers, position, rotation and gripper, which the released weights know. vector: the
+    source's own numbers as they are, of any width, for other robots: two arms, joints, a mobile base."""
+    actions: Literal["difference", "recorded"] = "difference"
+    """difference: what carries a state to the next one; of vectors, the plain difference. recorded: the commands in the
+    source, of any width; for vectors only."""
+    join_actions: Literal["sum", "mean", "last"] | None = None
+    """How the recorded commands of a model step's control steps become one action. sum: deltas. mean: velocities. last:
+    absolute targets. Must be given unless `stride` is 1."""
     frames: Annotated[int, Field(ge=2, le=256)] = 16
     """Frames of a clip, one per model step."""
     stride: PositiveInt | Literal["auto"] = 4
@@ -234,6 +250,31 @@ class DataConfig(Section):
             raise ValueError("validation_share and test_share leave nothing to train on")
         if self.pose_frame == "camera" and self.source in {"rlds", "lerobot"}:
             raise ValueError(f"pose_frame camera needs camera poses, which a source of {self.source} does not have")
+        return self
+
+    @model_validator(mode="after")
+    def _vectors_fit(self) -> DataConfig:
+        pose_only = {
+            "source droid_raw": self.source == "droid_raw",
+            "pose_frame camera": self.pose_frame == "camera",
+            "idle.rule motion": self.idle.rule == "motion",
+            "fields.gripper": self.fields.gripper != "closedness",
+            "lerobot.rotation": self.lerobot.rotation != "euler_xyz",
+            "lerobot.gripper_open and gripper_closed": (self.lerobot.gripper_open, self.lerobot.gripper_closed)
+            != (0, 1),
+        }
+        asked = [name for name, is_asked in pose_only.items() if is_asked]
+        if self.states == "vector" and asked:
+            raise ValueError(f"{', '.join(asked)}: a matter of poses, and states is vector")
+        if self.actions == "recorded" and self.states == "pose":
+            raise ValueError("actions recorded needs states vector: the action of a pose is its difference to the next")
+        if self.actions == "recorded" and self.stride != 1 and self.join_actions is None:
+            raise ValueError(
+                "actions recorded: a model step has a command for each of its control steps; set join_actions to sum"
+                " (deltas), mean (velocities) or last (absolute targets)"
+            )
+        if self.actions != "recorded" and self.join_actions is not None:
+            raise ValueError("join_actions belongs to actions recorded")
         return self
 
     @property

@@ -4,37 +4,29 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from itertools import islice
-from typing import Literal
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.check_vectors import has_moved, vector_findings
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.finding import Finding, Level
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
 
-Level = Literal["ok", "warning", "error"]
-
+_MOVED_M = 0.01  # of the flange: it should be seen
 _DARK = 8  # of 255: mean of pictures that show next to nothing
 _STILL_CM, _FAR_CM = 0.2, 30.0  # medians of |dxyz| per model step that are worth a word
 _REACH_M = 1.6  # beyond the reach of common arms
 _LONGEST = 300  # letters of a reason
 _NARROW = 0.2  # a gripper that never closes further may be given in metres
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One line of the check."""
-
-    level: Level
-    about: str
-    text: str
 
 
 def at_some_stride(dataset: Dataset) -> Dataset:
@@ -122,7 +114,7 @@ def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int, clock: Ca
     if not read:
         yield Finding("error", "clips", f"none of {len(batches) * batch_size} could be read: see data.broken_episodes")
         return
-    yield from findings_in(read)
+    yield from findings_in(read, is_pose=dataset.config.states == "pose")
     rate = sum(len(batch.starts) for batch in batches[1:]) / max(rest_s, 1e-9)
     speed = f"first batch of {batch_size} after {first_s:.2f} s, then {rate:.1f} clips/s"
     yield Finding("ok", "timing", f"{speed} with {dataset.config.workers} workers")
@@ -132,8 +124,8 @@ def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int, clock: Ca
         yield Finding("ok", "network", f"{fetched / count / 1e3:,.0f} kB fetched per clip, over {count} clips")
 
 
-def findings_in(batches: Sequence[Batch]) -> Iterator[Finding]:
-    """Yield what the numbers of some batches say; a pure look, nothing is read."""
+def findings_in(batches: Sequence[Batch], *, is_pose: bool = True) -> Iterator[Finding]:
+    """Yield what the numbers of some batches say, whose states are poses or not; a pure look, nothing is read."""
     clips = sum(len(batch.starts) for batch in batches)
     first = batches[0]
     shapes = f"frames {tuple(first.frames.shape)} {str(first.frames.dtype).removeprefix('torch.')}"
@@ -141,10 +133,15 @@ def findings_in(batches: Sequence[Batch]) -> Iterator[Finding]:
     yield Finding(
         "ok", "batch", f"{shapes}, states {tuple(first.states.shape)}, actions {tuple(first.actions.shape)}, {poses}"
     )
-    states = np.concatenate([batch.states.numpy().reshape(-1, 7) for batch in batches]).astype(np.float64)
-    actions = np.concatenate([batch.actions.numpy().reshape(-1, 7) for batch in batches]).astype(np.float64)
+    states = np.concatenate([batch.states.flatten(0, 1).numpy() for batch in batches]).astype(np.float64)
+    actions = np.concatenate([batch.actions.flatten(0, 1).numpy() for batch in batches]).astype(np.float64)
     yield _pixels(batches)
-    yield _still_pictures(batches)
+    if not is_pose:
+        ranges = torch.from_numpy((states.max(axis=0) - states.min(axis=0)).astype(np.float32))
+        yield _still_pictures(batches, [has_moved(batch.states, ranges) for batch in batches])
+        yield from vector_findings(states, actions)
+        return
+    yield _still_pictures(batches, [batch.actions[..., :3].norm(dim=-1) > _MOVED_M for batch in batches])
     yield _positions(states)
     yield _rotations(states, actions)
     yield _gripper(states[:, 6], clips)
@@ -163,11 +160,10 @@ def _pixels(batches: Sequence[Batch]) -> Finding:
     return Finding("ok", "pixels", text)
 
 
-def _still_pictures(batches: Sequence[Batch]) -> Finding:
-    """Compare pictures with the ones before them, where the flange has moved by more than 1 cm."""
+def _still_pictures(batches: Sequence[Batch], has_moved: Sequence[Tensor]) -> Finding:
+    """Compare pictures with the ones before them, where the robot has moved."""
     same = moved = 0
-    for batch in batches:
-        far = batch.actions[..., :3].norm(dim=-1) > 0.01
+    for batch, far in zip(batches, has_moved, strict=True):
         equal = (batch.frames[:, 1:] == batch.frames[:, :-1]).flatten(2).all(dim=-1)
         moved += int(far.sum())
         same += int((far & equal).sum())

@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from vjepa2_ac.data.actions import actions_of, require_widths
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.exclusion import with_way_out
 from vjepa2_ac.data.transforms import view
-from vjepa2_ac.episode import ACTION_DIM, STATE_DIM, Augmentation, Batch, Clip, Episode
+from vjepa2_ac.episode import Augmentation, Batch, Clip, Episode, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states, states_in_camera_frame
+from vjepa2_ac.geometry import states_in_camera_frame
 from vjepa2_ac.remote import UnreachableError
 
 Augment = Callable[[int, int], Augmentation | None]  # from the height and width of a clip's frames
@@ -88,13 +89,14 @@ def read_clip(dataset: Dataset, wish: Wish) -> Clip:
     config = dataset.config
     steps = range(wish.start, wish.start + config.clip_steps, config.model_stride)
     recording = dataset.source.read(wish.episode, wish.camera, dataset.needed_steps(wish.episode))
+    require_widths(recording, dataset.widths)
     frames = view(recording.read_frames(steps), config.crop)
-    states, extrinsics = _poses(recording, list(steps), in_camera_frame=config.pose_frame == "camera")
+    states, extrinsics = _states(recording, list(steps), in_camera_frame=config.pose_frame == "camera")
     draw_change = wish.augmentation
     return Clip(
         frames=frames,
         states=states.astype(np.float32),
-        actions=actions_from_states(states).astype(np.float32),
+        actions=actions_of(states, recording.commands, steps, config).astype(np.float32),
         extrinsics=None if extrinsics is None else extrinsics.astype(np.float32),
         episode_id=recording.info.id,
         start=wish.start,
@@ -103,9 +105,9 @@ def read_clip(dataset: Dataset, wish: Wish) -> Clip:
     )
 
 
-def _poses(
+def _states(
     recording: Episode, steps: list[int], *, in_camera_frame: bool
-) -> tuple[Float[np.ndarray, "time 7"], Float[np.ndarray, "time 6"] | None]:
+) -> tuple[Float[np.ndarray, "time state_dim"], Float[np.ndarray, "time 6"] | None]:
     """Return states and camera poses at some steps."""
     states = recording.states[steps]
     extrinsics = None if recording.extrinsics is None else recording.extrinsics[steps]
@@ -121,12 +123,12 @@ def _poses(
     return states_in_camera_frame(states, extrinsics), extrinsics
 
 
-def no_clips(frames: int, bytes_fetched: int) -> Batch:
+def no_clips(frames: int, widths: Widths, bytes_fetched: int) -> Batch:
     """Return a micro-batch of which no clip could be read."""
     return Batch(
         frames=torch.zeros(0, frames, 1, 1, 3, dtype=torch.uint8),
-        states=torch.zeros(0, frames, STATE_DIM),
-        actions=torch.zeros(0, frames - 1, ACTION_DIM),
+        states=torch.zeros(0, frames, widths.state),
+        actions=torch.zeros(0, frames - 1, widths.action),
         extrinsics=None,
         episode_ids=(),
         starts=(),

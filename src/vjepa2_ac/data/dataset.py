@@ -10,17 +10,20 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.actions import widths_of
 from vjepa2_ac.data.broken import BrokenEpisodes
 from vjepa2_ac.data.exclusion import included, with_way_out
 from vjepa2_ac.data.idle_search import FoundRanges, find_ranges
 from vjepa2_ac.data.kept import KeptSteps, Starts, clip_starts
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.windows import Split, Windows, windows_of
-from vjepa2_ac.episode import EpisodeSource, Progress, StepRanges
+from vjepa2_ac.episode import POSE_WIDTHS, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
+
+_TRIED = 8  # episodes that are read for their widths, where some are broken
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,25 @@ class Dataset:
         """Control steps per second: what the source says of the whole set, or else of its first episode."""
         said = self.table.texts.get("control_rate_hz")
         return float(said) if said is not None else self.source.read(int(self.episodes[0])).control_rate_hz
+
+    @cached_property
+    def widths(self) -> Widths:
+        """How many numbers states and actions have: 7 of poses, else those of the first episode that can be read.
+
+        Raises:
+            InputError: None of the first ones can be.
+        """
+        if self.config.states == "pose":
+            return POSE_WIDTHS
+        first_error: InputError | None = None
+        for episode in self.episodes[:_TRIED].tolist():
+            try:
+                return widths_of(self.source.read(episode))
+            except UnreachableError:
+                raise
+            except InputError as error:
+                first_error = first_error or error
+        raise first_error or ValueError("a data set without episodes")
 
     def leave_out(self, episode: int, error: InputError) -> None:
         """Do what `data.broken_episodes` says with an episode that cannot be read: take note of it, or stop.

@@ -201,7 +201,8 @@ def _fingerprint(table: EpisodeTable) -> str:
 
 
 def _knobs_that_matter(config: DataConfig) -> dict[str, object]:
-    return config.model_dump(include={"source", "path", "fields", "droid_raw", "lerobot"}) | {
+    knobs = {"source", "path", "fields", "droid_raw", "lerobot"}
+    return config.model_dump(include=knobs, exclude={"fields": {"action"}, "lerobot": {"action"}}) | {
         "idle": config.idle.model_dump(exclude={"keep_share"})
     }
 

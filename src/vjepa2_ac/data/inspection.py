@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +16,9 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import RAW_CAMERAS
 from vjepa2_ac.data.dataset import Dataset, Removed
 from vjepa2_ac.data.idle import idle_by_motion
+from vjepa2_ac.data.inspection_vectors import ChangePerStep, change_per_step
 from vjepa2_ac.data.windows import Split, in_split, spread
-from vjepa2_ac.episode import Episode, Progress
+from vjepa2_ac.episode import Episode, Progress, Widths
 from vjepa2_ac.errors import InputError
 
 PERCENTILES = (10, 50, 90, 99)
@@ -36,7 +37,7 @@ class ReadEpisode:
     """An episode of the sample, without pictures."""
 
     index: int  # place in the data set's table
-    states: Float[np.ndarray, "steps 7"]
+    states: Float[np.ndarray, "steps state_dim"]
     kept: tuple[tuple[int, int], ...]  # ranges that clips come from
 
 
@@ -68,8 +69,10 @@ class Inspection:
     episodes_of: dict[Split, int]
     windows_of: dict[Split, int]
     sample: tuple[ReadEpisode, ...]
-    still_share: float  # of the sample's steps: in a run of idle ones, by the measured motion
-    motions: tuple[MotionPerStep, ...]
+    widths: Widths
+    still_share: float | None  # of the sample's steps: in a run of idle ones, by the measured motion; None: no poses
+    motions: tuple[MotionPerStep, ...]  # of poses
+    changes: tuple[ChangePerStep, ...]  # of vectors
 
     @property
     def hours(self) -> float:
@@ -92,6 +95,16 @@ class Inspection:
         """The cameras that can be asked for, as far as the config knows."""
         known = self.config.known_cameras
         return known if known is not None else RAW_CAMERAS if self.config.source == "droid_raw" else self.config.cameras
+
+    @property
+    def is_pose(self) -> bool:
+        """Whether the states are poses."""
+        return self.config.states == "pose"
+
+    @property
+    def ranges(self) -> Float[np.ndarray, "state_dim 2"]:
+        """The least and the greatest value of each number of the sample's states."""
+        return np.array([self.range_of(column) for column in range(self.widths.state)])
 
     def range_of(self, column: int) -> tuple[float, float]:
         """Return the least and the greatest value of one number of the sample's states."""
@@ -116,10 +129,17 @@ class Inspection:
             "removed": [vars(one) for one in self.removed],
             "splits": {name: {"episodes": self.episodes_of[name], "windows": self.windows_of[name]} for name in SPLITS},
             "sampled_episodes": len(self.sample),
+            "state_dim": self.widths.state,
+            "action_dim": self.widths.action,
+            "percentiles": list(PERCENTILES),
+            **(self._poses_as_dict() if self.is_pose else self._vectors_as_dict()),
+        }
+
+    def _poses_as_dict(self) -> dict[str, Any]:
+        return {
             "still_share": self.still_share,
             "xyz_m": [self.range_of(column) for column in range(3)],
             "gripper": self.range_of(6),
-            "percentiles": list(PERCENTILES),
             "per_model_step": [
                 {
                     "stride": one.stride,
@@ -130,6 +150,19 @@ class Inspection:
                 for one in self.motions
             ],
             "released_weights": RELEASED,
+        }
+
+    def _vectors_as_dict(self) -> dict[str, Any]:
+        return {
+            "ranges": self.ranges.tolist(),
+            "per_model_step": [
+                {
+                    "stride": one.stride,
+                    "seconds": one.seconds,
+                    "changed_percent_of_range": one.percentiles(PERCENTILES),
+                }
+                for one in self.changes
+            ],
         }
 
 
@@ -145,9 +178,8 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
         InputError: Episodes of the sample cannot be read, and `data.broken_episodes` does not leave them out.
     """
     sample = tuple(_read(dataset, sample_of(dataset, episodes), progress))
-    idle = np.concatenate([idle_runs(one.states, dataset.config) for one in sample])
-    rate = dataset.control_rate_hz
-    return Inspection(
+    rate, strides = dataset.control_rate_hz, dataset.config.strides_to_try(dataset.control_rate_hz)
+    found = Inspection(
         config=dataset.config,
         control_rate_hz=rate,
         lengths=dataset.table.num_steps,
@@ -157,9 +189,17 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
         episodes_of={name: _episodes(dataset, name) for name in SPLITS},
         windows_of={name: _windows(dataset, name) for name in SPLITS},
         sample=sample,
-        still_share=float(idle.mean()),
-        motions=tuple(motion_per_step(sample, stride, rate) for stride in dataset.config.strides_to_try(rate)),
+        widths=dataset.widths,
+        still_share=None,
+        motions=(),
+        changes=(),
     )
+    if not found.is_pose:
+        pieces = [one.states[start:end] for one in sample for start, end in one.kept]
+        return replace(found, changes=tuple(change_per_step(pieces, found.ranges, stride, rate) for stride in strides))
+    idle = np.concatenate([idle_runs(one.states, dataset.config) for one in sample])
+    motions = tuple(motion_per_step(sample, stride, rate) for stride in strides)
+    return replace(found, still_share=float(idle.mean()), motions=motions)
 
 
 def sample_of(dataset: Dataset, count: int) -> list[int]:

@@ -168,7 +168,9 @@ class _Clips(TorchDataset[_Row]):
             clips = [one for one in read if isinstance(one, Clip)]
             skipped = tuple(one for one in read if isinstance(one, Skipped))
             fetched = storage.bytes_fetched() - before
-            return _Row(collate(clips, fetched) if clips else no_clips(self.dataset.config.frames, fetched), skipped)
+            if not clips:
+                return _Row(no_clips(self.dataset.config.frames, self.dataset.widths, fetched), skipped)
+            return _Row(collate(clips, fetched), skipped)
         except InputError as error:
             return error
 

@@ -35,7 +35,7 @@ class TriedStride:
     ratio: Ratio  # of the error to that of copying the frame before
     error: float  # mean over clips
     persistence: float
-    moved_cm: float  # median distance of the flange per model step
+    moved_cm: float | None  # median distance of the flange per model step; None: the states are no poses
     clips: int
     episodes: int
 
@@ -157,7 +157,8 @@ def calibrate(
     chosen = [windows[index] for index in far_neighbours(spread(len(windows), clips))]
     measured = {}
     for done, stride in enumerate(possible):
-        parts = _measure(model, encode, batches_of(views[stride], chosen, batch_size=batch_size))
+        batches = batches_of(views[stride], chosen, batch_size=batch_size)
+        parts = _measure(model, encode, batches, is_pose=settings.states == "pose")
         tell = _told(progress, done * len(chosen), len(possible) * len(chosen))
         measured[stride] = _Measured.joined(list(tell(parts)))
     runner_up, difference = _compared(measured)
@@ -172,7 +173,7 @@ class _Measured:
 
     errors: Float[np.ndarray, " clips"]
     persistence: Float[np.ndarray, " clips"]
-    moved_cm: Float[np.ndarray, " steps"]
+    moved_cm: Float[np.ndarray, " steps"]  # none where the states are no poses
     clips: tuple[tuple[str, int], ...]
 
     @classmethod
@@ -199,17 +200,21 @@ class _Measured:
             ratio=ratio(self.errors, self.persistence, self.episode_ids),
             error=float(self.errors.mean()),
             persistence=float(self.persistence.mean()),
-            moved_cm=float(np.median(self.moved_cm)),
+            moved_cm=float(np.median(self.moved_cm)) if len(self.moved_cm) else None,
             clips=len(self.clips),
             episodes=len(set(self.episode_ids)),
         )
 
 
-def _measure(model: Predictor, encode: Callable[[Batch], LatentBatch], batches: Iterator[Batch]) -> Iterator[_Measured]:
+def _measure(
+    model: Predictor, encode: Callable[[Batch], LatentBatch], batches: Iterator[Batch], *, is_pose: bool
+) -> Iterator[_Measured]:
     for batch in batches:
         with torch.no_grad():
             errors, persistence = one_step_errors(model, encode(batch))
-        moved_cm = batch.actions[..., :3].norm(dim=-1).flatten().numpy().astype(np.float64) * 100
+        moved_cm = np.zeros(0)
+        if is_pose:
+            moved_cm = batch.actions[..., :3].norm(dim=-1).flatten().numpy().astype(np.float64) * 100
         yield _Measured(errors, persistence, moved_cm, tuple(zip(batch.episode_ids, batch.starts, strict=True)))
 
 

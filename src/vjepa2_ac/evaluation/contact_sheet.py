@@ -37,25 +37,30 @@ class Strip:
     success: bool | None
     frames: UInt8[np.ndarray, "time height width 3"]
     steps: Int[np.ndarray, " time"]  # control steps of the pictures
-    speed_cm_s: Float[np.ndarray, " steps"]
-    closedness: Float[np.ndarray, " steps"]
+    speed: Float[np.ndarray, " steps"]  # per second, in the unit of the sheet
+    closedness: Float[np.ndarray, " steps"] | None  # None: the states are no poses
     shaded: tuple[tuple[int, int], ...]  # ranges [start, end) of steps: idle, or left out
     seen: CropBox  # what the model sees of a picture
 
 
 @dataclass(frozen=True, eq=False)
 class ContactSheet:
-    """Everything that the picture of a data set shows."""
+    """Everything that the picture of a data set shows.
+
+    Its unit of motion is cm of the flange. Where the states are vectors it is the percentage of its range by which the
+    number changes that changes most; these have no places in space.
+    """
 
     title: str
     facts: tuple[str, ...]  # lines
     strips: tuple[Strip, ...]
     control_rate_hz: float
     lengths_s: Float[np.ndarray, " episodes"]  # of all episodes
-    moved_cm: Mapping[int, Float[np.ndarray, " pairs"]]  # stride -> per model step
-    reference_cm: float  # a step that the released weights are known to have seen
-    places_m: Float[np.ndarray, "points 3"]  # where the flange was
+    moved: Mapping[int, Float[np.ndarray, " pairs"]]  # stride -> per model step
+    reference: float | None  # a step that the released weights are known to have seen
+    places_m: Float[np.ndarray, "points 3"] | None  # where the flange was
     shaded_means: str  # what the shaded parts of a strip are
+    ranges: Float[np.ndarray, "state_dim 2"] | None = None  # of vectors: the least and greatest value of each number
 
 
 def pictures_per_row(height: int, width: int) -> int:
@@ -111,10 +116,15 @@ def _panels(page: _Page, sheet: ContactSheet, top: float) -> None:
     lengths.set_title("Length of episodes (s)", loc="left", fontsize=9)
     lengths.locator_params(axis="y", nbins=4, integer=True)
     _motion(page.axes(5.0, top, 5.2, _PANELS), sheet)
+    if sheet.places_m is not None:
+        _places(page, sheet.places_m, top)
+    if sheet.ranges is not None:
+        _ranges(page.axes(11.1, top, 4.3, _PANELS), sheet.ranges)
+
+
+def _places(page: _Page, places_m: Float[np.ndarray, "points 3"], top: float) -> None:
     places = page.axes(11.1, top, 4.3, _PANELS)
-    shown = places.scatter(
-        -sheet.places_m[:, 1], sheet.places_m[:, 0], c=sheet.places_m[:, 2], s=2, cmap="viridis", linewidths=0
-    )
+    shown = places.scatter(-places_m[:, 1], places_m[:, 0], c=places_m[:, 2], s=2, cmap="viridis", linewidths=0)
     places.set_aspect("equal", adjustable="datalim")
     places.set_title("Where the flange was, from above (m; colour: height)", loc="left", fontsize=9)
     places.set(xlabel="-y: to the robot's right", ylabel="x: forward")
@@ -122,24 +132,40 @@ def _panels(page: _Page, sheet: ContactSheet, top: float) -> None:
     page.figure.colorbar(shown, ax=places, fraction=0.04, pad=0.02)
 
 
+def _ranges(axes: Any, ranges: Float[np.ndarray, "state_dim 2"]) -> None:
+    axes.bar(np.arange(len(ranges)), ranges[:, 1] - ranges[:, 0], bottom=ranges[:, 0], color=_SPEED)
+    axes.set_title("Range of each number of the state", loc="left", fontsize=9)
+    axes.set(xlabel="number, from 0")
+    axes.locator_params(axis="x", integer=True)
+
+
 def _motion(axes: Any, sheet: ContactSheet) -> None:
-    values = [moved for moved in sheet.moved_cm.values() if len(moved)]
-    far = max([sheet.reference_cm * 1.3, *(float(np.percentile(moved, 97)) for moved in values)])
+    is_pose = sheet.places_m is not None
+    unit = "cm" if is_pose else "%"
+    values = [moved for moved in sheet.moved.values() if len(moved)]
+    far = max([(sheet.reference or 1.0) * 1.3, *(float(np.percentile(moved, 97)) for moved in values)])
     reached = np.linspace(0, far, 200)
-    for (stride, moved), colour in zip(sheet.moved_cm.items(), _STRIDES, strict=False):
+    for (stride, moved), colour in zip(sheet.moved.items(), _STRIDES, strict=False):
         if not len(moved):
             continue
         share = np.searchsorted(np.sort(moved), reached, side="right") / len(moved) * 100
-        label = f"stride {stride} ({stride / sheet.control_rate_hz:.2f} s): median {np.median(moved):.1f} cm"
+        label = f"stride {stride} ({stride / sheet.control_rate_hz:.2f} s): median {np.median(moved):.1f} {unit}"
         axes.plot(reached, share, color=colour, linewidth=1.5, label=label)
-    axes.axvline(sheet.reference_cm, color=_GRIPPER, linestyle="--", linewidth=1.2, label="upstream's example pair")
-    axes.set_title("Share of model steps (%) that move the flange less far than this (cm)", loc="left", fontsize=9)
+    if sheet.reference is not None:
+        axes.axvline(sheet.reference, color=_GRIPPER, linestyle="--", linewidth=1.2, label="upstream's example pair")
+    less = (
+        "that move the flange less far than this (cm)" if is_pose else "that change no number by this (% of its range)"
+    )
+    axes.set_title(f"Share of model steps (%) {less}", loc="left", fontsize=9)
     axes.set(xlim=(0, far), ylim=(0, 102))
     axes.legend(framealpha=0.85, edgecolor="none", fontsize=8, loc="lower right")
 
 
 def _legend(page: _Page, sheet: ContactSheet, top: float) -> None:
-    entries = (("speed (cm/s)", _SPEED), ("gripper: 0 open, 1 closed", _GRIPPER), (sheet.shaded_means, _FAINT))
+    speed = "speed (cm/s)" if sheet.places_m is not None else "fastest number (% of its range per second)"
+    entries = [(speed, _SPEED), (sheet.shaded_means, _FAINT)]
+    if sheet.places_m is not None:
+        entries.insert(1, ("gripper: 0 open, 1 closed", _GRIPPER))
     left = _SIDE + _LABEL
     for words, colour in entries:
         page.text(left, top, f"■ {words}", color=colour, size=9)
@@ -148,14 +174,14 @@ def _legend(page: _Page, sheet: ContactSheet, top: float) -> None:
 
 
 def _fastest(strips: Sequence[Strip]) -> float:
-    speeds = np.concatenate([strip.speed_cm_s for strip in strips]) if strips else np.zeros(1)
+    speeds = np.concatenate([strip.speed for strip in strips]) if strips else np.zeros(1)
     return max(float(np.percentile(speeds, 99.5)) * 1.15, 1.0)
 
 
 def _strip(page: _Page, strip: Strip, control_rate_hz: float, fastest: float, top: float) -> None:
     left, across = _SIDE + _LABEL, _WIDTH - 2 * _SIDE - _LABEL
     words, colour = _OUTCOME[strip.success]
-    steps = len(strip.closedness)
+    steps = len(strip.speed)
     mark = page.axes(_SIDE, top, 0.05, _PICTURE + _PLOT)
     mark.set_axis_off()
     mark.add_patch(Rectangle((0, 0), 1, 1, color=colour))
@@ -192,13 +218,14 @@ def _picture(
 
 
 def _motion_of(axes: Any, strip: Strip, control_rate_hz: float, fastest: float) -> None:
-    seconds = (np.arange(len(strip.closedness)) + 0.5) / control_rate_hz
+    seconds = (np.arange(len(strip.speed)) + 0.5) / control_rate_hz
     for start, end in strip.shaded:
         axes.axvspan(start / control_rate_hz, end / control_rate_hz, color=_IDLE, alpha=0.6, linewidth=0)
-    axes.fill_between(seconds, strip.speed_cm_s, color=_SPEED, alpha=0.25, linewidth=0)
-    axes.plot(seconds, strip.speed_cm_s, color=_SPEED, linewidth=1)
-    axes.plot(seconds, strip.closedness * fastest, color=_GRIPPER, linewidth=1.2)
-    axes.set(xlim=(0, len(strip.closedness) / control_rate_hz), ylim=(0, fastest * 1.04))
+    axes.fill_between(seconds, strip.speed, color=_SPEED, alpha=0.25, linewidth=0)
+    axes.plot(seconds, strip.speed, color=_SPEED, linewidth=1)
+    if strip.closedness is not None:
+        axes.plot(seconds, strip.closedness * fastest, color=_GRIPPER, linewidth=1.2)
+    axes.set(xlim=(0, len(strip.speed) / control_rate_hz), ylim=(0, fastest * 1.04))
     axes.locator_params(axis="x", nbins=14)
     axes.set_yticks([0, round(fastest / 1.15)])
     axes.tick_params(labelsize=7, length=2, pad=1.5, colors=_FAINT)

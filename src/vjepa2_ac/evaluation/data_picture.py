@@ -6,9 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.inspection import RELEASED_STEP_CM, Inspection, ReadEpisode, idle_runs
+from vjepa2_ac.data.inspection_vectors import largest_change
 from vjepa2_ac.data.transforms import crop_box
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
@@ -32,7 +34,7 @@ def picture_data_set(
     strips = []
     for done, (one, name) in enumerate(zip(shown, names, strict=True), start=1):
         try:
-            strips.append(_strip(dataset, one, name))
+            strips.append(_strip(dataset, inspection, one, name))
         except InputError as error:
             dataset.leave_out(one.index, error)
         if progress is not None:
@@ -42,18 +44,20 @@ def picture_data_set(
 
 def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
     """Return what the sheet shows besides the strips: the title, the facts and the data of the plots."""
-    config = inspection.config
+    config, is_pose = inspection.config, inspection.is_pose
     places = np.concatenate([one.states[:, :3] for one in inspection.sample])
+    moved = {one.stride: one.moved_cm for one in inspection.motions}
     return ContactSheet(
         title=config.path,
         facts=_facts(inspection),
         strips=tuple(strips),
         control_rate_hz=inspection.control_rate_hz,
         lengths_s=inspection.lengths / inspection.control_rate_hz,
-        moved_cm={one.stride: one.moved_cm for one in inspection.motions},
-        reference_cm=RELEASED_STEP_CM,
-        places_m=places[:: -(-len(places) // _PLACES)],
+        moved=moved if is_pose else {one.stride: one.percent for one in inspection.changes},
+        reference=RELEASED_STEP_CM if is_pose else None,
+        places_m=places[:: -(-len(places) // _PLACES)] if is_pose else None,
         shaded_means="standing still" if config.idle.rule == "none" else f"left out by data.idle ({config.idle.rule})",
+        ranges=None if is_pose else inspection.ranges,
     )
 
 
@@ -68,23 +72,29 @@ def _facts(inspection: Inspection) -> tuple[str, ...]:
         f"{steps:,} steps at {inspection.control_rate_hz:g} per second: {lasting}",
         f"{shortest} to {longest} steps (median {median})",
         "outcome not known" if success is None else f"{success:.0%} successes",
-        f"{inspection.still_share:.0%} of the time standing still",
     ]
+    if inspection.still_share is not None:
+        first.append(f"{inspection.still_share:.0%} of the time standing still")
     if inspection.broken:
         first.append(f"{inspection.broken} broken")
-    gripper = inspection.range_of(6)
     second = [
         f"camera {', '.join(config.cameras)} of {', '.join(inspection.cameras)}",
         f"crop {config.crop}",
-        f"gripper {gripper[0]:.2f} to {gripper[1]:.2f}",
+        _about_states(inspection),
         f"clips of {config.frames} frames at stride {config.model_stride}: "
         + ", ".join(f"{count:,} {name}" for name, count in inspection.windows_of.items()),
     ]
     sampled = len(inspection.sample)
-    third = (
-        f"Motion and gripper: from {'all' if sampled == len(inspection.lengths) else 'a sample of'} {sampled} episodes."
-    )
+    shown = "Motion and gripper" if inspection.is_pose else "Motion"
+    third = f"{shown}: from {'all' if sampled == len(inspection.lengths) else 'a sample of'} {sampled} episodes."
     return "  ·  ".join(first), "  ·  ".join(second), third
+
+
+def _about_states(inspection: Inspection) -> str:
+    if not inspection.is_pose:
+        return f"states of {inspection.widths.state} numbers, actions of {inspection.widths.action}"
+    gripper = inspection.range_of(6)
+    return f"gripper {gripper[0]:.2f} to {gripper[1]:.2f}"
 
 
 def _rows_of(inspection: Inspection, rows: int) -> list[ReadEpisode]:
@@ -107,26 +117,36 @@ def _short_names(names: Sequence[str]) -> list[str]:
     return ["/".join(part) for part in parts]
 
 
-def _strip(dataset: Dataset, one: ReadEpisode, name: str) -> Strip:
+def _strip(dataset: Dataset, inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
     episode = dataset.source.read(one.index)
     steps = len(one.states)
     height, width = episode.read_frames([0]).shape[1:3]
     count = min(pictures_per_row(height, width), steps)
     at = ((np.arange(count) + 0.5) * steps / count).astype(np.int64)
-    speed = np.linalg.norm(np.gradient(one.states[:, :3], axis=0), axis=1) if steps > 1 else np.zeros(1)
     return Strip(
         name=name,
         success=episode.info.success,
         frames=episode.read_frames([int(step) for step in at]),
         steps=at,
-        speed_cm_s=speed * episode.control_rate_hz * 100,
-        closedness=one.states[:, 6],
+        speed=_change_per_step(one, inspection) * episode.control_rate_hz,
+        closedness=one.states[:, 6] if inspection.is_pose else None,
         shaded=_shaded(dataset, one),
         seen=crop_box(height, width, dataset.config.crop),
     )
 
 
+def _change_per_step(one: ReadEpisode, inspection: Inspection) -> Float[np.ndarray, " steps"]:
+    """Return by how much the robot moves in a control step, in the sheet's unit."""
+    if len(one.states) == 1:
+        return np.zeros(1)
+    if not inspection.is_pose:
+        return largest_change(np.gradient(one.states, axis=0), inspection.ranges)
+    return np.asarray(np.linalg.norm(np.gradient(one.states[:, :3], axis=0), axis=1) * 100)
+
+
 def _shaded(dataset: Dataset, one: ReadEpisode) -> tuple[tuple[int, int], ...]:
+    if dataset.config.idle.rule == "none" and dataset.config.states == "vector":
+        return ()  # what standing still means is not known
     if dataset.config.idle.rule == "none":
         mask = idle_runs(one.states, dataset.config)
     else:

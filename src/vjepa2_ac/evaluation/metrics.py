@@ -121,7 +121,7 @@ def _stand_in(actions: Tensor) -> Tensor:
 
 @torch.no_grad()
 def one_step_errors(
-    model: Predictor, batch: LatentBatch, actions: Float[Tensor, "batch steps 7"] | None = None
+    model: Predictor, batch: LatentBatch, actions: Float[Tensor, "batch steps action_dim"] | None = None
 ) -> tuple[Float[np.ndarray, " batch"], Float[np.ndarray, " batch"]]:
     """Return, for each clip, the teacher-forced error with its own or other actions, and that of persistence."""
     latents, extrinsics = batch.latents, batch.extrinsics

@@ -46,6 +46,24 @@ def require_plausible(states: Float[np.ndarray, "steps 7"], where: str, *, fix: 
             )
 
 
+def require_finite(states: Float[np.ndarray, "steps state_dim"], where: str, *, fix: str) -> None:
+    """Refuse vectors that cannot be a robot's state or command, and an episode of no steps. What they mean is unknown.
+
+    Raises:
+        InputError: Names the first step with a number that is not finite.
+    """
+    if len(states) == 0:
+        raise zero_steps(where)
+    if (wrong := ~np.isfinite(states).all(axis=1)).any():
+        step = int(wrong.argmax())
+        raise InputError(
+            where=f"{where}: step {step}",
+            found=f"the numbers {np.array2string(states[step], precision=4, max_line_width=200)}",
+            needed="finite numbers",
+            fix=fix,
+        )
+
+
 def zero_steps(where: str) -> InputError:
     """Return the error of an episode without a single step."""
     return InputError(where=where, found="no steps", needed="one or more")

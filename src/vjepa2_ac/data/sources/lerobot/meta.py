@@ -67,10 +67,12 @@ class DatasetInfo:
         """
         fields = config.lerobot
         columns = [name for name, feature in self.features.items() if not feature.is_camera]
-        for name in fields.state:
-            if name not in columns:
-                raise missing("data.lerobot.state", "column", name, self.where, columns)
-        _require_state(self, fields)
+        wanted = {"state": fields.state, "action": fields.action if config.actions == "recorded" else ()}
+        for knob, names in wanted.items():
+            for name in names:
+                if name not in columns:
+                    raise missing(f"data.lerobot.{knob}", "column", name, self.where, columns)
+        _require_state(self, fields, is_pose=config.states == "pose")
         for camera in config.cameras:
             self.camera_key(fields, camera)
 
@@ -172,7 +174,7 @@ def _require_version(where: str, version: object) -> None:
     )
 
 
-def _require_state(info: DatasetInfo, fields: LeRobotFields) -> None:
+def _require_state(info: DatasetInfo, fields: LeRobotFields, *, is_pose: bool) -> None:
     described = " + ".join(_described(name, info.features[name]) for name in fields.state)
     where = "data.lerobot.select" if fields.select is not None else "data.lerobot.state"
     joined = sum(info.features[name].width for name in fields.state)
@@ -181,7 +183,7 @@ def _require_state(info: DatasetInfo, fields: LeRobotFields) -> None:
             where=where, found=f"{beyond[0]}, of {joined} numbers in {described}", needed=f"0 to {joined - 1}"
         )
     width, needed = len(fields.select or range(joined)), _STATE_NUMBERS[fields.rotation]
-    if width != needed:
+    if is_pose and width != needed:
         rotation = "3 Euler angles" if needed == STATE_WITH_EULER else "a quaternion's 4"
         raise InputError(
             where=where,

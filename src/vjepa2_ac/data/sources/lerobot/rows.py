@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from vjepa2_ac.config import LeRobotFields
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.lerobot.kept import Columns
 from vjepa2_ac.data.sources.lerobot.meta import DatasetInfo, missing
 from vjepa2_ac.data.sources.lerobot.parquet import EPISODE
-from vjepa2_ac.data.sources.lerobot.states import states_of
+from vjepa2_ac.data.sources.lerobot.states import states_of, vectors_of
 from vjepa2_ac.errors import InputError
 
 FRAME, TIME = "frame_index", "timestamp"
@@ -23,32 +23,41 @@ _FIX = "Copy the file again, or leave the episode out"
 class EpisodeContent:
     """What is read of an episode beside its pictures."""
 
-    states: Float[np.ndarray, "steps 7"]
+    states: Float[np.ndarray, "steps state_dim"]
     joint_velocities: Float[np.ndarray, "steps joints"] | None
     success: bool | None
+    commands: Float[np.ndarray, "steps action_dim"] | None = None
 
 
-def wanted_columns(fields: LeRobotFields) -> list[str]:
+def wanted_columns(config: DataConfig) -> list[str]:
     """Return the columns that are read where a file has them."""
+    fields = config.lerobot
     optional = [name for name in (fields.joint_velocity, fields.success) if name is not None]
-    return [EPISODE, FRAME, TIME, *fields.state, *optional]
+    commands = fields.action if config.actions == "recorded" else ()
+    return [EPISODE, FRAME, TIME, *fields.state, *commands, *optional]
 
 
-def content_of(rows: Columns, length: int, info: DatasetInfo, fields: LeRobotFields, where: str) -> EpisodeContent:
+def content_of(rows: Columns, length: int, info: DatasetInfo, config: DataConfig, where: str) -> EpisodeContent:
     """Return what the rows of an episode hold.
 
     Args:
         rows: As `ParquetRows.rows` returns them.
         length: How many there must be.
         info: What the data set says of its columns.
-        fields: Names and conventions of the columns.
+        config: Names and conventions of the columns, and what a state is.
         where: File and episode, for the message.
 
     Raises:
         InputError: Rows or columns are missing, are of another width, or are not a robot's states.
     """
     _require_rows(rows, length, info.fps, where)
-    states = states_of([_column(rows, name, info, where) for name in fields.state], fields, where)
+    fields = config.lerobot
+    columns = [_column(rows, name, info, where) for name in fields.state]
+    is_pose = config.states == "pose"
+    states = states_of(columns, fields, where) if is_pose else vectors_of(columns, fields.select, where)
+    commands = None
+    if config.actions == "recorded":
+        commands = vectors_of([_column(rows, name, info, where) for name in fields.action], None, where)
     for name in (fields.joint_velocity, fields.success):
         if name is not None and name in info.features and name not in rows:
             raise missing("data.lerobot", "column", name, where, rows)
@@ -64,7 +73,7 @@ def content_of(rows: Columns, length: int, info: DatasetInfo, fields: LeRobotFie
                 fix="Leave the episode out, or set data.lerobot.joint_velocity: null",
             )
     success = bool(rows[fields.success].any()) if fields.success is not None and fields.success in rows else None
-    return EpisodeContent(states, velocities, success)
+    return EpisodeContent(states, velocities, success, commands)
 
 
 def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:

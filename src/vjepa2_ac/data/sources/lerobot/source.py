@@ -86,6 +86,7 @@ class LeRobotSource:
             control_rate_hz=self._control_rate_hz,
             joint_velocities=content.joint_velocities,
             metadata={"language": task} if task else {},
+            commands=content.commands,
         )
 
     @cached_property
@@ -103,7 +104,7 @@ class LeRobotSource:
     @cached_property
     def _parquet(self) -> ParquetRows:
         kept = KeptRows(fetched_data(self._config.disk_cache), self._data_version)
-        return ParquetRows(self._open, wanted_columns(self._config.lerobot), kept)
+        return ParquetRows(self._open, wanted_columns(self._config), kept)
 
     @cached_property
     def _files(self) -> EpisodeFiles:
@@ -134,11 +135,13 @@ class LeRobotSource:
         for key in keys:
             if info.features[key].dtype == "video":
                 files |= list_by_template(info.root, info.video_path or "", key, connections=self._connections)
+        vector = {"vector": wanted_columns(config)} if config.states == "vector" else {}
         self._version = key_of(
             {
+                **vector,
                 "source": "lerobot",
                 "path": storage.absolute(config.path),
-                "fields": config.lerobot.model_dump(),
+                "fields": config.lerobot.model_dump(exclude={"action"}),
                 "keys": keys,
                 "outcome": self._is_far and config.outcome != "all",
                 "info": repr(replace(info, root="")),
@@ -175,7 +178,7 @@ class LeRobotSource:
 
     def _content(self, row: EpisodeRow) -> EpisodeContent:
         rows = self._parquet.rows(storage.join(self._info.root, data_file(self._info, row)), row.index)
-        return content_of(rows, row.length, self._info, self._config.lerobot, self._where(row))
+        return content_of(rows, row.length, self._info, self._config, self._where(row))
 
     def _pictures(self, row: EpisodeRow, key: str, where: str) -> FrameReader:
         info = self._info

@@ -9,7 +9,7 @@ from jaxtyping import Float, Shaped
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config import LeRobotFields
-from vjepa2_ac.data.sources.states import require_plausible
+from vjepa2_ac.data.sources.states import require_finite, require_plausible
 from vjepa2_ac.errors import InputError
 
 _UNIT_TOLERANCE = 1e-2
@@ -32,6 +32,21 @@ def states_of(
     states = np.concatenate([joined[:, :3], _euler(joined[:, 3:-1], fields, where), gripper], axis=1)
     require_plausible(states, where, fix=_FIX)
     return states
+
+
+def vectors_of(
+    columns: Sequence[Shaped[np.ndarray, "steps _"]], select: Sequence[int] | None, where: str
+) -> Float[np.ndarray, "steps width"]:
+    """Return the joined columns of an episode as they are, or the selected ones of their numbers.
+
+    Raises:
+        InputError: A number is not finite, or there are no steps.
+    """
+    joined = np.concatenate([column.astype(np.float64) for column in columns], axis=1)
+    if select is not None:
+        joined = joined[:, select]
+    require_finite(joined, where, fix="Leave the episode out, or check data.lerobot: state, select and action")
+    return joined
 
 
 def _euler(rotation: Float[np.ndarray, "steps _"], fields: LeRobotFields, where: str) -> Float[np.ndarray, "steps 3"]:

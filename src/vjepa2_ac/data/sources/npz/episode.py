@@ -4,6 +4,7 @@ An episode NAME.npz, as numpy.savez or numpy.savez_compressed writes it, holds
 
     states             [steps, 7]  measured: x, y, z in metres, roll, pitch, yaw in radians (extrinsic xyz Euler),
                                    gripper closedness, 0 open .. 1 closed; all in the robot's base frame
+                                   ([steps, any] with data.states: vector: whatever the robot has)
     frames             [steps, height, width, 3] uint8, RGB: the picture at each step
     fps_hz             control steps per second, the same in all episodes
 
@@ -12,6 +13,7 @@ and may hold
     any other name     more cameras, shaped as `frames`; `data.camera` chooses by name
     extrinsics         [6] or [steps, 6]: the camera in the base frame; extrinsics_CAMERA: that of one camera
     joint_velocities   [steps, joints], *commanded*, radians per second: the idle filter's rule `commands` reads them
+    actions            [steps, any], *commanded*: read with data.actions: recorded
     success            true or false
     language           the task in words
 
@@ -34,7 +36,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.data.sources.npz.file import NpzFile
-from vjepa2_ac.data.sources.states import require_plausible
+from vjepa2_ac.data.sources.states import require_finite, require_plausible
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.errors import InputError
 
@@ -45,12 +47,18 @@ FORMAT_HELP = "docs/data.md says what an episode holds"
 class NpzEpisode:
     """What an episode's file holds, but for the pictures (legend: `vjepa2_ac.episode`)."""
 
-    states: Float[np.ndarray, "steps 7"]
+    states: Float[np.ndarray, "steps state_dim"]
     fps_hz: float
     success: bool | None
     language: str | None
     extrinsics: dict[str, Any]  # of each camera: [steps 6], or None
     joint_velocities: Float[np.ndarray, "steps joints"] | None
+    commands: Float[np.ndarray, "steps action_dim"] | None
+
+    @property
+    def widths(self) -> tuple[int, int | None]:
+        """How many numbers a state and a command have."""
+        return self.states.shape[1], None if self.commands is None else self.commands.shape[1]
 
 
 def read_episode(opened: str | KeptFile, path: str, cameras: Sequence[str], config: DataConfig) -> NpzEpisode:
@@ -60,16 +68,17 @@ def read_episode(opened: str | KeptFile, path: str, cameras: Sequence[str], conf
         opened: What to open to read: the path, or a file far away.
         path: Of the file, for messages.
         cameras: Whose pictures must be there.
-        config: Whether camera poses must be, too.
+        config: Whether camera poses and commands must be, too, and what a state is.
 
     Raises:
         InputError: It is no episode, or cannot be a robot's.
     """
     with opened_npz(opened, path) as file:
         arrays = _Arrays(file, path)
-        states = arrays.numbers("states", (None, STATE_DIM))
+        is_pose = config.states == "pose"
+        states = arrays.numbers("states", (None, STATE_DIM if is_pose else None))
         steps = len(states)
-        require_plausible(states, path, fix=FORMAT_HELP)
+        (require_plausible if is_pose else require_finite)(states, path, fix=FORMAT_HELP)
         extrinsics = {}
         for camera in cameras:
             require_pictures(file, camera, steps, path)
@@ -90,6 +99,7 @@ def read_episode(opened: str | KeptFile, path: str, cameras: Sequence[str], conf
             language=arrays.text("language") if "language" in file.names else None,
             extrinsics=extrinsics,
             joint_velocities=arrays.numbers("joint_velocities", (steps, None)) if has_velocities else None,
+            commands=arrays.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
         )
 
 

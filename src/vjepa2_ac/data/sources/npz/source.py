@@ -81,6 +81,7 @@ class NpzSource:
             extrinsics=found.extrinsics[camera],
             joint_velocities=found.joint_velocities,
             metadata={} if found.language is None else {"language": found.language},
+            commands=found.commands,
         )
 
     def _indexed(self, progress: Progress | None) -> EpisodeTable:
@@ -98,7 +99,9 @@ class NpzSource:
                 needed="one for each episode",
                 fix=FORMAT_HELP,
             )
-        knobs = {"cameras": config.cameras, "pose_frame": config.pose_frame}
+        knobs: dict[str, object] = {"cameras": config.cameras, "pose_frame": config.pose_frame}
+        if config.states == "vector":
+            knobs |= {"states": config.states, "actions": config.actions}
         self._version = key_of({"source": "npz", "path": storage.absolute(self._root), **knobs, "listed": listed})
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
         return kept_or_built(config.disk_cache, self._version, lambda: self._scan_all(ids, progress))
@@ -120,7 +123,12 @@ class NpzSource:
             raise as_error(problems[0])
         rate = Counter(one.fps_hz for one in found.values()).most_common(1)[0][0]
         problems += [self._other_rate(name, one.fps_hz, rate) for name, one in found.items() if one.fps_hz != rate]
-        infos = [EpisodeInfo(name, len(one.states), one.success) for name, one in found.items() if one.fps_hz == rate]
+        found = {name: one for name, one in found.items() if one.fps_hz == rate}
+        widths = Counter(one.widths for one in found.values()).most_common(1)[0][0]
+        problems += [
+            self._other_widths(name, one.widths, widths) for name, one in found.items() if one.widths != widths
+        ]
+        infos = [EpisodeInfo(name, len(one.states), one.success) for name, one in found.items() if one.widths == widths]
         logger.info("%s: %d episodes, %d that cannot be used", self._root, len(infos), len(problems))
         return EpisodeTable.of(infos, problems=problems, texts={"control_rate_hz": str(rate)})
 
@@ -136,6 +144,14 @@ class NpzSource:
     def _other_rate(self, identity: str, rate: float, others: float) -> Problem:
         needed = f"{others:g}, as in most episodes: strides count control steps"
         return Problem(identity, f"{self._path(identity)}: fps_hz", f"{rate:g}", needed, "Resample the episode")
+
+    def _other_widths(self, identity: str, widths: tuple[int, int | None], others: tuple[int, int | None]) -> Problem:
+        found, needed = (
+            f"{state} numbers a state" + ("" if action is None else f", {action} an action")
+            for state, action in (widths, others)
+        )
+        fix = "Keep the recordings of different robots in different folders"
+        return Problem(identity, self._path(identity), found, f"{needed}, as in most episodes", fix)
 
     def _opened(self, path: str) -> str | KeptFile:
         return self._files.open(path, version=self._version)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.config import RldsFields
+from vjepa2_ac.config import DataConfig, RldsFields
 from vjepa2_ac.data.sources.rlds.record import Record
-from vjepa2_ac.data.sources.states import require_plausible, zero_steps
+from vjepa2_ac.data.sources.states import require_finite, require_plausible, zero_steps
 from vjepa2_ac.episode import STATE_DIM, EpisodeInfo
 from vjepa2_ac.errors import InputError
 
@@ -34,18 +34,25 @@ def info_of(identity: str, num_steps: int) -> EpisodeInfo:
     return EpisodeInfo(id=identity, num_steps=num_steps, success=success)
 
 
-def num_steps_of(record: Record, fields: RldsFields) -> int:
-    """Count the steps by their first flag; a data set without it by its states.
+def features_of_steps(config: DataConfig) -> tuple[str, ...]:
+    """Return the features that states and recorded actions are made of."""
+    return config.fields.state + (config.fields.action if config.actions == "recorded" else ())
+
+
+def num_steps_of(record: Record, config: DataConfig) -> int:
+    """Count the steps by their first flag; a data set without it by its states, where these are poses.
 
     Raises:
         InputError: Neither is there.
     """
+    if config.states == "vector":  # of any width: only the flag tells
+        record.require([STEP_FLAG])
     if STEP_FLAG in record.located:
         return record.count_integers(STEP_FLAG)
-    return sum(len(record.floats(name)) for name in fields.state) // STATE_DIM
+    return sum(len(record.floats(name)) for name in config.fields.state) // STATE_DIM
 
 
-def states_of(record: Record, fields: RldsFields, steps: int, where: str) -> Float[np.ndarray, "steps 7"]:
+def states_of(record: Record, config: DataConfig, steps: int, where: str) -> Float[np.ndarray, "steps state_dim"]:
     """Return the measured states (legend: `vjepa2_ac.episode`), which are what a robot's can be.
 
     Raises:
@@ -53,8 +60,12 @@ def states_of(record: Record, fields: RldsFields, steps: int, where: str) -> Flo
     """
     if steps == 0:
         raise zero_steps(where)
+    fields = config.fields
     columns = [_of_every_step(record, name, steps, where) for name in fields.state]
     states = np.concatenate(columns, axis=1)
+    if config.states == "vector":
+        require_finite(states, where, fix="Check data.fields.state, or leave the episode out")
+        return states
     if states.shape[1] != STATE_DIM:
         found = " + ".join(f"{name} [{column.shape[1]}]" for name, column in zip(fields.state, columns, strict=True))
         raise InputError(
@@ -64,6 +75,21 @@ def states_of(record: Record, fields: RldsFields, steps: int, where: str) -> Flo
     if fields.gripper == "openness":
         states[:, 6] = 1.0 - states[:, 6]
     return states
+
+
+def commands_of(
+    record: Record, config: DataConfig, steps: int, where: str
+) -> Float[np.ndarray, "steps action_dim"] | None:
+    """Return the recorded actions where `data.actions` asks for them.
+
+    Raises:
+        InputError: A feature is missing, is not of one shape for all steps, or holds numbers that are not finite.
+    """
+    if config.actions != "recorded":
+        return None
+    commands = np.concatenate([_of_every_step(record, name, steps, where) for name in config.fields.action], axis=1)
+    require_finite(commands, f"{where}: {', '.join(config.fields.action)}", fix="Check data.fields.action")
+    return commands
 
 
 def joint_velocities_of(

@@ -9,11 +9,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vjepa2_ac.config import RldsFields
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import as_error, as_problem
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard
 from vjepa2_ac.data.sources.rlds.example_index import Read
-from vjepa2_ac.data.sources.rlds.fields import identity_of, info_of, num_steps_of, states_of
+from vjepa2_ac.data.sources.rlds.fields import (
+    commands_of,
+    features_of_steps,
+    identity_of,
+    info_of,
+    num_steps_of,
+    states_of,
+)
 from vjepa2_ac.data.sources.rlds.record import Record
 from vjepa2_ac.data.sources.rlds.shard_file import open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, RecordSpan, require_intact, span_at
@@ -38,13 +45,13 @@ Examine = Callable[[Read, RecordSpan], Found]
 
 
 def index_local(
-    shards: Sequence[Shard], fields: RldsFields, cameras: Sequence[str], *, threads: int, progress: Progress | None
+    shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str], *, threads: int, progress: Progress | None
 ) -> EpisodeTable:
     """Return every episode of shards on this machine; its states are checked, its pictures only found to be there.
 
     Args:
         shards: All of the data set's.
-        fields: Names of the features.
+        config: Names of the features, and what a state is.
         cameras: Features with pictures that every episode must have.
         threads: Shards that are read at once.
         progress: Told how many of the episodes have been looked at.
@@ -54,7 +61,7 @@ def index_local(
     """
 
     def examine(read: Read, span: RecordSpan) -> Found:
-        return _examine(read, span, fields, cameras)
+        return _examine(read, span, config, cameras)
 
     def scan(shard: Shard) -> list[Found]:
         with open_shard(shard) as read:
@@ -156,15 +163,16 @@ def place_of(span: RecordSpan) -> str:
     return f"{span.path.replace(chr(92), '/').rsplit('/', 1)[-1]}: record {span.number}"
 
 
-def _examine(read: Read, span: RecordSpan, fields: RldsFields, cameras: Sequence[str]) -> Found:
+def _examine(read: Read, span: RecordSpan, config: DataConfig, cameras: Sequence[str]) -> Found:
     """Look at identity, steps, states and the presence of the pictures."""
     name = place_of(span)
     record = Record(read, span)
     try:
-        name = identity_of(record, fields)
-        record.require([*fields.state, *cameras])
-        steps = num_steps_of(record, fields)
-        states_of(record, fields, steps, f"{span} ({name})")
+        name = identity_of(record, config.fields)
+        record.require([*features_of_steps(config), *cameras])
+        steps = num_steps_of(record, config)
+        states_of(record, config, steps, f"{span} ({name})")
+        commands_of(record, config, steps, f"{span} ({name})")
     except InputError as error:
         return as_problem(_damage_or(error, read, span), name)
     return Row(info_of(name, steps), span)

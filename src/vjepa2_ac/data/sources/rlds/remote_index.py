@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from vjepa2_ac.config import RldsFields
+from vjepa2_ac.config import DataConfig, RldsFields
 from vjepa2_ac.data.broken import as_problem
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard
 from vjepa2_ac.data.sources.rlds.example_index import (
@@ -24,7 +24,15 @@ from vjepa2_ac.data.sources.rlds.example_index import (
     features_behind,
     iterate_features,
 )
-from vjepa2_ac.data.sources.rlds.fields import STEP_FLAG, identity_of, info_of, num_steps_of, states_of
+from vjepa2_ac.data.sources.rlds.fields import (
+    STEP_FLAG,
+    commands_of,
+    features_of_steps,
+    identity_of,
+    info_of,
+    num_steps_of,
+    states_of,
+)
 from vjepa2_ac.data.sources.rlds.index import Found, Row, in_parallel, place_of, scan_shard, table_of
 from vjepa2_ac.data.sources.rlds.record import Record, not_an_example
 from vjepa2_ac.data.sources.rlds.remote_file import RemoteFile
@@ -65,13 +73,13 @@ class Layout:
 
 
 def index_remote(
-    shards: Sequence[Shard], fields: RldsFields, cameras: Sequence[str], *, threads: int, progress: Progress | None
+    shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str], *, threads: int, progress: Progress | None
 ) -> EpisodeTable:
     """Return every episode of shards behind a URL, by identity and number of steps.
 
     Args:
         shards: All of the data set's.
-        fields: Names of the features.
+        config: Names of the features, and what a state is.
         cameras: Features with pictures that episodes must have; looked for in a few of them.
         threads: Shards that are read at once, at least `FEWEST_IN_FLIGHT`.
         progress: Told how many of the episodes have been found.
@@ -79,10 +87,10 @@ def index_remote(
     Raises:
         InputError: No episode can be used; a shard cannot be read.
     """
-    layout = learn_layout(shards, fields, cameras)
+    layout = learn_layout(shards, config, cameras)
 
     def examine(read: Read, span: RecordSpan) -> Found:
-        return _examine(read, span, fields, layout)
+        return _examine(read, span, config, layout)
 
     def scan(shard: Shard) -> list[Found]:
         return list(scan_shard(RemoteFile(shard, window=layout.window, kept=_PIECES), shard, examine))
@@ -90,7 +98,7 @@ def index_remote(
     return table_of(shards, in_parallel(scan, shards, max(threads, FEWEST_IN_FLIGHT), progress))
 
 
-def learn_layout(shards: Sequence[Shard], fields: RldsFields, cameras: Sequence[str]) -> Layout:
+def learn_layout(shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str]) -> Layout:
     """Look at the first record of a few shards, as closely as at a local one.
 
     Raises:
@@ -99,7 +107,7 @@ def learn_layout(shards: Sequence[Shard], fields: RldsFields, cameras: Sequence[
 
     def first_record(shard: Shard) -> tuple[Record, int] | InputError:
         try:
-            return _whole_record(shard, fields, cameras)
+            return _whole_record(shard, config, cameras)
         except UnreachableError:
             raise  # says nothing of the record
         except InputError as error:
@@ -111,6 +119,7 @@ def learn_layout(shards: Sequence[Shard], fields: RldsFields, cameras: Sequence[
     good = [one for one in looked if not isinstance(one, InputError)]
     if not good:
         raise next(one for one in looked if isinstance(one, InputError))
+    fields = config.fields
     step_bytes = _step_bytes(good, fields)
     seconds = {
         window: sum(_cost_s(record, fields, step_bytes.keys(), window) for record, _ in good) for window in _WINDOWS
@@ -120,13 +129,14 @@ def learn_layout(shards: Sequence[Shard], fields: RldsFields, cameras: Sequence[
     return Layout(step_bytes, window)
 
 
-def _whole_record(shard: Shard, fields: RldsFields, cameras: Sequence[str]) -> tuple[Record, int]:
+def _whole_record(shard: Shard, config: DataConfig, cameras: Sequence[str]) -> tuple[Record, int]:
     read = RemoteFile(shard, window=_SAMPLE_WINDOW)
     span = span_at(read(0, HEADER_BYTES), shard.path, 0, 0, shard.size)
     record = Record(read, span)
-    record.require([*fields.identity, *fields.state, *cameras])
-    steps = num_steps_of(record, fields)
-    states_of(record, fields, steps, str(span))
+    record.require([*config.fields.identity, *features_of_steps(config), *cameras])
+    steps = num_steps_of(record, config)
+    states_of(record, config, steps, str(span))
+    commands_of(record, config, steps, str(span))
     return record, steps
 
 
@@ -173,14 +183,14 @@ def _cost_s(record: Record, fields: RldsFields, telling: Iterable[str], window: 
     return max(1, reads) * _ASSUMED_LATENCY_S + FEWEST_IN_FLIGHT * shared_s
 
 
-def _examine(read: Read, span: RecordSpan, fields: RldsFields, layout: Layout) -> Found:
+def _examine(read: Read, span: RecordSpan, config: DataConfig, layout: Layout) -> Found:
     """Look at the record's head; if need be at its end, with the head of the next; then hop from one to the other."""
     name = place_of(span)
     try:
-        found, steps = _search(read, span, fields, layout)
+        found, steps = _search(read, span, config.fields, layout)
         record = Record(read, span, found)
-        name = identity_of(record, fields)
-        steps = num_steps_of(record, fields) if steps is None else steps
+        name = identity_of(record, config.fields)
+        steps = num_steps_of(record, config) if steps is None else steps
         if steps == 0:
             raise zero_steps(f"{span} ({name})")
     except UnreachableError:

@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import DataConfig, RldsFields
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.index import cache_folder, kept_or_built, key_of
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard, find_shards
 from vjepa2_ac.data.sources.rlds.example_index import Read
 from vjepa2_ac.data.sources.rlds.fields import (
     STEP_FLAG,
+    commands_of,
+    features_of_steps,
     identity_of,
     info_of,
     joint_velocities_of,
@@ -126,22 +128,23 @@ class RldsSource:
             pictures: FrameReader = PicturesAt(read, record.located[feature], info.num_steps, f"{where}: {feature}")
         else:
             remote = RemoteEpisode(shard, span, opened.cache)
-            numbers = [*fields.identity, *fields.state, STEP_FLAG, fields.joint_velocity]
+            numbers = [*fields.identity, *features_of_steps(self._config), STEP_FLAG, fields.joint_velocity]
             record = remote.record([name for name in numbers if name], [fields.language] if fields.language else [])
             record.require([feature])
             pictures = remote.pictures(feature, record.located, info.num_steps, needed, f"{where}: {feature}")
         return self._episode(record, info, pictures, where)
 
     def _episode(self, record: Record, info: EpisodeInfo, pictures: FrameReader, where: str) -> Episode:
-        fields = self._config.fields
-        _require_as_indexed(record, info, fields, where)
+        config, fields = self._config, self._config.fields
+        _require_as_indexed(record, info, config, where)
         return Episode(
             info=info,
-            states=states_of(record, fields, info.num_steps, where),
+            states=states_of(record, config, info.num_steps, where),
             read_frames=pictures,
             control_rate_hz=fields.control_rate_hz,
             joint_velocities=joint_velocities_of(record, fields, info.num_steps, where),
             metadata=language_of(record, fields),
+            commands=commands_of(record, config, info.num_steps, where),
         )
 
     def _check(
@@ -169,6 +172,7 @@ class RldsSource:
         config, fields = self._config, self._config.fields
         shards = tuple(find_shards(config.path))
         key = key_of({
+            **({"vector": features_of_steps(config)} if config.states == "vector" else {}),
             "source": "rlds",
             "path": storage.absolute(config.path),
             "state": fields.state,
@@ -180,7 +184,7 @@ class RldsSource:
         make = index_remote if storage.is_url(config.path) else index_local
 
         def build() -> EpisodeTable:
-            return make(shards, fields, self._features(), threads=config.connections, progress=progress)
+            return make(shards, config, self._features(), threads=config.connections, progress=progress)
 
         table = kept_or_built(config.disk_cache, key, build)
         return _Opened(
@@ -197,9 +201,9 @@ def _place_of(opened: _Opened, index: int) -> tuple[Shard, RecordSpan]:
     return shard, RecordSpan(path=shard.path, number=at["record"], offset=at["offset"], length=at["length"])
 
 
-def _require_as_indexed(record: Record, info: EpisodeInfo, fields: RldsFields, where: str) -> None:
+def _require_as_indexed(record: Record, info: EpisodeInfo, config: DataConfig, where: str) -> None:
     """Refuse a record that is not the one that the index speaks of."""
-    found = info_of(identity_of(record, fields), num_steps_of(record, fields))
+    found = info_of(identity_of(record, config.fields), num_steps_of(record, config))
     if found != info:
         raise InputError(
             where=where,

@@ -1,0 +1,77 @@
+"""Which action belongs to a model step? A difference of states, or the commands that were recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.episode import Episode, Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import actions_from_states
+
+
+def actions_of(
+    states: Float[np.ndarray, "time state_dim"],
+    commands: Float[np.ndarray, "steps action_dim"] | None,
+    steps: Sequence[int],
+    config: DataConfig,
+) -> Float[np.ndarray, "time-1 action_dim"]:
+    """Return the action between each two model steps of a clip.
+
+    Args:
+        states: At these steps, in the frame that the config asks for.
+        commands: Recorded ones of all control steps of the episode; read for `data.actions: recorded` only.
+        steps: Control steps of the clip, evenly apart.
+        config: What an action is.
+
+    Raises:
+        ValueError: Commands are asked for and there are none.
+    """
+    if config.states == "pose":
+        return actions_from_states(states)
+    if config.actions == "difference":
+        return np.diff(states, axis=0)
+    if commands is None:
+        raise ValueError("no commands: a source gives them where data.actions is recorded")
+    return joined(commands[steps[0] : steps[-1]], config.model_stride, config.join_actions)
+
+
+def joined(
+    commands: Float[np.ndarray, "steps action_dim"], stride: int, how: str | None
+) -> Float[np.ndarray, "model_steps action_dim"]:
+    """Return one action for each `stride` commands: their sum, their mean, or the last of them.
+
+    The command of a control step is what was sent after that step was measured: those of the model step from control
+    step t to t + stride are the ones of t .. t + stride - 1.
+    """
+    groups = commands.reshape(-1, stride, commands.shape[1])
+    if how == "sum":
+        return np.asarray(groups.sum(axis=1))
+    if how == "mean":
+        return np.asarray(groups.mean(axis=1))
+    return groups[:, -1]  # the only one at stride 1
+
+
+def widths_of(episode: Episode) -> Widths:
+    """Return how many numbers states and actions of an episode have."""
+    state = int(episode.states.shape[1])
+    return Widths(state, state if episode.commands is None else int(episode.commands.shape[1]))
+
+
+def require_widths(episode: Episode, widths: Widths) -> None:
+    """Refuse an episode whose numbers are more or fewer than those of the others.
+
+    Raises:
+        InputError: Names both.
+    """
+    found = widths_of(episode)
+    if found != widths:
+        raise InputError(
+            where=f"episode {episode.info.id}",
+            found=f"states of {found.state} and actions of {found.action} numbers",
+            needed=f"{widths.state} and {widths.action}, as in the others",
+            fix="Keep the recordings of different robots in different data sets",
+        )

@@ -1,0 +1,285 @@
+"""Robots without a pose: the numbers arrive as they are, of any width, from every source that can have them."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from gcs import Gcs
+from lerobot_sets import Recorded, recorded, write_v21, write_v30
+from memory_source import MemorySource
+from vector_sets import vectors, write_vectors
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config_file import parse_config
+from vjepa2_ac.data.actions import actions_of, joined
+from vjepa2_ac.data.check import check_data, findings_in
+from vjepa2_ac.data.clips import clip_at
+from vjepa2_ac.data.dataset import open_dataset, open_source
+from vjepa2_ac.data.inspection import inspect_dataset
+from vjepa2_ac.episode import Batch, Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.data_picture import picture_data_set
+from vjepa2_ac.geometry import actions_from_states
+
+JOINTS = ("steps/observation/joint_position", "steps/observation/gripper_position")
+VELOCITIES = ("steps/action_dict/joint_velocity", "steps/action_dict/gripper_velocity")
+
+
+def knobs(path: object, **changes: Any) -> DataConfig:
+    values = {
+        "source": "npz", "path": str(path), "states": "vector", "frames": 3, "stride": 2, "workers": 0,
+        "validation_share": 0.3, "test_share": 0.0,
+    }  # fmt: skip
+    return DataConfig.model_validate_json(json.dumps(values | changes))
+
+
+def recorded_by(how: str | None, **changes: Any) -> dict[str, Any]:
+    return {"actions": "recorded", "join_actions": how} | changes
+
+
+@pytest.mark.parametrize("width", [1, 7, 14])
+def test_states_are_the_numbers_of_the_file_and_actions_their_differences(tmp_path: Path, width: int) -> None:
+    dataset = open_dataset(knobs(write_vectors(tmp_path, width=width)))
+    assert dataset.widths == Widths(width, width)
+    clip = clip_at(dataset, 0, 3)
+    written = vectors(24, width, seed=0)
+    np.testing.assert_array_equal(clip.states, written[[3, 5, 7]].astype(np.float32))
+    np.testing.assert_array_equal(clip.actions, (written[[5, 7]] - written[[3, 5]]).astype(np.float32))
+
+
+@pytest.mark.parametrize(("how", "join"), [("sum", np.sum), ("mean", np.mean), ("last", lambda x, **_: x[:, -1])])
+def test_commands_of_a_model_step_are_those_of_its_control_steps_joined(
+    tmp_path: Path, how: str, join: Callable[..., np.ndarray]
+) -> None:
+    dataset = open_dataset(knobs(write_vectors(tmp_path, width=14, action_width=5), **recorded_by(how)))
+    assert dataset.widths == Widths(14, 5)
+    clip = clip_at(dataset, 1, 4)
+    written = vectors(24, 5, seed=1001)  # of control steps 4, 5 and 6, 7
+    np.testing.assert_array_equal(clip.actions, join(written[4:8].reshape(2, 2, 5), axis=1).astype(np.float32))
+
+
+def test_at_stride_one_there_is_nothing_to_join(tmp_path: Path) -> None:
+    config = knobs(write_vectors(tmp_path, width=8, action_width=8), stride=1, actions="recorded")
+    clip = clip_at(open_dataset(config), 0, 0)
+    np.testing.assert_array_equal(clip.actions, vectors(24, 8, seed=1000)[:2].astype(np.float32))
+
+
+def test_summed_deltas_of_absolute_commands_equal_the_difference_of_the_commands() -> None:
+    targets = vectors(13, 6, seed=0)
+    deltas = np.diff(targets, axis=0)
+    np.testing.assert_allclose(joined(deltas, 4, "sum"), np.diff(targets[::4], axis=0), atol=1e-12)
+
+
+def test_poses_keep_their_own_actions() -> None:
+    states = vectors(4, 7, seed=1)
+    pose = DataConfig(path="nowhere", source="npz")
+    np.testing.assert_array_equal(actions_of(states, None, range(4), pose), actions_from_states(states))
+
+
+def test_a_pose_that_is_read_as_a_vector_is_not_turned_into_rotations(droid: Path) -> None:
+    states = ["steps/observation/cartesian_position", "steps/observation/gripper_position"]
+    plain = open_dataset(knobs(droid, source="rlds", states="pose"))
+    vector = open_dataset(knobs(droid, source="rlds", fields={"state": states}))
+    one, other = clip_at(plain, 0, 2), clip_at(vector, 0, 2)
+    np.testing.assert_array_equal(one.states, other.states)
+    assert not np.array_equal(one.actions[:, 3:6], other.actions[:, 3:6])
+    np.testing.assert_array_equal(one.actions[:, :3], other.actions[:, :3])
+
+
+def test_rlds_gives_the_features_that_are_named(droid: Path) -> None:
+    fields = {"state": JOINTS, "action": VELOCITIES}
+    config = knobs(droid, source="rlds", fields=fields, **recorded_by("mean"))
+    dataset = open_dataset(config)
+    assert dataset.widths == Widths(8, 8)
+    episode = dataset.source.read(0)
+    steps = np.arange(12)
+    joints = np.sin(steps[:, None] / 15.0 + np.arange(7))
+    np.testing.assert_allclose(episode.states[:, :7], joints, atol=1e-6)
+    np.testing.assert_allclose(episode.commands[:, :7], np.gradient(joints, axis=0), atol=1e-6)
+    without = config.model_copy(update={"fields": config.fields.model_copy(update={"action": ("steps/actoin",)})})
+    with pytest.raises(InputError, match="Did you mean steps/action"):
+        open_dataset(without)
+
+
+def test_rlds_far_away_gives_the_same(droid: Path, gcs: Gcs) -> None:
+    gcs.upload(droid, "bucket/droid")
+    fields = {"state": JOINTS, "action": VELOCITIES}
+    here, far = (
+        open_source(knobs(path, source="rlds", fields=fields, **recorded_by("mean")))
+        for path in (droid, "gs://bucket/droid")
+    )
+    assert [info.id for info in here.infos()] == [info.id for info in far.infos()]
+    for index in range(2):
+        np.testing.assert_array_equal(here.read(index).states, far.read(index).states)
+        np.testing.assert_array_equal(here.read(index).commands, far.read(index).commands)
+
+
+def test_rlds_without_a_flag_for_each_step_cannot_say_how_wide_a_vector_is(
+    spoiled: Callable[[Callable[[Any], None]], Path],
+) -> None:
+    folder = spoiled(lambda features: features.pop("steps/is_first"))
+    with pytest.raises(InputError, match="steps/is_first"):
+        open_dataset(knobs(folder, source="rlds", fields={"state": JOINTS}))
+
+
+def test_a_number_that_is_not_finite_is_named(spoiled: Callable[[Callable[[Any], None]], Path]) -> None:
+    def spoil(features: Any) -> None:
+        features[JOINTS[0]][1][9] = float("nan")
+
+    with pytest.raises(InputError, match=r"step 1.*finite numbers"):
+        open_dataset(knobs(spoiled(spoil), source="rlds", fields={"state": JOINTS}))
+
+
+def bimanual(number: int, steps: int) -> Recorded:
+    columns = {
+        "observation.state": vectors(steps, 14, seed=number).astype(np.float32),
+        "action": vectors(steps, 16, seed=50 + number).astype(np.float32),
+    }
+    return Recorded(columns, recorded(number, steps).frames)
+
+
+@pytest.mark.parametrize("write", [write_v30, write_v21], ids=["v3.0", "v2.1"])
+def test_lerobot_gives_the_columns_that_are_named(tmp_path: Path, write: Callable[..., Path]) -> None:
+    folder = write(tmp_path / "set", [bimanual(number, 12) for number in range(4)])
+    lerobot = {"state": ["observation.state"], "joint_velocity": None, "success": None}
+    dataset = open_dataset(knobs(folder, source="lerobot", lerobot=lerobot, **recorded_by("last")))
+    assert dataset.widths == Widths(14, 16)
+    clip = clip_at(dataset, 2, 1)
+    np.testing.assert_array_equal(clip.states, vectors(12, 14, seed=2)[[1, 3, 5]].astype(np.float32))
+    np.testing.assert_array_equal(clip.actions, vectors(12, 16, seed=52)[[2, 4]].astype(np.float32))
+    some = open_source(knobs(folder, source="lerobot", lerobot=lerobot | {"select": [13, 0]}))
+    np.testing.assert_array_equal(some.read(0).states, vectors(12, 14, seed=0)[:, [13, 0]].astype(np.float32))
+    wrong = knobs(folder, source="lerobot", lerobot=lerobot | {"action": ["actions"]}, **recorded_by("last"))
+    with pytest.raises(InputError, match=r"data\.lerobot\.action.*Did you mean action"):
+        open_dataset(wrong)
+
+
+def test_a_robot_of_another_width_is_a_broken_episode(tmp_path: Path) -> None:
+    write_vectors(tmp_path, width=14)
+    write_vectors(tmp_path / "other", width=8, episodes=1)
+    with pytest.raises(InputError, match=r"other.*8 numbers a state.*14 numbers a state, as in most"):
+        open_dataset(knobs(tmp_path))
+
+
+def test_an_episode_of_another_width_that_no_index_saw_is_named_when_it_is_read() -> None:
+    source = MemorySource([9, 9], states=lambda index: vectors(9, 14 - index, seed=index))
+    dataset = open_dataset_of(source)
+    assert clip_at(dataset, 0, 0).states.shape == (3, 14)
+    with pytest.raises(InputError, match=r"episode 1.*states of 13.*14 and 14, as in the others"):
+        clip_at(dataset, 1, 0)
+
+
+def open_dataset_of(source: MemorySource) -> Any:
+    import vjepa2_ac.data.dataset as module
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "open_source", lambda _: source)
+        return open_dataset(knobs("memory"))
+
+
+def test_commands_that_are_asked_for_must_be_there_for_every_step(tmp_path: Path) -> None:
+    write_vectors(tmp_path / "none", width=8)
+    with pytest.raises(InputError, match=r"actions: no such array"):
+        open_dataset(knobs(tmp_path / "none", **recorded_by("sum")))
+    write_vectors(tmp_path / "few", width=8, actions=np.zeros((23, 3)))
+    with pytest.raises(InputError, match=r"actions: shape \(23, 3\).*24 x any"):
+        open_dataset(knobs(tmp_path / "few", **recorded_by("sum")))
+
+
+def test_an_index_of_poses_is_not_taken_for_one_of_vectors(tmp_path: Path) -> None:
+    write_vectors(tmp_path, width=8)
+    with pytest.raises(InputError, match="any x 7"):
+        open_dataset(knobs(tmp_path, states="pose"))
+    assert open_dataset(knobs(tmp_path)).widths.state == 8
+    with pytest.raises(InputError, match="actions: no such array"):
+        open_dataset(knobs(tmp_path, **recorded_by("sum")))
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"source": "droid_raw"}, "source droid_raw: a matter of poses"),
+        ({"pose_frame": "camera"}, "pose_frame camera: a matter of poses"),
+        ({"idle": {"rule": "motion"}}, "idle.rule motion: a matter of poses"),
+        ({"fields": {"gripper": "openness"}}, "fields.gripper"),
+        ({"lerobot": {"rotation": "quaternion_wxyz"}}, "lerobot.rotation"),
+        ({"lerobot": {"gripper_open": 0.08}}, "lerobot.gripper_open"),
+        ({"actions": "recorded"}, "set join_actions to sum"),
+        ({"actions": "recorded", "stride": "auto"}, "set join_actions to sum"),
+        ({"states": "pose", "actions": "recorded", "join_actions": "sum"}, "needs states vector"),
+        ({"join_actions": "sum"}, "join_actions belongs to actions recorded"),
+    ],
+)
+def test_what_needs_poses_or_says_too_little_is_refused_with_the_config(
+    changes: dict[str, Any], complaint: str
+) -> None:
+    values = {"path": "d", "source": "npz", "states": "vector"} | changes
+    with pytest.raises(InputError, match=complaint):
+        parse_config({"run_dir": "r", "model": {"base": "b"}, "data": values}, where="here")
+
+
+def test_the_check_says_how_wide_and_that_all_is_well(tmp_path: Path) -> None:
+    config = knobs(write_vectors(tmp_path, width=14, action_width=3), **recorded_by("sum"))
+    found = {one.about: one for one in check_data(config, clips=8)}
+    assert {one.level for one in found.values()} == {"ok"}
+    assert found["states"].text.startswith("14 numbers, -1")
+    assert found["actions"].text.startswith("3 numbers")
+    assert "states (2, 3, 14), actions (2, 2, 3)" in found["batch"].text
+    assert found["pictures"].text.startswith("0 of 16")
+
+
+def batch(states: np.ndarray, actions: np.ndarray | None = None) -> Batch:
+    numbers = states.astype(np.float32)[None]
+    taken = np.diff(numbers, axis=1) if actions is None else actions.astype(np.float32)[None]
+    frames = torch.randint(0, 255, (1, len(states), 4, 4, 3), generator=torch.Generator().manual_seed(0))
+    return Batch(frames.to(torch.uint8), torch.from_numpy(numbers), torch.from_numpy(taken), None, ("e",), (0,))
+
+
+@pytest.mark.parametrize(
+    ("states", "about", "level", "words"),
+    [
+        (vectors(9, 5, seed=0) * [1, 0, 1, 1, 0], "states", "warning", "1, 4 (from 0) never change"),
+        (vectors(9, 5, seed=0) * [1, 1, 4096, 1, 1], "states", "warning", "large are 2 (from 0)"),
+        (vectors(9, 5, seed=0) * 0, "states", "error", "none of them ever changes"),
+        (vectors(9, 5, seed=0) * 0, "actions", "error", "nothing to learn from"),
+    ],
+)
+def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: str, level: str, words: str) -> None:
+    found = {one.about: one for one in findings_in([batch(states)], is_pose=False)}
+    assert found[about].level == level
+    assert words in found[about].text
+
+
+def test_pictures_that_never_change_while_a_number_does_are_an_error() -> None:
+    moving = batch(vectors(9, 5, seed=0))
+    stuck = Batch(torch.zeros_like(moving.frames), moving.states, moving.actions, None, ("e",), (0,))
+    found = {one.about: one for one in findings_in([stuck], is_pose=False)}
+    assert found["pictures"].level == "error"
+
+
+def test_inspection_and_picture_of_vectors(tmp_path: Path) -> None:
+    from vjepa2_ac.console_data import inspection_lines, motion_table
+
+    dataset = open_dataset(knobs(write_vectors(tmp_path / "set", width=14)))
+    found = inspect_dataset(dataset)
+    figures = json.loads(json.dumps(found.as_dict()))
+    assert (figures["state_dim"], figures["action_dim"], len(figures["ranges"])) == (14, 14, 14)
+    assert "gripper" not in figures
+    assert [one["stride"] for one in figures["per_model_step"]] == [3, 5, 10]
+    assert any(line.startswith("states") and "14 numbers: -" in line for line in inspection_lines(found))
+    assert motion_table(found).row_count == 3
+    assert picture_data_set(dataset, found, tmp_path / "sheet.png").stat().st_size > 10_000
+
+
+def test_a_number_changes_by_a_share_of_its_range(tmp_path: Path) -> None:
+    ramp = np.stack([np.linspace(0, 1, 24), np.linspace(0, 460, 24) / 2], axis=1)
+    ramp[:, 1] = np.minimum(ramp[:, 1], 115.0)  # twice as fast, over half the time
+    dataset = open_dataset(knobs(write_vectors(tmp_path, width=2, states=ramp), stride_candidates=[1, 5]))
+    one, five = inspect_dataset(dataset).changes
+    assert one.percent.max() == pytest.approx(100 / 11.5)
+    assert one.percent.min() == pytest.approx(100 / 23)
+    assert five.percent.max() == pytest.approx(500 / 11.5)
