@@ -10,8 +10,9 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from vjepa2_ac.data.transforms import pixels_to_input
-from vjepa2_ac.episode import Batch, LatentBatch
+from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.world_model import WorldModel
 
 
@@ -39,6 +40,27 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
         episode_ids=batch.episode_ids,
         starts=batch.starts,
     )
+
+
+def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> None:
+    """Refuse data whose states or actions are wider or narrower than what the model takes.
+
+    Args:
+        world_model: The model.
+        widths: Of the data.
+        where: What named the model.
+
+    Raises:
+        InputError: Names both.
+    """
+    needed = widths_of_model(world_model.sizes)
+    if widths != needed:
+        raise InputError(
+            where=where,
+            found=f"data with states of {widths.state} and actions of {widths.action} numbers",
+            needed=f"{needed.state} and {needed.action}, which this model takes",
+            fix="Choose other data, or train on these: `train` then replaces the model's input heads",
+        )
 
 
 def extrinsics_for(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "batch time 6"] | None:

@@ -35,6 +35,10 @@ class PredictorSizes(Section):
     """Hidden width of the MLP over the width."""
     use_extrinsics: bool = False
     """Whether the camera pose is one more input token per time step."""
+    action_dim: PositiveInt = 7
+    """Numbers of an action. Where the data's are others, its encoder is replaced by a fresh one."""
+    state_dim: PositiveInt = 7
+    """Numbers of a state, likewise."""
 
 
 class ModelSizes(Section):

@@ -24,10 +24,12 @@ from vjepa2_ac.model.adapter_start import (
     set_original_weights,
     start_from,
 )
+from vjepa2_ac.model.heads import fit_heads, require_trained
 from vjepa2_ac.model.trained_folder import (
     FULL_WEIGHTS,
     LORA_WEIGHTS,
     PRINCIPAL_PARTS,
+    read_fresh_heads,
     read_kind,
     read_weights,
     write_trained,
@@ -74,7 +76,8 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     is a part of the weights, taken off them, which comes to the same up to rounding.
 
     Raises:
-        InputError: A target matches no layer, or another knob does not fit the predictor.
+        InputError: A target matches no layer, another knob does not fit the predictor, or a fresh head (`model.heads`)
+            would not be trained.
         ValueError: The model has been adapted already.
     """
     if model.adaptation is not None:
@@ -82,6 +85,7 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
     if config.kind == "none":
         _train_everything(model)
         return
+    require_trained(_names_of_fresh_heads(model), config)
     _wrap(model, LoraConfig(**lora_arguments(model.predictor, config, unused=_unused(model))))
     layers = _lora_layers(model)
     if config.init == "pissa":
@@ -111,10 +115,10 @@ def save_trained(model: WorldModel, folder: str | Path) -> None:
     """
     adaptation, folder = _adaptation(model), Path(folder)
     if adaptation.kind == "lora":
-        write_trained(folder, adaptation, _lora_weights(model))  # and PiSSA's principal parts
+        write_trained(folder, adaptation, _lora_weights(model), _card_of_fresh_heads(model))  # and PiSSA's parts
         _lora_config(model).save_pretrained(str(folder))
     else:
-        write_trained(folder, adaptation, model.predictor.state_dict())
+        write_trained(folder, adaptation, model.predictor.state_dict(), _card_of_fresh_heads(model))
 
 
 def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
@@ -131,7 +135,10 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
     """
     folder = Path(folder)
     fresh = model.adaptation is None
-    if read_kind(folder, model) == "lora":
+    kind, heads = read_kind(folder, model), read_fresh_heads(folder)
+    if heads is not None and fresh and model.fresh_heads is None:
+        fit_heads(model, *heads)
+    if kind == "lora":
         _load_lora(model, folder)
     else:
         _load_everything(model, folder)
@@ -141,7 +148,10 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
 
 @contextmanager
 def base_only(model: WorldModel) -> Iterator[None]:
-    """Let the model predict as the base it was adapted from, for a while; a model that was not adapted is the base."""
+    """Let the model predict as the base it was adapted from, for a while; a model that was not adapted is the base.
+
+    A model with fresh heads goes back to these as they were drawn: not a base that could be compared with.
+    """
     if model.adaptation is None:
         yield
         return
@@ -172,7 +182,19 @@ def merge_adapter(model: WorldModel) -> None:
     elif adaptation.start is not None:
         dtype = next(iter(adaptation.start.values())).dtype
     model.predictor.to(dtype).requires_grad_(False)
-    model.adaptation = None
+    model.adaptation = model.fresh_heads = None
+
+
+def _names_of_fresh_heads(model: WorldModel) -> tuple[str, ...]:
+    replaced = () if model.fresh_heads is None else model.fresh_heads.replaced
+    return tuple(dict.fromkeys(name.split(".")[0] for name in replaced))
+
+
+def _card_of_fresh_heads(model: WorldModel) -> dict[str, int] | None:
+    if model.fresh_heads is None:
+        return None
+    sizes = model.sizes.predictor
+    return {"action_dim": sizes.action_dim, "state_dim": sizes.state_dim, "seed": model.fresh_heads.seed}
 
 
 def _train_everything(model: WorldModel) -> None:

@@ -35,6 +35,8 @@ class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers h
         num_attention_heads: int = 16,
         mlp_ratio: float = 4.0,
         use_extrinsics: bool = False,
+        action_dim: int = ACTION_DIM,
+        state_dim: int = STATE_DIM,
         **common: Any,
     ) -> None:
         super().__init__(**common)
@@ -46,6 +48,8 @@ class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers h
         self.num_attention_heads = num_attention_heads
         self.mlp_ratio = mlp_ratio
         self.use_extrinsics = use_extrinsics
+        self.action_dim = action_dim
+        self.state_dim = state_dim
 
     @classmethod
     def from_sizes(cls, sizes: ModelSizes) -> PredictorConfig:
@@ -59,6 +63,8 @@ class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers h
             num_attention_heads=sizes.predictor.heads,
             mlp_ratio=sizes.predictor.mlp_ratio,
             use_extrinsics=sizes.predictor.use_extrinsics,
+            action_dim=sizes.predictor.action_dim,
+            state_dim=sizes.predictor.state_dim,
         )
 
 
@@ -81,8 +87,8 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         width = config.hidden_size
         hidden = hidden_width(width, config.mlp_ratio)
         self.predictor_embed = nn.Linear(config.latent_dim, width)
-        self.action_encoder = nn.Linear(ACTION_DIM, width)
-        self.state_encoder = nn.Linear(STATE_DIM, width)
+        self.action_encoder = nn.Linear(config.action_dim, width)
+        self.state_encoder = nn.Linear(config.state_dim, width)
         self.extrinsics_encoder = nn.Linear(EXTRINSICS_DIM, width)  # always there, as in the official checkpoint
         self.blocks = nn.ModuleList(
             Block(width, config.num_attention_heads, hidden, layer=index + 1)
@@ -102,8 +108,8 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
     def forward(
         self,
         latents: Float[Tensor, "batch time tokens dim"],
-        actions: Float[Tensor, "batch time 7"],
-        states: Float[Tensor, "batch time 7"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
         extrinsics: Float[Tensor, "batch time 6"] | None = None,
         cache: KeyValueCache | None = None,
         keep: int | None = None,

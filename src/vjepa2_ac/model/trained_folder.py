@@ -10,6 +10,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.folder import check_tensors
 from vjepa2_ac.model.world_model import Adaptation, WorldModel
@@ -20,15 +21,23 @@ FULL_WEIGHTS = "predictor.safetensors"
 PRINCIPAL_PARTS = "pissa_start.safetensors"  # what an adapter of init pissa started from, and the base then lacks
 
 
-def write_trained(folder: Path, adaptation: Adaptation, weights: dict[str, Tensor]) -> None:
-    """Write weights and the card that says what they are and what they were trained on."""
+def write_trained(
+    folder: Path, adaptation: Adaptation, weights: dict[str, Tensor], fresh_heads: dict[str, int] | None = None
+) -> None:
+    """Write weights and the card that says what they are, what they were trained on, and with which fresh heads."""
     folder.mkdir(parents=True, exist_ok=True)
     whole = {key: value.detach().to("cpu").contiguous() for key, value in weights.items()}
     name = LORA_WEIGHTS if adaptation.kind == "lora" else FULL_WEIGHTS
     save_file(whole, folder / name, metadata={"format": "pt"})
     if adaptation.principal is not None:
         save_file(adaptation.principal, folder / PRINCIPAL_PARTS, metadata={"format": "pt"})
-    card = {"kind": adaptation.kind, "base_predictor": adaptation.base, "encoder": adaptation.encoder}
+    card: dict[str, Any] = {
+        "kind": adaptation.kind,
+        "base_predictor": adaptation.base,
+        "encoder": adaptation.encoder,
+    }
+    if fresh_heads is not None:
+        card["fresh_heads"] = fresh_heads
     (folder / CARD).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
 
 
@@ -48,6 +57,29 @@ def read_kind(folder: Path, model: WorldModel) -> str:
             fix="Set adapter.kind to the one it was trained with",
         )
     return str(card["kind"])
+
+
+def read_fresh_heads(folder: Path) -> tuple[Widths, int] | None:
+    """Return the widths of states and actions and the seed of fresh heads; None where the base's own were kept.
+
+    Raises:
+        InputError: The folder is of another kind, or damaged.
+    """
+    card = _read_card(folder)
+    if "fresh_heads" not in card:
+        return None
+    try:
+        said = card["fresh_heads"]
+        state, action, seed = (int(said[key]) for key in ("state_dim", "action_dim", "seed"))
+    except (KeyError, TypeError, ValueError):
+        state = action = seed = 0
+    if min(state, action) < 1:
+        raise InputError(
+            where=str(folder / CARD),
+            found=f"fresh_heads that cannot be used: {card['fresh_heads']!r}"[:200],
+            needed="state_dim, action_dim and seed, as they were written",
+        )
+    return Widths(state, action), seed
 
 
 def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:

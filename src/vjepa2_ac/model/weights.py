@@ -14,9 +14,10 @@ from pydantic import ValidationError
 from torch import Tensor, nn
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
-from vjepa2_ac.episode import ACTION_DIM
+from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.folder import check_sizes, check_tensors
+from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.layers import mlp_ratio_of
 from vjepa2_ac.model.world_model import WorldModel
 
@@ -60,10 +61,12 @@ def to_official(model: WorldModel) -> dict[str, Any]:
     """Return the weights by Meta's names, q, k and v fused: what `torch.save` makes an official checkpoint of.
 
     Raises:
-        ValueError: An adapter is on: merge it first.
+        ValueError: An adapter is on: merge it first. Or states and actions are not of the widths that Meta's code has.
     """
     if model.predictor is not model.base_predictor:
         raise ValueError("an adapter is on: merge_adapter first")
+    if widths_of_model(model.sizes) != POSE_WIDTHS:
+        raise ValueError(f"Meta's code takes {POSE_WIDTHS}, not {widths_of_model(model.sizes)}")
     encoder = _to_official(model.encoder.state_dict(), "encoder")
     return {
         "encoder": encoder,

@@ -33,6 +33,14 @@ class Adaptation:
     principal: dict[str, Tensor] | None = None  # PiSSA: the matrices that were taken off those weights
 
 
+@dataclass(frozen=True)
+class FreshHeads:
+    """What `model.heads` did to the predictor: encoders for states or actions of other widths than the base's."""
+
+    replaced: dict[str, Tensor]  # the base's own, by their names in the predictor
+    seed: int  # that decided the new ones
+
+
 class WorldModel(nn.Module):
     """A frozen encoder and an action-conditioned predictor.
 
@@ -49,6 +57,7 @@ class WorldModel(nn.Module):
         self.predictor: nn.Module = ActionConditionedPredictor(PredictorConfig.from_sizes(sizes))
         self.predictor.requires_grad_(False)
         self.adaptation: Adaptation | None = None
+        self.fresh_heads: FreshHeads | None = None
 
     @classmethod
     def random(
@@ -141,8 +150,8 @@ class WorldModel(nn.Module):
     def predict(
         self,
         latents: Float[Tensor, "batch time tokens dim"],
-        actions: Float[Tensor, "batch time 7"],
-        states: Float[Tensor, "batch time 7"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
         extrinsics: Float[Tensor, "batch time 6"] | None = None,
         cache: KeyValueCache | None = None,
         keep: int | None = None,
@@ -158,8 +167,8 @@ class WorldModel(nn.Module):
     def rollout(
         self,
         context: Float[Tensor, "batch context tokens dim"],
-        actions: Float[Tensor, "batch time 7"],
-        states: Float[Tensor, "batch time 7"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
         extrinsics: Float[Tensor, "batch time 6"] | None = None,
         cache: KeyValueCache | None = None,
     ) -> Float[Tensor, "batch steps tokens dim"]:
@@ -203,8 +212,9 @@ class WorldModel(nn.Module):
         return fingerprint(self.encoder.state_dict())
 
     def predictor_fingerprint(self) -> str:
-        """Return a hash of the predictor's own weights; an adapter on them does not change it."""
-        return fingerprint(base_weights(self.base_predictor))
+        """Return a hash of the predictor's own weights; neither an adapter on them nor fresh heads change it."""
+        replaced = {} if self.fresh_heads is None else self.fresh_heads.replaced
+        return fingerprint(base_weights(self.base_predictor) | replaced)
 
 
 def fingerprint(weights: Mapping[str, Tensor]) -> str:
