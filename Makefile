@@ -1,9 +1,9 @@
-# make demo · make test · make lint · make bench · make base: each creates the environment it needs and does its job.
+# make demo · make test · make lint · make soak · make bench · make base: each creates the environment it needs.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: demo demo-seeds base test lint format bench clean
+.PHONY: demo demo-seeds base test soak lint format bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
@@ -28,6 +28,9 @@ base:  $(INSTALLED)  ## make the demo's base model again (about an hour); replac
 
 test: $(INSTALLED)  ## the whole test suite
 	$(BIN)/pytest -q
+
+soak: $(INSTALLED)  ## runs that are killed 20 times each (0 and 2 loader workers, with and without a best checkpoint)
+	VJEPA2_AC_SOAK=20 $(BIN)/pytest -q --log-cli-level=INFO tests/training/test_soak.py
 
 lint: $(INSTALLED)  ## style and types
 	$(BIN)/ruff check .

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 from typing import Any
@@ -24,13 +25,17 @@ PRINCIPAL_PARTS = "pissa_start.safetensors"  # what an adapter of init pissa sta
 def write_trained(
     folder: Path, adaptation: Adaptation, weights: dict[str, Tensor], fresh_heads: dict[str, int] | None = None
 ) -> None:
-    """Write weights and the card that says what they are, what they were trained on, and with which fresh heads."""
+    """Write weights and the card that says what they are, what they were trained on, and with which fresh heads.
+
+    Raises:
+        OSError: The disk is full, or another reason of the system's.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     whole = {key: value.detach().to("cpu").contiguous() for key, value in weights.items()}
     name = LORA_WEIGHTS if adaptation.kind == "lora" else FULL_WEIGHTS
-    save_file(whole, folder / name, metadata={"format": "pt"})
+    _save(whole, folder / name)
     if adaptation.principal is not None:
-        save_file(adaptation.principal, folder / PRINCIPAL_PARTS, metadata={"format": "pt"})
+        _save(adaptation.principal, folder / PRINCIPAL_PARTS)
     card: dict[str, Any] = {
         "kind": adaptation.kind,
         "base_predictor": adaptation.base,
@@ -97,6 +102,13 @@ def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
     found, needed = ({name: tuple(value.shape) for name, value in some.items()} for some in (weights, like))
     check_tensors(found, needed, where=str(path))
     return weights
+
+
+def _save(weights: dict[str, Tensor], path: Path) -> None:
+    try:
+        save_file(weights, path, metadata={"format": "pt"})
+    except SafetensorError as error:  # the system's reason stands in its text alone
+        raise OSError(errno.EIO, str(error), str(path)) from None
 
 
 def _read_card(folder: Path) -> dict[str, Any]:

@@ -1,0 +1,103 @@
+"""A run that is killed again and again, whenever it happens, is the run that was not.
+
+A few kills here; many with `make soak` (VJEPA2_AC_SOAK=20: so many kills of each kind of run).
+"""
+
+import logging
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from killable import KILLED, Child, Nursery, wait_for_the_end_of
+from same_run import assert_same_run
+from vjepa2_ac.config_file import config_as_yaml
+from vjepa2_ac.training.loop import train
+
+logger = logging.getLogger(__name__)
+
+MANY = int(os.environ.get("VJEPA2_AC_SOAK", "0"))
+WAYS = ("before a file", "while writing", "whenever")
+CHANGES = {
+    "training__steps": 24, "validation__every": 4, "checkpoint__every": 2, "checkpoint__keep": 2,
+    "checkpoint__every_minutes": None,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def nursery() -> Iterator[Nursery]:
+    nursery = Nursery()
+    yield nursery
+    nursery.close()
+
+
+class Killer:
+    """Starts a run, kills it in one of three ways by turns, and counts."""
+
+    def __init__(self, nursery: Nursery, seed: int) -> None:
+        self.kills, self.in_a_checkpoint, self.processes = 0, 0, set()
+        self._nursery, self._chance = nursery, np.random.default_rng(seed)
+
+    def kill(self, config_file: Path, run: Path) -> int:
+        """Start a run or let it go on, and kill it; return its status: another one where it was done before."""
+        before = half_written(run)
+        child, wait = self._start(WAYS[self.kills % len(WAYS)], config_file, run)
+        self.processes.add(child.pid)
+        status = wait()
+        if status == KILLED:
+            self.kills += 1
+            self.in_a_checkpoint += bool(half_written(run) - before)
+        return status
+
+    def _start(self, way: str, config_file: Path, run: Path):
+        chance, arguments = self._chance, ("train", str(config_file))
+        if way == "before a file":  # one of some 25 for each checkpoint; those at the start are before the first
+            child = self._nursery.start(*arguments, folder=run, die_at=int(chance.integers(1, 120)))
+            return child, child.wait
+        child = self._nursery.start(*arguments, folder=run)
+        if way == "while writing":
+            wait_for_writing(child, run / "checkpoints", times=int(chance.integers(1, 4)))
+            return child, lambda: child.kill_after(chance.uniform(0.0, 0.01))  # writing takes about so long
+        return child, lambda: child.kill_after(chance.uniform(0.0, 2.0))
+
+
+def half_written(run: Path) -> set[tuple[str, int]]:
+    """Return the checkpoints that were not finished, each with the time of its last change."""
+    return {(path.name, path.stat().st_ctime_ns) for path in (run / "checkpoints").glob(".writing-*")}
+
+
+def wait_for_writing(child: Child, checkpoints: Path, times: int) -> None:
+    """Wait until a run has begun to write that many checkpoints, or is done."""
+    seen: set[str] = set()
+    while len(seen) < times and child.is_running():
+        seen |= {path.name for path in checkpoints.glob(".writing-*")}
+        time.sleep(0.0005)
+
+
+@pytest.mark.parametrize("keep_best", [False, True] if MANY else [True])
+@pytest.mark.parametrize("workers", [0, 2] if MANY else [0])
+def test_a_run_killed_many_times_is_the_run_that_was_not(
+    make_config, reporter, tmp_path, nursery: Nursery, workers: int, keep_best: bool
+) -> None:
+    changes = {**CHANGES, "checkpoint__keep_best": keep_best}
+    train(make_config(run_dir=str(tmp_path / "whole"), **changes), reporter)
+    killer, runs, wanted = Killer(nursery, seed=2 * workers + keep_best), 0, MANY or len(WAYS)
+    while killer.kills < wanted:
+        runs += 1
+        run, config_file = tmp_path / f"killed-{runs}", tmp_path / f"{runs}.yaml"
+        config_file.write_text(config_as_yaml(make_config(run_dir=str(run), data__workers=workers, **changes)))
+        status = KILLED
+        while status == KILLED and killer.kills < wanted:
+            status = killer.kill(config_file, run)
+        if status == KILLED:
+            status = nursery.start("train", str(config_file), folder=run).wait()
+        assert status == 0
+        assert_same_run(tmp_path / "whole", run)
+    assert not wait_for_the_end_of(killer.processes, timeout_s=30), "a worker outlived its run"
+    logger.info(
+        "%d workers, keep_best %s: %d kills in %d runs, %d of them in the middle of a checkpoint",
+        workers, keep_best, killer.kills, runs, killer.in_a_checkpoint,
+    )  # fmt: skip
