@@ -1,0 +1,48 @@
+"""How is a torch file written on a disk that may be full, and read when anybody may have written it?"""
+
+from __future__ import annotations
+
+import pickle
+import re
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import torch
+
+from vjepa2_ac.errors import InputError
+
+
+def write_torch(value: object, file: BinaryIO) -> None:
+    """Write tensors and plain values.
+
+    Raises:
+        OSError: The disk is full, or another reason of the system's, which torch alone would hide.
+    """
+    try:
+        torch.save(value, file)
+    except RuntimeError as error:
+        if isinstance(error.__context__, OSError):
+            raise error.__context__ from None
+        raise
+
+
+def read_torch(path: Path) -> Any:
+    """Return the tensors and plain values of a file, on the CPU. Nothing in it is executed.
+
+    Raises:
+        InputError: The file cannot be read, or holds more than tensors and plain values.
+    """
+    try:
+        return torch.load(path, weights_only=True, map_location="cpu")
+    except pickle.UnpicklingError as error:
+        name = re.search(r"GLOBAL (\S+)", str(error))
+        found = f"more than tensors and plain values{f' ({name[1]})' if name else ''}: such a file can run foreign code"
+        raise InputError(where=str(path), found=found, needed="a file that this program wrote") from None
+    except (OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        raise InputError(
+            where=str(path), found=f"cannot be read ({_first_line(error)})", needed="a file that this program wrote"
+        ) from None
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().split("\n", 1)[0]
