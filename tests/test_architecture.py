@@ -27,7 +27,7 @@ HOMES = {
     "google_crc32c": {"data/sources/rlds/tfrecord.py"},
     "simplejpeg": {"data/"},
     "mujoco": {"simulation/"},
-    "matplotlib": {"evaluation/plots.py", "evaluation/contact_sheet.py"},
+    "matplotlib": {"evaluation/plots.py", "evaluation/contact_sheet.py", "evaluation/clip_picture.py"},
     "fsspec": {"remote/"},
     "av": {"data/video.py"},
     "h5py": {"data/sources/droid_raw/trajectory.py"},

@@ -60,6 +60,11 @@ def config_as_dict(config: Config) -> dict[str, Any]:
     return dict(config.model_dump(mode="json"))
 
 
+def config_as_flat_dict(config: Config) -> dict[str, Any]:
+    """Return the resolved config by dotted keys, which is what trackers take."""
+    return _flatten(config_as_dict(config))
+
+
 def config_as_yaml(config: Config) -> str:
     """Return the resolved config as YAML that `load_config` reads back to an equal config."""
     return str(yaml.safe_dump(config_as_dict(config), sort_keys=False))
@@ -72,7 +77,7 @@ def config_schema() -> dict[str, Any]:
 
 def changed_keys(old: Config, new: Config) -> list[str]:
     """Return the dotted keys in which two configs differ."""
-    flat_old, flat_new = _flatten(config_as_dict(old)), _flatten(config_as_dict(new))
+    flat_old, flat_new = config_as_flat_dict(old), config_as_flat_dict(new)
     return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
 
 
