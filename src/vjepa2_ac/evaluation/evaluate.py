@@ -23,6 +23,9 @@ from vjepa2_ac.model.world_model import WorldModel
 Variant = Callable[[WorldModel], contextlib.AbstractContextManager[object]]
 
 
+_NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
+
+
 @dataclass(frozen=True)
 class Example:
     """One clip, frame by frame, and where the predictions of it are wrong."""
@@ -39,6 +42,7 @@ class Evaluation:
     models: dict[str, PredictionErrors]
     seconds_per_step: float
     example: Example
+    why_no_base: str = ""  # where there would be a base, but not one to compare with
 
     @property
     def trained(self) -> str:
@@ -72,11 +76,14 @@ def evaluate(
 ) -> Evaluation:
     """Measure a model on clips, with what was trained switched on and, where `has_base`, off.
 
+    A base whose input heads were replaced cannot predict on these clips: it is left out, and the result says why.
+
     Raises:
         ValueError: No clips.
     """
     world_model.eval()
-    variants: dict[str, Variant] = {"base": base_only} if has_base else {}
+    why_no_base = _NO_BASE if has_base and world_model.fresh_heads is not None else ""
+    variants: dict[str, Variant] = {"base": base_only} if has_base and not why_no_base else {}
     variants["adapter" if _has_lora(world_model) else "model"] = contextlib.nullcontext
     meters = {name: ErrorMeter() for name in variants}
     chosen: tuple[Batch, LatentBatch, int] | None = None
@@ -93,7 +100,7 @@ def evaluate(
     if chosen is None:
         raise ValueError("no clips to evaluate on")
     models = {name: meter.result() for name, meter in meters.items()}
-    return Evaluation(models, seconds_per_step, _example(world_model, *chosen, variants))
+    return Evaluation(models, seconds_per_step, _example(world_model, *chosen, variants), why_no_base)
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ def verdict(evaluation: Evaluation) -> str:
     absolute += {-1: "better.", 0: "no clear difference.", 1: "NOT better."}[_side(error, of=1.0)]
     gain = improvement(evaluation, evaluation.horizon)
     if gain is None:
-        return f"The model was measured {where}. {absolute}"
+        return " ".join(filter(None, [f"The model was measured {where}. {absolute}", evaluation.why_no_base]))
     direction = "better" if gain.value > 0 else "WORSE"
     compared = f"{abs(gain.value):.0%} {direction} than the base (gain {_interval(gain, '.0%')}), {where}"
     if _side(gain, of=0.0) == 0:

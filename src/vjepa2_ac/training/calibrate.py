@@ -9,6 +9,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.calibration import Calibration
+from vjepa2_ac.latents import require_widths
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.assembly import make_accelerator
@@ -44,6 +45,7 @@ def calibrate_config(
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=indexing)
     world_model = _load(config, model)
+    require_widths(world_model, dataset.widths, where=model or f"model.base: {config.model.base}")
     world_model.to(accelerator.device)
     return calibrate_model(
         world_model, dataset, config, accelerator, clips=clips, split=split, frames=frames, progress=measuring

@@ -9,6 +9,7 @@ from typing import Any
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_as_yaml
+from vjepa2_ac.episode import Widths
 
 _FRONT = """---
 library_name: peft
@@ -37,6 +38,7 @@ class AdapterFacts:
     base_encoder: str
     evaluation: Mapping[str, Any] | None  # what `vjepa2-ac evaluate` wrote
     plot: str | None  # name of the file beside the card
+    fresh_heads: Widths | None = None  # of states and actions, where the base's input heads were replaced
 
 
 def model_card(config: Config, facts: AdapterFacts) -> str:
@@ -49,10 +51,10 @@ def model_card(config: Config, facts: AdapterFacts) -> str:
         f"{_FRONT}\n# {facts.name}: a LoRA adapter for V-JEPA 2-AC",
         f"Written by vjepa2-ac {__version__} from `{facts.checkpoint}` of the run.",
         _base(config, facts),
-        _data(config),
+        _data(config, facts),
         _training(config, facts),
         _results(facts),
-        _use(config),
+        _use(config, facts.fresh_heads),
         f"## Every setting\n\n```yaml\n{config_as_yaml(config.model_copy(update={'run_dir': facts.name}))}```",
     ]
     return "\n\n".join(parts) + "\n"
@@ -69,7 +71,19 @@ def _base(config: Config, facts: AdapterFacts) -> str:
     )
 
 
-def _data(config: Config) -> str:
+def _states(config: Config, facts: AdapterFacts) -> dict[str, str]:
+    data = config.data
+    if data.states == "pose":
+        return {"poses": f"in the frame of the {data.pose_frame}"}
+    joined = f", joined by {data.join_actions}" if data.join_actions else ""
+    lines = {"states": "the robot's own numbers", "actions": f"{data.actions}{joined}"}
+    if facts.fresh_heads is not None:
+        state, action = facts.fresh_heads
+        lines["input heads"] = f"fresh, for states of {state} and actions of {action} numbers; trained whole"
+    return lines
+
+
+def _data(config: Config, facts: AdapterFacts) -> str:
     data = config.data
     return _list(
         "Data",
@@ -78,7 +92,7 @@ def _data(config: Config) -> str:
             "camera": ", ".join(f"`{name}`" for name in data.cameras),
             "clips": f"{data.frames} frames, one every {data.stride} control steps (the stride)",
             "crop": data.crop,
-            "poses": f"in the frame of the {data.pose_frame}",
+            **_states(config, facts),
             "held out": f"{data.validation_share:.0%} of the episodes for validation, {data.test_share:.0%} for test",
         },
     )
@@ -136,7 +150,7 @@ def _ratio(ratio: Mapping[str, Any]) -> str:
     return f"{ratio['value']:.3f}{interval}"
 
 
-def _use(config: Config) -> str:
+def _use(config: Config, fresh_heads: Widths | None) -> str:
     base = config.model.model_dump(mode="json", include={"base", "sizes", "dtype"}, exclude_defaults=True)
     return f"""## Use
 
@@ -151,13 +165,30 @@ model = load_base(ModelConfig.model_validate({base!r}), seed=0)
 load_trained(model, "FOLDER")  # the folder of this card
 ```
 
-With PEFT alone, on the predictor of that base:
+With PEFT alone, on the predictor of that base{_with_heads(fresh_heads)}:
 
 ```python
 from peft import PeftModel
 
-predictor = PeftModel.from_pretrained(load_base(ModelConfig.model_validate({base!r}), seed=0).predictor, "FOLDER")
+{_peft_lines(base, fresh_heads)}
 ```"""
+
+
+def _with_heads(fresh_heads: Widths | None) -> str:
+    return "" if fresh_heads is None else ", whose input heads have other widths and must be replaced first"
+
+
+def _peft_lines(base: Mapping[str, Any], fresh_heads: Widths | None) -> str:
+    load = f"load_base(ModelConfig.model_validate({base!r}), seed=0)"
+    if fresh_heads is None:
+        return f'predictor = PeftModel.from_pretrained({load}.predictor, "FOLDER")'
+    state, action = fresh_heads
+    return f"""from vjepa2_ac.episode import Widths
+from vjepa2_ac.model.heads import fit_heads
+
+model = {load}
+fit_heads(model, Widths(state={state}, action={action}), seed=0)
+predictor = PeftModel.from_pretrained(model.predictor, "FOLDER")"""
 
 
 def _list(title: str, entries: Mapping[str, str]) -> str:
