@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -119,14 +120,16 @@ def _train(options: argparse.Namespace) -> int:
         )
     config = read_run_config(path) if options.resume else load_config(path, options.overrides)
     reporter = ConsoleReporter()
+    speaks = os.environ.get("RANK", "0") == "0"  # one of several processes
     try:
         folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
     except StoppedError as stopped:
-        print(stopped, file=sys.stderr)
+        if speaks:
+            print(stopped, file=sys.stderr)
         return EXIT_STATUS
     finally:
         reporter.close()
-    if not options.check:
+    if speaks and not options.check:
         console.print(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
     return 0
 

@@ -127,7 +127,7 @@ def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporte
         run = assemble(config, reporter.note)
         run.optimizer.step = lambda: None
         run.optimizer.zero_grad = lambda **_: None
-        training_step(run, batches_from(run, 0), 1)
+        training_step(run, batches_from(run), 1)
         return {name: p.grad for name, p in run.world_model.named_parameters() if p.grad is not None}
 
     big, small = gradients(4, 1), gradients(1, 4)
@@ -139,7 +139,7 @@ def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporte
 def test_checkpointing_of_activations_changes_no_gradient(make_config, reporter) -> None:
     def one_step(checkpointing: bool) -> list[float]:
         run = assemble(make_config(training__gradient_checkpointing=checkpointing), reporter.note)
-        figures_of_step = training_step(run, batches_from(run, 0), 1)
+        figures_of_step = training_step(run, batches_from(run), 1)
         return [figures_of_step["loss"], figures_of_step["grad_norm"]]
 
     assert one_step(checkpointing=False) == one_step(checkpointing=True)
@@ -200,7 +200,7 @@ def test_a_loss_that_is_not_finite_stops_before_the_weights_move(make_config, re
         poisoned[0, 0] = float("nan")
     before = [p.detach().clone() for p in run.world_model.parameters()]
     with pytest.raises(InputError, match="not finite") as caught:
-        training_step(run, batches_from(run, 0), 1)
+        training_step(run, batches_from(run), 1)
     assert "episode" in str(caught.value)
     for old, new in zip(before, run.world_model.parameters(), strict=True):
         assert torch.equal(old.nan_to_num(), new.detach().nan_to_num())
@@ -273,7 +273,7 @@ def test_bf16_runs_and_keeps_what_is_trained_in_float32(make_config: object, rep
 
 def test_a_resumed_run_still_counts_the_broken_episodes_that_it_met(make_config, reporter, monkeypatch) -> None:
     read, config = loader.read_clip, make_config(training__steps=2, data__broken_episodes="skip")
-    bad = next(batches_from(assemble(config, reporter.note), 0)).episode_ids[0]
+    bad = next(batches_from(assemble(config, reporter.note))).episode_ids[0]
 
     def read_some(dataset: Dataset, wish: Wish) -> Clip:
         if dataset.table.identity(wish.episode) == bad:
@@ -290,7 +290,7 @@ def test_a_resumed_run_still_counts_the_broken_episodes_that_it_met(make_config,
 def test_an_episode_may_be_left_out_within_a_run(make_config, reporter) -> None:
     config = make_config(training__steps=2)
     train(config, reporter)
-    broken = next(batches_from(assemble(config, reporter.note), 0)).episode_ids[0]
+    broken = next(batches_from(assemble(config, reporter.note))).episode_ids[0]
     assert not any("data has changed" in note for note in reporter.notes)
     train(make_config(training__steps=2, data__exclude=[broken]), reporter)
     assert "Going on from" in reporter.notes[-2]

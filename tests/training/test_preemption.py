@@ -26,12 +26,15 @@ from vjepa2_ac.cli import main
 sys.exit(main(sys.argv[1:]))
 """
 WAITING = """
-import os, signal, sys
+import time
 from vjepa2_ac.training.preemption import stop_on_signals
 with stop_on_signals(same_within_s=0.0) as stop:
+    print(stop.reason, flush=True)
+    while stop.reason is None:
+        time.sleep(0.01)
+    print(stop.reason, flush=True)
     while True:
-        print(stop.reason, flush=True)
-        signal.pause()
+        time.sleep(0.01)
 """
 
 

@@ -15,9 +15,10 @@ class TrainingConfig(Section):
     steps: PositiveInt = 100_000
     """Optimizer steps."""
     batch_size: PositiveInt = 2
-    """Clips per device and micro-batch."""
+    """Clips per process and micro-batch."""
     accumulation: PositiveInt = 16
-    """Micro-batches per optimizer step."""
+    """Micro-batches of each process per optimizer step. A run that goes on with another number of processes keeps the
+    clips of a step: accumulation then follows from that."""
     rollout_steps: Annotated[int, Field(ge=1, le=64)] = 2
     """Predictions of the rollout loss; the first is the teacher-forced one, each further one is fed back."""
     loss: Literal["l1", "l2", "smooth_l1"] = "l1"
@@ -49,8 +50,8 @@ class TrainingConfig(Section):
     """AdamW's decay rates of the running moments."""
     max_grad_norm: Annotated[float, Field(gt=0.0)] | None = 1.0
     """Gradients are scaled down to this norm; null: never (the released recipe)."""
-    precision: Literal["bf16", "fp32"] = "bf16"
-    """Arithmetic of the networks (autocast)."""
+    precision: Literal["bf16", "fp16", "fp32"] = "bf16"
+    """Arithmetic of the networks (autocast). fp16 scales the loss, and needs CUDA."""
     gradient_checkpointing: bool = False
     """Compute each predictor block again in the backward pass instead of keeping its activations."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -103,6 +104,13 @@ class CheckpointConfig(Section):
     """How many of the newest checkpoints stay."""
     keep_best: bool = True
     """Write one after the validation that went best (rollout error over persistence at the last horizon); it stays."""
+    remote: Annotated[str, Field(min_length=1)] | None = None
+    """Where the run is copied to as it goes: gs://bucket/folder, another URL of fsspec that can be written, or a folder
+    (a mounted disk). A start with an empty run_dir goes on from there; null: nowhere. Same keep and best as here."""
+    remote_every_minutes: Annotated[float, Field(ge=0.0)] = 30.0
+    """Minutes between two times that remote is brought up to date; at the end and on preemption it is, too."""
+    remote_wait_seconds: Annotated[float, Field(ge=0.0)] = 120.0
+    """How long a run that was asked to stop waits for that; shorter than the notice that the machine gives."""
 
 
 class TrackingConfig(Section):
@@ -110,3 +118,9 @@ class TrackingConfig(Section):
 
     tensorboard: bool = True
     """Event files in RUN/tensorboard."""
+    wandb: Literal["disabled", "online", "offline"] = "disabled"
+    """Weights & Biases, extra wandb. offline: files in RUN/wandb, which `wandb sync` sends later."""
+    trackio: bool = False
+    """trackio, extra trackio: kept where trackio keeps its runs (TRACKIO_DIR), shown by `trackio show`."""
+    project: Annotated[str, Field(min_length=1)] = "vjepa2-ac"
+    """Name of the project there; the run in it has the same id wherever it goes on."""

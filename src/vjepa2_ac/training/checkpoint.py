@@ -25,6 +25,8 @@ logger = logging.getLogger(__name__)
 
 MANIFEST = "manifest.json"
 STATE = "state.json"
+ADAPTER = "adapter"  # a folder: what `model.lora.save_trained` writes
+OPTIMIZER = "optimizer.pt"
 _NAME = re.compile(r"step-(\d{8})$")
 
 
@@ -33,7 +35,7 @@ class RunState:
     """Where a run stands. Data order, learning rate and random numbers are functions of the step."""
 
     step: int  # optimizer steps done
-    run_id: str = ""  # a random name that stays with the run for good, wherever it goes on; empty before its first start
+    run_id: str = ""  # a random name that stays with the run for good, wherever it goes on
     clips_done: int = 0  # place in the row of clips of the whole run
     clips_per_step: int | None = None  # of all processes together
     processes: int = 1
@@ -150,7 +152,10 @@ def damage(checkpoint: Path) -> str | None:
 
 def read_state(checkpoint: Path) -> RunState:
     """Return where the run stood when the checkpoint was written; a best one that is not there any more is no best."""
-    state = RunState(**json.loads((checkpoint / STATE).read_text()))
+    values = json.loads((checkpoint / STATE).read_text())
+    if "clips_done" not in values:  # or the run would begin the row of clips again
+        raise ValueError(f"{STATE} is of an older version of this program, without clips_done")
+    state = RunState(**values)
     if state.best_step is None or (checkpoint.parent / checkpoint_name(state.best_step)).is_dir():
         return state
     return replace(state, best_step=None, best_error=None)

@@ -12,14 +12,15 @@ import torch
 from safetensors import safe_open
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.episode import POSE_WIDTHS, Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.lora import merge_adapter, trainable_report
 from vjepa2_ac.model.trained_folder import LORA_WEIGHTS
 from vjepa2_ac.model.weights import to_official
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import atomic_writer, folder_writer, user_can_write, write_atomically
-from vjepa2_ac.training.assembly import ADAPTER
-from vjepa2_ac.training.checkpoint import read_state
+from vjepa2_ac.training.checkpoint import ADAPTER, read_state
 from vjepa2_ac.training.model_card import AdapterFacts, model_card
 from vjepa2_ac.training.run_folder import read_run_config
 from vjepa2_ac.training.runs import EVALUATION, PLOT, TrainedRun, load_run
@@ -46,7 +47,8 @@ def export_run(folder: Path, destination: Path, form: Form = "merged") -> Path:
         The file or folder that was written.
 
     Raises:
-        InputError: As `load_run`; the destination is occupied or cannot be written; hub: the run has no adapter, or
+        InputError: As `load_run`; the destination is occupied or cannot be written; official: the model is of another
+            width than Meta's code; hub: the run has no adapter, or
             its `evaluation.json` is damaged.
     """
     _check_free(destination)
@@ -57,6 +59,8 @@ def export_run(folder: Path, destination: Path, form: Form = "merged") -> Path:
         _write_hub(load_run(folder), folder, destination, evaluation)
         return destination
     model = load_run(folder).world_model
+    if form == "official":
+        _check_widths(folder, widths_of_model(model.sizes))
     merge_adapter(model)
     if form == "merged":
         model.save_pretrained(destination)
@@ -83,6 +87,16 @@ def _check_adapter(folder: Path, config: Config) -> None:
             found=f"a run without an adapter (adapter.kind: {config.adapter.kind})",
             needed="one with adapter.kind: lora, for --to hub",
             fix="Export the whole model with --to merged or --to official",
+        )
+
+
+def _check_widths(folder: Path, widths: Widths) -> None:
+    if widths != POSE_WIDTHS:
+        raise InputError(
+            where=str(folder),
+            found=f"a model of states of {widths.state} and actions of {widths.action} numbers",
+            needed="7 and 7: Meta's code has one width for both, and makes that of the camera's pose one less",
+            fix="Export it with --to merged, which `model.base` takes",
         )
 
 
@@ -128,6 +142,7 @@ def _facts(run: TrainedRun, folder: Path, evaluation: dict[str, Any] | None, plo
         base_encoder=adaptation.encoder,
         evaluation=evaluation,
         plot=plot.name if plot else None,
+        fresh_heads=None if run.world_model.fresh_heads is None else widths_of_model(run.world_model.sizes),
     )
 
 

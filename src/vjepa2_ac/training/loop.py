@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import signal
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -17,15 +18,18 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.config_file import config_as_dict
 from vjepa2_ac.data.loader import validation_batches
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, prediction_errors, ratios_by_horizon
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, save_checkpoint
+from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, make_accelerator, save_checkpoint
 from vjepa2_ac.training.checkpoint import CheckpointClock
 from vjepa2_ac.training.journal import Journal
 from vjepa2_ac.training.preemption import StoppedError, stop_on_signals
+from vjepa2_ac.training.processes import from_first, largest, require_same
+from vjepa2_ac.training.quiet import QuietJournal, QuietReporter
 from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open_run_folder
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.stride import CALIBRATION, with_settled_stride
@@ -74,66 +78,86 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
         InputError: Something the user gave cannot be used; raised before the first step wherever that can be known.
         StoppedError: A signal asked the run to stop between its first and last step; see `training.preemption`.
     """
-    config = with_settled_stride(config)
-    check_run_folder(config, allow_config_change=allow_config_change)
+    accelerator = make_accelerator(config)
+    require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
+    if accelerator.is_main_process:  # the only one that needs to see the run's folder
+        config = with_settled_stride(config)
+        check_run_folder(config, allow_config_change=allow_config_change)
+    else:
+        reporter = QuietReporter()
+    config = from_first(accelerator, config)
     with _out_of_memory_explained():
-        return _train(config, reporter, check_only=check_only, allow_config_change=allow_config_change)
+        run = assemble(config, reporter.note, reporter.looked_through, accelerator)
+        try:
+            return _train(run, reporter, check_only=check_only, allow_config_change=allow_config_change)
+        except StoppedError:
+            accelerator.end_training()
+            raise
 
 
-def _train(config: Config, reporter: Reporter, *, check_only: bool, allow_config_change: bool) -> Path:
-    run = assemble(config, reporter.note, reporter.looked_through)
-    config = run.config
+def _train(run: Run, reporter: Reporter, *, check_only: bool, allow_config_change: bool) -> Path:
+    config, folder, writes = run.config, Path(run.config.run_dir), run.accelerator.is_main_process
     first = _validate(run, reporter) if run.state.step == 0 else None
     if first is not None:
         _refuse_weak_base(config, first)
-    if allow_config_change:
+    if allow_config_change and writes:
         for line in config_changes(config):
             reporter.note(f"The config changes: {line}")
     if check_only:
-        gradients(run, batches_from(run, run.state.step))
+        gradients(run, batches_from(run))
         reporter.note("Everything is in place: data, model, validation and gradients were tried; nothing was written.")
-        return Path(config.run_dir)
-    folder = open_run_folder(config, allow_config_change=allow_config_change)
-    if run.calibration is not None:
+        return folder
+    if writes:
+        open_run_folder(config, run.state.run_id, allow_config_change=allow_config_change)
+    if run.calibration is not None and writes:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
-    with Journal(folder, first_step=run.state.step, tensorboard=config.tracking.tensorboard) as journal:
+    with _open_journal(run, folder) as journal:
         if first is not None:
             journal.write("validation", 0, validation_figures(first))
         _loop(run, folder, journal, reporter)
+    run.accelerator.end_training()
     return folder
 
 
-def _loop(run: Run, folder: Path, journal: Journal, reporter: Reporter) -> None:
+def _open_journal(run: Run, folder: Path) -> Journal | QuietJournal:
+    if not run.accelerator.is_main_process:
+        return QuietJournal()
+    return Journal(folder, first_step=run.state.step, tensorboard=run.config.tracking.tensorboard)
+
+
+def _loop(run: Run, folder: Path, journal: Journal | QuietJournal, reporter: Reporter) -> None:
     training = run.config.training
     reporter.started(run.state.step, training.steps)
     clock = CheckpointClock(run.config.checkpoint)
-    with stop_on_signals() as stop, contextlib.closing(batches_from(run, run.state.step)) as batches:
+    with stop_on_signals() as stop, contextlib.closing(batches_from(run)) as batches:
         for step in range(run.state.step + 1, training.steps + 1):
             figures = _timed_step(run, batches, step)
             reporter.stepped(step, figures)
             last = step == training.steps
             if step % training.log_every == 0 or last:
                 journal.write("train", step, figures)
-            run.state = replace(run.state, step=step)
+            run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             is_best = _validate_if_due(run, journal, reporter)
-            stopped_by = stop.reason  # read once: a signal after this waits for the next step
-            if clock.is_due(step) or is_best or stopped_by or last:
-                _save(run, folder)
+            # Agreed among all processes, and read once: a signal after this waits for the next step.
+            stopped_by, due = largest(run.accelerator, [stop.number, clock.is_due(step) or is_best or last])
+            if due or stopped_by:
+                save_checkpoint(run, folder)
                 clock.restart()
             if stopped_by and not last:
-                raise StoppedError(folder, step, stopped_by)
+                run.accelerator.wait_for_everyone()  # whoever ended first would have the others ended by the launcher
+                raise StoppedError(folder, step, signal.Signals(stopped_by).name)
+    run.accelerator.wait_for_everyone()
 
 
 def _timed_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, float]:
     started = time.perf_counter()
     figures = training_step(run, batches, step)
-    training = run.config.training
-    clips = training.batch_size * training.accumulation - figures.get("clips_left_out", 0.0)
+    clips = run.clips_per_step - figures.get("clips_left_out", 0.0)
     figures["samples_per_second"] = clips / (time.perf_counter() - started)
     return figures
 
 
-def _validate_if_due(run: Run, journal: Journal, reporter: Reporter) -> bool:
+def _validate_if_due(run: Run, journal: Journal | QuietJournal, reporter: Reporter) -> bool:
     """Measure and note, where it is time to; return whether no earlier measurement was as good."""
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
@@ -145,11 +169,6 @@ def _validate_if_due(run: Run, journal: Journal, reporter: Reporter) -> bool:
     before = run.state
     run.state = before.measured(figures[BEST_BY])
     return run.state != before
-
-
-def _save(run: Run, folder: Path) -> None:
-    run.state = replace(run.state, broken=run.dataset.broken.reasons, windows=len(run.dataset.windows("train")))
-    save_checkpoint(run, folder)
 
 
 def validation_figures(errors: PredictionErrors) -> dict[str, Any]:

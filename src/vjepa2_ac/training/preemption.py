@@ -47,6 +47,11 @@ class StopRequest:
         self._same_within_s = same_within_s
         self._came_at = 0.0
 
+    @property
+    def number(self) -> int:
+        """The signal's number; 0: none came."""
+        return 0 if self.reason is None else signal.Signals[self.reason].value
+
     def take(self, number: int, _frame: FrameType | None) -> None:
         """Note a first signal; let a second one do what it does by default."""
         if self.reason is None:

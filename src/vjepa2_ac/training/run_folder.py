@@ -3,6 +3,7 @@
 RUN/config.yaml         the resolved config, defaults and a chosen stride included
 RUN/environment.json    versions, machine and command of every start
 RUN/calibration.json    figures of each stride, where data.stride was auto
+RUN/run_id              a name that no other run has
 RUN/metrics.jsonl       figures, a row per line
 RUN/checkpoints/        step-XXXXXXXX folders
 RUN/tensorboard/        event files
@@ -13,6 +14,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
+import secrets
 import sys
 import tempfile
 import time
@@ -25,6 +27,7 @@ from vjepa2_ac.storage import write_atomically
 
 CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
+RUN_ID = "run_id"
 CHECKPOINTS = "checkpoints"
 
 # Settings that may change between two starts of one run. They do not change what is computed, but for those by which a
@@ -72,11 +75,12 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
     _check_writable(folder)
 
 
-def open_run_folder(config: Config, *, allow_config_change: bool = False) -> Path:
+def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool = False) -> Path:
     """Create the run's folder, or go on in it, and note this start's versions.
 
     Args:
         config: The run.
+        run_name: What `run_id` gave, or a checkpoint from elsewhere.
         allow_config_change: Go on with this config where the folder has another, and note what changed with this start.
 
     Raises:
@@ -93,7 +97,14 @@ def open_run_folder(config: Config, *, allow_config_change: bool = False) -> Pat
     write_atomically(path, json.dumps([*starts, start], indent=1).encode())
     if allow_config_change or not (folder / CONFIG).exists():
         write_atomically(folder / CONFIG, config_as_yaml(config).encode())
+    write_atomically(folder / RUN_ID, run_name)
     return folder
+
+
+def run_id(folder: Path) -> str:
+    """Return the name that a run got at its first start; a new one where there is none."""
+    path = folder / RUN_ID
+    return path.read_text().strip() if path.is_file() else secrets.token_hex(8)
 
 
 def config_changes(config: Config) -> list[str]:

@@ -14,12 +14,13 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import Evaluation, evaluate
 from vjepa2_ac.evaluation.plots import plot_evaluation
 from vjepa2_ac.evaluation.report import evaluation_as_dict
+from vjepa2_ac.latents import require_widths
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import load_trained
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.training.assembly import ADAPTER, make_accelerator
-from vjepa2_ac.training.checkpoint import newest_checkpoint
+from vjepa2_ac.training.assembly import make_accelerator
+from vjepa2_ac.training.checkpoint import ADAPTER, newest_checkpoint
 from vjepa2_ac.training.run_folder import CHECKPOINTS, read_run_config
 
 EVALUATION, PLOT = "evaluation.json", "evaluation.png"
@@ -66,6 +67,7 @@ def evaluate_run(folder: Path, *, split: Split, clips: int) -> tuple[Evaluation,
     run = load_run(folder)
     config = run.config
     dataset = open_dataset(config.data)
+    require_widths(run.world_model, dataset.widths, where=str(folder))
     batches = validation_batches(dataset, split, clips=clips, batch_size=config.validation.batch_size)
     accelerator = make_accelerator(config)
     run.world_model.to(accelerator.device)

@@ -2,34 +2,37 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
+from torch import nn
 
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import is_url
 from vjepa2_ac.training.assembly import Run, encode
 from vjepa2_ac.training.optim import learning_rate_at, set_learning_rate, trained_parameters
+from vjepa2_ac.training.processes import add_up_gradients, sums
+
+SMALLEST_LOSS_SCALE = 1.0  # fp16: where gradients overflow even so, they are not finite for another reason
 
 
 @dataclass(frozen=True)
 class Gradients:
-    """What the gradients of one optimizer step were taken from."""
+    """What the gradients of one optimizer step were taken from, by all processes together."""
 
     forced_loss: float  # mean over the clips; NaN where there is none
     rollout_loss: float
-    norm: float  # before clipping
+    norm: float  # before clipping; not finite where fp16 has overflowed, which the loss scale answers
     clips: int  # that could be read
     bytes_fetched: int
 
 
 def training_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, float]:
-    """Do one optimizer step: accumulate gradients over micro-batches, clip, update.
+    """Do one optimizer step: accumulate gradients over micro-batches and processes, clip, update.
 
     Raises:
         InputError: The loss or a gradient is not finite; names the clips. The weights have not moved.
@@ -38,7 +41,9 @@ def training_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, fl
     learning_rate = learning_rate_at(step, run.config.training)
     set_learning_rate(run.optimizer, learning_rate)
     taken = gradients(run, batches)
-    run.optimizer.step()  # without a clip there are no gradients, and nothing moves
+    if taken.clips:  # without a clip there are no gradients, and nothing moves
+        run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
+        run.scaler.update()
     run.optimizer.zero_grad(set_to_none=True)
     return {
         "loss": taken.forced_loss + taken.rollout_loss,
@@ -47,59 +52,63 @@ def training_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, fl
         "grad_norm": taken.norm,
         "learning_rate": learning_rate,
         **_about_the_data(run, taken),
+        **({"loss_scale": run.scaler.get_scale()} if run.scaler.is_enabled() else {}),
     }
 
 
 def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
-    """Accumulate and clip the gradients of the next micro-batches; the weights do not move.
+    """Accumulate and clip the gradients of the next micro-batches of all processes; the weights do not move.
 
     Loss and gradient are means over the clips of the step. Where clips are left out (`data.broken_episodes`: skip) they
     are means over those that are left: each counts as much as the others, whatever micro-batch it is in.
 
     Raises:
-        InputError: A loss or gradient is not finite; names the clips.
+        InputError: A loss or gradient is not finite; names the clips of this process.
     """
-    training = run.config.training
     run.world_model.train()
-    sums = torch.zeros(2, device=run.accelerator.device)
+    expected = run.clips_per_step
+    totals = torch.zeros(2, device=run.accelerator.device)
     seen: list[str] = []
     fetched = 0
-    for micro in range(training.accumulation):
+    for _ in range(run.micro_batches):
         batch = next(batches)
         fetched += batch.bytes_fetched
         if not batch.starts:
             continue
         seen += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
-        parts = training.accumulation * (training.batch_size / len(batch.starts))
-        last = micro == training.accumulation - 1
-        with contextlib.nullcontext() if last else run.accelerator.no_sync(run.objective):
-            forced, rollout = run.objective(encode(run, batch))
-            run.accelerator.backward((forced + rollout) / parts)
-        sums += torch.stack([forced.detach(), rollout.detach()]) / parts
-    if not seen:
-        return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=fetched)
-    _scale_up(run, sums, training.accumulation * training.batch_size / len(seen))
-    grad_norm = _clip(run)
-    forced_loss, rollout_loss = sums.tolist()
-    _refuse_not_finite(forced_loss + rollout_loss + grad_norm, seen)
-    return Gradients(forced_loss, rollout_loss, grad_norm, len(seen), fetched)
+        parts = expected / len(batch.starts)
+        latents = encode(run, batch)
+        with run.accelerator.autocast():
+            forced, rollout = run.objective(latents)
+        run.scaler.scale((forced + rollout) / parts).backward()
+        totals += torch.stack([forced.detach(), rollout.detach()]) / parts
+    *losses, clips, fetched_by_all = sums(run.accelerator, [*totals.tolist(), len(seen), fetched])
+    if not clips:
+        return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(fetched_by_all))
+    forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
+    norm = _settle(run, factor=expected / clips)
+    _refuse_not_finite(run, forced_loss + rollout_loss, norm, seen)
+    return Gradients(forced_loss, rollout_loss, norm, int(clips), int(fetched_by_all))
 
 
-def _scale_up(run: Run, sums: torch.Tensor, factor: float) -> None:
-    """Turn shares of the clips that were to come into shares of those that came."""
-    if factor == 1:
-        return
-    sums *= factor
-    for parameter in trained_parameters(run.objective):
-        if parameter.grad is not None:
-            parameter.grad *= factor
+def _settle(run: Run, factor: float) -> float:
+    """Make the sums of scaled parts of all processes the gradient of the mean, clip it, and return its norm before."""
+    trained = list(trained_parameters(run.objective))
+    add_up_gradients(run.accelerator, trained)
+    run.scaler.unscale_(run.optimizer)
+    if factor != 1:
+        for parameter in trained:
+            if parameter.grad is not None:
+                parameter.grad *= factor
+    limit = run.config.training.max_grad_norm
+    return float(nn.utils.clip_grad_norm_(trained, math.inf if limit is None else limit))
 
 
 def _about_the_data(run: Run, taken: Gradients) -> dict[str, float]:
-    data, training = run.config.data, run.config.training
+    data = run.config.data
     figures: dict[str, float] = {}
     if data.broken_episodes == "skip":
-        figures["clips_left_out"] = float(training.accumulation * training.batch_size - taken.clips)
+        figures["clips_left_out"] = float(run.clips_per_step - taken.clips)
     if is_url(data.path):
         figures["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
     return figures
@@ -111,19 +120,13 @@ def step_seed(seed: int, step: int, rank: int) -> int:
     return int.from_bytes(digest, "big") >> 1
 
 
-def _clip(run: Run) -> float:
-    limit = run.config.training.max_grad_norm
-    norm = run.accelerator.clip_grad_norm_(
-        list(trained_parameters(run.objective)), math.inf if limit is None else limit
-    )
-    return float(norm)
-
-
-def _refuse_not_finite(value: float, clips: list[str]) -> None:
-    if math.isfinite(value):
+def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> None:
+    overflow = run.scaler.is_enabled() and run.scaler.get_scale() >= SMALLEST_LOSS_SCALE
+    if math.isfinite(loss) and (math.isfinite(norm) or overflow):
         return
+    fp16 = ", or set training.precision to bf16 or fp32" if run.scaler.is_enabled() else ""
     raise InputError(
         where="training",
         found=f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}",
-        fix="The weights have not moved. Look at these clips, or lower training.learning_rate",
+        fix=f"The weights have not moved. Look at these clips, or lower training.learning_rate{fp16}",
     )

@@ -1,0 +1,99 @@
+"""How does a run go on where it stood? Its newest checkpoint, on whatever number of processes."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.lora import load_trained
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, read_state
+from vjepa2_ac.training.processes import from_first, require_same, take_from_first
+from vjepa2_ac.training.run_folder import CHECKPOINTS, run_id
+
+
+def take_up(
+    config: Config,
+    accelerator: Accelerator,
+    world_model: WorldModel,
+    optimizer: torch.optim.Optimizer,
+    note: Callable[[str], None],
+) -> RunState:
+    """Bring every process to where the run stands: the first one reads its newest checkpoint, the others get it there.
+
+    Raises:
+        InputError: The processes have different bases, or the checkpoint is not of this run.
+    """
+    encoder = world_model.adaptation.encoder if world_model.adaptation else ""
+    require_same(accelerator, encoder, what="model.base", fix="Give every machine the same checkpoint")
+    state, moments = RunState(step=0), None
+    folder = Path(config.run_dir)
+    if accelerator.is_main_process and (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is not None:
+        state, moments = _read(checkpoint, world_model, optimizer)
+        note(f"Going on from {checkpoint} ({state.step} of {config.training.steps} steps are done).")
+    state = from_first(accelerator, replace(state, run_id=state.run_id or run_id(folder)))
+    take_from_first(accelerator, world_model.predictor.state_dict().values())
+    moments = from_first(accelerator, moments)
+    if moments is not None and not accelerator.is_main_process:
+        optimizer.load_state_dict(moments)
+    return state
+
+
+def micro_batches_of(config: Config, state: RunState, processes: int, note: Callable[[str], None]) -> int:
+    """Return how many micro-batches a process does per step.
+
+    They are the config's; but on another number of processes than before so many that a step has the clips it had.
+
+    Raises:
+        InputError: So many processes cannot share a step's clips evenly.
+    """
+    batch_size, accumulation = config.training.batch_size, config.training.accumulation
+    as_configured = state.clips_per_step in {None, batch_size * accumulation * state.processes}
+    if state.clips_per_step is None or processes == state.processes or not as_configured:
+        return accumulation
+    micro_batches, rest = divmod(state.clips_per_step, batch_size * processes)
+    if rest or not micro_batches:
+        raise InputError(
+            where="training.batch_size",
+            found=f"{processes} processes of {batch_size} clips for a run with {state.clips_per_step} clips per step",
+            needed="a number of processes and a batch_size whose product divides the clips of a step",
+            fix="Start another number of processes, or set a smaller training.batch_size and --allow-config-change",
+        )
+    note(
+        f"{processes} processes instead of {state.processes}: {micro_batches} micro-batches of {batch_size} in each, so"
+        f" that a step has the same {state.clips_per_step} clips."
+    )
+    return micro_batches
+
+
+def say_what_is_new(dataset: Dataset, state: RunState, note: Callable[[str], None]) -> None:
+    """Note where the data is not what it was when the checkpoint was written."""
+    windows = len(dataset.windows("train"))
+    if state.windows not in {None, windows}:
+        note(
+            f"The data has changed: {windows:,} training clips instead of {state.windows:,}."
+            " From here on their order is another, and some may be seen twice in this epoch or not at all."
+        )
+
+
+def _read(
+    checkpoint: Path, world_model: WorldModel, optimizer: torch.optim.Optimizer
+) -> tuple[RunState, dict[str, Any]]:
+    load_trained(world_model, checkpoint / ADAPTER, trainable=True)
+    try:
+        moments = torch.load(checkpoint / OPTIMIZER, weights_only=True, map_location="cpu")
+        optimizer.load_state_dict(moments)
+        return read_state(checkpoint), moments
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, pickle.UnpicklingError) as error:
+        raise InputError(
+            where=str(checkpoint), found=f"not the state of this run ({error})", fix="Delete it to use an older one"
+        ) from None
