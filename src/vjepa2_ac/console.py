@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from datetime import timedelta
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, ratios_by_horizon
+
+_MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
+_WIDE = 120  # columns that leave room for a long bar
 
 console = Console(highlight=False, soft_wrap=True)
 if not console.is_terminal:
@@ -21,14 +25,19 @@ class ProgressBar:
 
     def __init__(self, title: str, total: int, done: int = 0, line_every_s: float = 10.0) -> None:
         self._title, self._total, self._done, self._line_every_s = title, total, done, line_every_s
-        self._last_line = time.monotonic()
+        self._first, self._began = done, time.monotonic()
+        self._last_line = self._began
         self._bar: Progress | None = None
         self._task: TaskID | None = None
         if console.is_terminal:
             self._bar = Progress(
-                TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-                TextColumn("{task.fields[words]}"), console=console,
-            )  # fmt: skip
+                TextColumn("{task.description}"),
+                BarColumn(bar_width=40 if console.width >= _WIDE else 6, table_column=Column(no_wrap=True)),
+                MofNCompleteColumn(table_column=Column(no_wrap=True)),
+                TimeRemainingColumn(table_column=Column(no_wrap=True)),
+                TextColumn("{task.fields[words]}", table_column=Column()),  # goes on below where it does not fit
+                console=console,
+            )
             self._task = self._bar.add_task(title, total=total, completed=done, words="")
             self._bar.start()
 
@@ -39,7 +48,7 @@ class ProgressBar:
             self._bar.update(self._task, completed=done, words=words)
         elif done == self._total or time.monotonic() - self._last_line >= self._line_every_s:
             self._last_line = time.monotonic()
-            console.print(f"{self._title} {done}/{self._total}  {words}")
+            console.print(f"{self._title} {done}/{self._total}  {words}{self._left()}")
         if done >= self._total:
             self.close()
 
@@ -48,6 +57,14 @@ class ProgressBar:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+    def _left(self) -> str:
+        """Return the time left at the speed so far, in words."""
+        advanced, remaining = self._done - self._first, self._total - self._done
+        if advanced <= 0 or remaining <= 0:
+            return ""
+        seconds = (time.monotonic() - self._began) / advanced * remaining
+        return f"  {timedelta(seconds=round(seconds))} left"
 
 
 class LateProgress:
@@ -110,10 +127,13 @@ class ConsoleReporter:
     def stepped(self, step: int, figures: Mapping[str, float]) -> None:
         """Move the bar."""
         if self._bar is not None:
-            fetched = f"  {figures['bytes_per_clip'] / 1e6:.2f} MB/clip" if "bytes_per_clip" in figures else ""
-            speed = f"{figures['samples_per_second']:.1f} clips/s{fetched}"
-            words = f"loss {figures['loss']:.4f}  {speed}  {self._validation}"
-            self._bar.advance_to(step, words)
+            speed = figures["samples_per_second"]
+            words = [f"loss {figures['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
+            if "bytes_per_clip" in figures:
+                words.append(f"{figures['bytes_per_clip'] / 1e6:.2f} MB/clip")
+            if figures.get("data_wait_share", 0.0) > _MUCH_WAITING:
+                words.append(f"waits for data {figures['data_wait_share']:.0%} of the time")
+            self._bar.advance_to(step, "  ".join(word for word in words if word))
 
     def validated(self, step: int, errors: PredictionErrors) -> None:
         """Print a line of the validation's figures."""
