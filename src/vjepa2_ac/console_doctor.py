@@ -16,6 +16,8 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
     training, counts = config.training, estimate.parameters
     clips = f"{training.batch_size} clips of {config.data.frames} frames"
     fed_back = training.rollout_steps - 1 if estimate.rollout else 0
+    eight_bits = "8 bits where a tensor has 4,096 elements" if training.optimizer == "adamw_8bit" else "float32"
+    guess = f"a guess: four tensors as wide as the MLP{', a weight measured by DoRA' if config.adapter.dora else ''}"
     parts = [
         ("encoder, frozen", estimate.encoder_weights, f"{counts.encoder:,} weights in {config.model.dtype}"),
         (
@@ -24,15 +26,19 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
         ),
         ("trained", estimate.trained, f"{counts.trained:,} weights in float32"),
         ("gradients", estimate.gradients, "float32"),
-        ("optimizer", estimate.moments, "AdamW's two moments, float32"),
+        ("optimizer", estimate.moments, f"AdamW's two moments, {eight_bits}"),
         ("latents", estimate.latents, f"{clips}, float32"),
         ("encoder, at work", estimate.encoding, f"{config.model.encode_chunk} frames at once; before the predictor"),
         ("predictor, teacher forcing", estimate.teacher_forcing, "kept for the backward pass, without checkpointing"),
-        ("predictor, rollout", estimate.rollout, f"{fed_back} further passes, without checkpointing"),
+        ("predictor, rollout", estimate.rollout, f"{fed_back} x one step more, without checkpointing"),
         ("losses", estimate.losses, "without checkpointing"),
         ("all three, checkpointed", estimate.checkpointed, "instead: inputs of blocks, and one block computed again"),
-        ("bfloat16 copies", estimate.cast_cache, "of trained weights"),
-        ("temporaries", estimate.temporaries, "a guess: four tensors as wide as the MLP"),
+        ("copies", estimate.cast_cache, f"of trained weights in {training.precision}"),
+        ("temporaries", estimate.temporaries, guess),
+        (
+            "validation", estimate.validating,
+            f"instead of all that: {config.validation.batch_size} clips, and the keys and values of their rollout",
+        ),
         ("CUDA, cuBLAS, holes", ALLOWANCE, "an allowance, not computed"),
     ]  # fmt: skip
     lines = [f"  {name:<28}{size / GIGABYTE:8.3f} GB  {about}" for name, size, about in parts]
@@ -40,7 +46,7 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
         chosen = "  <- this config" if checkpointing == estimate.checkpointing else ""
         total = estimate.total(checkpointing=checkpointing) / GIGABYTE
         lines.append(f"  peak {word + ' checkpointing':<23}{total:8.3f} GB{chosen}")
-    return [*lines, *_not_counted(config), UNTESTED]
+    return [*lines, UNTESTED]
 
 
 def verdict(needed: int, available: int, gpu: str, knobs: list[str] | None) -> str:
@@ -59,10 +65,3 @@ def verdict(needed: int, available: int, gpu: str, knobs: list[str] | None) -> s
     if knobs is None:
         return f"{short} No knob makes it fit: it needs a larger GPU or a smaller model."
     return f"{short} It would with {', '.join(knobs)}."
-
-
-def _not_counted(config: Config) -> list[str]:
-    adapter = config.adapter
-    knobs = {"dora": adapter.dora, "rank_pattern": adapter.rank_pattern, "modules_to_save": adapter.modules_to_save}
-    used = [f"adapter.{name}" for name, value in knobs.items() if value and adapter.kind == "lora"]
-    return [f"Not counted, so that it needs more or less than this: {', '.join(used)}."] if used else []

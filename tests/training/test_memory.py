@@ -1,176 +1,83 @@
-"""The estimate counts what is really there: parameters exactly, and what autograd keeps nearly."""
+"""The estimate adds up what is there at once, knows every knob that changes it, and doctor tells it."""
 
 import subprocess
 import sys
-from typing import Any
 
 import pytest
 import torch
 
+from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.cli import main
-from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.config_file import parse_config
+from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.console_doctor import memory_lines
-from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.lora import add_adapter, trainable_report
-from vjepa2_ac.model.positions import rotary_tables
-from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.training.assembly import make_accelerator
-from vjepa2_ac.training.kept import Kept
-from vjepa2_ac.training.loss import Objective
-from vjepa2_ac.training.memory import USUAL_GPU, count_parameters, estimate_memory, ways_to_fit
-
-SMALL = {
-    "image_size": 64, "patch_size": 16,
-    "encoder": {"width": 48, "depth": 1, "heads": 2, "mlp_ratio": 2.0},
-    "predictor": {"width": 48, "depth": 2, "heads": 2},
-}  # fmt: skip
-WIDER = {
-    "image_size": 96, "patch_size": 16,
-    "encoder": {"width": 96, "depth": 1, "heads": 2, "mlp_ratio": 48 / 11},
-    "predictor": {"width": 128, "depth": 5, "heads": 4, "mlp_ratio": 3.0},
-}  # fmt: skip
-LORA = {"rank": 4, "alpha": 8}
-EVERYWHERE = [
-    "q", "k", "v", "o", "fc1", "fc2", "predictor_embed", "predictor_proj", "action_encoder", "state_encoder",
-]  # fmt: skip
-ADAPTERS: dict[str, dict[str, Any]] = {
-    "lora": LORA, "attention only": {**LORA, "targets": ["q", "v"]}, "no dropout": {**LORA, "dropout": 0.0},
-    "everywhere": {**LORA, "targets": EVERYWHERE}, "none": {"kind": "none"},
-}  # fmt: skip
+from vjepa2_ac.model.key_value_cache import KeyValueCache
+from vjepa2_ac.training.memory import USUAL_GPU, estimate_memory, ways_to_fit
+from vjepa2_ac.training.optim import make_optimizer
 
 
-def run_config(adapter: dict[str, Any] | None = None, **changes: Any) -> Config:
-    """Return a run; its base and data are never opened."""
-    values: dict[str, Any] = {
-        "run_dir": "run", "data": {"path": "set", "frames": 6}, "model": {"base": "base"}, "adapter": adapter or LORA,
-        "training": {"device": "cpu", "batch_size": 2, "rollout_steps": 2},
-    }  # fmt: skip
-    for key, value in changes.items():
-        section, name = key.split("__")
-        values[section] = {**values[section], name: value}
-    return parse_config(values, where="test")
-
-
-def built(config: Config, sizes: ModelSizes) -> WorldModel:
-    dtype = torch.bfloat16 if config.model.dtype == "bfloat16" else torch.float32
-    model = WorldModel.random(sizes, seed=0, dtype=dtype)
-    add_adapter(model, config.adapter, seed=0)
-    model.set_gradient_checkpointing(config.training.gradient_checkpointing)
-    return model.train()  # type: ignore[return-value]
-
-
-class Keeping(torch.autograd.graph.saved_tensors_hooks):
-    """Sums the bytes that autograd saves, each storage once; weights are not activations."""
-
-    def __init__(self, model: WorldModel) -> None:
-        self.storages: dict[int, torch.Tensor] = {}
-        self.weights = {value.untyped_storage().data_ptr() for value in model.parameters()}
-        super().__init__(self._pack, lambda saved: saved)
-
-    def _pack(self, saved: torch.Tensor) -> torch.Tensor:
-        self.storages[saved.untyped_storage().data_ptr()] = saved
-        return saved
-
-    @property
-    def bytes(self) -> int:
-        return sum(s.untyped_storage().nbytes() for place, s in self.storages.items() if place not in self.weights)
-
-
-def kept_by_autograd(config: Config, sizes: ModelSizes) -> int:
-    """Return what PyTorch keeps of the objective of one micro-batch, in the arithmetic of a run."""
-    model, accelerator = built(config, sizes), make_accelerator(config)
-    objective = accelerator.prepare(Objective(model, config.training))
-    clips, frames = config.training.batch_size, config.data.frames
-    batch = LatentBatch(
-        latents=torch.randn(clips, frames, model.num_tokens, model.latent_dim),
-        actions=torch.randn(clips, frames - 1, 7), states=torch.randn(clips, frames, 7), extrinsics=None,
-        episode_ids=("a",) * clips, starts=(0,) * clips,
-    )  # fmt: skip
-    keeping = Keeping(model)
-    with keeping:
-        forced, rollout = objective(batch)
-    kept = keeping.bytes
-    accelerator.backward(forced + rollout)
-    return kept
-
-
-def kept_by_one_block(config: Config, sizes: ModelSizes) -> int:
-    """Return what PyTorch keeps of one block: what is there while checkpointing computes it again."""
-    model, accelerator = built(config, sizes), make_accelerator(config)
-    predictor = model.base_predictor
-    layout = predictor._assemble(
-        torch.zeros(config.training.batch_size, config.data.frames - 1, model.num_tokens, model.latent_dim),
-        *[torch.zeros(config.training.batch_size, config.data.frames - 1, 7)] * 2, None,
-    )[1]  # fmt: skip
-    tables = rotary_tables(layout, sizes.predictor.width // sizes.predictor.heads, torch.device("cpu"))
-    dtype = torch.bfloat16 if config.training.precision == "bf16" else torch.float32
-    tokens = torch.randn(config.training.batch_size, layout.length, sizes.predictor.width, dtype=dtype)
-    keeping = Keeping(model)
-    with accelerator.autocast(), keeping:
-        predictor.blocks[1](tokens.requires_grad_(), tables, layout.tokens_per_step)
-    return keeping.bytes
-
-
-# Two shapes, and every kind of adapter and arithmetic at one of them.
-CASES = [
-    (SMALL, 6, 2, "bf16", "bfloat16", "lora"), (WIDER, 5, 3, "bf16", "bfloat16", "lora"),
-    (WIDER, 5, 1, "fp32", "float32", "lora"), (SMALL, 5, 3, "bf16", "float32", "lora"),
-    (SMALL, 6, 2, "bf16", "bfloat16", "none"), (WIDER, 5, 3, "bf16", "float32", "none"),
-]  # fmt: skip
-OTHER_ADAPTERS = [
-    (WIDER, 5, 2, "bf16", "bfloat16", "attention only"), (SMALL, 6, 2, "bf16", "bfloat16", "everywhere"),
-    (SMALL, 6, 3, "fp32", "float32", "no dropout"),
-]  # fmt: skip
-NAMES = ("shape", "frames", "rollout", "precision", "dtype", "adapter")
-
-
-def case(shape: Any, frames: int, rollout: int, precision: str, dtype: str, adapter: str) -> tuple[Config, ModelSizes]:
-    config = run_config(
-        ADAPTERS[adapter], data__frames=frames, training__rollout_steps=rollout, training__precision=precision,
-        model__dtype=dtype,
-    )  # fmt: skip
-    return config, ModelSizes.model_validate(shape)
-
-
-@pytest.mark.parametrize(NAMES, CASES + OTHER_ADAPTERS)
-def test_estimate_is_what_autograd_keeps(shape, frames, rollout, precision, dtype, adapter) -> None:
-    config, sizes = case(shape, frames, rollout, precision, dtype, adapter)
-    measured = kept_by_autograd(config, sizes)
-    assert Kept(config, sizes, "cpu").without_checkpointing() == pytest.approx(measured, rel=0.15)
-
-
-@pytest.mark.parametrize(NAMES, CASES)
-def test_estimate_is_what_autograd_keeps_with_checkpointing(shape, frames, rollout, precision, dtype, adapter) -> None:
-    config, sizes = case(shape, frames, rollout, precision, dtype, adapter)
-    training = config.training.model_copy(update={"gradient_checkpointing": True})
-    config = config.model_copy(update={"training": training})
-    measured = kept_by_autograd(config, sizes) + kept_by_one_block(config, sizes)
-    assert Kept(config, sizes, "cpu").with_checkpointing() == pytest.approx(measured, rel=0.15)
-
-
-@pytest.mark.parametrize("adapter", ADAPTERS)
-@pytest.mark.parametrize("shape", [SMALL, WIDER], ids=["small", "wider"])
-def test_parameters_are_those_of_a_model_that_was_built(shape, adapter) -> None:
-    config, sizes = run_config(ADAPTERS[adapter]), ModelSizes.model_validate(shape)
+def bytes_of_moments(**changes: object) -> tuple[int, int]:
+    """Return the bytes of the estimate and those of an optimizer that has made a step."""
+    config, sizes = run_config({**LORA, "rank": 24, "dora": True}, **changes), model_sizes(width=96)
     model = built(config, sizes)
-    counts, report = count_parameters(config, sizes), trainable_report(model)
-    assert (counts.predictor, counts.encoder) == (report.predictor, report.total - report.predictor)
-    assert counts.trained == report.trained
+    for value in model.parameters():
+        value.grad = torch.ones_like(value) if value.requires_grad else None
+    optimizer = make_optimizer(model, config.training)
+    optimizer.step()
+    kept = {
+        tensor.data_ptr(): tensor.nbytes
+        for state in optimizer.state.values()
+        for name, tensor in state.items()
+        if isinstance(tensor, torch.Tensor) and name != "step" and not name.startswith("qmap")  # one table for all
+    }
+    return estimate_memory(config, sizes).moments, sum(kept.values())
 
 
-@pytest.mark.parametrize("rank", [1, 16])
-def test_parameters_of_the_released_model_are_the_known_ones(rank: int) -> None:
-    counts = count_parameters(run_config({"rank": rank}), ModelSizes())
-    assert counts.encoder == 1_012_173_952
-    assert counts.trained == rank * 442_368
+def test_moments_are_those_of_the_optimizer() -> None:
+    estimate, measured = bytes_of_moments()
+    assert estimate == measured
 
 
-def test_nothing_is_kept_for_a_rollout_that_does_not_count() -> None:
-    config = run_config(training__rollout_steps=3, training__rollout_weight=0.0)
-    estimate = estimate_memory(config, ModelSizes())
-    assert estimate.rollout == 0
-    assert estimate.losses < estimate_memory(run_config(training__rollout_steps=3), ModelSizes()).losses
+def test_moments_in_8_bits_are_those_of_bitsandbytes() -> None:
+    pytest.importorskip("bitsandbytes")
+    estimate, measured = bytes_of_moments(training__optimizer="adamw_8bit")
+    assert estimate == measured < bytes_of_moments()[0]
+
+
+def test_a_rollout_of_validation_keeps_the_keys_and_values_that_are_counted() -> None:
+    # With many layers and few tokens a frame, little but the cache is left of a batch of validation.
+    config = run_config(validation__batch_size=3, training__precision="fp32", model__dtype="float32")
+    sizes = model_sizes(latent=12, width=48, depth=32, mlp=0.25)
+    model, steps = built(config, sizes), config.data.frames - 1
+    cache = KeyValueCache()
+    with torch.no_grad():
+        model.predict(torch.zeros(3, steps - 1, 16, 12), *[torch.zeros(3, steps - 1, 7)] * 2, cache=cache)
+    cached = sum(piece.nbytes for layer in range(32) for piece in cache.layer(layer))
+    latents = 3 * config.data.frames * 16 * 12 * 4
+    assert estimate_memory(config, sizes).validating == cached + 3 * latents
+
+
+def test_the_peak_is_that_of_training_or_of_validation() -> None:
+    few, many = (run_config(data__frames=16, validation__batch_size=clips) for clips in (2, 64))
+    estimate = estimate_memory(many, ModelSizes())
+    assert estimate.total(checkpointing=True) == estimate.standing + estimate.validating
+    assert estimate.total(checkpointing=True) > estimate_memory(few, ModelSizes()).total(checkpointing=True)
+
+
+def test_what_is_trained_otherwise_is_counted() -> None:
+    plain = estimate_memory(run_config(), ModelSizes())
+    dora, pissa = (
+        estimate_memory(run_config({**LORA, **how}), ModelSizes()) for how in ({"dora": True}, {"init": "pissa"})
+    )
+    assert pissa == plain  # what PiSSA started from stays on the CPU
+    assert dora.trained > plain.trained
+    assert dora.teacher_forcing > plain.teacher_forcing
+    assert dora.temporaries > plain.temporaries
+
+
+def test_fp16_keeps_copies_of_bfloat16_weights() -> None:
+    estimates = [estimate_memory(run_config(training__precision=name), ModelSizes()) for name in ("bf16", "fp16")]
+    copies = 24 * 12 * 1024**2 * 2 + 2 * 1408 * 1024
+    assert estimates[1].teacher_forcing - estimates[0].teacher_forcing == copies - 3 * 1024**2 * 2  # none for latents
 
 
 def test_a_run_that_fits_needs_no_knob_and_a_large_one_is_told_which() -> None:
@@ -203,7 +110,8 @@ def test_doctor_says_whether_it_fits_and_what_it_has_not_been_compared_with(
     assert f"vjepa2-ac data check {path}" in said
 
 
-def test_doctor_says_what_it_does_not_count() -> None:
-    plain, dora = run_config(), run_config({**LORA, "dora": True})
-    assert not any("adapter.dora" in line for line in memory_lines(plain, estimate_memory(plain, ModelSizes())))
-    assert any("adapter.dora" in line for line in memory_lines(dora, estimate_memory(dora, ModelSizes())))
+@pytest.mark.parametrize(("optimizer", "words"), [("adamw", "float32"), ("adamw_8bit", "8 bits")])
+def test_doctor_says_how_moments_are_kept(optimizer: str, words: str) -> None:
+    config = run_config(training__optimizer=optimizer)
+    (line,) = [line for line in memory_lines(config, estimate_memory(config, ModelSizes())) if "moments" in line]
+    assert words in line

@@ -10,28 +10,27 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.episode import ACTION_DIM, EXTRINSICS_DIM, STATE_DIM
-from vjepa2_ac.training.kept import FLOAT32, Kept, Kind, adapted_layers
+from vjepa2_ac.training.kept import Kept
+from vjepa2_ac.training.kept_block import FLOAT32, HALF, Kind
+from vjepa2_ac.training.parameters import (
+    CONDITIONS,
+    Parameters,
+    adapter_ranks,
+    count_parameters,
+    linear_layers,
+    trained_tensors,
+)
 
 GIGABYTE = 10**9
 ALLOWANCE = 3 * GIGABYTE // 2  # CUDA context 0.5, cuBLAS workspaces, holes between blocks: not computed, allowed for
 USUAL_GPU = 24 * GIGABYTE
 
-_TUBELET = 2  # frames that the encoder's first layer takes at once
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """How many parameters there are, exactly."""
-
-    encoder: int
-    predictor: int
-    trained: int  # an adapter's; or the whole predictor
+_SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # of bitsandbytes
 
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """Bytes on the GPU, part by part. `total` is the largest of three moments: they do not happen at once."""
+    """Bytes on the GPU, part by part. `total` is the largest of four moments: they do not happen at once."""
 
     parameters: Parameters
     checkpointing: bool  # what the config asks for
@@ -45,22 +44,24 @@ class MemoryEstimate:
     teacher_forcing: int
     rollout: int
     losses: int
-    cast_cache: int  # bfloat16 copies of trained weights
+    cast_cache: int  # copies of trained weights in the arithmetic's type
     checkpointed: int  # all of teacher forcing, rollout and losses, when blocks are computed again
     temporaries: int
     optimizer_temporaries: int
+    validating: int  # all of a batch of validation
 
     @property
     def standing(self) -> int:
         """What is there all the time."""
         weights = self.encoder_weights + self.predictor_weights + self.trained
-        return weights + self.gradients + self.moments + ALLOWANCE
+        return weights + self.moments + ALLOWANCE
 
     def total(self, *, checkpointing: bool) -> int:
         """Return the peak with or without gradient checkpointing."""
         kept = self.checkpointed if checkpointing else self.teacher_forcing + self.rollout + self.losses
         predicting = self.latents + kept + self.cast_cache + self.temporaries
-        return self.standing + max(self.latents + self.encoding, predicting, self.optimizer_temporaries)
+        training = self.gradients + max(self.latents + self.encoding, predicting, self.optimizer_temporaries)
+        return self.standing + max(training, self.validating)
 
 
 def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> MemoryEstimate:
@@ -81,44 +82,18 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
         predictor_weights=parameters.predictor * number if config.adapter.kind == "lora" else 0,
         trained=parameters.trained * FLOAT32,
         gradients=parameters.trained * FLOAT32,
-        moments=2 * parameters.trained * FLOAT32,
-        latents=_frames(config) * _tokens_per_frame(sizes) * sizes.encoder.width * FLOAT32,
-        encoding=_encoding(config, sizes),
+        moments=sum(_moments(config, size) for size in trained_tensors(config, sizes)),
+        latents=_latents(config, sizes, config.training.batch_size),
+        encoding=_encoding(config, sizes, config.training.batch_size),
         teacher_forcing=kept.teacher_forcing(),
         rollout=kept.rollout(),
         losses=kept.losses(),
         cast_cache=kept.cast_cache(),
         checkpointed=kept.with_checkpointing(),
-        temporaries=_temporaries(config, sizes),
-        optimizer_temporaries=parameters.trained * FLOAT32,
+        temporaries=_temporaries(config, sizes, config.training.batch_size) + _dora_temporaries(config, sizes),
+        optimizer_temporaries=parameters.trained * FLOAT32 if config.training.optimizer == "adamw" else 0,
+        validating=_validating(config, sizes),
     )
-
-
-def count_parameters(config: Config, sizes: ModelSizes) -> Parameters:
-    """Return how many parameters a model of these sizes has, and how many of them the config trains."""
-    encoder, predictor = sizes.encoder, sizes.predictor
-    patch = 3 * _TUBELET * sizes.patch_size**2
-    in_encoder = (patch + 1) * encoder.width + 2 * encoder.width
-    in_encoder += encoder.depth * _block(encoder.width, int(encoder.width * encoder.mlp_ratio))
-    hidden = int(predictor.width * predictor.mlp_ratio)
-    inputs = sum(dim + 1 for dim in (encoder.width, ACTION_DIM, STATE_DIM, EXTRINSICS_DIM)) * predictor.width
-    outputs = 2 * predictor.width + (predictor.width + 1) * encoder.width
-    in_predictor = inputs + predictor.depth * _block(predictor.width, hidden) + outputs
-    if config.adapter.kind == "none":
-        idle = 0 if predictor.use_extrinsics else (EXTRINSICS_DIM + 1) * predictor.width  # there, and left alone
-        return Parameters(in_encoder, in_predictor, trained=in_predictor - idle)
-    ends = {
-        "q": 2 * predictor.width, "k": 2 * predictor.width, "v": 2 * predictor.width, "o": 2 * predictor.width,
-        "fc1": predictor.width + hidden, "fc2": predictor.width + hidden,
-    }  # fmt: skip
-    outer = {
-        "predictor_embed": encoder.width, "predictor_proj": encoder.width, "action_encoder": ACTION_DIM,
-        "state_encoder": STATE_DIM, "extrinsics_encoder": EXTRINSICS_DIM,
-    }  # fmt: skip
-    targets = adapted_layers(config, sizes)
-    rows = predictor.depth * sum(size for name, size in ends.items() if name in targets)
-    rows += sum(size + predictor.width for name, size in outer.items() if name in targets)
-    return Parameters(in_encoder, in_predictor, trained=config.adapter.rank * rows)
 
 
 def ways_to_fit(config: Config, sizes: ModelSizes, available: int) -> list[str] | None:
@@ -157,37 +132,76 @@ _KNOBS: tuple[tuple[str, Callable[[Config], Config]], ...] = (
         "data.frames=8",
         lambda run: _with(run, "data", frames=min(run.data.frames, max(8, run.training.rollout_steps + 1))),
     ),
+    ("training.optimizer=adamw_8bit", lambda run: _with(run, "training", optimizer="adamw_8bit")),
     ("adapter.kind=lora", lambda run: run if run.model.random else _with(run, "adapter", kind="lora")),
 )
 
 
-def _block(width: int, hidden: int) -> int:
-    """Return the parameters of a transformer block: four projections, two norms, two layers of an MLP."""
-    return 4 * (width + 1) * width + 4 * width + (width + 1) * hidden + (hidden + 1) * width
+def _moments(config: Config, elements: int) -> int:
+    """Return the bytes of AdamW's two moments of one tensor.
+
+    In 8 bits there is a float32 scale for every 256 elements; small tensors keep float32.
+
+    Source: bitsandbytes 0.50, optim/optimizer.py, Optimizer2State.init_state.
+    """
+    if config.training.optimizer == "adamw" or elements < _SMALLEST_IN_8_BITS:
+        return 2 * elements * FLOAT32
+    return 2 * (elements + -(-elements // _ELEMENTS_OF_A_SCALE) * FLOAT32)
 
 
-def _frames(config: Config) -> int:
-    return config.training.batch_size * config.data.frames
+def _latents(config: Config, sizes: ModelSizes, clips: int) -> int:
+    return clips * config.data.frames * _tokens_per_frame(sizes) * sizes.encoder.width * FLOAT32
 
 
 def _tokens_per_frame(sizes: ModelSizes) -> int:
     return (sizes.image_size // sizes.patch_size) ** 2
 
 
-def _encoding(config: Config, sizes: ModelSizes) -> int:
+def _number(config: Config) -> int:
+    return FLOAT32 if config.training.precision == "fp32" else HALF
+
+
+def _encoding(config: Config, sizes: ModelSizes, clips: int) -> int:
     """Return the bytes that live at once in the larger half of an encoder block, the frames, and the features."""
     width, hidden = sizes.encoder.width, int(sizes.encoder.width * sizes.encoder.mlp_ratio)
-    number = 2 if config.training.precision == "bf16" else FLOAT32
-    tokens = min(config.model.encode_chunk, _frames(config)) * _tokens_per_frame(sizes)
+    number, frames = _number(config), clips * config.data.frames
+    tokens = min(config.model.encode_chunk, frames) * _tokens_per_frame(sizes)
     attention = width * (4 * number + 5 * FLOAT32)  # residual, query, key, value; normed, and four while rotating
     mlp = width * (2 * number + 2 * FLOAT32) + 2 * hidden * number  # residual and output; normed, cast; around GELU
-    frames = _frames(config) * 3 * sizes.image_size**2 * FLOAT32
-    features = _frames(config) * _tokens_per_frame(sizes) * width * (number + FLOAT32)  # as computed, and as float32
-    return tokens * max(attention, mlp) + frames + features
+    pixels = frames * 3 * sizes.image_size**2 * FLOAT32
+    features = frames * _tokens_per_frame(sizes) * width * (number + FLOAT32)  # as computed, and as float32
+    return tokens * max(attention, mlp) + pixels + features
 
 
-def _temporaries(config: Config, sizes: ModelSizes) -> int:
+def _temporaries(config: Config, sizes: ModelSizes, clips: int) -> int:
     """Return four float32 tensors as wide as the MLP: the adapter's input and gradients at their widest."""
-    conditions = 2 + sizes.predictor.use_extrinsics
-    tokens = config.training.batch_size * (config.data.frames - 1) * (_tokens_per_frame(sizes) + conditions)
-    return 4 * tokens * int(sizes.predictor.width * sizes.predictor.mlp_ratio) * FLOAT32
+    hidden = int(sizes.predictor.width * sizes.predictor.mlp_ratio)
+    return 4 * _tokens(config, sizes, clips) * hidden * FLOAT32
+
+
+def _tokens(config: Config, sizes: ModelSizes, clips: int) -> int:
+    """Return the tokens of all steps that the predictor sees at once."""
+    return clips * (config.data.frames - 1) * (_tokens_per_frame(sizes) + CONDITIONS + sizes.predictor.use_extrinsics)
+
+
+def _dora_temporaries(config: Config, sizes: ModelSizes) -> int:
+    """Return what PEFT makes to measure the rows of the largest weight: an identity, the update, and their sums."""
+    if not config.adapter.dora or config.adapter.kind == "none":
+        return 0
+    cast = HALF if _number(config) == HALF else 0
+    layers = linear_layers(sizes)
+    adapted = [layers[name] for name in adapter_ranks(config, sizes)]
+    return max(layer.inputs**2 * (FLOAT32 + cast) + layer.weight * (cast + 4 * FLOAT32) for layer in adapted)
+
+
+def _validating(config: Config, sizes: ModelSizes) -> int:
+    """Return the bytes of a batch of validation, without gradients.
+
+    Either it is encoded, or predicted: true latents, two predictions of them, and the larger of what a block makes of
+    all steps at once (MLP) and the keys and values that the rollout keeps of all steps but the last two.
+    """
+    clips = config.validation.batch_size
+    latents, steps = _latents(config, sizes, clips), config.data.frames - 1
+    cached = 2 * sizes.predictor.depth * sizes.predictor.width * _number(config)
+    cached *= _tokens(config, sizes, clips) * (steps - 1) // steps
+    return latents + max(_encoding(config, sizes, clips), 2 * latents + max(cached, _temporaries(config, sizes, clips)))

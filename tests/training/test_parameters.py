@@ -1,0 +1,61 @@
+"""Parameters are counted exactly: as many, tensor by tensor, as a model has that was built."""
+
+from typing import Any
+
+import pytest
+
+from sized_runs import LORA, built, model_sizes, run_config
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.model.lora import trainable_report
+from vjepa2_ac.training.parameters import adapted_layers, count_parameters, trained_tensors
+
+HEADS = ["action_encoder", "state_encoder"]
+ADAPTERS: dict[str, dict[str, Any]] = {
+    "lora": LORA,
+    "rank": {"rank": 7},
+    "some": {**LORA, "targets": ["q", "fc2", "predictor_proj"]},
+    "attention": {**LORA, "targets": ["attention"]},
+    "mlp and a head": {**LORA, "targets": ["mlp", "state_encoder"]},
+    "all": {**LORA, "targets": ["all"]},
+    "all but the heads": {**LORA, "targets": ["all"], "modules_to_save": HEADS},
+    "one head whole": {**LORA, "modules_to_save": HEADS[:1]},
+    "dora": {**LORA, "dora": True},
+    "dora everywhere": {**LORA, "dora": True, "targets": ["all"]},
+    "pissa": {**LORA, "init": "pissa"},
+    "patterns": {**LORA, "rank_pattern": {"fc1": 6, r"blocks\.0\.attn\.q": 2, "attn.(k|v)": 3}},
+    "patterns that overlap": {**LORA, "rank_pattern": {r"blocks\.1\..*": 5, "q": 2}, "dora": True},
+    "a pattern for a head": {**LORA, "targets": ["all"], "rank_pattern": {"predictor_embed": 9, ".*_encoder": 1}},
+    "none": {"kind": "none"},
+}
+SHAPES = {
+    "small": model_sizes(),
+    "wider": model_sizes(latent=96, width=128, depth=3, heads=4, mlp=3.3, image=96),
+    "extrinsics": model_sizes(extrinsics=True),
+}
+
+
+@pytest.mark.parametrize("adapter", ADAPTERS)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_parameters_are_those_of_a_model_that_was_built(shape: str, adapter: str) -> None:
+    config, sizes = run_config(ADAPTERS[adapter]), SHAPES[shape]
+    model = built(config, sizes)
+    counts, report = count_parameters(config, sizes), trainable_report(model)
+    assert (counts.predictor, counts.encoder) == (report.predictor, report.total - report.predictor)
+    assert counts.trained == report.trained
+    found = sorted(value.numel() for value in model.parameters() if value.requires_grad)
+    assert sorted(trained_tensors(config, sizes)) == found
+
+
+@pytest.mark.parametrize("rank", [1, 16])
+def test_parameters_of_the_released_model_are_the_known_ones(rank: int) -> None:
+    counts = count_parameters(run_config({"rank": rank}), ModelSizes())
+    assert counts.encoder == 1_012_173_952
+    assert counts.trained == rank * 442_368
+
+
+def test_layers_with_an_adapter_go_by_their_last_name() -> None:
+    config = run_config(ADAPTERS["all but the heads"])
+    assert adapted_layers(config, model_sizes()) == {
+        "q", "k", "v", "o", "fc1", "fc2", "predictor_embed", "predictor_proj",
+    }  # fmt: skip
+    assert adapted_layers(run_config(ADAPTERS["none"]), model_sizes()) == frozenset()
