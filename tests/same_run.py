@@ -6,9 +6,10 @@ import torch
 from safetensors.torch import load_file
 
 from vjepa2_ac.training.checkpoint import newest_checkpoint
+from vjepa2_ac.training.health import MEASURED
 from vjepa2_ac.training.journal import read_journal
 
-TIMINGS = {"samples_per_second"}
+TIMINGS = MEASURED  # figures of the machine
 
 
 def trained_weights(run: Path) -> dict[str, torch.Tensor]:

@@ -1,9 +1,11 @@
 """Rows are appended, survive a kill, and are not written twice."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 from vjepa2_ac.training.journal import Journal, read_journal
+from vjepa2_ac.training.trackers import Trackers
 
 
 def steps(folder: Path) -> list[int]:
@@ -11,7 +13,7 @@ def steps(folder: Path) -> list[int]:
 
 
 def test_rows_read_back(tmp_path: Path) -> None:
-    with Journal(tmp_path, first_step=0, tensorboard=False) as journal:
+    with Journal(tmp_path, first_step=0) as journal:
         journal.write("train", 1, {"loss": 0.5, "by_horizon": [1.0, 2.0]})
     assert list(read_journal(tmp_path / "metrics.jsonl")) == [
         {"kind": "train", "step": 1, "loss": 0.5, "by_horizon": [1.0, 2.0]}
@@ -19,46 +21,45 @@ def test_rows_read_back(tmp_path: Path) -> None:
 
 
 def test_steps_that_will_be_done_again_are_dropped_on_resume(tmp_path: Path) -> None:
-    with Journal(tmp_path, first_step=0, tensorboard=False) as journal:
+    with Journal(tmp_path, first_step=0) as journal:
         for step in range(6):
             journal.write("train", step, {"loss": 0.5})
-    with Journal(tmp_path, first_step=3, tensorboard=False) as journal:
+    with Journal(tmp_path, first_step=3) as journal:
         journal.write("train", 4, {"loss": 0.4})
     assert steps(tmp_path) == [0, 1, 2, 3, 4]
 
 
 def test_a_line_left_by_halves_is_dropped(tmp_path: Path) -> None:
     (tmp_path / "metrics.jsonl").write_text(json.dumps({"kind": "train", "step": 1}) + '\n{"kind": "tra')
-    with Journal(tmp_path, first_step=5, tensorboard=False):
+    with Journal(tmp_path, first_step=5):
         pass
     assert steps(tmp_path) == [1]
 
 
 def test_what_json_cannot_hold_becomes_null(tmp_path: Path) -> None:
-    with Journal(tmp_path, first_step=0, tensorboard=False) as journal:
+    with Journal(tmp_path, first_step=0) as journal:
         journal.write("train", 1, {"loss": float("nan")})
     assert next(read_journal(tmp_path / "metrics.jsonl"))["loss"] is None
 
 
-def test_tensorboard_gets_the_numbers(tmp_path: Path) -> None:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+def test_trackers_get_each_row_and_are_closed_with_the_journal(tmp_path: Path) -> None:
+    class Tracker:
+        def __init__(self) -> None:
+            self.said: list[object] = []
 
-    with Journal(tmp_path, first_step=0, tensorboard=True) as journal:
-        journal.write("train", 7, {"loss": 0.25})
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
-    events.Reload()
-    assert [(event.step, event.value) for event in events.Scalars("train/loss")] == [(7, 0.25)]
-
-
-def test_a_tracker_that_fails_never_stops_the_journal(tmp_path: Path) -> None:
-    class Broken:
-        def add_scalar(self, *_: object) -> None:
+        def log(self, figures: Mapping[str, float], step: int) -> None:
+            self.said.append((step, dict(figures)))
             raise RuntimeError("disk quota")
 
-        def close(self) -> None: ...
+        def close(self) -> None:
+            self.said.append("closed")
 
-    with Journal(tmp_path, first_step=0, tensorboard=False) as journal:
-        journal._tensorboard = Broken()
+    working, broken = Tracker(), Tracker()
+    working.log = lambda figures, step: working.said.append((step, dict(figures)))  # type: ignore[method-assign]
+    trackers = Trackers({"working": lambda: working, "broken": lambda: broken})
+    with Journal(tmp_path, first_step=0, trackers=trackers) as journal:
         journal.write("train", 1, {"loss": 0.5})
-        journal.write("train", 2, {"loss": 0.5})
+        journal.write("train", 2, {"loss": 0.25})
     assert steps(tmp_path) == [1, 2]
+    assert working.said == [(1, {"train/loss": 0.5}), (2, {"train/loss": 0.25}), "closed"]
+    assert broken.said == [(1, {"train/loss": 0.5})], "one that failed is left alone"

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from vjepa2_ac.episode import Batch
+from vjepa2_ac.data import loader
+from vjepa2_ac.episode import Batch, Clip
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.training import not_finite
+from vjepa2_ac.training.assembly import assemble, batches_from
+from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.not_finite import MOST_CLIPS, LookBack
 
 
@@ -78,3 +82,52 @@ def test_a_full_disk_is_told_and_not_raised(tmp_path: Path, monkeypatch: pytest.
     assert "could not all be saved" in said
     assert "No space left" in said
     assert not list((tmp_path / "step").iterdir())
+
+
+@pytest.fixture
+def bad_clip(make_config: Any, reporter: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[str, int]:
+    """The second clip of a run is poisoned where it is read: a state is not a number."""
+    read, batch = loader.read_clip, next(batches_from(assemble(make_config(), reporter.note)))
+    bad = (batch.episode_ids[1], batch.starts[1])
+
+    def poisoned(*arguments: Any) -> Clip:
+        clip = read(*arguments)
+        if (clip.episode_id, clip.start) == bad:
+            clip.states[1, 0] = np.nan
+        return clip
+
+    monkeypatch.setattr(loader, "read_clip", poisoned)
+    monkeypatch.setattr("vjepa2_ac.data.clips.read_clip", poisoned)
+    return bad
+
+
+def test_a_run_that_meets_what_is_not_a_number_saves_it_before_it_stops(make_config, reporter, bad_clip) -> None:
+    config = make_config()
+    folder = Path(config.run_dir) / "not_finite/step-00000001"
+    with pytest.raises(InputError, match="not finite") as caught:
+        train(config, reporter)
+    assert reporter.steps == []
+    assert f"4 of them are saved in {folder}" in str(caught.value)
+    assert f"{bad_clip[0]} from step {bad_clip[1]}" in str(caught.value)
+    worst = np.load(folder / "process0-clip00.npz")
+    assert (str(worst["episode_id"]), int(worst["start"])) == bad_clip
+    assert np.isnan(worst["states"]).any()
+    assert (folder / "process0.png").is_file()
+
+
+def test_a_trial_that_meets_what_is_not_a_number_writes_nothing(make_config, reporter, bad_clip) -> None:
+    config = make_config()
+    with pytest.raises(InputError, match="not finite") as caught:
+        train(config, reporter, check_only=True)
+    assert bad_clip[0] in str(caught.value)
+    assert not Path(config.run_dir).exists()
+
+
+def test_a_disk_that_is_full_does_not_hide_what_was_wrong(make_config, reporter, bad_clip, monkeypatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    with pytest.raises(InputError, match=r"not finite.*could not all be saved.*No space left") as caught:
+        train(make_config(), reporter)
+    assert bad_clip[0] in str(caught.value)

@@ -30,6 +30,7 @@ from vjepa2_ac.training.processes import from_first, of_all
 from vjepa2_ac.training.resume import micro_batches_of, say_what_is_new, take_up
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 from vjepa2_ac.training.stride import choose_stride, require_learned, with_stride
+from vjepa2_ac.training.trackers import require_installed
 
 LONGEST_WAIT = timedelta(hours=2)  # of a process for the others: one may look through a data set for the first time
 _CLIPS_TRIED = 8  # one is read; the others are for where data.broken_episodes passes over it
@@ -74,6 +75,8 @@ def assemble(
         InputError: Something cannot be used.
     """
     accelerator = accelerator or make_accelerator(config)
+    if accelerator.is_main_process:  # the only one that has trackers
+        require_installed(config.tracking)
     if config.data.stride == "auto":
         require_learned(config.model)
     with accelerator.local_main_process_first():  # the others find the index of the first one on this machine

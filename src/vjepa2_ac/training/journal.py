@@ -1,4 +1,4 @@
-"""Where do the figures of a run go? metrics.jsonl always, TensorBoard when asked."""
+"""Where do the figures of a run go? Into metrics.jsonl always, and on to its trackers."""
 
 from __future__ import annotations
 
@@ -11,40 +11,33 @@ from types import TracebackType
 from typing import Any
 
 from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.training.trackers import Trackers
 
 logger = logging.getLogger(__name__)
 
 
 class Journal:
-    """Appends rows to `metrics.jsonl`, a JSON object per line, and mirrors numbers to TensorBoard.
+    """Appends rows to `metrics.jsonl`, a JSON object per line, and hands them on to trackers.
 
     Args:
         run_dir: The run's folder.
         first_step: Rows after this step are from a part of the run that is now done again; they are dropped.
-        tensorboard: Whether to write event files to RUN/tensorboard.
+        trackers: Closed with the journal; None: there are none.
     """
 
-    def __init__(self, run_dir: Path, *, first_step: int, tensorboard: bool) -> None:
+    def __init__(self, run_dir: Path, *, first_step: int, trackers: Trackers | None = None) -> None:
         self.path = run_dir / "metrics.jsonl"
         kept = [row for row in read_journal(self.path) if row["step"] <= first_step] if first_step > 0 else []
         write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in kept).encode())
         self._file = self.path.open("a", encoding="utf-8")
-        self._tensorboard = _open_tensorboard(run_dir / "tensorboard", first_step) if tensorboard else None
+        self._trackers = trackers or Trackers({})
 
     def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
         """Append one row: its kind (train, validation), its optimizer step, and figures (numbers or lists of them)."""
         row = {"kind": kind, "step": step, **{key: _plain(value) for key, value in figures.items()}}
         self._file.write(json.dumps(row) + "\n")
         self._file.flush()
-        if self._tensorboard is None:
-            return
-        try:
-            for key, value in figures.items():
-                if isinstance(value, (int, float)):
-                    self._tensorboard.add_scalar(f"{kind}/{key}", value, step)
-        except Exception:  # a tracker that fails never stops training
-            logger.exception("TensorBoard failed; going on with %s alone", self.path)
-            self._tensorboard = None
+        self._trackers.log(kind, step, figures)
 
     def __enter__(self) -> Journal:
         """Return the journal, open."""
@@ -55,8 +48,7 @@ class Journal:
     ) -> None:
         """Close the files."""
         self._file.close()
-        if self._tensorboard is not None:
-            self._tensorboard.close()
+        self._trackers.close()
 
 
 def read_journal(path: Path) -> Iterator[dict[str, Any]]:
@@ -78,9 +70,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None  # JSON has no NaN
     return value
-
-
-def _open_tensorboard(folder: Path, first_step: int) -> Any:
-    from torch.utils.tensorboard import SummaryWriter
-
-    return SummaryWriter(str(folder), purge_step=first_step + 1)

@@ -20,12 +20,12 @@ import torch
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_as_dict
 from vjepa2_ac.data.loader import validation_batches
-from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, prediction_errors, ratios_by_horizon
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, make_accelerator, save_checkpoint
 from vjepa2_ac.training.checkpoint import CheckpointClock
+from vjepa2_ac.training.health import Throughput, TimedBatches
 from vjepa2_ac.training.journal import Journal
 from vjepa2_ac.training.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.training.processes import from_first, largest, require_same
@@ -33,6 +33,7 @@ from vjepa2_ac.training.quiet import QuietJournal, QuietReporter
 from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open_run_folder
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.stride import CALIBRATION, with_settled_stride
+from vjepa2_ac.training.trackers import open_trackers
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: the longest look ahead is what planning leans on
 
@@ -122,19 +123,26 @@ def _train(run: Run, reporter: Reporter, *, check_only: bool, allow_config_chang
 def _open_journal(run: Run, folder: Path) -> Journal | QuietJournal:
     if not run.accelerator.is_main_process:
         return QuietJournal()
-    return Journal(folder, first_step=run.state.step, tensorboard=run.config.tracking.tensorboard)
+    done = run.state.step
+    trackers = open_trackers(run.config, folder, run_id=run.state.run_id, first_step=done)
+    return Journal(folder, first_step=done, trackers=trackers)
 
 
 def _loop(run: Run, folder: Path, journal: Journal | QuietJournal, reporter: Reporter) -> None:
     training = run.config.training
+    device, processes = run.accelerator.device, run.accelerator.num_processes
+    throughput = Throughput.of(run.config, run.world_model.sizes, device, processes)
+    reporter.note(str(throughput))
     reporter.started(run.state.step, training.steps)
     clock = CheckpointClock(run.config.checkpoint)
     with stop_on_signals() as stop, contextlib.closing(batches_from(run)) as batches:
+        timed = TimedBatches(batches)
         for step in range(run.state.step + 1, training.steps + 1):
-            figures = _timed_step(run, batches, step)
-            reporter.stepped(step, figures)
             last = step == training.steps
-            if step % training.log_every == 0 or last:
+            is_logged = step % training.log_every == 0 or last
+            figures = _timed_step(run, timed, step, throughput, measure_update=is_logged)
+            reporter.stepped(step, figures)
+            if is_logged:
                 journal.write("train", step, figures)
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             is_best = _validate_if_due(run, journal, reporter)
@@ -149,12 +157,13 @@ def _loop(run: Run, folder: Path, journal: Journal | QuietJournal, reporter: Rep
     run.accelerator.wait_for_everyone()
 
 
-def _timed_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, float]:
-    started = time.perf_counter()
-    figures = training_step(run, batches, step)
+def _timed_step(
+    run: Run, batches: TimedBatches, step: int, throughput: Throughput, *, measure_update: bool
+) -> dict[str, float]:
+    started, waited_s = time.perf_counter(), batches.waited_s
+    figures = training_step(run, batches, step, measure_update=measure_update)
     clips = run.clips_per_step - figures.get("clips_left_out", 0.0)
-    figures["samples_per_second"] = clips / (time.perf_counter() - started)
-    return figures
+    return figures | throughput.figures(clips, time.perf_counter() - started, batches.waited_s - waited_s)
 
 
 def _validate_if_due(run: Run, journal: Journal | QuietJournal, reporter: Reporter) -> bool:

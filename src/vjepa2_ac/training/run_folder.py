@@ -6,7 +6,8 @@ RUN/calibration.json    figures of each stride, where data.stride was auto
 RUN/run_id              a name that no other run has
 RUN/metrics.jsonl       figures, a row per line
 RUN/checkpoints/        step-XXXXXXXX folders
-RUN/tensorboard/        event files
+RUN/tensorboard/        event files; RUN/wandb/ likewise
+RUN/not_finite/         clips of a step that could not be done
 """
 
 from __future__ import annotations

@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from torch import nn
@@ -14,6 +15,9 @@ from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import is_url
 from vjepa2_ac.training.assembly import Run, encode
+from vjepa2_ac.training.checkpoint import checkpoint_name
+from vjepa2_ac.training.health import Update
+from vjepa2_ac.training.not_finite import NOT_FINITE, LookBack
 from vjepa2_ac.training.optim import learning_rate_at, set_learning_rate, trained_parameters
 from vjepa2_ac.training.processes import add_up_gradients, sums
 
@@ -31,16 +35,23 @@ class Gradients:
     bytes_fetched: int
 
 
-def training_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, float]:
+def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_update: bool = False) -> dict[str, float]:
     """Do one optimizer step: accumulate gradients over micro-batches and processes, clip, update.
 
+    Args:
+        run: The run.
+        batches: Where its micro-batches come from.
+        step: From 1.
+        measure_update: Tell how far the weights have moved, too, for which they are copied.
+
     Raises:
-        InputError: The loss or a gradient is not finite; names the clips. The weights have not moved.
+        InputError: The loss or a gradient is not finite; names the clips and saves them. The weights have not moved.
     """
     torch.manual_seed(step_seed(run.config.seed, step, run.accelerator.process_index))
     learning_rate = learning_rate_at(step, run.config.training)
     set_learning_rate(run.optimizer, learning_rate)
-    taken = gradients(run, batches)
+    taken = gradients(run, batches, LookBack())
+    update = Update(trained_parameters(run.objective)) if measure_update else None
     if taken.clips:  # without a clip there are no gradients, and nothing moves
         run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
         run.scaler.update()
@@ -51,16 +62,22 @@ def training_step(run: Run, batches: Iterator[Batch], step: int) -> dict[str, fl
         "loss_rollout": taken.rollout_loss,
         "grad_norm": taken.norm,
         "learning_rate": learning_rate,
+        **({"update_to_weight": update.to_weight()} if update else {}),
         **_about_the_data(run, taken),
         **({"loss_scale": run.scaler.get_scale()} if run.scaler.is_enabled() else {}),
     }
 
 
-def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
+def gradients(run: Run, batches: Iterator[Batch], look_back: LookBack | None = None) -> Gradients:
     """Accumulate and clip the gradients of the next micro-batches of all processes; the weights do not move.
 
     Loss and gradient are means over the clips of the step. Where clips are left out (`data.broken_episodes`: skip) they
     are means over those that are left: each counts as much as the others, whatever micro-batch it is in.
+
+    Args:
+        run: The run.
+        batches: Where its micro-batches come from.
+        look_back: Saves clips into the run's folder where a loss or gradient is not finite; None: nothing is written.
 
     Raises:
         InputError: A loss or gradient is not finite; names the clips of this process.
@@ -82,12 +99,14 @@ def gradients(run: Run, batches: Iterator[Batch]) -> Gradients:
             forced, rollout = run.objective(latents)
         run.scaler.scale((forced + rollout) / parts).backward()
         totals += torch.stack([forced.detach(), rollout.detach()]) / parts
+        if look_back is not None:
+            look_back.add(batch, forced + rollout)
     *losses, clips, fetched_by_all = sums(run.accelerator, [*totals.tolist(), len(seen), fetched])
     if not clips:
         return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(fetched_by_all))
     forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
     norm = _settle(run, factor=expected / clips)
-    _refuse_not_finite(run, forced_loss + rollout_loss, norm, seen)
+    _refuse_not_finite(run, forced_loss + rollout_loss, norm, seen, look_back)
     return Gradients(forced_loss, rollout_loss, norm, int(clips), int(fetched_by_all))
 
 
@@ -120,13 +139,17 @@ def step_seed(seed: int, step: int, rank: int) -> int:
     return int.from_bytes(digest, "big") >> 1
 
 
-def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str]) -> None:
+def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str], look_back: LookBack | None) -> None:
     overflow = run.scaler.is_enabled() and run.scaler.get_scale() >= SMALLEST_LOSS_SCALE
     if math.isfinite(loss) and (math.isfinite(norm) or overflow):
         return
+    saved = ""
+    if look_back is not None:
+        folder = Path(run.config.run_dir) / NOT_FINITE / checkpoint_name(run.state.step + 1)
+        saved = f" ({look_back.save(folder, run.accelerator.process_index)})"
     fp16 = ", or set training.precision to bf16 or fp32" if run.scaler.is_enabled() else ""
     raise InputError(
         where="training",
         found=f"a loss or gradient that is not finite; the clips were {'; '.join(clips)}",
-        fix=f"The weights have not moved. Look at these clips, or lower training.learning_rate{fp16}",
+        fix=f"The weights have not moved. Look at these clips{saved}, or lower training.learning_rate{fp16}",
     )

@@ -1,0 +1,142 @@
+"""How much arithmetic is one clip? Floating-point operations by formula: no model is built and torch is not needed.
+
+What counts is what the mathematics asks for, once (model FLOPs): a product of matrices is two operations per pair of
+numbers; forward, backward with respect to inputs wherever a gradient has to pass, with respect to weights only for what
+is trained. What is computed again (gradient checkpointing, the scores in a fused attention's backward pass) does not
+count, nor do norms, activations and rotations, which are no products of matrices. Attention is counted as the
+block-causal it is: a token of step t looks at the tokens of steps up to t.
+
+Not counted: the norms of weights that DoRA needs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.training.parameters import adapter_ranks, linear_layers
+
+_TUBELET = 2  # frames that the encoder's first layer takes at once
+
+
+@dataclass(frozen=True)
+class ClipFlops:
+    """Floating-point operations of training on one clip."""
+
+    encoder: int  # the frozen encoder, forward, on every frame
+    forward: int  # of the predictor: teacher forcing and the further predictions of the rollout
+    backward: int  # of the predictor
+
+    @property
+    def predictor(self) -> int:
+        """What is left where the latents are there already."""
+        return self.forward + self.backward
+
+    @property
+    def total(self) -> int:
+        """Everything, from pixels to gradients."""
+        return self.encoder + self.predictor
+
+
+def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
+    """Return the operations of one clip of a run.
+
+    Args:
+        config: What is trained, frames and rollout.
+        sizes: Sizes of its model, such as `model.load.base_sizes` gives.
+    """
+    passes = _Passes(config, sizes)
+    frames, training = config.data.frames, config.training
+    total = passes.over(frames - 1, keys=range(1, frames), fed_back=False)
+    for step in range(2, 1 + (training.rollout_steps if training.rollout_weight else 1)):
+        total += passes.over(1, keys=range(step, step + 1), fed_back=True)  # earlier keys and values are there
+    return ClipFlops(frames * frame_flops(sizes), total.forward, total.backward)
+
+
+def frame_flops(sizes: ModelSizes) -> int:
+    """Return the operations of encoding one frame."""
+    encoder = sizes.encoder
+    tokens, width, hidden = _patches(sizes), encoder.width, int(encoder.width * encoder.mlp_ratio)
+    embedding = 2 * tokens * 3 * _TUBELET * sizes.patch_size**2 * width
+    linear = 2 * tokens * (4 * width**2 + 2 * width * hidden)
+    return embedding + encoder.depth * (linear + 4 * tokens**2 * width)
+
+
+@dataclass(frozen=True)
+class _Work:
+    forward: int = 0
+    backward: int = 0
+
+    def __add__(self, other: _Work) -> _Work:
+        return _Work(self.forward + other.forward, self.backward + other.backward)
+
+
+class _Passes:
+    """Counts passes of one clip through the predictor."""
+
+    def __init__(self, config: Config, sizes: ModelSizes) -> None:
+        self._sizes = sizes
+        self._layers, self._ranks = linear_layers(sizes), adapter_ranks(config, sizes)
+        self._whole = frozenset(self._layers) if config.adapter.kind == "none" else config.adapter.modules_to_save
+        extrinsics = ("extrinsics_encoder",) if sizes.predictor.use_extrinsics else ()
+        self._conditions = ("action_encoder", "state_encoder", *extrinsics)
+
+    def over(self, steps: int, *, keys: range, fed_back: bool) -> _Work:
+        """Return the work of a pass.
+
+        Args:
+            steps: Steps whose tokens are computed.
+            keys: For each of them, how many steps its tokens look at.
+            fed_back: Whether its latents are predictions, through which gradients pass.
+        """
+        patches = steps * _patches(self._sizes)
+        work = self._linear("predictor_embed", patches, into=fed_back)
+        for name in self._conditions:
+            work += self._linear(name, steps, into=False)
+        flowing = fed_back or any(self._changes(name) for name in ("predictor_embed", *self._conditions))
+        per_step = _patches(self._sizes) + len(self._conditions)
+        pairs = per_step**2 * sum(keys)
+        for index in range(self._sizes.predictor.depth):
+            block, flowing = self._block(f"blocks.{index}", steps * per_step, pairs, flowing=flowing)
+            work += block
+        return work + self._linear("predictor_proj", patches, into=flowing)
+
+    def _block(self, block: str, tokens: int, pairs: int, *, flowing: bool) -> tuple[_Work, bool]:
+        """Return the work of a block, and whether a gradient has to pass through what comes out.
+
+        Args:
+            block: Its name.
+            tokens: Whose queries are computed.
+            pairs: Queries and keys that meet.
+            flowing: Whether a gradient has to pass through what comes in.
+        """
+        work = _Work()
+        projections = [f"{block}.attn.{name}" for name in ("q", "k", "v")]
+        for name in projections:
+            work += self._linear(name, tokens, into=flowing)
+        query, key, value = (flowing or self._changes(name) for name in projections)
+        product = 2 * pairs * self._sizes.predictor.width
+        # Forward: scores, and values by weights. Backward: of values, of weights, and through them of queries and keys.
+        work += _Work(2 * product, (value + (query or key) + query + key) * product)
+        flowing = query or key or value
+        for name in (f"{block}.attn.o", f"{block}.mlp.fc1", f"{block}.mlp.fc2"):
+            work += self._linear(name, tokens, into=flowing)
+            flowing = flowing or self._changes(name)
+        return work, flowing
+
+    def _linear(self, name: str, tokens: int, *, into: bool) -> _Work:
+        """Return the work of a linear layer with its adapter; `into`: its input needs a gradient."""
+        layer = self._layers[name]
+        product = 2 * tokens * layer.weight
+        work = _Work(product, product * (into + (name in self._whole)))
+        if name in self._ranks:
+            first, second = (2 * tokens * self._ranks[name] * side for side in (layer.inputs, layer.outputs))
+            work += _Work(first + second, first * (into + 1) + 2 * second)
+        return work
+
+    def _changes(self, name: str) -> bool:
+        return name in self._whole or name in self._ranks
+
+
+def _patches(sizes: ModelSizes) -> int:
+    return (sizes.image_size // sizes.patch_size) ** 2

@@ -1,0 +1,92 @@
+"""The formulas count exactly what PyTorch's counter sees of a tiny model, and nearly what is known of the real one."""
+
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+import torch
+from torch.nn.attention import SDPBackend, sdpa_kernel
+from torch.utils.flop_counter import FlopCounterMode
+
+from paths import ROOT
+from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.config_file import load_config, parse_config
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.flops import clip_flops, frame_flops
+from vjepa2_ac.training.loss import Objective
+
+SIZES = ModelSizes.model_validate({
+    "image_size": 64, "patch_size": 16, "encoder": {"width": 36, "depth": 2, "heads": 2, "mlp_ratio": 2.0},
+    "predictor": {"width": 48, "depth": 3, "heads": 2, "mlp_ratio": 3.0},
+})  # fmt: skip
+LORA: dict[str, Any] = {"rank": 4, "alpha": 8, "dropout": 0.0}
+ADAPTERS: dict[str, dict[str, Any]] = {
+    "lora": LORA, "value only": {**LORA, "targets": ["v"]}, "late": {**LORA, "targets": ["fc2"]},
+    "everywhere": {**LORA, "targets": ["all"]}, "heads": {**LORA, "modules_to_save": ["action_encoder"]},
+    "none": {"kind": "none"}, "ranks": {**LORA, "rank_pattern": {"fc1": 8, "blocks.0.attn.q": 2}},
+}  # fmt: skip
+
+
+def run_config(adapter: dict[str, Any], **training: Any) -> Config:
+    values = {
+        "run_dir": "run", "data": {"path": "set", "frames": 6}, "adapter": adapter, "training": training,
+        "model": {"base": "base", "dtype": "float32"},
+    }  # fmt: skip
+    return parse_config(values, where="test")
+
+
+def counted(config: Config, clips: int = 2) -> tuple[int, int]:
+    """Return what PyTorch counts of the objective of one clip, forward and backward."""
+    model = WorldModel.random(SIZES, seed=0)
+    add_adapter(model, config.adapter, seed=0)
+    frames, objective = config.data.frames, Objective(model.train(), config.training)
+    batch = LatentBatch(
+        latents=torch.randn(clips, frames, model.num_tokens, model.latent_dim), states=torch.randn(clips, frames, 7),
+        actions=torch.randn(clips, frames - 1, 7), extrinsics=None, episode_ids=("a",) * clips, starts=(0,) * clips,
+    )  # fmt: skip
+    with sdpa_kernel(SDPBackend.MATH):  # the one kernel of a CPU whose products are counted
+        with FlopCounterMode(display=False) as forward:
+            loss = sum(objective(batch))
+        with FlopCounterMode(display=False) as backward:
+            loss.backward()
+    return forward.get_total_flops() // clips, backward.get_total_flops() // clips
+
+
+@pytest.mark.parametrize("adapter", ADAPTERS)
+@pytest.mark.parametrize("rollout_steps", [1, 3])
+def test_a_clip_is_what_pytorch_counts(adapter: str, rollout_steps: int) -> None:
+    config = run_config(ADAPTERS[adapter], rollout_steps=rollout_steps)
+    flops = clip_flops(config, SIZES)
+    assert (flops.forward, flops.backward) == counted(config)
+
+
+def test_a_frame_is_what_pytorch_counts() -> None:
+    model = WorldModel.random(SIZES, seed=0)
+    with sdpa_kernel(SDPBackend.MATH), FlopCounterMode(display=False) as counter:
+        model.encode(torch.randn(1, 1, 3, 64, 64))
+    assert frame_flops(SIZES) == counter.get_total_flops()
+
+
+def test_what_is_computed_twice_counts_once() -> None:
+    plain, again = run_config(LORA), run_config(LORA, gradient_checkpointing=True)
+    assert clip_flops(plain, SIZES) == clip_flops(again, SIZES)
+
+
+def test_a_rollout_that_does_not_count_costs_nothing() -> None:
+    without = clip_flops(run_config(LORA, rollout_steps=3, rollout_weight=0.0), SIZES)
+    assert without == clip_flops(run_config(LORA, rollout_steps=1), SIZES)
+
+
+def test_the_default_run_has_the_flops_that_were_worked_out_by_hand() -> None:
+    flops = clip_flops(load_config(ROOT / "configs/default.yaml"), ModelSizes())
+    assert flops.encoder == pytest.approx(8.5e12, rel=0.01)
+    assert flops.predictor == pytest.approx(7.5e12, rel=0.05)
+    assert flops.total == pytest.approx(16e12, rel=0.02)
+
+
+def test_the_arithmetic_does_without_torch() -> None:
+    code = "import sys, vjepa2_ac.training.flops; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
