@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import signal
+import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,9 +28,11 @@ from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, mak
 from vjepa2_ac.training.checkpoint import CheckpointClock
 from vjepa2_ac.training.health import Throughput, TimedBatches
 from vjepa2_ac.training.journal import Journal
+from vjepa2_ac.training.mirror import Mirror, NoMirror
 from vjepa2_ac.training.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.training.processes import from_first, largest, require_same
 from vjepa2_ac.training.quiet import QuietJournal, QuietReporter
+from vjepa2_ac.training.remote_start import Remote, open_remote
 from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open_run_folder
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.stride import CALIBRATION, with_settled_stride
@@ -81,22 +84,28 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
     """
     accelerator = make_accelerator(config)
     require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
-    if accelerator.is_main_process:  # the only one that needs to see the run's folder
-        config = with_settled_stride(config)
-        check_run_folder(config, allow_config_change=allow_config_change)
-    else:
-        reporter = QuietReporter()
-    config = from_first(accelerator, config)
-    with _out_of_memory_explained():
+    remote = None
+    with contextlib.ExitStack() as until_the_end:
+        if accelerator.is_main_process:  # the only one that needs to see the run's folder
+            config = with_settled_stride(config)
+            check_run_folder(config, allow_config_change=allow_config_change)
+            # What is checked only is fetched to where it does not last.
+            into = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run") if check_only else None
+            remote = open_remote(config, reporter.note, allow_config_change=allow_config_change, into=into)
+            config = with_settled_stride(remote.config if remote else config)
+        else:
+            reporter = QuietReporter()
+        config = from_first(accelerator, config)
+        until_the_end.enter_context(_out_of_memory_explained())
         run = assemble(config, reporter.note, reporter.looked_through, accelerator)
         try:
-            return _train(run, reporter, check_only=check_only, allow_config_change=allow_config_change)
+            return _train(run, remote, reporter, check_only=check_only, allow_config_change=allow_config_change)
         except StoppedError:
             accelerator.end_training()
             raise
 
 
-def _train(run: Run, reporter: Reporter, *, check_only: bool, allow_config_change: bool) -> Path:
+def _train(run: Run, remote: Remote | None, reporter: Reporter, *, check_only: bool, allow_config_change: bool) -> Path:
     config, folder, writes = run.config, Path(run.config.run_dir), run.accelerator.is_main_process
     first = _validate(run, reporter) if run.state.step == 0 else None
     if first is not None:
@@ -115,7 +124,8 @@ def _train(run: Run, reporter: Reporter, *, check_only: bool, allow_config_chang
     with _open_journal(run, folder) as journal:
         if first is not None:
             journal.write("validation", 0, validation_figures(first))
-        _loop(run, folder, journal, reporter)
+        with remote.mirror(run.state.run_id) if remote else NoMirror() as mirror:
+            _loop(run, folder, journal, mirror, reporter)
     run.accelerator.end_training()
     return folder
 
@@ -128,7 +138,9 @@ def _open_journal(run: Run, folder: Path) -> Journal | QuietJournal:
     return Journal(folder, first_step=done, trackers=trackers)
 
 
-def _loop(run: Run, folder: Path, journal: Journal | QuietJournal, reporter: Reporter) -> None:
+def _loop(
+    run: Run, folder: Path, journal: Journal | QuietJournal, mirror: Mirror | NoMirror, reporter: Reporter
+) -> None:
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
     throughput = Throughput.of(run.config, run.world_model.sizes, device, processes)
@@ -151,9 +163,12 @@ def _loop(run: Run, folder: Path, journal: Journal | QuietJournal, reporter: Rep
             if due or stopped_by:
                 save_checkpoint(run, folder)
                 clock.restart()
+            mirror.tick()
             if stopped_by and not last:
+                mirror.finish(lambda: True)
                 run.accelerator.wait_for_everyone()  # whoever ended first would have the others ended by the launcher
                 raise StoppedError(folder, step, signal.Signals(stopped_by).name)
+        mirror.finish(lambda: stop.reason is not None)
     run.accelerator.wait_for_everyone()
 
 
