@@ -360,7 +360,7 @@ def test_what_is_only_here_in_the_end_is_said(bucket: Gcs, run: Path, caplog: py
     bucket.fail_next(503, times=99)
     mirror.finish(lambda: False)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
-    assert "is on this machine only. The next start sends it" in caplog.text
+    assert "is on this machine only. A next start sends it" in caplog.text
 
 
 def test_a_place_of_another_run_is_never_written(bucket: Gcs, run: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -92,7 +92,7 @@ class Mirror:
         self._stop.set()
         if not self._is_off and not (in_time and self._sent == self._update.newest_here()):
             logger.warning(
-                "%s has checkpoints up to %s; what %s has after that is on this machine only%s. The next start sends it",
+                "%s has checkpoints up to %s; what %s has after that is on this machine only%s. A next start sends it",
                 self._place, self._sent or "those of earlier starts", self._folder / CHECKPOINTS,
                 "" if in_time else ": there was no more time",
             )  # fmt: skip
