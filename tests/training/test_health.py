@@ -1,8 +1,10 @@
 """Figures of health say what they say they do."""
 
 import math
+import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,9 +13,12 @@ from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.config_file import parse_config
 from vjepa2_ac.data.clips import no_clips
 from vjepa2_ac.episode import POSE_WIDTHS, Batch
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.training import health
 from vjepa2_ac.training.flops import clip_flops
 from vjepa2_ac.training.health import MEASURED, Throughput, TimedBatches, Update, matmul_speed, peak_memory_gb
+from vjepa2_ac.training.journal import read_journal
+from vjepa2_ac.training.loop import train
 
 CPU = torch.device("cpu")
 
@@ -89,3 +94,26 @@ def test_peak_memory_grows_with_what_is_held() -> None:
     before = peak_memory_gb(CPU)
     held = torch.ones(round((before + 0.2) * 1e9 / 4))  # touched, so that it is resident
     assert peak_memory_gb(CPU) >= held.nbytes / 1e9 - 0.01
+
+
+def test_every_row_of_training_says_how_the_run_and_the_machine_are(make_config, reporter) -> None:
+    stepped: dict[int, dict[str, float]] = {}
+    reporter.stepped = lambda step, figures: stepped.update({step: figures})
+    folder = train(make_config(training__steps=3, training__log_every=2, training__schedule="constant"), reporter)
+    rows = [row for row in read_journal(folder / "metrics.jsonl") if row["kind"] == "train"]
+    assert [row["step"] for row in rows] == [2, 3]
+    for row in rows:
+        assert row.keys() >= MEASURED | {"loss", "grad_norm", "learning_rate", "update_to_weight"}
+        assert 0 < row["update_to_weight"] < 1
+        assert 0 < row["data_wait_share"] < 1
+        assert row["mfu"] > 0
+    assert "update_to_weight" not in stepped[1], "it needs a copy of the weights"
+    assert sum("ceiling for mfu" in note for note in reporter.notes) == 1
+
+
+def test_a_tracker_that_is_not_there_stops_a_run_before_its_first_step(make_config, reporter, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    config = make_config(tracking__wandb="offline")
+    with pytest.raises(InputError, match="wandb is not installed"):
+        train(config, reporter)
+    assert not Path(config.run_dir).exists()
