@@ -141,6 +141,16 @@ def _add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="folder of a run; several: their spread too")
     parser.add_argument("--split", choices=["test", "validation"], default="test", help="which held-out episodes")
     parser.add_argument("--clips", type=count, default=256, help="at most this many clips, spread over the episodes")
+    _add_checkpoint(parser)
+
+
+def _add_checkpoint(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--checkpoint",
+        default="newest",
+        metavar="newest|best|STEP",
+        help="which one: the newest (default), the best by validation, or that of a step",
+    )
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -150,11 +160,13 @@ def _evaluate(options: argparse.Namespace) -> None:
 
     evaluations = []
     for run in options.runs:
-        evaluation, written = evaluate_run(run, split=options.split, clips=options.clips)
+        measured = evaluate_run(run, split=options.split, clips=options.clips, checkpoint=options.checkpoint)
+        evaluation = measured.evaluation
         evaluations.append(evaluation)
+        console.print(f"{run}: checkpoint {measured.checkpoint}")
         console.print(evaluation_table(evaluation.models, evaluation.seconds_per_step))
         console.print(verdict(evaluation))
-        for path in written:
+        for path in measured.files:
             console.print(f"  {path}")
     if len(evaluations) > 1:
         console.print(spread(evaluations))
@@ -173,15 +185,16 @@ def _add_export(commands: _Commands[argparse.ArgumentParser]) -> None:
         help="merged: a folder that `model.base` takes. official: one .pt by Meta's names, for the official code."
         " hub: the adapter in PEFT's format with a model card, ready to upload",
     )
+    _add_checkpoint(parser)
 
 
 def _export(options: argparse.Namespace) -> None:
     from vjepa2_ac.console import console
     from vjepa2_ac.training.export import export_run
 
-    written = export_run(options.run, options.folder, options.to)
+    written = export_run(options.run, options.folder, options.to, options.checkpoint)
     what = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}
-    console.print(f"The {what[options.to]} is in {written}")
+    console.print(f"The {what[options.to]} of checkpoint {written.checkpoint} is in {written.path}")
 
 
 def _add_config(commands: _Commands[argparse.ArgumentParser]) -> None:

@@ -10,9 +10,10 @@ from torch import Tensor
 from vjepa2_ac.config import AdapterConfig, ModelConfig, ModelSizes
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter_end import base_only, merge_adapter
 from vjepa2_ac.model.heads import fit_heads, heads_to_replace, widths_of_model
 from vjepa2_ac.model.load import load_base
-from vjepa2_ac.model.lora import add_adapter, base_only, load_trained, merge_adapter, save_trained
+from vjepa2_ac.model.lora import add_adapter, load_trained, save_trained
 from vjepa2_ac.model.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.weights import to_official
 from vjepa2_ac.model.world_model import WorldModel

@@ -11,12 +11,11 @@ from torch import Tensor
 
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter_end import base_only, merge_adapter
 from vjepa2_ac.model.lora import (
     add_adapter,
-    base_only,
     has_adapter,
     load_trained,
-    merge_adapter,
     save_trained,
     trainable_report,
 )
@@ -168,6 +167,22 @@ def test_a_knob_that_does_not_fit_the_predictor_is_refused(
     with pytest.raises(InputError, match=message):
         add_adapter(model, LORA.model_copy(update=knobs), seed=0)
     assert not has_adapter(model)
+
+
+@both_types
+def test_pissa_that_goes_on_takes_its_start_from_the_folder_and_does_not_compute_it(
+    fresh: Fresh, inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype
+) -> None:
+    first, second = fresh(dtype=dtype), fresh(dtype=dtype)
+    add_adapter(first, METHODS["pissa"], seed=0)
+    train(first, inputs)
+    save_trained(first, tmp_path)
+    monkeypatch.setattr(torch.linalg, "svd", lambda *_, **__: pytest.fail("minutes, at the real size"))
+    add_adapter(second, METHODS["pissa"], seed=0, started=tmp_path)
+    load_trained(second, tmp_path, trainable=True)
+    assert all(torch.equal(value, second.state_dict()[name]) for name, value in first.state_dict().items())
+    with pytest.raises(InputError, match="pissa_start"):
+        add_adapter(fresh(), METHODS["pissa"].model_copy(update={"rank": 3}), seed=0, started=tmp_path)
 
 
 def test_pissa_starts_at_the_largest_singular_values(model: WorldModel) -> None:

@@ -1,15 +1,25 @@
 """A checkpoint is whole or is not used."""
 
 import errno
+import json
 import logging
+import os
+import re
+import resource
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import torch
+from safetensors.torch import load_file
 
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.assembly import assemble, save_checkpoint
 from vjepa2_ac.training.checkpoint import (
     CheckpointClock,
     RunState,
@@ -19,6 +29,8 @@ from vjepa2_ac.training.checkpoint import (
     read_state,
     write_checkpoint,
 )
+from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.manifest import seal
 
 
 def write_weights(folder: Path) -> None:
@@ -131,10 +143,13 @@ def test_a_best_checkpoint_that_somebody_removed_is_not_waited_for(tmp_path: Pat
     assert read_state(newest) == RunState(20)
 
 
-def test_a_state_from_before_the_best_was_kept_is_still_read(tmp_path: Path) -> None:
+def test_a_state_without_a_best_is_read_and_one_without_its_place_in_the_data_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, 20)
-    (path / "state.json").write_text('{"step": 20, "broken": {}, "windows": 7}')
-    assert read_state(path) == RunState(20, {}, 7)
+    (path / "state.json").write_text('{"step": 20, "clips_done": 80, "windows": 7}')
+    assert read_state(path) == RunState(20, clips_done=80, windows=7)
+    (path / "state.json").write_text('{"step": 20, "windows": 7}')
+    with pytest.raises(ValueError, match="older version"):
+        read_state(path)
 
 
 def test_a_checkpoint_is_due_by_steps_and_by_minutes_since_the_last() -> None:
@@ -149,3 +164,157 @@ def test_a_checkpoint_is_due_by_steps_and_by_minutes_since_the_last() -> None:
     assert not clock.is_due(4)
     now[0] = 1e9
     assert not CheckpointClock(CheckpointConfig(every_minutes=None), lambda: now[0]).is_due(1)
+
+
+def manifest_of(files: dict[str, str]) -> str:
+    return json.dumps({"files": files})
+
+
+def test_a_manifest_that_names_too_little_or_a_file_elsewhere_is_no_manifest(tmp_path: Path, caplog) -> None:
+    older, newer = write(tmp_path / "run", 10), write(tmp_path / "run", 20)
+    files = json.loads((newer / "manifest.json").read_text())["files"]
+    (tmp_path / "elsewhere").write_bytes((newer / "state.json").read_bytes())
+    elsewhere = {"../../elsewhere": files["state.json"]}
+    for text, words in [
+        (manifest_of({}), "does not name state.json"),
+        (manifest_of({name: digest for name, digest in files.items() if name != "state.json"}), "does not name"),
+        (manifest_of({**files, **elsewhere}), "names ../../elsewhere, which is outside"),
+        (manifest_of({**files, str(tmp_path / "elsewhere"): files["state.json"]}), "which is outside"),
+        *((text, "no readable manifest.json") for text in ("", "[]", "{}", '{"files": 3}')),
+    ]:
+        (newer / "manifest.json").write_text(text)
+        caplog.clear()
+        assert newest_checkpoint(tmp_path / "run") == older
+        assert str(newer) in caplog.text, text
+        assert words in caplog.text, text
+
+
+class Faults:
+    """Lets the n-th operation that changes a disk fail, whoever asks for it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.done, self.fails_at, self._error = 0, -1, OSError()
+        places = [(os, name) for name in ("mkdir", "rename", "replace", "fsync")]
+        for where, name in [*places, (Path, "write_text"), (Path, "write_bytes")]:
+            monkeypatch.setattr(where, name, self._failing(getattr(where, name)))
+
+    def set(self, number: int, code: int) -> None:
+        self.done, self.fails_at, self._error = 0, number, OSError(code, os.strerror(code))
+
+    def _failing(self, real):
+        def operation(*arguments, **options):
+            self.done += 1
+            if self.done == self.fails_at:
+                raise self._error
+            return real(*arguments, **options)
+
+        return operation
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EIO])
+def test_whatever_operation_fails_older_checkpoints_stay_and_nothing_half_is_left(tmp_path, monkeypatch, code) -> None:
+    faults = Faults(monkeypatch)
+    write(tmp_path / "count", 10)
+    faults.set(-1, code)
+    write(tmp_path / "count", 20)
+    operations = faults.done
+    assert operations > 10, "folders, files, flushes, a rename"
+    for number in range(1, operations + 1):
+        folder = tmp_path / str(number)
+        faults.set(-1, code)
+        older = write(folder, 10)
+        faults.set(number, code)
+        with pytest.raises(InputError, match=rf"{checkpoint_name(20)}: .*cannot be written \({os.strerror(code)}\)"):
+            write(folder, 20)
+        assert damage(older) is None
+        assert all(damage(path) is None for path in folder.iterdir()), "whole or absent"
+        path = write(folder, 20)
+        assert newest_checkpoint(folder) == path, "with room again"
+
+
+@contextmanager
+def files_end_at(size: int) -> Iterator[None]:
+    """Let no file grow beyond a size: a full disk for Python, torch and safetensors alike."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("init", ["default", "pissa"])
+def test_a_disk_that_fills_up_in_any_file_is_the_users_error_and_changes_nothing(make_config, reporter, init) -> None:
+    config = make_config(training__steps=1, adapter__init=init)
+    folder = train(config, reporter)
+    run = assemble(config, reporter.note)
+    older = newest_checkpoint(folder / "checkpoints")
+    sizes = sorted(path.stat().st_size for path in older.rglob("*") if path.is_file())
+    run.state = replace(run.state, step=2)
+    for size in {0, *(size - 1 for size in sizes), sizes[-1] // 2, *range(0, sizes[-1], 9973)}:
+        with files_end_at(size), pytest.raises(InputError, match=r"step-00000002: .*cannot be written"):
+            save_checkpoint(run, folder)
+        assert [path.name for path in (folder / "checkpoints").iterdir()] == [older.name]
+    assert damage(older) is None
+    with files_end_at(sizes[-1] + 4096):
+        save_checkpoint(run, folder)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"adapter__init": "pissa"}, {"adapter__modules_to_save": ["action_encoder"]}, {"adapter__kind": "none"}],
+    ids=["lora", "pissa", "heads", "none"],
+)
+def test_a_checkpoint_holds_what_is_trained_and_never_the_frozen_base(make_config, reporter, changes) -> None:
+    config = make_config(training__steps=1, **changes)
+    checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
+    model = assemble(config, reporter.note).world_model
+    trained = sum(value.numel() for value in model.parameters() if value.requires_grad)
+    state = torch.load(checkpoint / "optimizer.pt", weights_only=True)["state"].values()
+    assert sum(moments[name].numel() for moments in state for name in ("exp_avg", "exp_avg_sq")) == 2 * trained
+    written = {path.name: load_file(path) for path in checkpoint.rglob("*.safetensors")}
+    if config.adapter.kind == "none":
+        assert {name: value.keys() for name, value in written.items()} == {
+            "predictor.safetensors": model.predictor.state_dict().keys()
+        }
+        return
+    for weights in written.values():  # the adapter; of PiSSA also where it started
+        assert sum(value.numel() for value in weights.values()) == trained
+        assert all(re.search(r"\.lora_[AB]|\.action_encoder\.", name) for name in weights)
+    rest = sum(path.stat().st_size for path in checkpoint.rglob("*") if path.name not in {*written, "optimizer.pt"})
+    assert rest < 20_000, "text"
+
+
+class Bomb:
+    """Leaves a mark when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self._mark = mark
+
+    def __reduce__(self) -> tuple:
+        return (Path.touch, (self._mark,))
+
+
+def test_an_optimizer_file_that_would_run_code_is_refused_and_does_not(make_config, reporter, tmp_path) -> None:
+    config = make_config(training__steps=1)
+    checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
+    torch.save({"state": Bomb(tmp_path / "mark")}, checkpoint / "optimizer.pt")
+    seal(checkpoint)  # whoever can write the file can write the manifest
+    with pytest.raises(InputError, match=r"optimizer\.pt: more than tensors and plain values .*run foreign code"):
+        train(config, reporter)
+    assert not (tmp_path / "mark").exists()
+    torch.load(checkpoint / "optimizer.pt", weights_only=False)
+    assert (tmp_path / "mark").exists(), "the bomb is one"
+
+
+def test_a_checkpoint_of_another_base_is_refused_though_its_path_is_the_same(
+    make_config, reporter, base_folder: Path, tmp_path
+) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(base_folder, base)
+    config = make_config(model__base=str(base), training__steps=1)
+    train(config, reporter)
+    shutil.rmtree(base)
+    WorldModel.random(WorldModel.from_pretrained(base_folder).sizes, seed=4).save_pretrained(base)
+    with pytest.raises(InputError, match="an adapter trained on another predictor"):
+        train(config, reporter)

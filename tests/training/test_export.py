@@ -11,18 +11,22 @@ import peft
 import pytest
 import torch
 import yaml
+from safetensors.torch import load_file
 from torch import Tensor
 
 from paths import GOLDEN
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.lora import base_only, load_trained
+from vjepa2_ac.model.adapter_end import base_only
+from vjepa2_ac.model.lora import load_trained
 from vjepa2_ac.model.weights import load_official
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training import export
-from vjepa2_ac.training.export import CARD, OFFICIAL_NAME, export_run
+from vjepa2_ac.training.checkpoint import checkpoint_name
+from vjepa2_ac.training.export import CARD, OFFICIAL_NAME, Exported, export_run
 from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.manifest import seal
 from vjepa2_ac.training.runs import EVALUATION, PLOT, load_run
 
 EVALUATED = {
@@ -75,13 +79,13 @@ def sizes_of(run: Path) -> ModelSizes:
 @pytest.mark.parametrize("kind", ["lora", "none"])
 def test_the_official_checkpoint_predicts_as_the_run_does(trained, tmp_path: Path, kind: str) -> None:
     run = trained(adapter__kind=kind)
-    written = export_run(run, tmp_path / "out.pt", "official")
+    written = export_run(run, tmp_path / "out.pt", "official").path
     assert written == tmp_path / "out.pt"
     assert_predicts_as(load_official(written, sizes_of(run)), run)
 
 
 def test_the_official_checkpoint_has_the_names_of_metas(trained, tmp_path: Path) -> None:
-    written = export_run(trained(), tmp_path / "folder", "official")
+    written = export_run(trained(), tmp_path / "folder", "official").path
     assert written == tmp_path / "folder" / OFFICIAL_NAME
     assert list(written.parent.iterdir()) == [written]
     found = torch.load(written, weights_only=True)
@@ -94,7 +98,7 @@ def test_the_official_checkpoint_has_the_names_of_metas(trained, tmp_path: Path)
 
 def test_it_loads_as_the_base_of_another_run(trained, make_config, reporter, tmp_path: Path) -> None:
     run = trained()
-    written = export_run(run, tmp_path / "base.pt", "official")
+    written = export_run(run, tmp_path / "base.pt", "official").path
     config = make_config(run_dir=str(tmp_path / "next"), model__base=str(written), training__steps=1)
     sizes = config.model.model_copy(update={"sizes": sizes_of(run)})
     train(config.model_copy(update={"model": sizes}), reporter)
@@ -103,13 +107,13 @@ def test_it_loads_as_the_base_of_another_run(trained, make_config, reporter, tmp
 
 def test_merged_is_a_folder_that_predicts_as_the_run_does(trained, tmp_path: Path) -> None:
     run = trained()
-    assert export_run(run, tmp_path / "merged") == tmp_path / "merged"
+    assert export_run(run, tmp_path / "merged") == Exported(tmp_path / "merged", "step-00000002 (the newest)")
     assert_predicts_as(WorldModel.from_pretrained(tmp_path / "merged"), run)
 
 
 def test_merging_into_a_bfloat16_base_keeps_its_type(trained, tmp_path: Path) -> None:
     run = trained(model__dtype="bfloat16", training__precision="bf16")
-    written = export_run(run, tmp_path / "out.pt", "official")
+    written = export_run(run, tmp_path / "out.pt", "official").path
     kinds = {value.dtype for part in ("encoder", "predictor") for value in torch.load(written)[part].values()}
     assert kinds == {torch.bfloat16}
 
@@ -186,6 +190,35 @@ def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(traine
     assert "another checkpoint**: `step-00000001`, not `step-00000002`" in card
 
 
+def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is_asked_for(
+    trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = trained(training__steps=4, checkpoint__every=1)
+    newest = load_run(run).checkpoint
+    state = json.loads((newest / "state.json").read_text())
+    (newest / "state.json").write_text(json.dumps({**state, "best_step": 2}))
+    seal(newest)
+    for asked, step, words in [("best", 2, "step-00000002 (the best)"), ("1", 1, "step-00000001 (as asked for)")]:
+        assert main(["evaluate", str(run), "--clips", "4", "--checkpoint", asked]) == 0
+        measured = json.loads((run / EVALUATION).read_text())
+        assert measured["checkpoint"] == str(run / "checkpoints" / f"step-{step:08d}")
+        assert measured["chosen"] == words
+        assert main(["export", str(run), str(tmp_path / asked), "--to", "hub", "--checkpoint", asked]) == 0
+        assert capsys.readouterr().out.count(f"checkpoint {words}") == 2, "both say which"
+        card = (tmp_path / asked / CARD).read_text()
+        assert f"from checkpoint {words} of the run" in card
+        assert "another checkpoint" not in card
+        found = load_file(tmp_path / asked / "adapter_model.safetensors")
+        assert all(torch.equal(found[name], value) for name, value in weights_of(run, step).items())
+        assert any(not torch.equal(found[name], value) for name, value in weights_of(run, 3).items())
+    assert main(["export", str(run), str(tmp_path / "x"), "--checkpoint", "7"]) == 2
+    assert "no checkpoint of step 7. needed: newest, best or one of the steps 1, 2, 3, 4" in capsys.readouterr().err
+
+
+def weights_of(run: Path, step: int) -> dict[str, Tensor]:
+    return load_file(run / "checkpoints" / checkpoint_name(step) / "adapter" / "adapter_model.safetensors")
+
+
 @pytest.mark.parametrize("content", ["{", "[]", "{}", '{"checkpoint": "x", "verdict": 3}'])
 def test_a_damaged_evaluation_is_named_and_nothing_is_written(trained, tmp_path: Path, content: str) -> None:
     run = trained()
@@ -204,7 +237,8 @@ def test_a_run_without_an_adapter_has_nothing_for_the_hub(trained, tmp_path: Pat
 def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is loaded."""
 
-    def refuse(folder: Path) -> None:
+    def refuse(folder: Path, checkpoint: str) -> None:
+        del checkpoint
         pytest.fail(f"{folder} was loaded")
 
     monkeypatch.setattr(export, "load_run", refuse)

@@ -17,7 +17,7 @@ from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.evaluation.metrics import ErrorMeter, PredictionErrors
 from vjepa2_ac.latents import encode_batch
-from vjepa2_ac.model.lora import base_only
+from vjepa2_ac.model.adapter_end import base_only
 from vjepa2_ac.model.world_model import WorldModel
 
 Variant = Callable[[WorldModel], contextlib.AbstractContextManager[object]]

@@ -1,9 +1,10 @@
-"""What is trained? A LoRA adapter on the predictor, or all of the predictor: add, save, load, switch off, merge."""
+"""What is trained? A LoRA adapter on the predictor, or all of the predictor: add, save, load.
+
+PEFT's home. How the base comes back, and how an adapter becomes part of it: `model.adapter_end`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +22,6 @@ from vjepa2_ac.model.adapter_start import (
     measure_magnitudes,
     original_weights,
     principal_parts,
-    set_original_weights,
     start_from,
 )
 from vjepa2_ac.model.heads import fit_heads, require_trained
@@ -69,15 +69,22 @@ class TrainableReport(NamedTuple):
         )
 
 
-def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
+def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Path | None = None) -> None:
     """Make a model trainable: its predictor gets an adapter, or all of it is trained. What is trained is float32.
 
     A fresh adapter changes nothing: its second matrix is zero; the first is decided by the seed. With `init: pissa` it
     is a part of the weights, taken off them, which comes to the same up to rounding.
 
+    Args:
+        model: The base.
+        config: What is trained.
+        seed: Decides the first matrices.
+        started: What `save_trained` wrote of an adapter that began in the same way. With `init: pissa` the part is read
+            there and not computed, which takes minutes; all else is for `load_trained`.
+
     Raises:
-        InputError: A target matches no layer, another knob does not fit the predictor, or a fresh head (`model.heads`)
-            would not be trained.
+        InputError: A target matches no layer, another knob does not fit the predictor, a fresh head (`model.heads`)
+            would not be trained, or `started` is of another adapter.
         ValueError: The model has been adapted already.
     """
     if model.adaptation is not None:
@@ -87,9 +94,10 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int) -> None:
         return
     require_trained(_names_of_fresh_heads(model), config)
     _wrap(model, LoraConfig(**lora_arguments(model.predictor, config, unused=_unused(model))))
-    layers = _lora_layers(model)
+    layers = lora_layers(model)
     if config.init == "pissa":
-        _start_from_principal_parts(model, principal_parts(layers))
+        parts = principal_parts(layers) if started is None else _read_principal_parts(model, started)
+        _start_from_principal_parts(model, parts)
     else:
         draw_first_matrices(layers, config.init, torch.Generator().manual_seed(seed))
     measure_magnitudes(layers)
@@ -113,7 +121,7 @@ def save_trained(model: WorldModel, folder: str | Path) -> None:
     Raises:
         ValueError: The model has not been adapted.
     """
-    adaptation, folder = _adaptation(model), Path(folder)
+    adaptation, folder = adaptation_of(model), Path(folder)
     if adaptation.kind == "lora":
         write_trained(folder, adaptation, _lora_weights(model), _card_of_fresh_heads(model))  # and PiSSA's parts
         _lora_config(model).save_pretrained(str(folder))
@@ -146,43 +154,21 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
         _set_trainable(model, bool(trainable))
 
 
-@contextmanager
-def base_only(model: WorldModel) -> Iterator[None]:
-    """Let the model predict as the base it was adapted from, for a while; a model that was not adapted is the base.
-
-    A model with fresh heads goes back to these as they were drawn: not a base that could be compared with.
-    """
-    if model.adaptation is None:
-        yield
-        return
-    trained = [(value, value.requires_grad) for value in model.predictor.parameters()]
-    switch = (
-        _lora_off(model, model.adaptation)
-        if model.adaptation.kind == "lora"
-        else _start_weights(model, model.adaptation)
-    )
-    try:
-        with switch:
-            yield
-    finally:
-        for value, requires_grad in trained:  # PEFT turns gradients on when it turns an adapter on
-            value.requires_grad_(requires_grad)
+def lora_layers(model: WorldModel) -> dict[str, Any]:
+    """Return the layers of the predictor that have an adapter (PEFT's LoraLayer), by name."""
+    found = model.base_predictor.named_modules()
+    return {name: layer for name, layer in found if isinstance(layer, LoraLayer)}
 
 
-def merge_adapter(model: WorldModel) -> None:
-    """Make what was trained part of the predictor: added in float32, then cast to the base's type, frozen.
+def adaptation_of(model: WorldModel) -> Adaptation:
+    """Return how a model was adapted.
 
     Raises:
-        ValueError: The model has not been adapted.
+        ValueError: It was not.
     """
-    adaptation = _adaptation(model)
-    dtype = model.base_predictor.predictor_embed.weight.dtype
-    if adaptation.kind == "lora":
-        model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
-    elif adaptation.start is not None:
-        dtype = next(iter(adaptation.start.values())).dtype
-    model.predictor.to(dtype).requires_grad_(False)
-    model.adaptation = model.fresh_heads = None
+    if model.adaptation is None:
+        raise ValueError("this model has not been adapted: add_adapter or load_trained first")
+    return model.adaptation
 
 
 def _names_of_fresh_heads(model: WorldModel) -> tuple[str, ...]:
@@ -228,15 +214,19 @@ def _unused(model: WorldModel) -> tuple[str, ...]:
 
 
 def _start_from_principal_parts(model: WorldModel, parts: dict[str, Tensor]) -> None:
-    adaptation, layers = _adaptation(model), _lora_layers(model)
+    adaptation, layers = adaptation_of(model), lora_layers(model)
     start = adaptation.start or original_weights(layers)
     start_from(layers, start, parts)
     model.adaptation = replace(adaptation, start=start, principal=parts)
 
 
-def _lora_layers(model: WorldModel) -> dict[str, Any]:
-    found = model.base_predictor.named_modules()
-    return {name: layer for name, layer in found if isinstance(layer, LoraLayer)}
+def _read_principal_parts(model: WorldModel, folder: Path) -> dict[str, Tensor]:
+    like = {
+        f"{name}.{matrix}": getattr(layer, matrix)["default"].weight
+        for name, layer in lora_layers(model).items()
+        for matrix in ("lora_A", "lora_B")
+    }
+    return read_weights(folder / PRINCIPAL_PARTS, like)
 
 
 def _lora_weights(model: WorldModel) -> dict[str, Tensor]:
@@ -248,12 +238,6 @@ def _lora_config(model: WorldModel) -> Any:
     config = LoraConfig(**{**predictor.peft_config["default"].to_dict(), "inference_mode": True})
     config.target_modules = sorted(config.target_modules)
     return config
-
-
-def _adaptation(model: WorldModel) -> Adaptation:
-    if model.adaptation is None:
-        raise ValueError("this model has not been adapted: add_adapter or load_trained first")
-    return model.adaptation
 
 
 def _set_trainable(model: WorldModel, trainable: bool) -> None:
@@ -271,12 +255,7 @@ def _load_lora(model: WorldModel, folder: Path) -> None:
         _check_same_adapter(_lora_config(model), config, where=str(folder))
     weights = read_weights(folder / LORA_WEIGHTS, _lora_weights(model))
     if config.init_lora_weights == "pissa":
-        shapes = {
-            f"{name}.{matrix}": getattr(layer, matrix)["default"].weight
-            for name, layer in _lora_layers(model).items()
-            for matrix in ("lora_A", "lora_B")
-        }
-        _start_from_principal_parts(model, read_weights(folder / PRINCIPAL_PARTS, shapes))
+        _start_from_principal_parts(model, _read_principal_parts(model, folder))
     set_peft_model_state_dict(model.predictor, weights)
 
 
@@ -304,26 +283,3 @@ def _load_everything(model: WorldModel, folder: Path) -> None:
     if model.adaptation is None:
         _train_everything(model)
     model.predictor.load_state_dict(weights)
-
-
-@contextmanager
-def _lora_off(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
-    predictor: Any = model.predictor
-    layers = _lora_layers(model) if adaptation.start else {}  # PiSSA's: their own weights are not the base's
-    now = {name: layer.get_base_layer().weight.detach().clone() for name, layer in layers.items()}
-    set_original_weights(layers, adaptation.start or {})
-    try:
-        with predictor.disable_adapter():
-            yield
-    finally:
-        set_original_weights(layers, now)
-
-
-@contextmanager
-def _start_weights(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
-    now = {name: value.detach().clone() for name, value in model.predictor.state_dict().items()}
-    model.predictor.load_state_dict(adaptation.start or {})
-    try:
-        yield
-    finally:
-        model.predictor.load_state_dict(now)

@@ -19,11 +19,11 @@ from pathlib import Path
 
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import sha256_of_file, sync
+from vjepa2_ac.storage import sync
+from vjepa2_ac.training.manifest import broken_seal, seal
 
 logger = logging.getLogger(__name__)
 
-MANIFEST = "manifest.json"
 STATE = "state.json"
 ADAPTER = "adapter"  # a folder: what `model.lora.save_trained` writes
 OPTIMIZER = "optimizer.pt"
@@ -98,12 +98,13 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
         temporary.mkdir(parents=True)
         write_files(temporary)
         (temporary / STATE).write_text(json.dumps(asdict(state)))
-        _seal(temporary)
+        seal(temporary)
         for stale in _listed(folder):  # damaged ones that were passed over; those steps are being done again
             if stale.name >= final.name:
                 shutil.rmtree(stale)
         temporary.rename(final)
         sync(folder)
+        _prune(folder, keep, state.best_step)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise InputError(
@@ -111,7 +112,6 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
             found=f"the checkpoint cannot be written ({error.strerror or error})",
             fix="Older checkpoints are untouched: make room or pass another run_dir, then resume",
         ) from error
-    _prune(folder, keep, state.best_step)
     return final
 
 
@@ -138,16 +138,7 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
 def damage(checkpoint: Path) -> str | None:
     """Return what is wrong with a checkpoint, or None when every file is what the manifest says."""
-    try:
-        files = json.loads((checkpoint / MANIFEST).read_text())["files"]
-        for name, digest in files.items():
-            if not (checkpoint / name).is_file():
-                return f"{name} is missing"
-            if sha256_of_file(checkpoint / name) != digest:
-                return f"{name} is damaged (its SHA-256 is not the manifest's)"
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        return f"no readable {MANIFEST} ({error})"
-    return None
+    return broken_seal(checkpoint, needed={STATE})
 
 
 def read_state(checkpoint: Path) -> RunState:
@@ -163,19 +154,6 @@ def read_state(checkpoint: Path) -> RunState:
 
 def _listed(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("step-*") if path.is_dir() and _NAME.search(path.name))
-
-
-def _seal(folder: Path) -> None:
-    """Flush every file to the disk, then write the manifest."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    digests = {}
-    for path in files:
-        sync(path)
-        digests[str(path.relative_to(folder))] = sha256_of_file(path)
-    manifest = folder / MANIFEST
-    manifest.write_text(json.dumps({"files": digests}, indent=1))
-    sync(manifest)
-    sync(folder)
 
 
 def _prune(folder: Path, keep: int, best_step: int | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,16 +15,18 @@ from safetensors import safe_open
 from vjepa2_ac.config import Config
 from vjepa2_ac.episode import POSE_WIDTHS, Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter_end import merge_adapter
 from vjepa2_ac.model.heads import widths_of_model
-from vjepa2_ac.model.lora import merge_adapter, trainable_report
+from vjepa2_ac.model.lora import trainable_report
 from vjepa2_ac.model.trained_folder import LORA_WEIGHTS
 from vjepa2_ac.model.weights import to_official
-from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import atomic_writer, folder_writer, user_can_write, write_atomically
 from vjepa2_ac.training.checkpoint import ADAPTER, read_state
+from vjepa2_ac.training.chosen import NEWEST
 from vjepa2_ac.training.model_card import AdapterFacts, model_card
 from vjepa2_ac.training.run_folder import read_run_config
 from vjepa2_ac.training.runs import EVALUATION, PLOT, TrainedRun, load_run
+from vjepa2_ac.training.torch_file import write_torch
 
 Form = Literal["merged", "official", "hub"]
 
@@ -32,7 +35,15 @@ CARD = "README.md"
 _PEFT_CONFIG = "adapter_config.json"
 
 
-def export_run(folder: Path, destination: Path, form: Form = "merged") -> Path:
+@dataclass(frozen=True)
+class Exported:
+    """What was written."""
+
+    path: Path  # the file or folder
+    checkpoint: str  # which one it was made of, in words
+
+
+def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoint: str = NEWEST) -> Exported:
     """Write what a run has learnt for others to use, whole or not at all.
 
     An adapter is merged in float32, then cast to the type of the base's weights (`model.dtype`).
@@ -42,9 +53,7 @@ def export_run(folder: Path, destination: Path, form: Form = "merged") -> Path:
         destination: A new or empty folder; for official also a file ending in `.pt`, which must not be there.
         form: merged: the model as a folder, which `model.base` takes. official: one `.pt` by Meta's own names, q, k
             and v fused, for the official code. hub: the adapter in PEFT's format with a model card, ready to upload.
-
-    Returns:
-        The file or folder that was written.
+        checkpoint: newest, best (by validation), or a number of optimizer steps.
 
     Raises:
         InputError: As `load_run`; the destination is occupied or cannot be written; official: the model is of another
@@ -56,18 +65,20 @@ def export_run(folder: Path, destination: Path, form: Form = "merged") -> Path:
     if form == "hub":
         _check_adapter(folder, config)
         evaluation = _read_evaluation(folder)
-        _write_hub(load_run(folder), folder, destination, evaluation)
-        return destination
-    model = load_run(folder).world_model
+        run = load_run(folder, checkpoint)
+        _write_hub(run, folder, destination, evaluation)
+        return Exported(destination, run.chosen)
+    run = load_run(folder, checkpoint)
     if form == "official":
-        _check_widths(folder, widths_of_model(model.sizes))
-    merge_adapter(model)
+        _check_widths(folder, widths_of_model(run.world_model.sizes))
+    merge_adapter(run.world_model)
     if form == "merged":
-        model.save_pretrained(destination)
-        return destination
+        run.world_model.save_pretrained(destination)
+        return Exported(destination, run.chosen)
     path = destination if destination.suffix == ".pt" else destination / OFFICIAL_NAME
-    _write_official(model, path)
-    return path
+    with user_can_write(path), atomic_writer(path) as file:
+        write_torch(to_official(run.world_model), file)
+    return Exported(path, run.chosen)
 
 
 def _check_free(destination: Path) -> None:
@@ -100,16 +111,6 @@ def _check_widths(folder: Path, widths: Widths) -> None:
         )
 
 
-def _write_official(model: WorldModel, path: Path) -> None:
-    with user_can_write(path), atomic_writer(path) as file:
-        try:
-            torch.save(to_official(model), file)
-        except RuntimeError as error:  # torch's own word for a write that failed
-            if isinstance(error.__context__, OSError):
-                raise error.__context__ from None
-            raise
-
-
 def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dict[str, Any] | None) -> None:
     """Copy the adapter of a checkpoint, which load_run has seen to be whole, and put the card beside it."""
     plot = folder / PLOT if evaluation is not None and (folder / PLOT).is_file() else None
@@ -137,6 +138,7 @@ def _facts(run: TrainedRun, folder: Path, evaluation: dict[str, Any] | None, plo
         name=folder.resolve().name,
         steps=read_state(run.checkpoint).step,
         checkpoint=run.checkpoint.name,
+        chosen=run.chosen,
         trained=str(trainable_report(run.world_model)._replace(trained=trained)),
         base_predictor=adaptation.base,
         base_encoder=adaptation.encoder,

@@ -33,6 +33,7 @@ class AdapterFacts:
     name: str
     steps: int  # optimizer steps done
     checkpoint: str  # name of the checkpoint that is exported
+    chosen: str  # the same, and whether it is the newest or the best
     trained: str  # how many parameters, in words
     base_predictor: str  # fingerprints
     base_encoder: str
@@ -49,7 +50,7 @@ def model_card(config: Config, facts: AdapterFacts) -> str:
     """
     parts = [
         f"{_FRONT}\n# {facts.name}: a LoRA adapter for V-JEPA 2-AC",
-        f"Written by vjepa2-ac {__version__} from `{facts.checkpoint}` of the run.",
+        f"Written by vjepa2-ac {__version__} from checkpoint {facts.chosen} of the run.",
         _base(config, facts),
         _data(config, facts),
         _training(config, facts),

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from vjepa2_ac.storage import download, file_sizes, join, read_bytes, remove, remove_folder, upload
-from vjepa2_ac.training.checkpoint import MANIFEST, STATE, damage
+from vjepa2_ac.training.checkpoint import STATE, damage
+from vjepa2_ac.training.manifest import MANIFEST
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 
 SENDING = ".sending.json"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, read_state
 from vjepa2_ac.training.processes import from_first, require_same, take_from_first
 from vjepa2_ac.training.run_folder import CHECKPOINTS, run_id
+from vjepa2_ac.training.torch_file import read_torch
 
 
 def take_up(
@@ -90,10 +90,10 @@ def _read(
 ) -> tuple[RunState, dict[str, Any]]:
     load_trained(world_model, checkpoint / ADAPTER, trainable=True)
     try:
-        moments = torch.load(checkpoint / OPTIMIZER, weights_only=True, map_location="cpu")
+        moments = read_torch(checkpoint / OPTIMIZER)
         optimizer.load_state_dict(moments)
         return read_state(checkpoint), moments
-    except (OSError, ValueError, KeyError, TypeError, RuntimeError, pickle.UnpicklingError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise InputError(
             where=str(checkpoint), found=f"not the state of this run ({error})", fix="Delete it to use an older one"
         ) from None

@@ -8,6 +8,7 @@ RUN/metrics.jsonl       figures, a row per line
 RUN/checkpoints/        step-XXXXXXXX folders
 RUN/tensorboard/        event files; RUN/wandb/ likewise
 RUN/not_finite/         clips of a step that could not be done
+RUN/.lock               held by the process that is training, see `training.run_lock`
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import changed_keys, config_as_dict, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.training.run_lock import LOCK
 
 CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
@@ -66,7 +68,7 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
     if (folder / CONFIG).exists():
         if not allow_config_change:
             _refuse_another_config(folder, config)
-    elif folder.exists() and any(folder.iterdir()):
+    elif folder.exists() and not all(_is_of_a_start(path) for path in folder.iterdir()):
         raise InputError(
             where=str(folder),
             found="a folder with other things in it, and no config.yaml",
@@ -89,16 +91,16 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     """
     check_run_folder(config, allow_config_change=allow_config_change)
     folder = Path(config.run_dir)
-    (folder / CHECKPOINTS).mkdir(parents=True, exist_ok=True)
     start = {"seed": config.seed, **environment()}
     if (changes := config_changes(config)) and allow_config_change:
         start["config_changes"] = changes
+    if allow_config_change or not (folder / CONFIG).exists():  # first of all files: it makes the folder a run's
+        write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     path = folder / ENVIRONMENT
     starts = _earlier_starts(path)
     write_atomically(path, json.dumps([*starts, start], indent=1).encode())
-    if allow_config_change or not (folder / CONFIG).exists():
-        write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     write_atomically(folder / RUN_ID, run_name)
+    (folder / CHECKPOINTS).mkdir(exist_ok=True)
     return folder
 
 
@@ -143,6 +145,11 @@ def environment() -> dict[str, object]:
         "machine": platform.platform(),
         "packages": {name: importlib.metadata.version(name) for name in packages},
     }
+
+
+def _is_of_a_start(path: Path) -> bool:
+    """Return whether a file is what a start leaves that was killed before its config stood there."""
+    return path.name == LOCK or (path.name.startswith(f".{CONFIG}.") and path.name.endswith(".partial"))
 
 
 def _earlier_starts(path: Path) -> list[object]:

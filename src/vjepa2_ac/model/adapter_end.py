@@ -1,0 +1,73 @@
+"""How does a model predict without its adapter again, and how does the adapter become part of it for good?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from vjepa2_ac.model.adapter_start import set_original_weights
+from vjepa2_ac.model.lora import adaptation_of, lora_layers
+from vjepa2_ac.model.world_model import Adaptation, WorldModel
+
+
+@contextmanager
+def base_only(model: WorldModel) -> Iterator[None]:
+    """Let the model predict as the base it was adapted from, for a while; a model that was not adapted is the base.
+
+    A model with fresh heads goes back to these as they were drawn: not a base that could be compared with.
+    """
+    if model.adaptation is None:
+        yield
+        return
+    trained = [(value, value.requires_grad) for value in model.predictor.parameters()]
+    switch = (
+        _lora_off(model, model.adaptation)
+        if model.adaptation.kind == "lora"
+        else _start_weights(model, model.adaptation)
+    )
+    try:
+        with switch:
+            yield
+    finally:
+        for value, requires_grad in trained:  # PEFT turns gradients on when it turns an adapter on
+            value.requires_grad_(requires_grad)
+
+
+def merge_adapter(model: WorldModel) -> None:
+    """Make what was trained part of the predictor: added in float32, then cast to the base's type, frozen.
+
+    Raises:
+        ValueError: The model has not been adapted.
+    """
+    adaptation = adaptation_of(model)
+    dtype = model.base_predictor.predictor_embed.weight.dtype
+    if adaptation.kind == "lora":
+        model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
+    elif adaptation.start is not None:
+        dtype = next(iter(adaptation.start.values())).dtype
+    model.predictor.to(dtype).requires_grad_(False)
+    model.adaptation = model.fresh_heads = None
+
+
+@contextmanager
+def _lora_off(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
+    predictor: Any = model.predictor
+    layers = lora_layers(model) if adaptation.start else {}  # PiSSA's: their own weights are not the base's
+    now = {name: layer.get_base_layer().weight.detach().clone() for name, layer in layers.items()}
+    set_original_weights(layers, adaptation.start or {})
+    try:
+        with predictor.disable_adapter():
+            yield
+    finally:
+        set_original_weights(layers, now)
+
+
+@contextmanager
+def _start_weights(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
+    now = {name: value.detach().clone() for name, value in model.predictor.state_dict().items()}
+    model.predictor.load_state_dict(adaptation.start or {})
+    try:
+        yield
+    finally:
+        model.predictor.load_state_dict(now)
