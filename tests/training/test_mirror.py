@@ -193,6 +193,22 @@ def test_a_file_that_somebody_removed_there_is_sent_again(bucket: Gcs, run: Path
     send(run)
     assert_same_files(run, checkpoint_name(10))
     assert len(bucket.uploads()) == 2 + 1 + 1 + 1, "small files, the claim, the file, the manifest"
+    gone = [request.target.rsplit("/", 1)[1] for request in bucket.requests if request.target.startswith("DELETE")]
+    assert gone == ["manifest.json", SENDING], "it is not complete while it is being sent"
+
+
+@pytest.mark.usefixtures("bucket")
+def test_small_files_are_sent_when_they_have_changed(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sent = []
+    monkeypatch.setattr(remote_update, "upload", lambda _, target: sent.append(target.rsplit("/", 1)[1]))
+    mirror = mirror_of(run)
+    for step in (10, 20):
+        write(run, step)
+        with (run / "metrics.jsonl").open("a") as metrics:
+            metrics.write("{}\n")
+        mirror.tick()
+        mirror._thread.join()
+    assert sent == ["config.yaml", "metrics.jsonl", "metrics.jsonl"]
 
 
 def test_the_same_are_kept_there_as_here(bucket: Gcs, run: Path) -> None:

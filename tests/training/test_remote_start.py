@@ -91,7 +91,10 @@ def test_a_fresh_machine_gets_the_newest_checkpoint_and_the_small_files(bucket: 
     assert read_state(newest).run_id == "mine"
     expected = {name: data for name, data in files_of(source).items() if checkpoint_name(10) not in name}
     assert files_of(local(config)) == expected
-    assert notes == [f"Fetched {checkpoint_name(20)} from {PLACE}."]
+    assert notes == [
+        f"{PLACE} can be written: it is brought up to date every 30 minutes, and in the end.",
+        f"Fetched {checkpoint_name(20)} from {PLACE}.",
+    ]
     check_run_folder(config)
 
 

@@ -70,6 +70,8 @@ def open_remote(
         stand = "without a checkpoint" if step is None else f"after step {step}"
         _warn(f"{error} Training begins with what is on this machine, {stand}, and tries again later")
         return replace(remote, is_reachable=False)
+    minutes = config.checkpoint.remote_every_minutes
+    note(f"{remote.place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
     further = [name for name in complete(listing) if step is None or name > checkpoint_name(step)]
     if not further:
         return remote
