@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.run_lock import LOCK, RunLock
 
 HOLD = """
@@ -92,3 +93,27 @@ def test_a_folder_that_cannot_be_made_is_the_users_to_mend(tmp_path: Path) -> No
     (tmp_path / "file").write_text("no folder")
     with RunLock(tmp_path / "file" / "run") as lock, pytest.raises(InputError, match="cannot be written"):
         lock.take()
+
+
+def test_a_run_holds_its_folder_while_it_trains_and_gives_it_back(make_config, reporter) -> None:
+    refused = []
+
+    def try_to_train_too(step: int, figures: object) -> None:
+        del figures
+        with pytest.raises(InputError, match=rf"by process {os.getpid()}"):
+            train(make_config(training__steps=2), other)
+        refused.append(step)
+
+    other, reporter.stepped = type(reporter)(), try_to_train_too
+    train(make_config(training__steps=2), reporter)
+    assert refused == [1, 2]
+    assert other.notes == [], "refused before anything was loaded"
+    train(make_config(training__steps=2), other)
+
+
+def test_a_check_needs_no_lock(make_config, reporter) -> None:
+    config = make_config(training__steps=2)
+    with RunLock(Path(config.run_dir)) as lock:
+        lock.take()
+        train(config, reporter, check_only=True)
+    assert "Everything is in place" in reporter.notes[-1]

@@ -24,12 +24,14 @@ from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import add_adapter, save_trained, trainable_report
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, write_checkpoint
+from vjepa2_ac.training.embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer
 from vjepa2_ac.training.processes import from_first, of_all
-from vjepa2_ac.training.resume import micro_batches_of, say_what_is_new, take_up
+from vjepa2_ac.training.resume import micro_batches_of, say_what_is_new, take_up, take_up_loss_scale
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 from vjepa2_ac.training.stride import choose_stride, require_learned, with_stride
+from vjepa2_ac.training.torch_file import write_torch
 from vjepa2_ac.training.trackers import require_installed
 
 LONGEST_WAIT = timedelta(hours=2)  # of a process for the others: one may look through a data set for the first time
@@ -81,6 +83,7 @@ def assemble(
         require_learned(config.model)
     with accelerator.local_main_process_first():  # the others find the index of the first one on this machine
         dataset = open_dataset(config.data, progress=looked_through)
+    check_heads(config, dataset)
     world_model, calibration = None, None
     if config.data.stride == "auto":
         world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
@@ -89,6 +92,7 @@ def assemble(
     first_clip = _read_one_clip_of_each_split(dataset)
     world_model = world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, first_clip)
+    fit_to_data(world_model, config, dataset, note)
     add_adapter(world_model, config.adapter, seed=config.seed)
     note(str(trainable_report(world_model)))
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
@@ -96,8 +100,7 @@ def assemble(
     optimizer = make_optimizer(world_model, config.training)
     scaler = torch.amp.GradScaler(accelerator.device.type, enabled=config.training.precision == "fp16")
     state = take_up(config, accelerator, world_model, optimizer, note)
-    if state.loss_scale is not None and scaler.is_enabled():
-        scaler.load_state_dict(dict(state.loss_scale))
+    take_up_loss_scale(scaler, state)
     dataset.broken.recall(state.broken)
     say_what_is_new(dataset, state, note)
     micro_batches = micro_batches_of(config, state, accelerator.num_processes, note)
@@ -159,7 +162,8 @@ def save_checkpoint(run: Run, folder: Path) -> None:
 
     def write(inner: Path) -> None:
         save_trained(run.world_model, inner / ADAPTER)
-        torch.save(run.optimizer.state_dict(), inner / OPTIMIZER)
+        with (inner / OPTIMIZER).open("wb") as file:
+            write_torch(run.optimizer.state_dict(), file)
 
     broken = {
         name: why for reasons in of_all(run.accelerator, run.dataset.broken.reasons) for name, why in reasons.items()

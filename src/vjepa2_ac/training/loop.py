@@ -26,6 +26,7 @@ from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, pred
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, make_accelerator, save_checkpoint
 from vjepa2_ac.training.checkpoint import CheckpointClock
+from vjepa2_ac.training.embodiment import NOT_ASKED
 from vjepa2_ac.training.health import Throughput, TimedBatches
 from vjepa2_ac.training.journal import Journal
 from vjepa2_ac.training.mirror import Mirror, NoMirror
@@ -34,6 +35,7 @@ from vjepa2_ac.training.processes import from_first, largest, require_same
 from vjepa2_ac.training.quiet import QuietJournal, QuietReporter
 from vjepa2_ac.training.remote_start import Remote, open_remote
 from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open_run_folder
+from vjepa2_ac.training.run_lock import RunLock
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.stride import CALIBRATION, with_settled_stride
 from vjepa2_ac.training.trackers import open_trackers
@@ -86,9 +88,12 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
     require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
     remote = None
     with contextlib.ExitStack() as until_the_end:
+        lock = until_the_end.enter_context(RunLock(Path(config.run_dir)))
         if accelerator.is_main_process:  # the only one that needs to see the run's folder
             config = with_settled_stride(config)
             check_run_folder(config, allow_config_change=allow_config_change)
+            if not check_only and Path(config.run_dir).is_dir():  # a new one is made, and locked, when all else is well
+                lock.take()
             # What is checked only is fetched to where it does not last.
             into = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run") if check_only else None
             remote = open_remote(config, reporter.note, allow_config_change=allow_config_change, into=into)
@@ -99,17 +104,19 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
         until_the_end.enter_context(_out_of_memory_explained())
         run = assemble(config, reporter.note, reporter.looked_through, accelerator)
         try:
-            return _train(run, remote, reporter, check_only=check_only, allow_config_change=allow_config_change)
+            return _train(run, lock, remote, reporter, check_only=check_only, allow_config_change=allow_config_change)
         except StoppedError:
             accelerator.end_training()
             raise
 
 
-def _train(run: Run, remote: Remote | None, reporter: Reporter, *, check_only: bool, allow_config_change: bool) -> Path:
+def _train(
+    run: Run, lock: RunLock, remote: Remote | None, reporter: Reporter, *, check_only: bool, allow_config_change: bool
+) -> Path:
     config, folder, writes = run.config, Path(run.config.run_dir), run.accelerator.is_main_process
     first = _validate(run, reporter) if run.state.step == 0 else None
     if first is not None:
-        _refuse_weak_base(config, first)
+        _refuse_weak_base(run, first, reporter)
     if allow_config_change and writes:
         for line in config_changes(config):
             reporter.note(f"The config changes: {line}")
@@ -118,6 +125,7 @@ def _train(run: Run, remote: Remote | None, reporter: Reporter, *, check_only: b
         reporter.note("Everything is in place: data, model, validation and gradients were tried; nothing was written.")
         return folder
     if writes:
+        lock.take()
         open_run_folder(config, run.state.run_id, allow_config_change=allow_config_change)
     if run.calibration is not None and writes:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
@@ -232,9 +240,12 @@ def _out_of_memory_explained() -> Iterator[None]:
         ) from error
 
 
-def _refuse_weak_base(config: Config, errors: PredictionErrors) -> None:
-    error = one_step_ratios(errors)["true"].value
+def _refuse_weak_base(run: Run, errors: PredictionErrors, reporter: Reporter) -> None:
+    config, error = run.config, one_step_ratios(errors)["true"].value
     if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:
+        return
+    if run.world_model.fresh_heads is not None:
+        reporter.note(NOT_ASKED)
         return
     raise InputError(
         where="model.base",
