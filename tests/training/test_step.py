@@ -13,7 +13,9 @@ from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.latents import extrinsics_for
-from vjepa2_ac.training.assembly import Run, assemble
+from vjepa2_ac.training.assembly import Run, assemble, save_checkpoint
+from vjepa2_ac.training.checkpoint import newest_checkpoint, read_state
+from vjepa2_ac.training.resume import take_up_loss_scale
 from vjepa2_ac.training.step import Gradients, gradients, training_step
 
 
@@ -93,3 +95,50 @@ def test_camera_poses_go_to_the_model_that_wants_them_only(make_config, reporter
     assert extrinsics_for(run.world_model, posed) is posed.extrinsics
     with pytest.raises(InputError, match=r"use_extrinsics: no pose of the camera in some of these episodes: /data/LAB"):
         extrinsics_for(run.world_model, batch)
+
+
+def with_loss_scale(run: Run, scale: float) -> Run:
+    """Let a run scale its losses, as it does in fp16; a CPU can do that in fp32, too."""
+    run.scaler = torch.amp.GradScaler("cpu", init_scale=scale, growth_interval=2)
+    return run
+
+
+def test_scaling_losses_by_a_power_of_two_changes_nothing(make_config, reporter) -> None:
+    plain, scaled = prepared(make_config, reporter, 2, 2), prepared(make_config, reporter, 2, 2)
+    with_loss_scale(scaled, 1024.0)
+    for run in (plain, scaled):
+        batches = training_loader(run.dataset, seed=0, batch_size=2)
+        rows = [training_step(run, batches, step) for step in (1, 2, 3)]
+    assert [row["loss_scale"] for row in [rows[-1]]] == [2048.0], "it has grown after two good steps"
+    weights = zip(plain.world_model.parameters(), scaled.world_model.parameters(), strict=True)
+    assert all(torch.equal(one, other) for one, other in weights)
+
+
+def test_an_overflow_skips_the_step_and_halves_the_loss_scale(make_config, reporter) -> None:
+    run = with_loss_scale(prepared(make_config, reporter, 2, 2), 2.0**127)
+    batches = training_loader(run.dataset, seed=0, batch_size=2)
+    before = [parameter.detach().clone() for parameter in run.world_model.parameters()]
+    row = training_step(run, batches, 1)
+    assert math.isfinite(row["loss"])
+    assert not math.isfinite(row["grad_norm"])
+    assert row["loss_scale"] == 2.0**126
+    assert all(torch.equal(old, new) for old, new in zip(before, run.world_model.parameters(), strict=True))
+
+
+def test_gradients_that_overflow_whatever_the_loss_scale_stop_the_run(make_config, reporter) -> None:
+    run = with_loss_scale(prepared(make_config, reporter, 2, 1), 0.5)
+    parameter = next(p for p in run.world_model.parameters() if p.requires_grad)
+    parameter.register_hook(lambda gradient: gradient * math.inf)
+    with pytest.raises(InputError, match=r"not finite.*training\.precision to bf16 or fp32"):
+        training_step(run, training_loader(run.dataset, seed=0, batch_size=2), 1)
+
+
+def test_the_loss_scale_goes_on_where_it_stood(make_config, reporter, tmp_path) -> None:
+    config = make_config(training__max_grad_norm=None)
+    run = with_loss_scale(assemble(config, reporter.note), 64.0)
+    training_step(run, training_loader(run.dataset, seed=0, batch_size=2), 1)
+    save_checkpoint(run, tmp_path / "run")
+    state = read_state(newest_checkpoint(tmp_path / "run/checkpoints"))
+    other = with_loss_scale(assemble(config, reporter.note), 1.0)
+    take_up_loss_scale(other.scaler, state)
+    assert other.scaler.state_dict() == run.scaler.state_dict()

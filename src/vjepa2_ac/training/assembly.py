@@ -23,7 +23,7 @@ from vjepa2_ac.latents import encode_batch, extrinsics_for
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import add_adapter, save_trained, trainable_report
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, write_checkpoint
+from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, write_checkpoint
 from vjepa2_ac.training.embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer
@@ -93,7 +93,7 @@ def assemble(
     world_model = world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, first_clip)
     fit_to_data(world_model, config, dataset, note)
-    add_adapter(world_model, config.adapter, seed=config.seed)
+    add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
     note(str(trainable_report(world_model)))
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
     world_model.to(accelerator.device)
@@ -178,6 +178,14 @@ def save_checkpoint(run: Run, folder: Path) -> None:
     )
     if run.accelerator.is_main_process:
         write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
+
+
+def _started(config: Config) -> Path | None:
+    """Return the adapter that the run goes on with, where that saves minutes: where PiSSA starts is not computed again."""
+    if config.adapter.init != "pissa":
+        return None
+    checkpoint = newest_checkpoint(Path(config.run_dir) / CHECKPOINTS)
+    return checkpoint / ADAPTER if checkpoint else None
 
 
 def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:

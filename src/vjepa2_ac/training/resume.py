@@ -75,6 +75,12 @@ def micro_batches_of(config: Config, state: RunState, processes: int, note: Call
     return micro_batches
 
 
+def take_up_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
+    """Let losses be scaled as they were when the checkpoint was written."""
+    if state.loss_scale is not None and scaler.is_enabled():
+        scaler.load_state_dict(dict(state.loss_scale))
+
+
 def say_what_is_new(dataset: Dataset, state: RunState, note: Callable[[str], None]) -> None:
     """Note where the data is not what it was when the checkpoint was written."""
     windows = len(dataset.windows("train"))

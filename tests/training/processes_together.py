@@ -1,0 +1,79 @@
+"""What test_processes.py starts twice: one process of a pair, which checks what both make together."""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+
+from vjepa2_ac.config_file import load_config
+from vjepa2_ac.data.loader import training_loader
+from vjepa2_ac.episode import Batch
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.training.assembly import Run, assemble, make_accelerator
+from vjepa2_ac.training.processes import from_first, largest, of_all, require_same, sums
+from vjepa2_ac.training.step import gradients
+
+
+def some_clips(batch: Batch, chosen: list[int]) -> Batch:
+    """Return a batch with some of its clips; the others could not be read."""
+    return replace(
+        batch,
+        frames=batch.frames[chosen],
+        states=batch.states[chosen],
+        actions=batch.actions[chosen],
+        episode_ids=tuple(batch.episode_ids[place] for place in chosen),
+        starts=tuple(batch.starts[place] for place in chosen),
+    )
+
+
+def batches(run: Run, read: list[list[int]]) -> Iterator[Batch]:
+    whole = training_loader(run.dataset, seed=0, batch_size=2)
+    return iter([some_clips(next(whole), chosen) for chosen in read])
+
+
+def gradient_of(run: Run, read: list[list[int]]) -> tuple[object, list[torch.Tensor]]:
+    run.optimizer.zero_grad(set_to_none=True)
+    taken = gradients(run, batches(run, read))
+    return taken, [p.grad for p in run.world_model.parameters() if p.grad is not None]
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    config = load_config(sys.argv[1])
+    accelerator = make_accelerator(config)
+    rank = accelerator.process_index
+    assert accelerator.num_processes == 2
+    assert sums(accelerator, [1.5, rank]) == [3.0, 1.0]
+    assert largest(accelerator, [rank * 15, 1 - rank]) == [15, 1]
+    assert from_first(accelerator, {"rank": rank}) == {"rank": 0}
+    assert of_all(accelerator, f"rank {rank}") == ["rank 0", "rank 1"]
+    require_same(accelerator, "one", what="it", fix="none")
+    with pytest.raises(InputError, match="in process 1 than in process 0"):
+        require_same(accelerator, rank, what="it", fix="none")
+
+    run = assemble(config, lambda _: None, accelerator=accelerator)
+    first = run.world_model.predictor.state_dict()
+    assert all(all(torch.equal(one, other) for one in of_all(accelerator, other)) for other in first.values())
+    # The second process cannot read its last micro-batch: the mean is over the five clips that came.
+    taken, together = gradient_of(run, [[0, 1], [0]] if rank == 0 else [[0, 1], []])
+    assert taken.clips == 5
+    together = [gradient.clone() for gradient in together]
+    # Both read what the pair read: each clip counts twice, in the sum and in the number.
+    taken_alone, alone = gradient_of(run, [[0, 1], [0]])
+    taken_other, other = gradient_of(run, [[0, 1], []])
+    for pair, mine, theirs in zip(together, alone, other, strict=True):
+        torch.testing.assert_close(pair, (mine * 3 + theirs * 2) / 5, rtol=1e-4, atol=1e-7)
+    expected = (taken_alone.forced_loss * 3 + taken_other.forced_loss * 2) / 5
+    assert abs(taken.forced_loss - expected) < 1e-6
+    nothing, none = gradient_of(run, [[], []])
+    assert nothing.clips == 0
+    assert none == []
+    one_has_none, _ = gradient_of(run, [[0, 1], [0, 1]] if rank == 0 else [[], []])
+    assert one_has_none.clips == 4
+    accelerator.end_training()
+
+
+if __name__ == "__main__":
+    main()
