@@ -318,3 +318,10 @@ def test_a_checkpoint_of_another_base_is_refused_though_its_path_is_the_same(
     WorldModel.random(WorldModel.from_pretrained(base_folder).sizes, seed=4).save_pretrained(base)
     with pytest.raises(InputError, match="an adapter trained on another predictor"):
         train(config, reporter)
+
+
+def test_a_run_of_pissa_goes_on_without_computing_where_it_started(make_config, reporter, monkeypatch) -> None:
+    config = make_config(training__steps=1, adapter__init="pissa")
+    train(config, reporter)
+    monkeypatch.setattr(torch.linalg, "svd", lambda *_, **__: pytest.fail("minutes, at the real size"))
+    assert assemble(config, reporter.note).state.step == 1

@@ -181,7 +181,7 @@ def save_checkpoint(run: Run, folder: Path) -> None:
 
 
 def _started(config: Config) -> Path | None:
-    """Return the adapter that the run goes on with, where that saves minutes: where PiSSA starts is not computed again."""
+    """Return the adapter that the run goes on with, where knowing it saves minutes: PiSSA starts where that one did."""
     if config.adapter.init != "pissa":
         return None
     checkpoint = newest_checkpoint(Path(config.run_dir) / CHECKPOINTS)
