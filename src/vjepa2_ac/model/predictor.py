@@ -130,20 +130,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             ValueError: The tokens do not belong to the image size, or extrinsics are missing or unasked for.
         """
         tokens, layout = self._assemble(latents, actions, states, extrinsics, cache)
-        tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
-        how = (tables, layout.tokens_per_step, self.attention)
-        kept_tokens = 0 if cache is None else layout.tokens_per_step * _kept_steps(layout.steps, keep)
-        added: list[Tensor] = []
-        for index, block in enumerate(self.blocks):
-            past = () if cache is None else cache.layer(index)
-            if self.gradient_checkpointing and torch.is_grad_enabled():
-                tokens, kept = checkpoint(block, tokens, *how, kept_tokens, *past, use_reentrant=False)
-            else:
-                tokens, kept = block(tokens, *how, kept_tokens, *past)
-            if kept is not None:
-                added.append(kept)
-        if cache is not None and added:
-            cache.append(added)
+        tokens = self._through_blocks(tokens, layout, cache, keep)
         patches = rearrange(tokens, "batch (time token) width -> batch time token width", time=layout.steps)[
             :, :, layout.conditioning :
         ]
@@ -195,6 +182,27 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         start = 0 if cache is None else cache.tokens // tokens.shape[2]
         return tokens.flatten(1, 2), TokenLayout(latents.shape[1], self.grid, len(conditions), start)
 
+    def _through_blocks(
+        self, tokens: Tensor, layout: TokenLayout, cache: KeyValueCache | None, keep: int | None
+    ) -> Tensor:
+        """Return the tokens after all blocks, which see the cache; what they leave for later steps goes into it."""
+        tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
+        how = (tables, layout.tokens_per_step, self.attention)
+        steps = layout.steps if keep is None else min(keep, layout.steps)
+        kept_tokens = 0 if cache is None else steps * layout.tokens_per_step
+        added: list[Tensor] = []
+        for index, block in enumerate(self.blocks):
+            past = () if cache is None else cache.layer(index)
+            if self.gradient_checkpointing and torch.is_grad_enabled():
+                tokens, kept = checkpoint(block, tokens, *how, kept_tokens, *past, use_reentrant=False)
+            else:
+                tokens, kept = block(tokens, *how, kept_tokens, *past)
+            if kept is not None:
+                added.append(kept)
+        if cache is not None and added:
+            cache.append(added)
+        return tokens
+
     def _init_weights(self, module: nn.Module) -> None:
         """Initialise one module: what transformers calls for weights that a checkpoint lacks."""
         initialise(module)
@@ -203,10 +211,6 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
     def is_gradient_checkpointing(self) -> bool:
         """Whether blocks are computed again in the backward pass; PEFT asks, and transformers' own answer warns."""
         return self.gradient_checkpointing
-
-
-def _kept_steps(steps: int, keep: int | None) -> int:
-    return steps if keep is None else min(keep, steps)
 
 
 def _in_own_type(layer: Any, values: Tensor) -> Tensor:
