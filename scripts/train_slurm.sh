@@ -1,0 +1,36 @@
+#!/usr/bin/env bash
+# A run on Slurm, one process for each GPU, on one node or many. Before its time is up, or when the job is preempted, the
+# run writes a checkpoint and ends with status 75; the job then queues again and goes on where it stood.
+#
+#     sbatch scripts/train_slurm.sh configs/default.yaml run_dir=/shared/runs/droid
+#
+# run_dir must be seen by the first node; checkpoint.remote makes any other machine able to go on.
+#SBATCH --job-name=vjepa2-ac
+#SBATCH --nodes=1
+#SBATCH --ntasks-per-node=1
+#SBATCH --gpus-per-node=1
+#SBATCH --cpus-per-task=12
+#SBATCH --time=24:00:00
+#SBATCH --requeue
+#SBATCH --open-mode=append
+#SBATCH --signal=USR1@300
+# ntasks-per-node and gpus-per-node: the same number. --signal: to every process, 300 seconds before the end.
+set -euo pipefail
+
+readonly STOPPED=75 # the run was asked to stop, and can go on
+
+MASTER_ADDR="$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)"
+MASTER_PORT="$((20000 + SLURM_JOB_ID % 20000))"
+WORLD_SIZE="$SLURM_NTASKS"
+export MASTER_ADDR MASTER_PORT WORLD_SIZE
+
+# A process learns its place from srun. When one fails the others are ended, too: they would wait for it.
+status=0
+srun --kill-on-bad-exit=1 bash -c 'RANK="$SLURM_PROCID" LOCAL_RANK="$SLURM_LOCALID" exec vjepa2-ac train "$@"' train "$@" ||
+  status=$?
+
+if [[ $status -eq $STOPPED ]]; then
+  scontrol requeue "$SLURM_JOB_ID"
+  exit 0
+fi
+exit "$status"

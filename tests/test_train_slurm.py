@@ -1,0 +1,55 @@
+"""The script for Slurm gives every process its place, and queues the job again when the run can go on."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from paths import ROOT
+
+SCRIPT = ROOT / "scripts" / "train_slurm.sh"
+SRUN = """#!/bin/bash
+shift  # --kill-on-bad-exit=1
+worst=0
+for place in 0 1; do
+  SLURM_PROCID=$place SLURM_LOCALID=0 "$@" || worst=$?
+done
+exit $worst
+"""
+SCONTROL = """#!/bin/bash
+echo "scontrol $*" >>calls
+if [[ $1 == show ]]; then printf 'node7\\nnode8\\n'; fi
+"""
+RUN = """#!/bin/bash
+echo "$RANK of $WORLD_SIZE, GPU $LOCAL_RANK, $MASTER_ADDR:$MASTER_PORT: $*" >>calls
+exit $RUN_ENDS_WITH
+"""
+
+
+def submit(folder: Path, run_ends_with: int) -> tuple[int, list[str]]:
+    """Run the script as a job of two tasks, where Slurm and the run only note how they were called."""
+    for name, text in {"srun": SRUN, "scontrol": SCONTROL, "vjepa2-ac": RUN}.items():
+        (folder / name).write_text(text)
+        (folder / name).chmod(0o755)
+    job = {"SLURM_JOB_ID": "123456", "SLURM_NTASKS": "2", "SLURM_JOB_NODELIST": "node[7-8]"}
+    environment = {"PATH": f"{folder}:{os.environ['PATH']}", "RUN_ENDS_WITH": str(run_ends_with), **job}
+    done = subprocess.run(["bash", str(SCRIPT), "my.yaml", "seed=1"], env=environment, cwd=folder, check=False)
+    return done.returncode, (folder / "calls").read_text().splitlines()
+
+
+def test_every_process_learns_its_place(tmp_path: Path) -> None:
+    status, calls = submit(tmp_path, run_ends_with=0)
+    assert status == 0
+    assert calls == [
+        "scontrol show hostnames node[7-8]",
+        "0 of 2, GPU 0, node7:23456: train my.yaml seed=1",
+        "1 of 2, GPU 0, node7:23456: train my.yaml seed=1",
+    ]
+
+
+@pytest.mark.parametrize(("ends_with", "status", "again"), [(75, 0, True), (2, 2, False), (137, 137, False)])
+def test_a_run_that_can_go_on_is_queued_again_and_no_other(tmp_path, ends_with: int, status: int, again: bool) -> None:
+    found, calls = submit(tmp_path, ends_with)
+    assert found == status
+    assert (calls[-1] == "scontrol requeue 123456") == again
