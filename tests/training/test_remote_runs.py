@@ -43,8 +43,15 @@ def _signals_are_not_ignored():
 
 
 @pytest.fixture
-def whole(make_config: MakeConfig, reporter, tmp_path: Path) -> Path:
-    return train(make_config(run_dir=str(tmp_path / "whole")), type(reporter)())
+def whole(make_config: MakeConfig, reporter, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run that nobody stopped: the same one for all tests."""
+    if not _whole:
+        folder = tmp_path_factory.mktemp("whole") / "run"
+        _whole.append(train(make_config(run_dir=str(folder)), type(reporter)()))
+    return _whole[0]
+
+
+_whole: list[Path] = []
 
 
 def mirrored(make_config: MakeConfig, tmp_path: Path, machine: str, **changes: object) -> Config:
