@@ -16,7 +16,7 @@ from types import TracebackType
 
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.remote import quietly
+from vjepa2_ac.remote import RefusedError, UnreachableError, quietly
 from vjepa2_ac.training.remote_checkpoints import RemoteCheckpoints
 from vjepa2_ac.training.remote_update import ForeignRunError, RemoteUpdate
 from vjepa2_ac.training.run_folder import CHECKPOINTS
@@ -137,7 +137,7 @@ class Mirror:
             say = logger.info if self._outage_said else logger.warning
             say(
                 "checkpoint.remote is not up to date: %s. Training goes on; tried again in %g minutes, and in the end",
-                str(error).rstrip("."), self._every_minutes,
+                reason_of(error), self._every_minutes,
             )  # fmt: skip
             self._outage_said = True
         except Exception:  # whatever it is, the run is worth more
@@ -149,6 +149,13 @@ class Mirror:
         """Break off where the run has ended, or is about to and has a newer checkpoint."""
         if self._stop.is_set() or (self._hurry.is_set() and self._update.newest_here() != self._aim):
             raise _BrokenOffError
+
+
+def reason_of(error: Exception) -> str:
+    """Return why a place is not up to date; the way out only where it does not pass by itself."""
+    if isinstance(error, UnreachableError) and not isinstance(error, RefusedError):
+        return f"{error.where}: {error.found}"
+    return str(error).rstrip(".")
 
 
 class NoMirror:

@@ -17,7 +17,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import RefusedError, UnreachableError, quietly
 from vjepa2_ac.storage import is_url, place, try_writing
 from vjepa2_ac.training.checkpoint import STATE, checkpoint_name, newest_checkpoint
-from vjepa2_ac.training.mirror import Mirror
+from vjepa2_ac.training.mirror import Mirror, reason_of
 from vjepa2_ac.training.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.training.remote_fetch import fetch_newest
 from vjepa2_ac.training.run_folder import CHECKPOINTS
@@ -68,7 +68,7 @@ def open_remote(
             listing = _look(checkpoints, run_id)
     except UnreachableError as error:
         stand = "without a checkpoint" if step is None else f"after step {step}"
-        _warn(f"{error} Training begins with what is on this machine, {stand}, and tries again later")
+        _warn(f"{reason_of(error)}. Training begins with what is on this machine, {stand}, and tries again later")
         return replace(remote, is_reachable=False)
     minutes = config.checkpoint.remote_every_minutes
     note(f"{remote.place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
@@ -81,7 +81,7 @@ def open_remote(
     except UnreachableError as error:
         if step is None:
             raise
-        _warn(f"{error} Training goes on after step {step}, though {further[0]} is there")
+        _warn(f"{reason_of(error)}. Training goes on after step {step}, though {further[0]} is there")
         return remote
     if damaged == further:
         _refuse_all_damaged(remote.place, damaged, step)
