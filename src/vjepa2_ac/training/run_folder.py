@@ -8,6 +8,7 @@ RUN/metrics.jsonl       figures, a row per line
 RUN/checkpoints/        step-XXXXXXXX folders
 RUN/tensorboard/        event files; RUN/wandb/ likewise
 RUN/not_finite/         clips of a step that could not be done
+RUN/.mirror/            links to what is being sent to checkpoint.remote, while it is
 RUN/.lock               held by the process that is training, see `training.run_lock`
 """
 
