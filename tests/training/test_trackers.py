@@ -3,6 +3,7 @@
 import logging
 import sys
 import threading
+import time
 import types
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -100,12 +101,13 @@ def test_one_that_fails_later_costs_one_warning(caplog, fails_in: str) -> None:
 
 
 def test_one_that_hangs_is_left_behind(caplog) -> None:
-    never = threading.Event()
+    never, started = threading.Event(), time.monotonic()
     slow = Kept()
     slow.close = never.wait  # type: ignore[method-assign, assignment]
     trackers = Trackers({"stuck": lambda: never.wait(), "slow": lambda: slow}, opening_s=0.05, closing_s=0.05)  # type: ignore[dict-item, return-value]
     trackers.log("train", 1, {"loss": 0.5})
     trackers.close()
+    assert time.monotonic() - started < 4.0
     never.set()
     assert len(slow.rows) == 1
     assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["stuck cannot be opened", "slow did not close"]
