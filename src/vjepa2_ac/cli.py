@@ -195,6 +195,8 @@ def _export(options: argparse.Namespace) -> None:
     written = export_run(options.run, options.folder, options.to, options.checkpoint)
     what = {"merged": "merged model", "official": "official checkpoint", "hub": "adapter with its model card"}
     console.print(f"The {what[options.to]} of checkpoint {written.checkpoint} is in {written.path}")
+    if options.to == "hub":
+        console.print("The card names base and data by their paths on this machine: read it before you upload it.")
 
 
 def _add_config(commands: _Commands[argparse.ArgumentParser]) -> None:

@@ -151,6 +151,18 @@ def test_the_card_tells_base_data_and_training(trained, base_folder: Path, data_
     assert f"{sum(value.numel() for name, value in weights.items() if '.lora_' in name):,} parameters" in card
 
 
+def test_the_card_tells_what_is_unusual_about_an_adapter(trained, tmp_path: Path) -> None:
+    heads = {"adapter__modules_to_save": ["action_encoder"]}
+    loss = {"training__loss": "l2", "training__rollout_weight": 2}
+    export_run(trained(adapter__init="pissa", adapter__dora=True, **heads, **loss), tmp_path / "hub", "hub")
+    card = (tmp_path / "hub" / CARD).read_text()
+    assert "rsLoRA, DoRA, started as pissa, `action_encoder` trained whole" in card
+    assert "loss: l2, teacher forcing + 2 x rollout of 2 steps" in card
+    assert "warm-up: 1 step\n" in card
+    assert "PEFT alone cannot use it" in card, "it would cut another part out of the base"
+    assert "from peft" not in card
+
+
 def test_the_code_of_the_card_runs(trained, tmp_path: Path) -> None:
     run = trained()
     export_run(run, tmp_path / "hub", "hub")

@@ -75,7 +75,7 @@ def _base(config: Config, facts: AdapterFacts) -> str:
 def _states(config: Config, facts: AdapterFacts) -> dict[str, str]:
     data = config.data
     if data.states == "pose":
-        return {"poses": f"in the frame of the {data.pose_frame}"}
+        return {"poses": f"in the frame of the {'robot base' if data.pose_frame == 'base' else data.pose_frame}"}
     joined = f", joined by {data.join_actions}" if data.join_actions else ""
     lines = {"states": "the robot's own numbers", "actions": f"{data.actions}{joined}"}
     if facts.fresh_heads is not None:
@@ -107,17 +107,35 @@ def _training(config: Config, facts: AdapterFacts) -> str:
             "steps": f"{facts.steps:,} of {training.steps:,} planned",
             "clips per step": f"batch {training.batch_size} x accumulation {training.accumulation} on each device",
             "learning rate": f"{training.learning_rate:g}, {training.schedule}",
-            "warm-up": f"{training.warmup_steps:,} steps",
-            "loss": f"teacher forcing + rollout of {training.rollout_steps} steps",
-            "weight decay": f"{training.weight_decay:g}",
+            "warm-up": _count(training.warmup_steps, "step"),
+            "loss": _loss(config),
+            "optimizer": f"{training.optimizer}, weight decay {training.weight_decay:g}",
             "precision": training.precision,
             "seed": f"{config.seed}",
-            "adapter": f"rank {adapter.rank}, alpha {adapter.alpha:g}, dropout {adapter.dropout:g}, "
-            + ("rsLoRA" if adapter.rslora else "plain scale"),
+            "adapter": _adapter(config),
             "layers": ", ".join(f"`{target}`" for target in adapter.targets),
-            "trained parameters": facts.trained,
+            "size": facts.trained,
         },
     )
+
+
+def _loss(config: Config) -> str:
+    training = config.training
+    parts = {"teacher forcing": training.teacher_forcing_weight}
+    parts[f"rollout of {_count(training.rollout_steps, 'step')}"] = training.rollout_weight
+    words = [name if weight == 1 else f"{weight:g} x {name}" for name, weight in parts.items() if weight]
+    return f"{training.loss}, {' + '.join(words)}"
+
+
+def _adapter(config: Config) -> str:
+    adapter = config.adapter
+    words = [f"rank {adapter.rank}", f"alpha {adapter.alpha:g}", f"dropout {adapter.dropout:g}"]
+    words.append("rsLoRA" if adapter.rslora else "plain scale")
+    words += ["DoRA"] * adapter.dora
+    words += [f"started as {adapter.init}"] * (adapter.init != "default")
+    words += ["other ranks or alphas for some layers"] * bool(adapter.rank_pattern or adapter.alpha_pattern)
+    words += [f"`{name}` trained whole" for name in adapter.modules_to_save]
+    return ", ".join(words)
 
 
 def _results(facts: AdapterFacts) -> str:
@@ -128,8 +146,9 @@ def _results(facts: AdapterFacts) -> str:
     lines = ["## Results", "", measured["verdict"], ""]
     if measured["checkpoint"] != facts.checkpoint:
         lines += [f"**Measured on another checkpoint**: `{measured['checkpoint']}`, not `{facts.checkpoint}`.", ""]
+    clips, episodes = _count(measured["clips"], "clip"), _count(measured["episodes"], "episode")
     about = (
-        f"Split {measured['split']}: {measured['clips']} clips of {measured['episodes']} episodes. Error of the rollout"
+        f"Split {measured['split']}: {clips} of {episodes}. Error of the rollout"
         " over that of copying the first frame (1: as good as doing nothing), with a 95 % interval over episodes:"
     )
     lines += [about, "", *_table(measured)]
@@ -166,7 +185,16 @@ model = load_base(ModelConfig.model_validate({base!r}), seed=0)
 load_trained(model, "FOLDER")  # the folder of this card
 ```
 
-With PEFT alone, on the predictor of that base{_with_heads(fresh_heads)}:
+{_use_with_peft(config, base, fresh_heads)}"""
+
+
+def _use_with_peft(config: Config, base: Mapping[str, Any], fresh_heads: Widths | None) -> str:
+    if config.adapter.init == "pissa":
+        return (
+            "PEFT alone cannot use it: an adapter that started as PiSSA belongs to a base from which `pissa_start` was"
+            " taken off, which `load_trained` does."
+        )
+    return f"""With PEFT's own loading and the imports above, on the predictor of that base{_with_heads(fresh_heads)}:
 
 ```python
 from peft import PeftModel
@@ -182,7 +210,7 @@ def _with_heads(fresh_heads: Widths | None) -> str:
 def _peft_lines(base: Mapping[str, Any], fresh_heads: Widths | None) -> str:
     load = f"load_base(ModelConfig.model_validate({base!r}), seed=0)"
     if fresh_heads is None:
-        return f'predictor = PeftModel.from_pretrained({load}.predictor, "FOLDER")'
+        return f'base = {load}\npredictor = PeftModel.from_pretrained(base.predictor, "FOLDER")'
     state, action = fresh_heads
     return f"""from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.heads import fit_heads
@@ -194,3 +222,7 @@ predictor = PeftModel.from_pretrained(model.predictor, "FOLDER")"""
 
 def _list(title: str, entries: Mapping[str, str]) -> str:
     return f"## {title}\n\n" + "\n".join(f"- {name}: {value}" for name, value in entries.items())
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number:,} {what}{'s' * (number != 1)}"
