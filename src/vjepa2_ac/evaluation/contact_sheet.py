@@ -59,7 +59,7 @@ class ContactSheet:
     moved: Mapping[int, Float[np.ndarray, " pairs"]]  # stride -> per model step
     reference: float | None  # a step that the released weights are known to have seen
     places_m: Float[np.ndarray, "points 3"] | None  # where the flange was
-    shaded_means: str  # what the shaded parts of a strip are
+    shaded_means: str  # what the shaded parts of a strip are; empty: there are none
     ranges: Float[np.ndarray, "state_dim 2"] | None = None  # of vectors: the least and greatest value of each number
 
 
@@ -154,7 +154,7 @@ def _motion(axes: Any, sheet: ContactSheet) -> None:
     if sheet.reference is not None:
         axes.axvline(sheet.reference, color=_GRIPPER, linestyle="--", linewidth=1.2, label="upstream's example pair")
     less = (
-        "that move the flange less far than this (cm)" if is_pose else "that change no number by this (% of its range)"
+        "that move the flange less far than this (cm)" if is_pose else "that change no number by more (% of its range)"
     )
     axes.set_title(f"Share of model steps (%) {less}", loc="left", fontsize=9)
     axes.set(xlim=(0, far), ylim=(0, 102))
@@ -163,9 +163,11 @@ def _motion(axes: Any, sheet: ContactSheet) -> None:
 
 def _legend(page: _Page, sheet: ContactSheet, top: float) -> None:
     speed = "speed (cm/s)" if sheet.places_m is not None else "fastest number (% of its range per second)"
-    entries = [(speed, _SPEED), (sheet.shaded_means, _FAINT)]
+    entries = [(speed, _SPEED)]
     if sheet.places_m is not None:
-        entries.insert(1, ("gripper: 0 open, 1 closed", _GRIPPER))
+        entries.append(("gripper: 0 open, 1 closed", _GRIPPER))
+    if sheet.shaded_means:
+        entries.append((sheet.shaded_means, _FAINT))
     left = _SIDE + _LABEL
     for words, colour in entries:
         page.text(left, top, f"■ {words}", color=colour, size=9)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.inspection import RELEASED_STEP_CM, Inspection, ReadEpisode, idle_runs
 from vjepa2_ac.data.inspection_vectors import largest_change
@@ -56,7 +57,7 @@ def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
         moved=moved if is_pose else {one.stride: one.percent for one in inspection.changes},
         reference=RELEASED_STEP_CM if is_pose else None,
         places_m=places[:: -(-len(places) // _PLACES)] if is_pose else None,
-        shaded_means="standing still" if config.idle.rule == "none" else f"left out by data.idle ({config.idle.rule})",
+        shaded_means=_shaded_means(config),
         ranges=None if is_pose else inspection.ranges,
     )
 
@@ -88,6 +89,12 @@ def _facts(inspection: Inspection) -> tuple[str, ...]:
     shown = "Motion and gripper" if inspection.is_pose else "Motion"
     third = f"{shown}: from {'all' if sampled == len(inspection.lengths) else 'a sample of'} {sampled} episodes."
     return "  ·  ".join(first), "  ·  ".join(second), third
+
+
+def _shaded_means(config: DataConfig) -> str:
+    if config.idle.rule != "none":
+        return f"left out by data.idle ({config.idle.rule})"
+    return "standing still" if config.states == "pose" else ""
 
 
 def _about_states(inspection: Inspection) -> str:
