@@ -410,15 +410,19 @@ def test_another_run_that_came_meanwhile_is_noticed(bucket: Gcs, run: Path, capl
     assert "another run" in caplog.text
 
 
-def test_damaged_checkpoints_there_are_replaced(bucket: Gcs, run: Path) -> None:
+def test_damaged_checkpoints_there_are_replaced_or_removed(bucket: Gcs, run: Path) -> None:
     write(run, 10)
     send(run)
     victim = f"run/checkpoints/{checkpoint_name(10)}/optimizer.pt"
     flipped = bytearray(storage.read_bytes(f"gs://bucket/{victim}"))
     flipped[7] ^= 1
     bucket.put(f"bucket/{victim}", bytes(flipped))
-    send(run, damaged=names(10))
+    further = f"bucket/run/checkpoints/{checkpoint_name(90)}"
+    bucket.put(f"{further}/state.json", b'{"run_id": "mine"}')
+    bucket.put(f"{further}/manifest.json", b"?")
+    send(run, damaged=names(10, 90))
     assert_same_files(run, checkpoint_name(10))
+    assert there() == names(10), "nobody is to try the other one again"
 
 
 @pytest.mark.usefixtures("bucket")
