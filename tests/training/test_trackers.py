@@ -183,7 +183,7 @@ def test_a_tracker_is_asked_to_resume_the_run_by_its_id(tmp_path: Path, monkeypa
 
 
 def test_trackio_goes_on_in_the_same_run(tmp_path: Path) -> None:
-    trackio = pytest.importorskip("trackio", reason="trackio needs another pillow than constraints.txt has")
+    trackio = pytest.importorskip("trackio")
     config = run_config(tmp_path, trackio=True, project="arms")
     for first_step in (0, 1):
         trackers = open_trackers(config, tmp_path, run_id="abc123", first_step=first_step)

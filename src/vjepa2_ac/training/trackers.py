@@ -30,8 +30,7 @@ CLOSING_S = 30.0
 
 _INSTALL = {
     "wandb": 'Run pip install -c constraints.txt -e ".[wandb]"',
-    # constraints.txt has a pillow that trackio (0.43 is the newest that was looked at) does not take.
-    "trackio": 'Run pip install -e ".[trackio]" (without constraints.txt: trackio needs a pillow below 13)',
+    "trackio": 'Run pip install -c constraints.txt -e ".[trackio]"',
 }
 
 
