@@ -20,7 +20,7 @@ from vjepa2_ac.training.kept import Kept
 from vjepa2_ac.training.kept_block import Setting, adapter_casts, block_bytes
 from vjepa2_ac.training.loss import distance_of, prediction_losses
 
-TOLERANCE = 0.02
+TOLERANCE = 0.015
 
 
 class Held:
