@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -12,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from ranks import finish, free_port, start_rank
 from same_run import figures, trained_weights
 from vjepa2_ac.config_file import config_as_yaml
 from vjepa2_ac.data.loader import training_loader
@@ -22,34 +22,6 @@ from vjepa2_ac.training.journal import read_journal
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.preemption import EXIT_STATUS
 from vjepa2_ac.training.resume import micro_batches_of
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-def start_rank(arguments: list[str], rank: int, processes: int, port: int) -> subprocess.Popen:
-    """Start one process of a run, as srun does."""
-    place = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": processes, "LOCAL_WORLD_SIZE": processes}
-    environment = {**os.environ, **{name: str(value) for name, value in place.items()}, "OMP_NUM_THREADS": "1"}
-    environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    return subprocess.Popen(
-        [sys.executable, *arguments],
-        env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-
-
-def finish(processes: list[subprocess.Popen], status: int = 0) -> list[tuple[str, str]]:
-    """Wait for all; return what each wrote. None is left behind."""
-    try:
-        said = [process.communicate(timeout=120) for process in processes]
-    finally:
-        for process in processes:
-            process.kill()
-    assert [process.returncode for process in processes] == [status] * len(processes), said
-    return said
 
 
 @pytest.fixture

@@ -115,8 +115,13 @@ def has_adapter(model: WorldModel) -> bool:
     return model.adaptation is not None
 
 
-def save_trained(model: WorldModel, folder: str | Path) -> None:
+def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tensor] | None = None) -> None:
     """Write what was trained: an adapter in PEFT's own format, or all of the predictor; and which base it belongs to.
+
+    Args:
+        model: The adapted model.
+        folder: Where to.
+        weights: All of the predictor, where the model itself has but a part of each weight.
 
     Raises:
         ValueError: The model has not been adapted.
@@ -126,7 +131,7 @@ def save_trained(model: WorldModel, folder: str | Path) -> None:
         write_trained(folder, adaptation, _lora_weights(model), _card_of_fresh_heads(model))  # and PiSSA's parts
         _lora_config(model).save_pretrained(str(folder))
     else:
-        write_trained(folder, adaptation, model.predictor.state_dict(), _card_of_fresh_heads(model))
+        write_trained(folder, adaptation, weights or model.predictor.state_dict(), _card_of_fresh_heads(model))
 
 
 def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:

@@ -30,6 +30,7 @@ from vjepa2_ac.training.optim import make_optimizer
 from vjepa2_ac.training.processes import from_first, of_all
 from vjepa2_ac.training.resume import micro_batches_of, say_what_is_new, take_up, take_up_loss_scale
 from vjepa2_ac.training.run_folder import CHECKPOINTS
+from vjepa2_ac.training.sharding import check_launch, share_if_asked, whole_moments, whole_weights
 from vjepa2_ac.training.stride import choose_stride, require_learned, with_stride
 from vjepa2_ac.training.torch_file import write_torch
 from vjepa2_ac.training.trackers import require_installed
@@ -100,6 +101,7 @@ def assemble(
     optimizer = make_optimizer(world_model, config.training)
     scaler = torch.amp.GradScaler(accelerator.device.type, enabled=config.training.precision == "fp16")
     state = take_up(config, accelerator, world_model, optimizer, note)
+    optimizer = share_if_asked(world_model, optimizer, config, accelerator, note)
     take_up_loss_scale(scaler, state)
     dataset.broken.recall(state.broken)
     say_what_is_new(dataset, state, note)
@@ -116,8 +118,9 @@ def make_accelerator(config: Config) -> Accelerator:
     Where there are several processes it joins them.
 
     Raises:
-        InputError: CUDA was asked for and there is none, or fp16 without CUDA.
+        InputError: CUDA was asked for and there is none, fp16 without CUDA, or a launch that cannot be followed.
     """
+    check_launch(config)
     training, has_cuda = config.training, torch.cuda.is_available()
     if training.device == "cuda" and not has_cuda:
         raise InputError(
@@ -159,11 +162,13 @@ def encode(run: Run, batch: Batch) -> LatentBatch:
 
 def save_checkpoint(run: Run, folder: Path) -> None:
     """Write where the run stands into its folder (see `training.checkpoint`): all processes call, the first writes."""
+    writes = run.accelerator.is_main_process
+    weights, moments = whole_weights(run.world_model, keep=writes), whole_moments(run.optimizer, keep=writes)
 
     def write(inner: Path) -> None:
-        save_trained(run.world_model, inner / ADAPTER)
+        save_trained(run.world_model, inner / ADAPTER, weights)
         with (inner / OPTIMIZER).open("wb") as file:
-            write_torch(run.optimizer.state_dict(), file)
+            write_torch(moments, file)
 
     broken = {
         name: why for reasons in of_all(run.accelerator, run.dataset.broken.reasons) for name, why in reasons.items()
@@ -176,7 +181,7 @@ def save_checkpoint(run: Run, folder: Path) -> None:
         processes=run.accelerator.num_processes,
         loss_scale=run.scaler.state_dict() if run.scaler.is_enabled() else None,
     )
-    if run.accelerator.is_main_process:
+    if writes:
         write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
 
 

@@ -14,6 +14,7 @@ import torch
 from accelerate import Accelerator
 from accelerate.utils import broadcast_object_list, gather_object
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.errors import InputError
 
@@ -39,11 +40,16 @@ def largest(accelerator: Accelerator, values: Sequence[int | bool]) -> list[int]
 
 
 def add_up_gradients(accelerator: Accelerator, parameters: Iterable[nn.Parameter]) -> None:
-    """Replace the gradient of each parameter by its sum over all processes; no gradient counts as zero."""
+    """Replace the gradient of each parameter by its sum over all processes; no gradient counts as zero.
+
+    The gradient of a shared weight (`training.sharding`) is such a sum already.
+    """
     if accelerator.num_processes == 1:
         return
     under_way = []
     for parameter in parameters:
+        if isinstance(parameter, DTensor):
+            continue
         if parameter.grad is None:
             parameter.grad = torch.zeros_like(parameter)
         under_way.append(torch.distributed.all_reduce(parameter.grad, async_op=True))

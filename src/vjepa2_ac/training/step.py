@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 from torch import nn
+from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
@@ -120,7 +121,8 @@ def _settle(run: Run, factor: float) -> float:
             if parameter.grad is not None:
                 parameter.grad *= factor
     limit = run.config.training.max_grad_norm
-    return float(nn.utils.clip_grad_norm_(trained, math.inf if limit is None else limit))
+    norm = nn.utils.clip_grad_norm_(trained, math.inf if limit is None else limit)
+    return float(norm.full_tensor() if isinstance(norm, DTensor) else norm)
 
 
 def _about_the_data(run: Run, taken: Gradients) -> dict[str, float]:
