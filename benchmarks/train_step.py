@@ -1,177 +1,195 @@
-"""How long does a training step of the predictor take? LoRA, forward and backward, against the plain way to compute it.
+"""How long does a training step take, and what share of the machine does it use? Ours against the official predictor's.
 
-    python benchmarks/train_step.py --frames 8 16 --dtype float32 --layers 24
-    python benchmarks/train_step.py --device cuda --dtype bfloat16 --batch 2 --checkpointing
+    python benchmarks/train_step.py --layers 4 --frames 8 16 --dtype float32 bfloat16 --official ../vjepa2
+    python benchmarks/train_step.py --device cuda --batch 1 2 8 --checkpointing off on --attention flex per_step dense
+    python benchmarks/train_step.py --device cuda --batch 8 --encoder
 
-The baseline is the same step with a dense attention mask and rotary tables computed again in every layer, as upstream
-computes it. The two take turns, so that a busy machine slows both; a ratio over 1 means faster than the baseline. The
-step is the teacher-forced loss over frames - 1 steps. Peak memory is measured in a process of its own for each variant.
+Ours is `training_step` itself on a LoRA of rank 16: loss, gradients, clipping, AdamW; latents are there already, or
+with --encoder are computed from pixels. The baseline is the same step of the official code with plain PEFT LoRA
+(`official.py`), where a checkout of facebookresearch/vjepa2 is at --official; before anything is timed both must give
+the same loss and gradients on the same weights, else there is no ratio to it. Without a checkout the baseline is our
+own step with a dense mask. A ratio over 1 means faster than the baseline.
+
+All take turns, so that a busy machine slows them alike. On a CPU the process's own time over its threads counts, else
+wall time. MFU: the model FLOPs of `training.flops` over what the device does in a product of matrices, measured first.
+Peak memory, weights included, is of two steps in a process of its own for each line.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
+import itertools
 import json
+import math
 import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import torch
-from torch import Tensor
+from official import PREDICTOR
+from timed_steps import OFFICIAL, PRECISIONS, Bench, Setting, has_checkout
 
-from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
-from vjepa2_ac.model import positions
-from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.lora import trainable_report
+from vjepa2_ac.training.health import matmul_speed
 
-BASELINE, OURS = "dense mask, tables per layer", "as in training"
-VARIANTS = (BASELINE, OURS)
+BESIDE = Path(__file__).resolve().parents[2] / "vjepa2"
+QUICK = {
+    "layers": 1, "width": 128, "latent_dim": 128, "encoder_layers": 1, "image_size": 64, "frames": [4], "batch": [1],
+    "repeats": 1, "threads": 1,
+}  # fmt: skip
 
 
-def main() -> None:
-    """Print a table: milliseconds, samples per second, peak memory and the ratio to the baseline."""
-    options = parse()
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print a line for each setting and way: milliseconds, clips a second, MFU, peak memory, ratio to the baseline."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    options = parse(given)
     if options.memory_of:
-        print(json.dumps(measure_memory(options)))
+        print(json.dumps(peak_memory_gb(Bench(options, options.dtype[0]), options)))
         return
-    print(f"torch {torch.__version__}, {device_name(options.device)}, {torch.get_num_threads()} threads")
-    print(
-        f"{options.layers} layers of width {options.width}, {options.image_size} px, batch {options.batch},"
-        f" {options.dtype}{', gradient checkpointing' if options.checkpointing else ''}, {options.repeats} repeats"
-    )
-    print(f"{'frames':>6}  {'variant':30} {'ms (median)':>11} {'samples/s':>9} {'peak GB':>8} {'ratio':>6}")
-    for frames in options.frames:
-        times = measure_times(options, frames)
-        for variant in VARIANTS:
-            seconds = statistics.median(times[variant])
-            ratio = statistics.median(b / o for b, o in zip(times[BASELINE], times[variant], strict=True))
-            peak = peak_in_own_process(frames, variant) if options.memory else float("nan")
-            speed = options.batch / seconds
-            line = f"{frames:>6}  {variant:30} {seconds * 1e3:11.0f} {speed:9.3f} {peak:8.2f} {ratio:6.2f}"
-            print(line, flush=True)
+    _introduce(options)
+    for dtype in options.dtype:
+        bench = Bench(options, dtype)
+        ways = choose_ways(bench, options)
+        ceiling = matmul_speed(bench.device, bench.dtype)
+        print(f"{dtype}: ceiling {ceiling / 1e12:.3g} TFLOP/s")
+        titles = ("ms", "clips/s", "MFU", "peak GB", f"of {ways[0]}")
+        print(
+            f"{'frames':>6} {'batch':>5} {'checkpointing':>13}  {'way':9}" + "".join(f"{title:>12}" for title in titles)
+        )
+        for setting in settings(options):
+            seconds = take_turns({way: bench.step(setting, way) for way in ways}, options)
+            flops = setting.batch * bench.flops_per_clip(setting)
+            for way in ways:
+                median = statistics.median(seconds[way])
+                ratio = statistics.median(b / o for b, o in zip(seconds[ways[0]], seconds[way], strict=True))
+                peak = in_own_process(given, setting, way, dtype) if options.memory else math.nan
+                print(
+                    f"{setting.frames:6} {setting.batch:5} {'yes' if setting.checkpointing else 'no':>13}  {way:9}"
+                    f"{median * 1e3:12.0f}{setting.batch / median:12.3f}{flops / median / ceiling:12.1%}"
+                    f"{peak:12.2f}{ratio:12.2f}",
+                    flush=True,
+                )
 
 
-def parse() -> argparse.Namespace:
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--layers", type=int, default=24)
-    parser.add_argument("--width", type=int, default=1024)
-    parser.add_argument("--image-size", type=int, default=256)
-    parser.add_argument("--frames", type=int, nargs="+", default=[8, 16])
-    parser.add_argument("--batch", type=int, default=1)
-    parser.add_argument("--dtype", choices=("float32", "bfloat16"), default="float32")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes: whether it works")
+    parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: vjepa2 beside this project)")
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--layers", type=int, help="of the predictor (default: 24; 2 on a CPU)")
+    parser.add_argument("--width", type=int, default=1024, help="of the predictor, 64 a head")
+    parser.add_argument("--latent-dim", type=int, default=1408, help="width of the encoder, 64 a head")
+    parser.add_argument("--image-size", type=int, default=256)
+    parser.add_argument("--encoder", action="store_true", help="compute latents in the step")
+    parser.add_argument("--encoder-layers", type=int, help="with --encoder (default: 40; 1 on a CPU)")
+    parser.add_argument("--frames", type=int, nargs="+", default=[8, 16])
+    parser.add_argument("--batch", type=int, nargs="+", default=[1])
+    parser.add_argument("--rollout-steps", type=int, default=2)
+    parser.add_argument("--dtype", nargs="+", choices=tuple(PRECISIONS), default=["bfloat16"])
+    parser.add_argument("--checkpointing", nargs="+", choices=("off", "on"), default=["off"])
+    parser.add_argument("--attention", nargs="+", default=["auto"], help="auto, per_step, flex, dense: a line each")
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--warm-up", type=int, default=1, help="rounds that do not count")
     parser.add_argument("--threads", type=int, default=0, help="0: as torch chooses")
-    parser.add_argument("--attention", default="auto", help="of our variant: auto, per_step, flex or dense")
-    parser.add_argument("--checkpointing", action="store_true", help="gradient checkpointing, in both variants")
     parser.add_argument("--memory", action=argparse.BooleanOptionalAction, default=True, help="measure peak memory too")
-    parser.add_argument("--memory-of", choices=VARIANTS, help=argparse.SUPPRESS)
-    options = parser.parse_args()
+    parser.add_argument("--memory-of", help=argparse.SUPPRESS)
+    options = parser.parse_args(arguments)
+    if options.quick:
+        vars(options).update(QUICK)
+    on_cpu = options.device == "cpu"
+    options.layers = options.layers or (2 if on_cpu else 24)
+    options.encoder_layers = 1 if not options.encoder else options.encoder_layers or (1 if on_cpu else 40)
     if options.threads:
         torch.set_num_threads(options.threads)
     return options
 
 
-def build(options: argparse.Namespace) -> WorldModel:
-    """Return a model of the released predictor's shape with the default adapter; its encoder is never used."""
-    sizes = ModelSizes(
-        image_size=options.image_size,
-        encoder=EncoderSizes(depth=1),
-        predictor=PredictorSizes(depth=options.layers, width=options.width),
-    )
-    model = WorldModel.random(sizes, seed=0, dtype=getattr(torch, options.dtype))
-    add_adapter(model, AdapterConfig(), seed=0)
-    model.set_gradient_checkpointing(options.checkpointing)
-    return model.to(options.device).train()
+def settings(options: argparse.Namespace) -> list[Setting]:
+    """Return all settings asked for."""
+    asked = itertools.product(options.frames, options.batch, options.checkpointing)
+    return [Setting(frames, batch, again == "on") for frames, batch, again in asked]
 
 
-def inputs(options: argparse.Namespace, model: WorldModel, frames: int) -> tuple[Tensor, Tensor]:
-    """Return latents of `frames` frames, and one less poses that serve as actions and states."""
-    generator = torch.Generator().manual_seed(0)
-    latents = torch.randn(options.batch, frames, model.num_tokens, model.latent_dim, generator=generator)
-    poses = torch.randn(options.batch, frames - 1, 7, generator=generator)
-    return latents.to(options.device), poses.to(options.device)
+def choose_ways(bench: Bench, options: argparse.Namespace) -> list[str]:
+    """Return the ways to compare, the baseline first; the official one only if it computes the same."""
+    print(f"ours: {trainable_report(bench.model)}")
+    if has_checkout(options):
+        count = sum(parameter.numel() for parameter in bench.official.trained)
+        print(f"official with plain PEFT LoRA on fused q, k, v: {count:,} parameters are trained")
+        found = bench.compare()
+        if found is None:
+            print("official: the same loss and gradients on the same weights (float32)")
+            return [OFFICIAL, *options.attention]
+        print(f"official: NO RATIO, for it does not compute the same: {found}")
+    else:
+        print(f"official: skipped, for there is no {options.official / PREDICTOR}")
+    return ["dense", *(way for way in options.attention if way != "dense")]
 
 
-def step(model: WorldModel, latents: Tensor, poses: Tensor, dtype: str) -> None:
-    """Compute the teacher-forced loss and its gradients."""
-    mixed = torch.autocast(latents.device.type, torch.bfloat16, enabled=dtype == "bfloat16")
-    with mixed:
-        loss = (model.predict(latents[:, :-1], poses, poses) - latents[:, 1:]).abs().mean()
-    loss.backward()
-    model.zero_grad(set_to_none=True)
-    if latents.is_cuda:
-        torch.cuda.synchronize()
-
-
-@contextlib.contextmanager
-def computing(model: WorldModel, variant: str, attention: str) -> Iterator[None]:
-    """Make the model compute as the variant says."""
-    model.set_attention("dense" if variant == BASELINE else attention)
-    inner = [block.attn for block in model.base_predictor.blocks]
-    plain = [attn.forward for attn in inner]
-    if variant == BASELINE:
-        for attn in inner:
-            attn.forward = _with_own_tables(attn)
-    try:
-        yield
-    finally:
-        for attn, forward in zip(inner, plain, strict=True):
-            attn.forward = forward
-
-
-def _with_own_tables(attn: Any) -> Callable[..., Tensor]:
-    forward = attn.forward
-    uncached = positions.rotary_tables.__wrapped__
-
-    def again(tokens: Tensor, tables: positions.RotaryTables, tokens_per_step: int, *how: Any) -> Any:
-        conditioning = 2
-        grid = round((tokens_per_step - conditioning) ** 0.5)
-        layout = positions.TokenLayout(tokens.shape[1] // tokens_per_step, grid, conditioning)
-        head_dim = tables.cosine.shape[-1]
-        return forward(tokens, uncached(layout, head_dim, tokens.device), tokens_per_step, *how)
-
-    return again
-
-
-def measure_times(options: argparse.Namespace, frames: int) -> dict[str, list[float]]:
-    """Return the seconds of each repeat of each variant; they take turns, after one round that does not count."""
-    model = build(options)
-    latents, poses = inputs(options, model, frames)
-    times: dict[str, list[float]] = {variant: [] for variant in VARIANTS}
-    for repeat in range(options.repeats + 1):
-        for variant in VARIANTS:
-            with computing(model, variant, options.attention):
-                start = time.perf_counter()
-                step(model, latents, poses, options.dtype)
-                if repeat:
-                    times[variant].append(time.perf_counter() - start)
+def take_turns(steps: dict[str, Callable[[], object]], options: argparse.Namespace) -> dict[str, list[float]]:
+    """Return the seconds of each repeat of each way."""
+    times: dict[str, list[float]] = {way: [] for way in steps}
+    for repeat in range(options.warm_up + options.repeats):
+        for way, step in steps.items():
+            start = _clock_s(options.device)
+            step()
+            if repeat >= options.warm_up:
+                times[way].append(_clock_s(options.device) - start)
     return times
 
 
-def measure_memory(options: argparse.Namespace) -> float:
-    """Return the peak in GB of one step of one variant, weights included."""
-    model = build(options)
-    latents, poses = inputs(options, model, options.frames[0])
-    with computing(model, options.memory_of, options.attention):
-        step(model, latents, poses, options.dtype)
-    if options.device == "cpu":
-        status = Path("/proc/self/status").read_text()
-        return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) * 1024 / 1e9
-    return torch.cuda.max_memory_allocated() / 1e9
+def peak_memory_gb(bench: Bench, options: argparse.Namespace) -> float:
+    """Return the peak in 10^9 bytes of two steps of one way: on CUDA of PyTorch's allocator, else resident."""
+    step = bench.step(settings(options)[0], options.memory_of)
+    if options.memory_of == OFFICIAL:
+        del bench.model
+    elif "official" in vars(bench):
+        del bench.official
+    bench._weights = None
+    if options.device != "cpu":
+        torch.cuda.reset_peak_memory_stats()
+    else:
+        with suppress(OSError):  # where the system has it: what building the model took is forgotten
+            Path("/proc/self/clear_refs").write_text("5")
+    step()
+    step()  # with the optimizer's moments
+    if options.device != "cpu":
+        return torch.cuda.max_memory_allocated() / 1e9
+    status = Path("/proc/self/status").read_text()
+    return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) * 1024 / 1e9
 
 
-def peak_in_own_process(frames: int, variant: str) -> float:
-    """Run one step in a fresh process and return its peak memory in GB."""
-    arguments = [*sys.argv[1:], "--frames", str(frames), "--memory-of", variant]
-    done = subprocess.run([sys.executable, __file__, *arguments], check=True, capture_output=True, text=True)  # noqa: S603
+def in_own_process(given: list[str], setting: Setting, way: str, dtype: str) -> float:
+    """Return the peak memory of one way in a fresh process."""
+    again = "on" if setting.checkpointing else "off"
+    own = [
+        "--frames", str(setting.frames), "--batch", str(setting.batch), "--checkpointing", again, "--dtype", dtype,
+        "--memory-of", way,
+    ]  # fmt: skip
+    command = [sys.executable, __file__, *given, *own]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)  # noqa: S603
     return float(json.loads(done.stdout.splitlines()[-1]))
+
+
+def _introduce(options: argparse.Namespace) -> None:
+    print(f"torch {torch.__version__}, {device_name(options.device)}, {torch.get_num_threads()} threads")
+    latents = f"latents from {options.encoder_layers} layers of encoder" if options.encoder else "latents from a cache"
+    print(
+        f"{options.layers} layers of width {options.width}, {options.image_size} px, {latents},"
+        f" rollout of {options.rollout_steps}, {options.repeats} repeats"
+    )
+
+
+def _clock_s(device: str) -> float:
+    if device == "cpu":
+        return time.process_time() / torch.get_num_threads()
+    torch.cuda.synchronize()
+    return time.perf_counter()
 
 
 def device_name(device: str) -> str:

@@ -1,0 +1,174 @@
+"""What is timed by `train_step.py`? A training step of ours as it is, and the official one, on the same weights."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any
+from unittest import mock
+
+import torch
+from official import PREDICTOR, Official, difference
+from torch.nn.functional import layer_norm
+
+from vjepa2_ac.config import (
+    AdapterConfig,
+    Config,
+    DataConfig,
+    EncoderSizes,
+    ModelConfig,
+    ModelSizes,
+    PredictorSizes,
+    TrainingConfig,
+)
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.transforms import pixels_to_input
+from vjepa2_ac.episode import Batch, LatentBatch
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.weights import to_official
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.assembly import Run, make_accelerator
+from vjepa2_ac.training.checkpoint import RunState
+from vjepa2_ac.training.flops import clip_flops
+from vjepa2_ac.training.loss import Objective
+from vjepa2_ac.training.optim import make_optimizer
+from vjepa2_ac.training.step import training_step
+
+OFFICIAL = "official"
+PRECISIONS = {"float32": "fp32", "bfloat16": "bf16"}
+_PAST_WARM_UP = 1001  # a step at which the learning rate is what it mostly is
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What a line is about."""
+
+    frames: int
+    batch: int
+    checkpointing: bool
+
+
+def has_checkout(options: argparse.Namespace) -> bool:
+    """Return whether the official code is where it is looked for."""
+    return bool((options.official / PREDICTOR).is_file())
+
+
+class Bench:
+    """Our model and the official one in one precision, with the same weights."""
+
+    def __init__(self, options: argparse.Namespace, dtype: str) -> None:
+        self.options, self.precision = options, PRECISIONS[dtype]
+        self.dtype, self.device = getattr(torch, dtype), torch.device(options.device)
+        self.sizes = ModelSizes(
+            image_size=options.image_size,
+            encoder=EncoderSizes(
+                width=options.latent_dim, heads=options.latent_dim // 64, depth=options.encoder_layers
+            ),
+            predictor=PredictorSizes(width=options.width, heads=options.width // 64, depth=options.layers),
+        )
+        # Values that either type can hold, so that both have the same; float32 until they have been compared.
+        self.model = WorldModel.random(self.sizes, seed=0, dtype=self.dtype).float()
+        self._weights = to_official(self.model) if has_checkout(options) else None
+        add_adapter(self.model, AdapterConfig(), seed=0)
+        self.model.to(self.device).train()
+
+    @cached_property
+    def official(self) -> Official:
+        """The official step; to be asked for before ours takes its own type."""
+        assert self._weights is not None, "no checkout"
+        config = self.config(Setting(max(self.options.frames), 1, checkpointing=False))
+        return Official(
+            self.options.official, self._weights, self.sizes, config.adapter, config.training,
+            frames=max(self.options.frames), encoder=self.options.encoder, device=self.device,
+        )  # fmt: skip
+
+    def compare(self) -> str | None:
+        """Return how the official predictor's loss and gradients differ from ours, on a short clip."""
+        setting = Setting(min(max(4, self.options.rollout_steps + 1), *self.options.frames), 1, checkpointing=False)
+        objective = Objective(self.model, self.config(setting).training)
+        latents = self.latents(setting)
+        if self.options.encoder:
+            pixels = pixels_to_input(self.batch(setting).frames.to(self.device), self.options.image_size)
+            gap = (self.model.encode(pixels) - self.official.encode(pixels.transpose(1, 2))).abs().max()
+            if not gap < 1e-3:  # of values of variance 1
+                return f"latents differ by {float(gap):.2g}"
+        return difference(objective, self.official, latents)
+
+    def config(self, setting: Setting) -> Config:
+        """Return what a run of a setting is; its data and base are never opened."""
+        options = self.options
+        return Config(
+            run_dir="benchmark",
+            data=DataConfig(path="none", frames=setting.frames),
+            model=ModelConfig(base="none", dtype="bfloat16" if self.precision == "bf16" else "float32"),
+            training=TrainingConfig(
+                batch_size=setting.batch, accumulation=1, rollout_steps=options.rollout_steps, device=self.device.type,
+                precision=self.precision, gradient_checkpointing=setting.checkpointing,
+            ),
+        )  # fmt: skip
+
+    def flops_per_clip(self, setting: Setting) -> int:
+        """Return the model FLOPs of a clip."""
+        flops = clip_flops(self.config(setting), self.sizes)
+        return flops.total if self.options.encoder else flops.predictor
+
+    def step(self, setting: Setting, way: str) -> Callable[[], object]:
+        """Return what does one optimizer step and waits for it: the official one, or ours with a kind of attention."""
+        latents, pixels = self.latents(setting), None
+        if way == OFFICIAL:
+            if self.options.encoder:
+                frames = self.batch(setting).frames.to(self.device)
+                pixels = pixels_to_input(frames, self.options.image_size).transpose(1, 2).contiguous()
+            return partial(
+                self.official.step, latents, pixels, self.dtype, checkpointing=setting.checkpointing
+            )  # it waits for its loss, as it does in training
+        for parameter in self.model.parameters():
+            if not parameter.requires_grad:
+                parameter.data = parameter.data.to(self.dtype)
+        return partial(self._our_step, self.run(setting), itertools.repeat(self.batch(setting)), latents, way)
+
+    def _our_step(self, run: Run, batches: Any, latents: LatentBatch, attention: str) -> None:
+        self.model.set_attention(attention)  # type: ignore[arg-type]  # checked when it is used
+        self.model.set_gradient_checkpointing(run.config.training.gradient_checkpointing)
+        if self.options.encoder:
+            training_step(run, batches, step=_PAST_WARM_UP)
+            return
+        with mock.patch("vjepa2_ac.training.step.encode", return_value=latents):  # they are there already
+            training_step(run, batches, step=_PAST_WARM_UP)
+
+    def run(self, setting: Setting) -> Run:
+        """Return the run that `training_step` works on."""
+        config = self.config(setting)
+        return Run(
+            config=config,
+            accelerator=make_accelerator(config),
+            world_model=self.model,
+            objective=Objective(self.model, config.training),
+            optimizer=make_optimizer(self.model, config.training),
+            scaler=torch.amp.GradScaler(self.device.type, enabled=False),
+            dataset=Dataset.__new__(Dataset),  # never opened: batches are given
+            state=RunState(step=0),
+            micro_batches=1,
+        )
+
+    def latents(self, setting: Setting) -> LatentBatch:
+        """Return random clips."""
+        generator = torch.Generator().manual_seed(0)
+        shape = (setting.batch, setting.frames, self.model.num_tokens, self.model.latent_dim)
+        drawn = layer_norm(torch.randn(shape, generator=generator), shape[-1:])
+        poses = torch.randn(setting.batch, setting.frames, 7, generator=generator) * 0.3
+        states, actions = poses.to(self.device), (poses[:, 1:] - poses[:, :-1]).to(self.device)
+        return LatentBatch(drawn.to(self.device), states, actions, None, ("a",) * setting.batch, (0,) * setting.batch)
+
+    def batch(self, setting: Setting) -> Batch:
+        """Return the same clips as the loader gives them; without pixels where nobody looks at them."""
+        side = self.options.image_size if self.options.encoder else 1
+        shape = (setting.batch, setting.frames, side, side, 3)
+        frames = torch.randint(256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+        latents = self.latents(setting)
+        return Batch(
+            frames, latents.states.cpu(), latents.actions.cpu(), None, latents.episode_ids, latents.starts
+        )  # as pinned memory would be: its way to the device is part of the step
