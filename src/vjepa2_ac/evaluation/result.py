@@ -1,0 +1,250 @@
+"""What was measured on held-out episodes? Records of plain arrays, which estimates, tables and the report are made of.
+
+Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). Every error compares
+layer-normalised latents: L1 is the mean absolute difference, L2 the mean *squared* difference (no root), cosine one
+minus the cosine similarity of a token, mean over tokens: 0 is perfect for each. Figures with intervals are made of
+these by `evaluation.estimates`, words by `evaluation.verdict`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from vjepa2_ac.evaluation.bootstrap import Estimate
+
+Metric = Literal["l1", "l2", "cosine"]
+Mode = Literal["teacher_forced", "rollout"]
+Actions = Literal["true", "zero", "shuffled"]
+Role = Literal["base", "trained", "other"]
+
+METRICS: tuple[Metric, ...] = ("l1", "l2", "cosine")
+MODES: tuple[Mode, ...] = ("teacher_forced", "rollout")
+ACTIONS: tuple[Actions, ...] = ("true", "zero", "shuffled")
+
+
+@dataclass(frozen=True)
+class About:
+    """What was measured, and on what."""
+
+    subject: str  # the run or model, as it was named
+    checkpoint: str  # which one, in words; "" where the subject is a model
+    checkpoint_path: str  # likewise
+    source: str  # data.source
+    data: str  # data.path
+    cameras: tuple[str, ...]
+    split: str
+    frames: int  # of a clip
+    stride: int  # control steps per model step
+    seconds_per_step: float
+    is_pose: bool  # states are poses: action sizes and landscapes are in cm; else they are plain numbers
+    seed: int
+    version: str  # of this package
+    time: str  # UTC
+
+
+@dataclass(frozen=True)
+class Clips:
+    """The clips, and how large their actions are."""
+
+    episode_ids: tuple[str, ...]
+    starts: tuple[int, ...]  # first control step of each
+    action_size: Float[np.ndarray, "clips horizon"]  # |dx, dy, dz| in cm; of vectors: the norm of the action
+    moving: Bool[np.ndarray, "clips horizon"]  # of each step, as `moving_means` says
+    moving_means: str  # the rule, in words
+
+    def __len__(self) -> int:
+        return len(self.episode_ids)
+
+    @property
+    def episodes(self) -> int:
+        """How many episodes the clips come from."""
+        return len(set(self.episode_ids))
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of one way of predicting; row i is clip i."""
+
+    l1: Float[np.ndarray, "clips horizon"]
+    l2: Float[np.ndarray, "clips horizon"]  # mean squared difference
+    cosine: Float[np.ndarray, "clips horizon"]  # 1 - cosine similarity
+
+    def of(self, metric: Metric) -> Float[np.ndarray, "clips horizon"]:
+        """Return those of one metric."""
+        return {"l1": self.l1, "l2": self.l2, "cosine": self.cosine}[metric]
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """Teacher-forced: frame h from the true frames before it. Rollout: from frame 0 alone, predictions fed back.
+
+    Of persistence: copying frame h - 1, and frame 0. Horizon 1 is the same in both.
+    """
+
+    teacher_forced: Errors
+    rollout: Errors
+
+    def of(self, mode: Mode) -> Errors:
+        """Return those of one mode."""
+        return self.teacher_forced if mode == "teacher_forced" else self.rollout
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Where the true action stands among others by the L1 energy of a one-step prediction from one frame.
+
+    Equal energies share their places. Chance: `mean_rank` 0.5, `top[k]` chance_of_top(k).
+    """
+
+    drawn_from: Literal["clips", "box"]  # the others: actions of other episodes, or uniform in a box
+    words: str  # the same, in words, with the size of the box
+    samples: int  # others per clip
+    clips: tuple[int, ...]  # which ones were measured, as places in Clips
+    rank: Float[np.ndarray, " ranked"]  # share of the others with lower energy: 0 best, 1 worst
+    mean_rank: Estimate
+    top: Mapping[int, Estimate]  # k -> how often the true action is among the k of lowest energy (of samples + 1)
+
+    def chance_of_top(self, k: int) -> float:
+        """Return how often a model that ignores actions has the true one among its best k."""
+        return k / (self.samples + 1)
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Does the prediction depend on the action?"""
+
+    change: Estimate  # mean L1 distance between predictions with the true and with others' actions, over the persistence error
+    change_by_clip: Float[np.ndarray, " ranked"]
+    rankings: tuple[Ranking, ...]  # clips, then box
+
+
+@dataclass(frozen=True)
+class Landscape:
+    """The L1 energy of one clip's first step over a grid of (dx, dy, dz); the rest of the action is the true one.
+
+    The grid spans about the same on both sides of *zero* and has a node exactly at the true action, so a minimum at the
+    true action is no artefact of the grid's centre.
+    """
+
+    episode_id: str
+    start: int
+    axes: Float[np.ndarray, "3 grid"]  # the actions tried along each axis, ascending; cm, or plain numbers
+    energy: Float[np.ndarray, "grid grid grid"]  # indices: first, second, third axis
+    true: Float[np.ndarray, " 3"]
+    minimum: Float[np.ndarray, " 3"]  # where the energy is lowest (the mean place where several are)
+    distance: float  # of the two, in the units of the axes
+
+
+@dataclass(frozen=True)
+class Landscapes:
+    """Landscapes of some clips of one model, and what they say together."""
+
+    axis_names: tuple[str, str, str]
+    unit: str  # cm, or "" where the states are no poses
+    maps: tuple[Landscape, ...]
+    distance: Estimate  # mean over clips
+    chance_distance: float  # the same of a node drawn at random
+    sign_agreement: tuple[Estimate, Estimate, Estimate]  # per axis: share of clips whose minimum has the true sign
+    sign_chance: tuple[float, float, float]  # share of the nodes that have it
+    sign_clips: tuple[
+        int, int, int
+    ]  # clips that count: those that move along the axis by a node's distance or more... see docs
+
+
+@dataclass(frozen=True)
+class ModelResult:
+    """What was measured of one model."""
+
+    name: str  # base, adapter, model, or that of another run
+    role: Role
+    true: Predicted  # with the true actions
+    zero: Predicted  # with actions of zero
+    shuffled: Predicted  # with those of another clip
+    sensitivity: Sensitivity | None = None
+    landscapes: Landscapes | None = None
+
+    def with_actions(self, actions: Actions) -> Predicted:
+        """Return what was predicted with the true, zero or shuffled actions."""
+        return {"true": self.true, "zero": self.zero, "shuffled": self.shuffled}[actions]
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """Steps that have something in common; `steps` picks [clip, horizon] of the *teacher-forced* errors."""
+
+    name: str  # such as moving, idle, "0.0 to 1.2 cm"
+    kind: Literal["motion", "action size"]
+    steps: Bool[np.ndarray, "clips horizon"]
+
+
+@dataclass(frozen=True)
+class Example:
+    """One clip in pictures, and how each model predicts it in a rollout from its first frame."""
+
+    why: str  # it was chosen: best, worst, median, most motion
+    episode_id: str
+    start: int
+    frames: UInt8[np.ndarray, "time height width 3"] | None  # as the encoder sees them; None: no pictures (a cache)
+    errors: Mapping[str, Float[np.ndarray, "horizon grid grid"]]  # model or persistence -> L1 error of each patch
+    true_colours: UInt8[np.ndarray, "time grid grid 3"]  # three principal components of the true latents, as RGB
+    predicted_colours: Mapping[str, UInt8[np.ndarray, "horizon grid grid 3"]]  # model -> in the same basis and scale
+
+
+@dataclass(frozen=True)
+class EpisodeScore:
+    """How well the trained model does on one episode, at the last horizon of the rollout (L1)."""
+
+    episode_id: str
+    clips: int
+    over_persistence: float
+    gain_over_base: float | None  # share of the base's error that is gone; None: no base
+
+
+@dataclass(frozen=True)
+class TrainingCurve:
+    """One figure of a run's metrics.jsonl over optimizer steps."""
+
+    name: str  # loss, learning_rate, validation/rollout_over_persistence ...
+    steps: tuple[int, ...]
+    values: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Everything that was measured; models are in the order of the table: base, others, and what was trained last."""
+
+    about: About
+    clips: Clips
+    persistence: Predicted  # of copying a frame; the same for all models, which share the encoder
+    models: Mapping[str, ModelResult]
+    strata: tuple[Stratum, ...]
+    episodes: tuple[EpisodeScore, ...]  # best first
+    examples: tuple[Example, ...]
+    training: tuple[TrainingCurve, ...] = ()
+    calibration: Mapping[str, Any] | None = None  # what `Calibration.as_dict` gives
+    notes: tuple[str, ...] = ()  # what a reader must know: why there is no base, no landscape ...
+
+    @property
+    def trained(self) -> str:
+        """The name of what was evaluated: adapter, or model."""
+        return next(name for name, model in self.models.items() if model.role == "trained")
+
+    @property
+    def base(self) -> str | None:
+        """The name of what it is compared with; None: there is no base."""
+        return next((name for name, model in self.models.items() if model.role == "base"), None)
+
+    @property
+    def horizon(self) -> int:
+        """How many model steps ahead was measured."""
+        return self.about.frames - 1
+
+    @property
+    def seconds_ahead(self) -> float:
+        """The same in seconds."""
+        return self.horizon * self.about.seconds_per_step
