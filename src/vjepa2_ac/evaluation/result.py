@@ -118,7 +118,8 @@ class Ranking:
 class Sensitivity:
     """Does the prediction depend on the action?"""
 
-    change: Estimate  # mean L1 distance between predictions with the true and with others' actions, over the persistence error
+    change: Estimate  # mean L1 distance of the predictions with others' actions to the one with the true action,
+    # over the error of persistence; 0: the action is ignored
     change_by_clip: Float[np.ndarray, " ranked"]
     rankings: tuple[Ranking, ...]  # clips, then box
 
@@ -151,9 +152,8 @@ class Landscapes:
     chance_distance: float  # the same of a node drawn at random
     sign_agreement: tuple[Estimate, Estimate, Estimate]  # per axis: share of clips whose minimum has the true sign
     sign_chance: tuple[float, float, float]  # share of the nodes that have it
-    sign_clips: tuple[
-        int, int, int
-    ]  # clips that count: those that move along the axis by a node's distance or more... see docs
+    sign_clips: tuple[int, int, int]  # clips that count: those whose true action is sign_least or more along the axis
+    sign_least: float  # in the units of the axes
 
 
 @dataclass(frozen=True)
