@@ -29,11 +29,11 @@ from vjepa2_ac.training.checkpoint import CheckpointClock
 from vjepa2_ac.training.embodiment import NOT_ASKED
 from vjepa2_ac.training.health import Throughput, TimedBatches
 from vjepa2_ac.training.journal import Journal
-from vjepa2_ac.training.mirror import Mirror, NoMirror
+from vjepa2_ac.training.mirror.mirror import Mirror, NoMirror
+from vjepa2_ac.training.mirror.start import Remote, open_remote
 from vjepa2_ac.training.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.training.processes import from_first, largest, require_same
 from vjepa2_ac.training.quiet import QuietJournal, QuietReporter
-from vjepa2_ac.training.remote_start import Remote, open_remote
 from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open_run_folder
 from vjepa2_ac.training.run_lock import RunLock
 from vjepa2_ac.training.step import gradients, training_step

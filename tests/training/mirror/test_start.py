@@ -20,7 +20,7 @@ from vjepa2_ac.training.checkpoint import (
     read_state,
     write_checkpoint,
 )
-from vjepa2_ac.training.remote_start import Remote, open_remote
+from vjepa2_ac.training.mirror.start import Remote, open_remote
 from vjepa2_ac.training.run_folder import check_run_folder
 
 PLACE = "gs://bucket/run"
@@ -301,10 +301,10 @@ def test_who_is_killed_while_fetching_fetches_again(
             raise KilledError
         storage.download(source, target)
 
-    monkeypatch.setattr("vjepa2_ac.training.remote_checkpoints.download", killed)
+    monkeypatch.setattr("vjepa2_ac.training.mirror.checkpoints.download", killed)
     with pytest.raises(KilledError):
         open_remote(config, NOTHING)
-    monkeypatch.setattr("vjepa2_ac.training.remote_checkpoints.download", storage.download)
+    monkeypatch.setattr("vjepa2_ac.training.mirror.checkpoints.download", storage.download)
     assert newest_checkpoint(local(config) / "checkpoints") is None
     check_run_folder(config)
     open_remote(config, NOTHING)

@@ -16,9 +16,9 @@ from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.remote import retries
 from vjepa2_ac.training import remote_update
 from vjepa2_ac.training.checkpoint import RunState, checkpoint_name, damage, read_state, write_checkpoint
-from vjepa2_ac.training.mirror import Mirror
-from vjepa2_ac.training.remote_checkpoints import SENDING, RemoteCheckpoints, complete
-from vjepa2_ac.training.remote_update import HELD
+from vjepa2_ac.training.mirror.checkpoints import SENDING, RemoteCheckpoints, complete
+from vjepa2_ac.training.mirror.mirror import Mirror
+from vjepa2_ac.training.mirror.update import HELD
 
 PLACE = "gs://bucket/run"
 FILES = {"adapter/weights.bin", "optimizer.pt", "state.json"}

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from vjepa2_ac.storage import join, upload
 from vjepa2_ac.training.checkpoint import STATE, checkpoint_name, damage
-from vjepa2_ac.training.remote_checkpoints import Listing, RemoteCheckpoints, complete, is_checkpoint_name
+from vjepa2_ac.training.mirror.checkpoints import Listing, RemoteCheckpoints, complete, is_checkpoint_name
 from vjepa2_ac.training.run_folder import CHECKPOINTS, CONFIG, ENVIRONMENT, RUN_ID
 from vjepa2_ac.training.stride import CALIBRATION
 

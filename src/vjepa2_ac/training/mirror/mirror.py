@@ -1,6 +1,6 @@
 """How does a run get to `checkpoint.remote` while it goes on?
 
-A thread brings the place up to date (`training.remote_update`); the loop only tells it, step by step, that time passes.
+A thread brings the place up to date (`training.mirror.update`); the loop only tells it, step by step, that time passes.
 Nothing that happens there stops the run. An outage is warned of once, however long it is; and what is only on this
 machine in the end, once more.
 """
@@ -17,8 +17,8 @@ from types import TracebackType
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import RefusedError, UnreachableError, quietly
-from vjepa2_ac.training.remote_checkpoints import RemoteCheckpoints
-from vjepa2_ac.training.remote_update import ForeignRunError, RemoteUpdate
+from vjepa2_ac.training.mirror.checkpoints import RemoteCheckpoints
+from vjepa2_ac.training.mirror.update import ForeignRunError, RemoteUpdate
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 
 logger = logging.getLogger(__name__)

@@ -17,9 +17,9 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import RefusedError, UnreachableError, quietly
 from vjepa2_ac.storage import is_url, place, try_writing
 from vjepa2_ac.training.checkpoint import STATE, checkpoint_name, newest_checkpoint
-from vjepa2_ac.training.mirror import Mirror, reason_of
-from vjepa2_ac.training.remote_checkpoints import Listing, RemoteCheckpoints, complete
-from vjepa2_ac.training.remote_fetch import fetch_newest
+from vjepa2_ac.training.mirror.checkpoints import Listing, RemoteCheckpoints, complete
+from vjepa2_ac.training.mirror.fetch import fetch_newest
+from vjepa2_ac.training.mirror.mirror import Mirror, reason_of
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 
 logger = logging.getLogger(__name__)

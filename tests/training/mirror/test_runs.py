@@ -17,8 +17,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.checkpoint import checkpoint_name
 from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.mirror.checkpoints import RemoteCheckpoints, complete
 from vjepa2_ac.training.preemption import StoppedError
-from vjepa2_ac.training.remote_checkpoints import RemoteCheckpoints, complete
 
 PLACE = "gs://bucket/run"
 
@@ -116,7 +116,7 @@ def test_a_machine_killed_while_sending_leaves_the_last_complete_checkpoint_to_t
         assert fourth_is_on_its_way.wait(60)
         raise KilledError
 
-    monkeypatch.setattr("vjepa2_ac.training.remote_checkpoints.upload", upload)
+    monkeypatch.setattr("vjepa2_ac.training.mirror.checkpoints.upload", upload)
     config = mirrored(make_config, tmp_path, "one", checkpoint__keep_best=False)
     dying = at_step(reporter, 6, die)
     stepped = dying.stepped

@@ -19,8 +19,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import download, join, sync, write_atomically
 from vjepa2_ac.training.checkpoint import STATE, checkpoint_name
-from vjepa2_ac.training.remote_checkpoints import RemoteCheckpoints
-from vjepa2_ac.training.remote_update import SMALL_FILES
+from vjepa2_ac.training.mirror.checkpoints import RemoteCheckpoints
+from vjepa2_ac.training.mirror.update import SMALL_FILES
 from vjepa2_ac.training.run_folder import CHECKPOINTS, check_run_folder
 from vjepa2_ac.training.stride import with_settled_stride
 

@@ -1,0 +1,1 @@
+"""How is a run kept in another place, and how does it go on from there? `checkpoint.remote`."""
