@@ -157,3 +157,19 @@ def test_a_folder_that_is_not_a_whole_model_is_named(
     spoil(tmp_path / "model")
     with pytest.raises(InputError, match=message):
         WorldModel.from_pretrained(tmp_path / "model")
+
+
+def test_a_model_whose_encoder_is_set_aside_predicts_as_before_and_knows_which_one_it_was(
+    model: WorldModel, fresh: Fresh, inputs, tmp_path: Path
+) -> None:
+    model.set_encoder_aside()
+    model.set_encoder_aside()  # once more changes nothing
+    whole = fresh(seed=0)
+    assert model.encoder_fingerprint() == whole.encoder_fingerprint()
+    assert sum(p.numel() for p in model.parameters()) == sum(p.numel() for p in whole.predictor.parameters())
+    assert model.to("cpu").device == torch.device("cpu")
+    given = inputs.latents, inputs.actions, inputs.states
+    assert torch.equal(model.predict(*given), whole.predict(*given))
+    for needs_it in (lambda: model.encode(inputs.frames), lambda: model.save_pretrained(tmp_path / "model")):
+        with pytest.raises(ValueError, match="set aside"):
+            needs_it()

@@ -67,7 +67,7 @@ def to_official(model: WorldModel) -> dict[str, Any]:
         raise ValueError("an adapter is on: merge_adapter first")
     if widths_of_model(model.sizes) != POSE_WIDTHS:
         raise ValueError(f"Meta's code takes {POSE_WIDTHS}, not {widths_of_model(model.sizes)}")
-    encoder = _to_official(model.encoder.state_dict(), "encoder")
+    encoder = _to_official(model.present_encoder.state_dict(), "encoder")
     return {
         "encoder": encoder,
         "target_encoder": dict(encoder),

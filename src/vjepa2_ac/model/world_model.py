@@ -41,6 +41,14 @@ class FreshHeads:
     seed: int  # that decided the new ones
 
 
+class AbsentEncoder(nn.Module):
+    """Stands where an encoder was that is not needed any more."""
+
+    def __init__(self, fingerprint: str) -> None:
+        super().__init__()
+        self.fingerprint = fingerprint  # of the one that was here
+
+
 class WorldModel(nn.Module):
     """A frozen encoder and an action-conditioned predictor.
 
@@ -53,7 +61,7 @@ class WorldModel(nn.Module):
     def __init__(self, sizes: ModelSizes) -> None:
         super().__init__()
         self.sizes = sizes
-        self.encoder = Encoder(sizes)
+        self.encoder: Encoder | AbsentEncoder = Encoder(sizes)
         self.predictor: nn.Module = ActionConditionedPredictor(PredictorConfig.from_sizes(sizes))
         self.predictor.requires_grad_(False)
         self.adaptation: Adaptation | None = None
@@ -69,7 +77,7 @@ class WorldModel(nn.Module):
         """
         model = cls.empty(sizes).to_empty(device="cpu")
         generator = torch.Generator().manual_seed(seed)
-        model.encoder.initialise(generator)
+        model.present_encoder.initialise(generator)
         model.base_predictor.initialise(generator)
         if at_persistence:
             model.base_predictor.start_at_persistence(generator)
@@ -99,11 +107,12 @@ class WorldModel(nn.Module):
 
         Raises:
             InputError: The folder cannot be written.
-            ValueError: An adapter is on: merge it first, or save it with `model.lora.save_trained`.
+            ValueError: An adapter is on: merge it first, or save it with `model.lora.save_trained`. Or the encoder was
+                set aside.
         """
         if self.predictor is not self.base_predictor:
             raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_trained saves it alone")
-        write_folder(Path(folder), self.sizes, self.encoder, self.predictor)
+        write_folder(Path(folder), self.sizes, self.present_encoder, self.predictor)
 
     @property
     def image_size(self) -> int:
@@ -122,8 +131,24 @@ class WorldModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the weights are."""
-        return next(self.parameters()).device
+        """Where the predictor's weights are."""
+        return next(self.predictor.parameters()).device
+
+    @property
+    def present_encoder(self) -> Encoder:
+        """The encoder.
+
+        Raises:
+            ValueError: It was set aside.
+        """
+        if isinstance(self.encoder, Encoder):
+            return self.encoder
+        raise ValueError("the encoder was set aside: latents come from a cache")
+
+    def set_encoder_aside(self) -> None:
+        """Let go of the encoder's weights, for good: latents come from a cache. Its fingerprint stays known."""
+        if isinstance(self.encoder, Encoder):
+            self.encoder = AbsentEncoder(self.encoder_fingerprint())
 
     @property
     def base_predictor(self) -> Any:
@@ -142,9 +167,9 @@ class WorldModel(nn.Module):
             chunk: Frames that go through the encoder at once: bounds the memory.
 
         Raises:
-            ValueError: The frames have another size than `image_size`.
+            ValueError: The frames have another size than `image_size`; or the encoder was set aside.
         """
-        features = _normalise(self.encoder(frames.flatten(0, 1), chunk))
+        features = _normalise(self.present_encoder(frames.flatten(0, 1), chunk))
         return rearrange(features, "(batch time) tokens dim -> batch time tokens dim", batch=len(frames))
 
     def predict(
@@ -209,6 +234,8 @@ class WorldModel(nn.Module):
 
     def encoder_fingerprint(self) -> str:
         """Return a hash that says which encoder made a latent: key cached latents by it."""
+        if isinstance(self.encoder, AbsentEncoder):
+            return self.encoder.fingerprint
         return fingerprint(self.encoder.state_dict())
 
     def predictor_fingerprint(self) -> str:
