@@ -14,8 +14,8 @@ from gcs import Failure, Gcs
 from vjepa2_ac import storage
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.remote import retries
-from vjepa2_ac.training import remote_update
 from vjepa2_ac.training.checkpoint import RunState, checkpoint_name, damage, read_state, write_checkpoint
+from vjepa2_ac.training.mirror import update
 from vjepa2_ac.training.mirror.checkpoints import SENDING, RemoteCheckpoints, complete
 from vjepa2_ac.training.mirror.mirror import Mirror
 from vjepa2_ac.training.mirror.update import HELD
@@ -103,9 +103,9 @@ def test_a_run_is_copied_to_any_kind_of_place(run: Path, place: str, caplog: pyt
 def test_whose_it_is_comes_first_and_the_manifest_last(run: Path, place: str, monkeypatch: pytest.MonkeyPatch) -> None:
     write(run, 10)
     order = []
-    for module in ("remote_update", "remote_checkpoints"):
+    for module in ("update", "checkpoints"):
         monkeypatch.setattr(
-            f"vjepa2_ac.training.{module}.upload",
+            f"vjepa2_ac.training.mirror.{module}.upload",
             lambda source, target: [order.append(target.rsplit("/", 1)[1]), storage.upload(source, target)],
         )
     send(run, place=place)
@@ -200,7 +200,7 @@ def test_a_file_that_somebody_removed_there_is_sent_again(bucket: Gcs, run: Path
 @pytest.mark.usefixtures("bucket")
 def test_small_files_are_sent_when_they_have_changed(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sent = []
-    monkeypatch.setattr(remote_update, "upload", lambda _, target: sent.append(target.rsplit("/", 1)[1]))
+    monkeypatch.setattr(update, "upload", lambda _, target: sent.append(target.rsplit("/", 1)[1]))
     mirror = mirror_of(run)
     for step in (10, 20):
         write(run, step)
@@ -263,8 +263,8 @@ class Gate:
             upload(source, target)
             self.sending -= 1
 
-        for module in ("remote_update", "remote_checkpoints"):
-            monkeypatch.setattr(f"vjepa2_ac.training.{module}.upload", gated)
+        for module in ("update", "checkpoints"):
+            monkeypatch.setattr(f"vjepa2_ac.training.mirror.{module}.upload", gated)
 
 
 @pytest.fixture
@@ -444,7 +444,7 @@ def test_without_hard_links_a_checkpoint_is_copied(run: Path, monkeypatch: pytes
     def no_links(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
-    monkeypatch.setattr(remote_update.os, "link", no_links)
+    monkeypatch.setattr(update.os, "link", no_links)
     write(run, 10)
     send(run)
     assert_same_files(run, checkpoint_name(10))
