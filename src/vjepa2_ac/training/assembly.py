@@ -17,13 +17,13 @@ from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader, validation_batches
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration import Calibration
 from vjepa2_ac.latents import encode_batch, extrinsics_for
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import add_adapter, save_trained, trainable_report
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, write_checkpoint
+from vjepa2_ac.training.device import is_on_cpu
 from vjepa2_ac.training.embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer
@@ -121,21 +121,7 @@ def make_accelerator(config: Config) -> Accelerator:
         InputError: CUDA was asked for and there is none, fp16 without CUDA, or a launch that cannot be followed.
     """
     check_launch(config)
-    training, has_cuda = config.training, torch.cuda.is_available()
-    if training.device == "cuda" and not has_cuda:
-        raise InputError(
-            where="training.device",
-            found="cuda, but this PyTorch sees no CUDA device",
-            fix="Set training.device=cpu, or install a CUDA build of PyTorch and a driver",
-        )
-    on_cpu = training.device == "cpu" or not has_cuda
-    if training.precision == "fp16" and on_cpu:
-        raise InputError(
-            where="training.precision",
-            found="fp16 on a CPU",
-            needed="a CUDA device: only there are losses scaled so that small gradients do not vanish",
-            fix="Set training.precision to bf16 or fp32",
-        )
+    training, on_cpu = config.training, is_on_cpu(config.training)
     AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
     precision = "no" if training.precision == "fp32" else training.precision
     patience = InitProcessGroupKwargs(timeout=LONGEST_WAIT)
