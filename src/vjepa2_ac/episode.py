@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Num, UInt8
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -58,6 +58,23 @@ class FrameReader(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class StoredLatents:
+    """Latents of frames as a cache keeps them; `latents.decoded` makes float32 of them, on the device."""
+
+    values: Num[Tensor, "*batch time tokens dim"]  # bfloat16, float32 or int8
+    scales: Float32[Tensor, "*batch time tokens"] | None = None  # of int8: what a value of 1 means, for each token
+
+
+@runtime_checkable
+class LatentReader(Protocol):
+    """Reads latents of one camera of one episode from a cache, and only those that are asked for."""
+
+    def __call__(self, steps: Sequence[int]) -> StoredLatents:
+        """Return the latents at these control steps, in this order."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class EpisodeInfo:
     """What is known of an episode without reading its pictures: enough to choose clips from it."""
@@ -81,6 +98,7 @@ class Episode:
     commands: Float[np.ndarray, "steps action_dim"] | None = (
         None  # recorded actions, where `data.actions` asks for them
     )
+    read_latents: LatentReader | None = None  # of a cache; its `read_frames` gives small pictures for people to look at
 
 
 @dataclass(frozen=True)
@@ -103,9 +121,9 @@ class Skipped:
 
 @dataclass(frozen=True)
 class Clip:
-    """A window of an episode at the model's step length; frames are cropped, not yet resized."""
+    """A window of an episode at the model's step length: frames, cropped but not yet resized, or latents of a cache."""
 
-    frames: UInt8[np.ndarray, "time height width 3"]
+    frames: UInt8[np.ndarray, "time height width 3"] | None  # None: there are latents
     states: Float32[np.ndarray, "time state_dim"]
     actions: Float32[np.ndarray, "time-1 action_dim"]
     extrinsics: Float32[np.ndarray, "time 6"] | None
@@ -113,13 +131,15 @@ class Clip:
     start: int  # first control step
     stride: int  # control steps per model step
     augmentation: Augmentation | None = None
+    latents: StoredLatents | None = None
+    camera: str | None = None  # None: the config's first
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Clips stacked for the device; pixels stay uint8 until they are there."""
+    """Clips stacked for the device; pixels stay uint8 until they are there, and cached latents in the cache's type."""
 
-    frames: UInt8[Tensor, "batch time height width 3"]
+    frames: UInt8[Tensor, "batch time height width 3"] | None  # None: there are latents
     states: Float32[Tensor, "batch time state_dim"]
     actions: Float32[Tensor, "batch time-1 action_dim"]
     extrinsics: Float32[Tensor, "batch time 6"] | None
@@ -127,6 +147,8 @@ class Batch:
     starts: tuple[int, ...]
     augmentations: tuple[Augmentation, ...] = ()  # one per clip, or none at all
     bytes_fetched: int = 0  # over the network, for these clips
+    latents: StoredLatents | None = None
+    cameras: tuple[str | None, ...] = ()  # one per clip; None: the config's first
 
 
 @dataclass(frozen=True)

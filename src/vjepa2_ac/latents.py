@@ -1,4 +1,4 @@
-"""Pixels to latents: where is the frozen encoder run?
+"""Pixels to latents: where is the frozen encoder run, or are the latents of a cache taken instead?
 
 Training, evaluation and planning see only what comes out of here.
 """
@@ -6,11 +6,16 @@ Training, evaluation and planning see only what comes out of here.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 from torch import Tensor
 
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.latent_cache import require_encoding
+from vjepa2_ac.data.sources.latents.key import Encoding
+from vjepa2_ac.data.sources.latents.precision import decoded
 from vjepa2_ac.data.transforms import pixels_to_input
-from vjepa2_ac.episode import Batch, LatentBatch, Widths
+from vjepa2_ac.episode import Batch, LatentBatch, StoredLatents, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.world_model import WorldModel
@@ -20,26 +25,72 @@ from vjepa2_ac.model.world_model import WorldModel
 def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int) -> LatentBatch:
     """Encode the frames of a batch, each by itself, on the device; a training batch is augmented there, too.
 
+    Of a batch from a latent cache, the latents are taken as they are: `require_encoding` has compared the encoders.
+
     Args:
         world_model: The model whose frozen encoder is used.
-        batch: Clips as the loader gives them: uint8 pixels, cropped, of any size.
+        batch: Clips as the loader gives them: uint8 pixels, cropped, of any size; or latents.
         device: Where the model is.
         chunk: Frames that go through the encoder at once.
 
     Raises:
-        InputError: The model wants camera poses and a clip has none.
+        InputError: The model wants camera poses and a clip has none; or cached latents are of another width.
     """
     extrinsics = extrinsics_for(world_model, batch)
-    frames = batch.frames.to(device, non_blocking=True)
-    inputs = pixels_to_input(frames, world_model.image_size, batch.augmentations)
     return LatentBatch(
-        latents=world_model.encode(inputs, chunk=chunk),
+        latents=_latents_of(world_model, batch, device, chunk),
         states=batch.states.to(device, non_blocking=True),
         actions=batch.actions.to(device, non_blocking=True),
         extrinsics=None if extrinsics is None else extrinsics.to(device, non_blocking=True),
         episode_ids=batch.episode_ids,
         starts=batch.starts,
     )
+
+
+def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
+    """Return what decides the latents that a model makes in a run: by this a cache is found, or refused.
+
+    Takes as long as it takes to hash the encoder's weights.
+    """
+    return Encoding(
+        encoder=world_model.encoder_fingerprint(),
+        image_size=world_model.image_size,
+        patch_size=world_model.sizes.patch_size,
+        tokens=world_model.num_tokens,
+        dim=world_model.latent_dim,
+        weights=config.model.dtype,
+        precision=config.training.precision,
+    )
+
+
+def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Config) -> None:
+    """Refuse cached latents that another encoder made, or the same in another precision; other data sets pass.
+
+    Raises:
+        InputError: Names what differs.
+    """
+    if dataset.config.source == "latents":  # else the weights need not be hashed
+        require_encoding(dataset, encoding_of(world_model, config))
+
+
+def _latents_of(
+    world_model: WorldModel, batch: Batch, device: torch.device, chunk: int
+) -> Float[Tensor, "batch time tokens dim"]:
+    if batch.latents is None:
+        if batch.frames is None:
+            raise ValueError("a batch with neither frames nor latents")
+        frames = batch.frames.to(device, non_blocking=True)
+        return world_model.encode(pixels_to_input(frames, world_model.image_size, batch.augmentations), chunk=chunk)
+    values, scales = batch.latents.values, batch.latents.scales
+    if values.shape[-2:] != (world_model.num_tokens, world_model.latent_dim):
+        raise InputError(
+            where="data.path",
+            found=f"cached latents of {values.shape[-2]} tokens of {values.shape[-1]} numbers",
+            needed=f"{world_model.num_tokens} of {world_model.latent_dim}, as this model's encoder makes them",
+            fix="Use a cache that was made with this model",
+        )
+    moved = None if scales is None else scales.to(device, non_blocking=True)
+    return decoded(StoredLatents(values.to(device, non_blocking=True), moved))
 
 
 def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> None:

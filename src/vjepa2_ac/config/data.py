@@ -14,6 +14,9 @@ RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 # A serial number is a name, also where YAML takes it for a number.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
+# YAML takes off for a truth value.
+_CacheUse = Annotated[Literal["off", "auto", "require"], BeforeValidator(lambda use: "off" if use is False else use)]
+
 _STRIDES_AT_15_HZ = (4, 8, 15)
 
 
@@ -173,9 +176,10 @@ class DiskCacheConfig(Section):
 class DataConfig(Section):
     """Which clips, from where."""
 
-    source: Literal["rlds", "droid_raw", "lerobot", "npz"] = "rlds"
+    source: Literal["rlds", "droid_raw", "lerobot", "npz", "latents"] = "rlds"
     """Form of the data set. rlds: TFRecord shards with a dataset_info.json, as TFDS writes them. droid_raw: DROID's
-    folders with trajectory.h5 and MP4. lerobot: LeRobotDataset v2.1 or v3.0. npz: a folder of .npz episodes."""
+    folders with trajectory.h5 and MP4. lerobot: LeRobotDataset v2.1 or v3.0. npz: a folder of .npz episodes. latents: a
+    latent cache alone, without the data set that it was made from."""
     path: Place
     """Folder of the data set: on this machine, or a URL such as gs://bucket/folder or hf://datasets/owner/name."""
     fields: RldsFields = RldsFields()
@@ -202,6 +206,9 @@ class DataConfig(Section):
     stride: PositiveInt | Literal["auto"] = 4
     """Control steps per model step. Unsettled for the released weights: 4, 8 and 15 are candidates. auto: before the
     first step the model chooses among `stride_candidates` by its prediction error over persistence."""
+    start_every: PositiveInt = 1
+    """Clips start at multiples of this many control steps, counted from the first step of their episode that
+    `data.idle` keeps. With the stride's own number, only every stride-th frame is ever needed: a small latent cache."""
     stride_candidates: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] | None = None
     """Strides that `auto` and `data calibrate` try; null: 4, 8, 15 at 15 control steps per second, scaled to others."""
     validation_share: Share = 0.05
@@ -226,9 +233,17 @@ class DataConfig(Section):
     square: its central square (upstream's evaluation). letterbox: all of it, with black bars."""
     augment: AugmentConfig = AugmentConfig()
     """Random changes of training clips."""
+    cache: _CacheUse = "off"
+    """Whether the frozen encoder's latents are kept on disk, so that each frame is encoded once. off: no. auto: those
+    that are not there yet are encoded before the first step. require: refuse to start where they are not there."""
+    cache_dtype: Literal["bf16", "fp32", "int8"] = "bf16"
+    """Type that latents are kept in: bf16; fp32, which takes twice as much room; int8 with a scale per token, half."""
+    cache_dir: str | None = None
+    """Folder for latent caches, one folder in it for each; null: `latents` in the folder of `disk_cache`."""
     check_crc: Literal["once", "always", "never"] = "once"
     """When the CRC-32C of a local TFRecord's data is checked: the first time that it is read on this machine, every
-    time, or never. The CRC of a record's length is always checked."""
+    time, or never. The CRC of a record's length is always checked. Likewise the CRC-32 of cached latents, frame by
+    frame; once is then once for each process."""
     disk_cache: DiskCacheConfig = DiskCacheConfig()
     """What is kept on this machine."""
     workers: Annotated[int, Field(ge=0, le=256)] = 4
@@ -246,6 +261,12 @@ class DataConfig(Section):
         for camera in self.cameras:
             if known is not None and camera not in known:
                 raise ValueError(f"camera {camera!r} is not one of {', '.join(known)}")
+        if self.source == "latents" and isinstance(self.stride, str):
+            raise ValueError("stride auto: a latent cache has one stride; give its number")
+        if self.source == "latents" and (self.cache != "off" or "://" in self.path):
+            raise ValueError("source latents is itself a cache, in a folder on this machine: set cache: off")
+        if self.augment.is_on and (self.source == "latents" or self.cache != "off"):
+            raise ValueError("augment changes pictures, and latents that are cached are of unchanged ones: choose one")
         if self.validation_share + self.test_share >= 1.0:
             raise ValueError("validation_share and test_share leave nothing to train on")
         if self.pose_frame == "camera" and self.source in {"rlds", "lerobot"}:
@@ -286,7 +307,7 @@ class DataConfig(Section):
     def cameras(self) -> tuple[str, ...]:
         """The cameras that clips are drawn from, one or more."""
         if self.camera is None:
-            first = {"droid_raw": RAW_CAMERAS[0], "npz": "frames"}
+            first = {"droid_raw": RAW_CAMERAS[0], "npz": "frames", "latents": "all"}
             return (first[self.source],) if self.known_cameras is None else self.known_cameras[:1]
         return (self.camera,) if isinstance(self.camera, str) else self.camera
 

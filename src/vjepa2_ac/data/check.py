@@ -128,20 +128,25 @@ def findings_in(batches: Sequence[Batch], *, is_pose: bool = True) -> Iterator[F
     """Yield what the numbers of some batches say, whose states are poses or not; a pure look, nothing is read."""
     clips = sum(len(batch.starts) for batch in batches)
     first = batches[0]
-    shapes = f"frames {tuple(first.frames.shape)} {str(first.frames.dtype).removeprefix('torch.')}"
+    name, seen = ("latents", first.latents.values) if first.latents else ("frames", _frames(first))
+    shapes = f"{name} {tuple(seen.shape)} {str(seen.dtype).removeprefix('torch.')}"
     poses = "no camera poses" if first.extrinsics is None else f"camera poses {tuple(first.extrinsics.shape)}"
     yield Finding(
         "ok", "batch", f"{shapes}, states {tuple(first.states.shape)}, actions {tuple(first.actions.shape)}, {poses}"
     )
     states = np.concatenate([batch.states.flatten(0, 1).numpy() for batch in batches]).astype(np.float64)
     actions = np.concatenate([batch.actions.flatten(0, 1).numpy() for batch in batches]).astype(np.float64)
-    yield _pixels(batches)
+    has_pixels = first.latents is None
+    if has_pixels:
+        yield _pixels(batches)
     if not is_pose:
         ranges = torch.from_numpy((states.max(axis=0) - states.min(axis=0)).astype(np.float32))
-        yield _still_pictures(batches, [has_moved(batch.states, ranges) for batch in batches])
+        if has_pixels:
+            yield _still_pictures(batches, [has_moved(batch.states, ranges) for batch in batches])
         yield from vector_findings(states, actions)
         return
-    yield _still_pictures(batches, [batch.actions[..., :3].norm(dim=-1) > _MOVED_M for batch in batches])
+    if has_pixels:
+        yield _still_pictures(batches, [batch.actions[..., :3].norm(dim=-1) > _MOVED_M for batch in batches])
     yield _positions(states)
     yield _rotations(states, actions)
     yield _gripper(states[:, 6], clips)
@@ -149,9 +154,9 @@ def findings_in(batches: Sequence[Batch], *, is_pose: bool = True) -> Iterator[F
 
 
 def _pixels(batches: Sequence[Batch]) -> Finding:
-    low = min(int(batch.frames.min()) for batch in batches)
-    high = max(int(batch.frames.max()) for batch in batches)
-    mean = float(np.mean([batch.frames.float().mean().item() for batch in batches]))
+    low = min(int(_frames(batch).min()) for batch in batches)
+    high = max(int(_frames(batch).max()) for batch in batches)
+    mean = float(np.mean([_frames(batch).float().mean().item() for batch in batches]))
     text = f"{low} to {high}, mean {mean:.0f}"
     if low == high:
         return Finding("error", "pixels", f"all are {low}: there is nothing to see. Check data.camera")
@@ -160,11 +165,18 @@ def _pixels(batches: Sequence[Batch]) -> Finding:
     return Finding("ok", "pixels", text)
 
 
+def _frames(batch: Batch) -> Tensor:
+    if batch.frames is None:
+        raise ValueError("a batch of cached latents has no pixels")
+    return batch.frames
+
+
 def _still_pictures(batches: Sequence[Batch], has_moved: Sequence[Tensor]) -> Finding:
     """Compare pictures with the ones before them, where the robot has moved."""
     same = moved = 0
     for batch, far in zip(batches, has_moved, strict=True):
-        equal = (batch.frames[:, 1:] == batch.frames[:, :-1]).flatten(2).all(dim=-1)
+        frames = _frames(batch)
+        equal = (frames[:, 1:] == frames[:, :-1]).flatten(2).all(dim=-1)
         moved += int(far.sum())
         same += int((far & equal).sum())
     text = f"{same} of {moved} pictures equal the one before although the robot moved"

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from vjepa2_ac.data.actions import actions_of, require_widths
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.exclusion import with_way_out
 from vjepa2_ac.data.transforms import view
-from vjepa2_ac.episode import Augmentation, Batch, Clip, Episode, Widths
+from vjepa2_ac.episode import Augmentation, Batch, Clip, Episode, StoredLatents, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import states_in_camera_frame
 from vjepa2_ac.remote import UnreachableError
@@ -60,20 +60,14 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
     Raises:
         InputError: The pictures of two clips differ in size.
     """
-    first = clips[0]
-    for clip in clips:
-        if clip.frames.shape != first.frames.shape:
-            error = InputError(
-                where=f"episode {clip.episode_id}",
-                found=f"pictures of {'x'.join(map(str, clip.frames.shape[1:3]))} after the crop",
-                needed=f"{'x'.join(map(str, first.frames.shape[1:3]))}, as in episode {first.episode_id}",
-                fix="Train on episodes of one size, or set training.batch_size: 1",
-            )
-            raise with_way_out(error, [clip.episode_id], skippable=False)
+    frames = [clip.frames for clip in clips if clip.frames is not None]
+    latents = [clip.latents for clip in clips if clip.latents is not None]
+    if frames:
+        _require_one_size(clips)
     extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
     augmentations = tuple(clip.augmentation for clip in clips if clip.augmentation is not None)
     return Batch(
-        frames=torch.from_numpy(np.stack([clip.frames for clip in clips])),
+        frames=torch.from_numpy(np.stack(frames)) if frames else None,
         states=torch.from_numpy(np.stack([clip.states for clip in clips])),
         actions=torch.from_numpy(np.stack([clip.actions for clip in clips])),
         extrinsics=torch.from_numpy(np.stack(extrinsics)) if len(extrinsics) == len(clips) else None,
@@ -81,7 +75,41 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
         starts=tuple(clip.start for clip in clips),
         augmentations=augmentations,
         bytes_fetched=bytes_fetched,
+        latents=_stacked(latents) if latents else None,
+        cameras=tuple(clip.camera for clip in clips),
     )
+
+
+def pictures_of(
+    dataset: Dataset, episode: int, start: int, *, camera: str | None = None
+) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return what the model sees in a clip, for people to look at; of a latent cache, its small pictures.
+
+    Raises:
+        InputError: The episode or one of the pictures cannot be read.
+    """
+    steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
+    recording = dataset.source.read(episode, camera, dataset.needed_steps(episode))
+    return view(recording.read_frames(steps), dataset.config.crop)
+
+
+def _require_one_size(clips: Sequence[Clip]) -> None:
+    shapes = [(clip.frames.shape, clip) for clip in clips if clip.frames is not None]
+    first_shape, first = shapes[0]
+    for shape, clip in shapes:
+        if shape != first_shape:
+            error = InputError(
+                where=f"episode {clip.episode_id}",
+                found=f"pictures of {'x'.join(map(str, shape[1:3]))} after the crop",
+                needed=f"{'x'.join(map(str, first_shape[1:3]))}, as in episode {first.episode_id}",
+                fix="Train on episodes of one size, or set training.batch_size: 1",
+            )
+            raise with_way_out(error, [clip.episode_id], skippable=False)
+
+
+def _stacked(latents: Sequence[StoredLatents]) -> StoredLatents:
+    scales = [one.scales for one in latents if one.scales is not None]
+    return StoredLatents(torch.stack([one.values for one in latents]), torch.stack(scales) if scales else None)
 
 
 def read_clip(dataset: Dataset, wish: Wish) -> Clip:
@@ -90,9 +118,14 @@ def read_clip(dataset: Dataset, wish: Wish) -> Clip:
     steps = range(wish.start, wish.start + config.clip_steps, config.model_stride)
     recording = dataset.source.read(wish.episode, wish.camera, dataset.needed_steps(wish.episode))
     require_widths(recording, dataset.widths)
-    frames = view(recording.read_frames(steps), config.crop)
+    frames = latents = augmentation = None
+    if recording.read_latents is not None:
+        latents = recording.read_latents(steps)
+    else:
+        frames = view(recording.read_frames(steps), config.crop)
+        draw_change = wish.augmentation
+        augmentation = None if draw_change is None else draw_change(frames.shape[1], frames.shape[2])
     states, extrinsics = _states(recording, list(steps), in_camera_frame=config.pose_frame == "camera")
-    draw_change = wish.augmentation
     return Clip(
         frames=frames,
         states=states.astype(np.float32),
@@ -101,7 +134,9 @@ def read_clip(dataset: Dataset, wish: Wish) -> Clip:
         episode_id=recording.info.id,
         start=wish.start,
         stride=config.model_stride,
-        augmentation=None if draw_change is None else draw_change(frames.shape[1], frames.shape[2]),
+        augmentation=augmentation,
+        latents=latents,
+        camera=wish.camera,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -15,6 +16,7 @@ from vjepa2_ac.data.broken import BrokenEpisodes
 from vjepa2_ac.data.exclusion import included, with_way_out
 from vjepa2_ac.data.idle_search import FoundRanges, find_ranges
 from vjepa2_ac.data.kept import KeptSteps, Starts, clip_starts
+from vjepa2_ac.data.sources.latents.source import LatentSource
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.windows import Split, Windows, windows_of
 from vjepa2_ac.episode import POSE_WIDTHS, EpisodeSource, Progress, StepRanges, Widths
@@ -58,10 +60,21 @@ class Dataset:
         Raises:
             InputError: There are none; see `windows_of`.
         """
-        return windows_of(self.table, self.kept.taking_part, self._starts, self.config, split)
+        return windows_of(self.table, self.kept.taking_part, self.starts, self.config, split)
 
     def with_stride(self, stride: int) -> Dataset:
-        """Return the same data at another stride."""
+        """Return the same data at another stride.
+
+        Raises:
+            InputError: The data is a latent cache, which has frames of one stride only.
+        """
+        if self.config.source == "latents" and stride != self.config.stride:
+            raise InputError(
+                where=self.config.path,
+                found=f"latents that were encoded for clips at stride {self.config.stride}",
+                needed=f"stride {stride}",
+                fix="Use the data set itself, with data.cache: off",
+            )
         return replace(self, config=self.config.with_stride(stride))
 
     @cached_property
@@ -93,7 +106,7 @@ class Dataset:
         """Return episodes, steps and, where the stride is known, windows."""
         windows = 0
         if self.config.stride != "auto":
-            starts = self._starts if kept is self.kept else clip_starts(self.table, kept, self.config)
+            starts = self.starts if kept is self.kept else clip_starts(self.table, kept, self.config)
             windows = starts.windows
         episodes = self.episodes if kept is self.kept else np.unique(kept.episode)
         return len(episodes), kept.steps, windows
@@ -106,7 +119,12 @@ class Dataset:
         return np.unique(self.kept.episode)
 
     @cached_property
-    def _starts(self) -> Starts:
+    def starts(self) -> Starts:
+        """The first steps of the clips of all splits.
+
+        Raises:
+            ValueError: The stride is still to be found out.
+        """
         return clip_starts(self.table, self.kept, self.config)
 
     @cached_property
@@ -124,6 +142,8 @@ class Dataset:
         """
         if self.config.states == "pose":
             return POSE_WIDTHS
+        if said := self.table.texts.get("widths"):
+            return Widths(*map(int, said.split()))
         first_error: InputError | None = None
         for episode in self.episodes[:_TRIED].tolist():
             try:
@@ -168,6 +188,8 @@ def open_source(config: DataConfig) -> EpisodeSource:
         from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 
         return LeRobotSource(config)
+    if config.source == "latents":
+        return LatentSource(config)
     from vjepa2_ac.data.sources.npz.source import NpzSource
 
     return NpzSource(config)
@@ -195,14 +217,38 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     if config.idle.rule == "none":
         kept = KeptSteps.whole(table, taking_part)
     else:
-        ranges = find_ranges(source, table, config, progress)
+        if isinstance(source, LatentSource):
+            ranges = source.kept_ranges()
+        else:
+            ranges = find_ranges(source, table, config, progress)
         kept = _kept_of(ranges, table, taking_part, broken)
         _say_how_many_are_listed(ranges, table, config)
     dataset = Dataset(config, source, table, kept, broken)
     if not len(dataset.episodes):
         raise _nothing_left(dataset)
+    if isinstance(source, LatentSource):
+        dataset = _of_latents(dataset, source)
     logger.info("%s: %d episodes take part, %d steps of them", config.path, kept.taking_part.sum(), kept.steps)
     return dataset
+
+
+def through_latents(dataset: Dataset, folder: Path) -> Dataset:
+    """Return the same data set, with the same clips in the same order, read from a latent cache that was made of it.
+
+    Raises:
+        InputError: The cache lacks episodes or is damaged.
+    """
+    changes = {"source": "latents", "path": str(folder), "cache": "off", "camera": dataset.config.cameras}
+    source = LatentSource(dataset.config.model_copy(update=changes))
+    return _of_latents(replace(dataset, source=source, table=source.infos()), source)
+
+
+def _of_latents(dataset: Dataset, source: LatentSource) -> Dataset:
+    """Check that a cache has what the clips need, and name its cameras in the config."""
+    source.require_encoded(dataset.starts.episode)
+    excluded = frozenset(dataset.config.exclude)
+    dataset.broken.found([problem for problem in source.wrong_files() if problem.name not in excluded])
+    return replace(dataset, config=source.settled_config)
 
 
 def _nothing_left(dataset: Dataset) -> InputError:

@@ -85,7 +85,7 @@ def find_ranges(
     """
     parts: dict[str, object] = {
         "found": "idle ranges",
-        "table": _fingerprint(table),
+        "table": fingerprint_of(table),
         "data": _knobs_that_matter(config),
     }
     if config.idle.rule == "published":
@@ -188,7 +188,7 @@ def _checked(ranges: object, name: str, steps: int, path: str) -> list[tuple[int
     return pairs
 
 
-def _fingerprint(table: EpisodeTable) -> str:
+def fingerprint_of(table: EpisodeTable) -> str:
     """Name everything that the episodes depend on: the key of their index, or where none is kept, what is known."""
     if "index" in table.texts:
         return table.texts["index"]

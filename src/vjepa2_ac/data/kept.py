@@ -48,21 +48,51 @@ class KeptSteps:
 
 @dataclass(frozen=True, eq=False)
 class Starts:
-    """First steps of clips as runs of neighbours: all of a run where count is span, else those that `drawn` chose."""
+    """First steps of clips as runs of neighbours: all of a run where count is span, else those that `drawn` chose.
+
+    Neighbours are `every` control steps apart: first, first + every, ..., span of them.
+    """
 
     episode: Int32[np.ndarray, " runs"]
     first: Int32[np.ndarray, " runs"]
     span: Int32[np.ndarray, " runs"]
     count: Int32[np.ndarray, " runs"]
+    every: int = 1
 
     def __getitem__(self, chosen: np.ndarray) -> Starts:
         """Return some of the runs, by a mask or by places."""
-        return Starts(*(column[chosen] for column in self.columns))
+        episode, first, span, count = (column[chosen] for column in self.columns)
+        return Starts(episode, first, span, count, self.every)
+
+    def thinned(self, phase: Int32[np.ndarray, " episodes"], every: int) -> Starts:
+        """Return every n-th start of runs of neighbours: those that lie a multiple of n from their episode's phase."""
+        first = self.first + (phase[self.episode] - self.first) % every
+        span = -((first - self.first - self.span) // every)  # rounded up; 0 or less where none is left
+        return Starts(self.episode, first, span, span, every)[span > 0]
+
+    def steps_of(self, run: int, id_hash: UInt64[np.ndarray, " episodes"], keep_share: float) -> Int[np.ndarray, " n"]:
+        """Return the starts of a run.
+
+        Args:
+            run: Which.
+            id_hash: Of all episodes.
+            keep_share: Of the idle windows.
+        """
+        episode, first, span, count = (int(column[run]) for column in self.columns)
+        steps = first + self.every * np.arange(span)
+        if count == span:
+            return steps
+        return steps[drawn(np.repeat(id_hash[[episode]], span), steps) < keep_share]
 
     @property
     def columns(self) -> tuple[Int32[np.ndarray, " runs"], ...]:
         """Episode, first, span, count."""
         return self.episode, self.first, self.span, self.count
+
+    @property
+    def episodes(self) -> Int32[np.ndarray, " episodes"]:
+        """The episodes that clips come from, each once, ascending."""
+        return np.unique(self.episode)
 
     @property
     def windows(self) -> int:
@@ -75,15 +105,21 @@ def clip_starts(table: EpisodeTable, kept: KeptSteps, config: DataConfig) -> Sta
     counts = kept.end - kept.start - (config.clip_steps - 1)
     fits = counts > 0
     runs = Starts(kept.episode[fits], kept.start[fits], counts[fits], counts[fits])
+    every, phase = config.start_every, np.zeros(len(table), np.int32)
+    phase[kept.episode[::-1]] = kept.start[::-1]  # the last one that is written counts: an episode's first range
     if config.idle.rule != "none" and config.idle.keep_share > 0:
-        still = _still(table, kept.taking_part, runs, config)
-        runs = Starts(*(np.concatenate(pair) for pair in zip(runs.columns, still.columns, strict=True)))
+        gaps = _gaps(table, kept.taking_part, runs, config).thinned(phase, every)
+        still = _still(table, gaps, config.idle.keep_share)
+        runs = runs.thinned(phase, every)
+        episode, first, span, count = map(np.concatenate, zip(runs.columns, still.columns, strict=True))
+        runs = Starts(episode, first, span, count, every)
+    else:
+        runs = runs.thinned(phase, every)
     return runs[np.lexsort((runs.first, table.id_rank[runs.episode]))]
 
 
-def _still(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], runs: Starts, config: DataConfig) -> Starts:
+def _still(table: EpisodeTable, gaps: Starts, keep_share: float) -> Starts:
     """Return the idle windows that stay: each is drawn by a hash of its episode's identity and its start."""
-    gaps = _gaps(table, taking_part, runs, config)
     ends = np.cumsum(gaps.span, dtype=np.int64)
     counts = np.zeros_like(gaps.span)
     cut = 0
@@ -92,11 +128,12 @@ def _still(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], runs
         upto = max(cut + 1, int(np.searchsorted(ends, before + _WINDOWS_AT_ONCE, side="right")))
         some = gaps[np.arange(cut, upto)]
         opens = ends[cut:upto] - before - some.span
-        start = np.arange(int(some.span.sum())) + np.repeat(some.first - opens, some.span)
-        stays = drawn(table.id_hash[np.repeat(some.episode, some.span)], start) < config.idle.keep_share
+        place = np.arange(int(some.span.sum())) - np.repeat(opens, some.span)  # within its gap
+        start = np.repeat(some.first, some.span) + gaps.every * place
+        stays = drawn(table.id_hash[np.repeat(some.episode, some.span)], start) < keep_share
         counts[cut:upto] = np.add.reduceat(stays, opens, dtype=np.int32)
         cut = upto
-    return Starts(gaps.episode, gaps.first, gaps.span, counts)[counts > 0]
+    return replace(gaps, count=counts)[counts > 0]
 
 
 def _gaps(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], runs: Starts, config: DataConfig) -> Starts:

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Int32, Int64, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.exclusion import NAMED, named
-from vjepa2_ac.data.kept import Starts, drawn
+from vjepa2_ac.data.kept import Starts
 from vjepa2_ac.data.table import EpisodeTable, identity_hash
 from vjepa2_ac.errors import InputError
 
@@ -51,10 +51,9 @@ class Windows:
         run = int(np.searchsorted(self.ends, index, side="right"))
         episode, first, span, count = (int(column[run]) for column in self.starts.columns)
         place = index - (int(self.ends[run]) - count)
-        if count < span:
-            numbers = drawn(np.repeat(self.id_hash[[episode]], span), np.arange(first, first + span))
-            place = int(np.flatnonzero(numbers < self.keep_share)[place])
-        return episode, first + place
+        if count == span:
+            return episode, first + self.starts.every * place
+        return episode, int(self.starts.steps_of(run, self.id_hash, self.keep_share)[place])
 
     @property
     def episodes(self) -> Int32[np.ndarray, " episodes"]:

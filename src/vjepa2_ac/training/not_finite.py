@@ -1,19 +1,22 @@
 """Which clips made a loss or gradient that is not finite? They are saved for a look, in RUN/not_finite/step-XXXXXXXX.
 
-Each process saves its own: an npz per clip (frames, states, actions, episode_id, start) and one picture of them.
+Each process saves its own: an npz per clip (frames, states, actions, episode_id, start) and one picture of them. Clips
+from a latent cache have no frames: their latents are saved instead, as float32, and the film is blank.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.episode import Batch
+from vjepa2_ac.data.sources.latents.precision import decoded
+from vjepa2_ac.episode import Batch, StoredLatents
 from vjepa2_ac.storage import atomic_writer
 
 NOT_FINITE = "not_finite"
@@ -31,7 +34,8 @@ class LookBack:
 
     def add(self, batch: Batch, loss: Float[Tensor, ""]) -> None:
         """Keep a micro-batch and its loss, unless too much is kept already. The loss is not waited for."""
-        self._bytes += batch.frames.nbytes
+        self._bytes += 0 if batch.frames is None else batch.frames.nbytes
+        self._bytes += 0 if batch.latents is None else batch.latents.values.nbytes
         if self._bytes <= MOST_BYTES:
             self._kept.append((batch, loss.detach()))
 
@@ -67,9 +71,10 @@ class LookBack:
 
 def _write(batch: Batch, place: int, path: Path) -> None:
     with atomic_writer(path) as file:
+        arrays: dict[str, Any] = _seen(batch, place)
         np.savez_compressed(
             file,
-            frames=batch.frames[place].numpy(),
+            **arrays,
             states=batch.states[place].numpy(),
             actions=batch.actions[place].numpy(),
             episode_id=np.array(batch.episode_ids[place]),
@@ -77,13 +82,23 @@ def _write(batch: Batch, place: int, path: Path) -> None:
         )
 
 
+def _seen(batch: Batch, place: int) -> dict[str, np.ndarray]:
+    if batch.frames is not None:
+        return {"frames": batch.frames[place].numpy()}
+    if batch.latents is None:
+        raise ValueError("a batch with neither frames nor latents")
+    scales = None if batch.latents.scales is None else batch.latents.scales[place]
+    return {"latents": decoded(StoredLatents(batch.latents.values[place], scales)).numpy()}
+
+
 def _draw(chosen: Sequence[tuple[Batch, int]], path: Path) -> None:
     from vjepa2_ac.evaluation.clip_picture import ClipPicture, plot_clips
 
+    blank = np.full((1, 9, 16, 3), 224, np.uint8)
     pictures = [
         ClipPicture(
             name=f"{batch.episode_ids[place]} from step {batch.starts[place]}",
-            frames=batch.frames[place].numpy(),
+            frames=_seen(batch, place).get("frames", blank),
             numbers={"states": batch.states[place].numpy(), "actions": batch.actions[place].numpy()},
         )
         for batch, place in chosen

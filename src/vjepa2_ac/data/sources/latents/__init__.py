@@ -1,0 +1,1 @@
+"""How does a latent cache become `Episode`s? One safetensors file for each episode and camera, and an index."""
