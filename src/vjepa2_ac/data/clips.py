@@ -80,17 +80,20 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
     )
 
 
-def pictures_of(
-    dataset: Dataset, episode: int, start: int, *, camera: str | None = None
-) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return what the model sees in a clip, for people to look at; of a latent cache, its small pictures.
+def pictures_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return the frames of a clip of a batch, cropped, for people to look at; of cached latents, small pictures.
 
     Raises:
-        InputError: The episode or one of the pictures cannot be read.
+        InputError: The pictures of a cache cannot be read.
+        ValueError: The clip is of another data set.
     """
+    if batch.frames is not None:
+        return batch.frames[row].numpy()
+    episode, start = dataset.table.find(batch.episode_ids[row]), batch.starts[row]
+    if episode is None:
+        raise ValueError(f"no episode {batch.episode_ids[row]}")
     steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
-    recording = dataset.source.read(episode, camera, dataset.needed_steps(episode))
-    return view(recording.read_frames(steps), dataset.config.crop)
+    return view(dataset.source.read(episode, batch.cameras[row]).read_frames(steps), dataset.config.crop)
 
 
 def _require_one_size(clips: Sequence[Clip]) -> None:
