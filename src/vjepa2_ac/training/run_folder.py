@@ -43,6 +43,7 @@ _FREE_TO_CHANGE = (
     "data.prefetch",
     "data.connections",
     "data.disk_cache.",
+    "data.cache_dir",
     "data.check_crc",
     "data.exclude",
     "data.broken_episodes",
