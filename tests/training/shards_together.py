@@ -8,12 +8,13 @@ from pathlib import Path
 
 import torch
 from accelerate import Accelerator
+from torch.distributed.fsdp import FSDPModule
 from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_as_dict, load_config, parse_config
 from vjepa2_ac.console import ConsoleReporter
-from vjepa2_ac.training.assembly import Run, assemble, batches_from, make_accelerator
+from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, make_accelerator
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.step import gradients, training_step
 
@@ -67,7 +68,11 @@ def check_parts(config: Config, accelerator: Accelerator) -> None:
     batches = batches_from(run)
     training_step(run, batches, 1)
     gradients(run, batches)
-    weights = list(run.world_model.predictor.parameters())
+    with torch.no_grad():
+        run.objective(encode(run, next(batches)))
+    predictor = run.world_model.base_predictor
+    assert all(isinstance(module, FSDPModule) for module in (predictor, *predictor.blocks))
+    weights = list(predictor.parameters())
     moments = [value for state in run.optimizer.state.values() for value in state.values() if value.ndim]
     trained = [value.grad for value in weights if value.grad is not None]
     assert len(moments) == 2 * len(trained) > 0
