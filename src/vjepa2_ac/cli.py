@@ -13,6 +13,7 @@ from pathlib import Path
 from vjepa2_ac import __version__
 from vjepa2_ac.cli_data import add_data, count
 from vjepa2_ac.cli_doctor import add_doctor
+from vjepa2_ac.cli_encode import add_encode
 from vjepa2_ac.errors import InputError
 
 Handler = Callable[[argparse.Namespace], int | None]
@@ -64,6 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_train(commands)
     _add_evaluate(commands)
     add_data(commands)
+    add_encode(commands)
     add_doctor(commands)
     _add_export(commands)
     _add_config(commands)

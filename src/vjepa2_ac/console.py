@@ -90,6 +90,26 @@ class LateProgress:
             self._bar = None
 
 
+class EncodingBar:
+    """A bar of frames that are encoded, with their number per second; begins when it is first told of any."""
+
+    def __init__(self) -> None:
+        self._bar: ProgressBar | None = None
+        self._began = 0.0
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that `done` of `total` are done."""
+        if self._bar is None:
+            self._bar, self._began = ProgressBar("encoding frames", total), time.monotonic()
+        speed = done / max(time.monotonic() - self._began, 1e-9)
+        self._bar.advance_to(done, f"{speed:.{1 if speed < 100 else 0}f} frames/s" if done else "")
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._bar is not None:
+            self._bar.close()
+
+
 class DownloadProgress:
     """Shows a download as it grows."""
 
@@ -109,6 +129,7 @@ class ConsoleReporter:
 
     def __init__(self) -> None:
         self._looking = LateProgress("looking through the data set")
+        self._encoding = EncodingBar()
         self._bar: ProgressBar | None = None
         self._validation = ""
 
@@ -119,6 +140,10 @@ class ConsoleReporter:
     def looked_through(self, done: int, total: int) -> None:
         """Show how far a data set is looked through."""
         self._looking(done, total)
+
+    def encoded(self, done: int, total: int) -> None:
+        """Show how far the latent cache is."""
+        self._encoding(done, total)
 
     def started(self, done: int, total: int) -> None:
         """Begin the bar."""
@@ -149,6 +174,7 @@ class ConsoleReporter:
     def close(self) -> None:
         """Leave the terminal as it was."""
         self._looking.close()
+        self._encoding.close()
         if self._bar is not None:
             self._bar.close()
 

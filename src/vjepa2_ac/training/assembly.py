@@ -22,6 +22,7 @@ from vjepa2_ac.latents import encode_batch, extrinsics_for
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import add_adapter, save_trained, trainable_report
 from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.cached import with_latents
 from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, write_checkpoint
 from vjepa2_ac.training.device import is_on_cpu
 from vjepa2_ac.training.embodiment import check_heads, fit_to_data
@@ -55,6 +56,11 @@ class Run:
     calibration: Calibration | None = None  # where data.stride was auto and is now chosen
 
     @property
+    def encodes(self) -> bool:
+        """Whether clips are pictures that go through the encoder, not latents of a cache."""
+        return self.dataset.config.source != "latents"
+
+    @property
     def clips_per_step(self) -> int:
         """Clips of an optimizer step, of all processes together."""
         return self.micro_batches * self.config.training.batch_size * int(self.accelerator.num_processes)
@@ -65,6 +71,9 @@ def assemble(
     note: Callable[[str], None],
     looked_through: Progress | None = None,
     accelerator: Accelerator | None = None,
+    encoding: Progress | None = None,
+    *,
+    check_only: bool = False,
 ) -> Run:
     """Open the data, load the model, attach the adapter, and take up the newest checkpoint. Cheap failures first.
 
@@ -73,6 +82,8 @@ def assemble(
         note: Told what a person should know.
         looked_through: Told how far the data set is looked through, where that was not done before.
         accelerator: What `make_accelerator` gave for this config; None: it is made here.
+        encoding: Told how many frames are encoded, where `data.cache` is auto and they are not there yet.
+        check_only: Leave such a cache alone, and say how large it would be.
 
     Raises:
         InputError: Something cannot be used.
@@ -93,10 +104,13 @@ def assemble(
     first_clip = _read_one_clip_of_each_split(dataset)
     world_model = world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, first_clip)
+    dataset = with_latents(config, dataset, world_model, accelerator, note, encoding=encoding, check_only=check_only)
     fit_to_data(world_model, config, dataset, note)
     add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
     note(str(trainable_report(world_model)))
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
+    if dataset.config.source == "latents":
+        world_model.set_encoder_aside()
     world_model.to(accelerator.device)
     optimizer = make_optimizer(world_model, config.training)
     scaler = torch.amp.GradScaler(accelerator.device.type, enabled=config.training.precision == "fp16")

@@ -67,11 +67,22 @@ class Throughput:
     device: torch.device
 
     @classmethod
-    def of(cls, config: Config, sizes: ModelSizes, device: torch.device, processes: int) -> Throughput:
-        """Measure the ceiling, once per device, precision and program."""
+    def of(
+        cls, config: Config, sizes: ModelSizes, device: torch.device, processes: int, *, encodes: bool = True
+    ) -> Throughput:
+        """Measure the ceiling, once per device, precision and program.
+
+        Args:
+            config: The run.
+            sizes: Of its model.
+            device: Of this process.
+            processes: Of the run.
+            encodes: Whether the encoder's work counts; latents from a cache need none.
+        """
         tokens = config.data.frames * (sizes.image_size // sizes.patch_size) ** 2
         ceiling = processes * matmul_speed(device, _TYPES[config.training.precision])
-        return cls(clip_flops(config, sizes).total, tokens, ceiling, device)
+        flops = clip_flops(config, sizes)
+        return cls(flops.total if encodes else flops.predictor, tokens, ceiling, device)
 
     def figures(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
         """Return the figures of one step.

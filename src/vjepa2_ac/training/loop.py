@@ -55,6 +55,10 @@ class Reporter(Protocol):
         """So much of a data set that was not known before is looked through."""
         ...
 
+    def encoded(self, done: int, total: int) -> None:
+        """So many frames are encoded into the latent cache."""
+        ...
+
     def started(self, done: int, total: int) -> None:
         """The loop begins after `done` of `total` optimizer steps."""
         ...
@@ -102,7 +106,9 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             reporter = QuietReporter()
         config = from_first(accelerator, config)
         until_the_end.enter_context(_out_of_memory_explained())
-        run = assemble(config, reporter.note, reporter.looked_through, accelerator)
+        run = assemble(
+            config, reporter.note, reporter.looked_through, accelerator, reporter.encoded, check_only=check_only
+        )
         try:
             return _train(run, lock, remote, reporter, check_only=check_only, allow_config_change=allow_config_change)
         except StoppedError:
@@ -151,7 +157,7 @@ def _loop(
 ) -> None:
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
-    throughput = Throughput.of(run.config, run.world_model.sizes, device, processes)
+    throughput = Throughput.of(run.config, run.world_model.sizes, device, processes, encodes=run.encodes)
     reporter.note(str(throughput))
     reporter.started(run.state.step, training.steps)
     clock = CheckpointClock(run.config.checkpoint)

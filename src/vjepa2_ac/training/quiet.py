@@ -17,6 +17,9 @@ class QuietReporter:
     def looked_through(self, done: int, total: int) -> None:
         """Show nothing."""
 
+    def encoded(self, done: int, total: int) -> None:
+        """Show nothing."""
+
     def started(self, done: int, total: int) -> None:
         """Show nothing."""
 

@@ -1,0 +1,159 @@
+"""How is a data set encoded before it is trained on, by itself or at the start of a run?
+
+By itself it needs no word between processes: each has its share of the episodes, and a file says when one is done.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
+
+import torch
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.latent_cache import folder_of, key_for
+from vjepa2_ac.data.sources.latents.folder import Manifest, is_whole, read_manifest
+from vjepa2_ac.data.sources.latents.writer import CacheWriter
+from vjepa2_ac.encoding.build import EncoderAtWork, build
+from vjepa2_ac.encoding.room import require_room
+from vjepa2_ac.encoding.work import Share, Work, take_folder
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.latents import encoding_of
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.device import autocast, is_on_cpu
+
+Note = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class EncodedSet:
+    """What became of a cache."""
+
+    folder: Path
+    manifest: Manifest | None  # None: other processes are still at work
+
+
+def encode_config(
+    config: Config,
+    note: Note,
+    *,
+    out: Path | None = None,
+    looked_through: Progress | None = None,
+    progress: Progress | None = None,
+) -> EncodedSet:
+    """Write the latents of every frame that the clips of a config need, or this process's share of them.
+
+    Args:
+        config: The data, the model whose encoder is used, device and precision.
+        note: Told what a person should know.
+        out: The folder of the cache; None: where `data.cache` looks for it.
+        looked_through: Told how far the data set is looked through.
+        progress: Told (done, total) in frames.
+
+    Raises:
+        InputError: Something cannot be used, or there is no room for it.
+    """
+    require_encodable(config)
+    is_on_cpu(config.training)
+    dataset = open_dataset(config.data, progress=looked_through)
+    model = load_base(config.model, seed=config.seed)
+    writer = writer_for(config, dataset, model, out)
+    if is_whole(writer.folder):
+        take_folder(writer)
+        note(f"Everything is encoded already, in {writer.folder}")
+        return EncodedSet(writer.folder, read_manifest(writer.folder))
+    share = Share(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
+    device = _device(config)
+    at_work = encoder_at_work(config, model, device)
+    return EncodedSet(writer.folder, encode_share(config, dataset, writer, at_work, share, note, progress))
+
+
+def require_encodable(config: Config) -> None:
+    """Refuse a config of which no cache can be made, before anything is opened.
+
+    Raises:
+        InputError: The data are a cache, the stride is not known, or clips are augmented.
+    """
+    data = config.data
+    if data.source == "latents":
+        raise InputError(
+            where="data.source", found="latents: they are encoded already", needed="a data set of pictures"
+        )
+    if data.stride == "auto":
+        raise InputError(
+            where="data.stride",
+            found="auto: which frames are needed is not known yet",
+            needed="a number of control steps",
+            fix="`vjepa2-ac data calibrate` finds one; or let the run encode by itself, with data.cache: auto",
+        )
+    if data.augment.is_on:
+        raise InputError(
+            where="data.augment",
+            found="clips that look different every time",
+            needed="none, for a cache: it holds one latent of each frame",
+            fix="Leave data.augment out",
+        )
+
+
+def writer_for(config: Config, dataset: Dataset, model: WorldModel, out: Path | None = None) -> CacheWriter:
+    """Return what writes the cache of a data set that is open, made with the encoder of this model."""
+    encoding = encoding_of(model, config)
+    key = key_for(dataset, encoding)
+    return CacheWriter(folder_of(config.data, key) if out is None else out.expanduser(), key, encoding)
+
+
+def encoder_at_work(config: Config, model: WorldModel, device: torch.device) -> EncoderAtWork:
+    """Put the encoder of a model on a device, and it alone."""
+    model.present_encoder.to(device)
+    return EncoderAtWork(model, device, partial(autocast, config.training, device), config.model.encode_chunk)
+
+
+def encode_share(
+    config: Config,
+    dataset: Dataset,
+    writer: CacheWriter,
+    encoder: EncoderAtWork,
+    share: Share,
+    note: Note,
+    progress: Progress | None = None,
+) -> Manifest | None:
+    """Say what is to be done, see that there is room, and do the share of one process.
+
+    Raises:
+        InputError: As `encode_config`.
+    """
+    work = Work.of(dataset, writer, share)
+    note(f"Encoding {config.data.path}: {work.room} as {config.data.cache_dtype}, in {writer.folder}")
+    if work.left_of_all < work.frames:
+        note(f"{work.frames - work.left_of_all:,} frames are there already; {work.left_of_all:,} are left")
+    require_room(work.room, writer.folder, smaller=smaller_caches(config))
+    take_folder(writer)
+    return build(work, encoder, threads=max(1, config.data.workers), progress=progress)
+
+
+def duration(frames: int, per_second: float) -> str:
+    """Return how long frames take, in words."""
+    return str(timedelta(seconds=round(frames / per_second)))
+
+
+def smaller_caches(config: Config) -> tuple[str, ...]:
+    """Return the knobs that would make a cache smaller."""
+    data = config.data
+    knobs = [] if data.cache_dtype == "int8" else ["data.cache_dtype: int8"]
+    if data.start_every % data.model_stride:
+        knobs.append(f"data.start_every: {data.model_stride}")
+    return tuple(knobs)
+
+
+def _device(config: Config) -> torch.device:
+    """Return the device of this process among those on its machine."""
+    if is_on_cpu(config.training):
+        return torch.device("cpu")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())
