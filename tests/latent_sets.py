@@ -60,7 +60,8 @@ def encode_for(config: Config, world_model: WorldModel, dataset: Dataset) -> Pat
 
     def encode(frames: np.ndarray) -> torch.Tensor:
         inputs = pixels_to_input(torch.from_numpy(np.ascontiguousarray(frames))[None], world_model.image_size)
-        with torch.no_grad():
+        is_bf16 = config.training.precision == "bf16"
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=is_bf16):
             return world_model.encode(inputs, chunk=config.model.encode_chunk)[0]
 
     return write_cache(dataset, encoding_of(world_model, config), encode)

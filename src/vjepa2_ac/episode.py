@@ -27,7 +27,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float32, Num, UInt8
+from jaxtyping import Float, Float32, Int, Num, UInt8
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -99,6 +99,7 @@ class Episode:
         None  # recorded actions, where `data.actions` asks for them
     )
     read_latents: LatentReader | None = None  # of a cache; its `read_frames` gives small pictures for people to look at
+    frame_steps: Int[np.ndarray, " frames"] | None = None  # control steps that have a picture, ascending; None: all
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,10 @@ from synthetic import synthetic_episode, synthetic_states
 from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import BrokenEpisodes
+from vjepa2_ac.data.check import check_data
 from vjepa2_ac.data.clips import pictures_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.inspection import inspect_dataset
 from vjepa2_ac.data.kept import KeptSteps
 from vjepa2_ac.data.latent_cache import needed_frames, require_encoding, through_cache
 from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
@@ -34,6 +36,7 @@ from vjepa2_ac.data.sources.rlds.writer import write_droid_rlds
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.data_picture import picture_data_set
 
 STEPS, FRAMES, TOKENS, DIM = 12, (0, 2, 5, 11), 4, 24
 
@@ -544,3 +547,14 @@ def test_knobs_that_contradict_a_cache_are_errors(tmp_path: Path, knobs: dict[st
 
 def test_off_needs_no_quotes(tmp_path: Path) -> None:
     assert config_of(tmp_path, tmp_path, cache=False).cache == "off"
+
+
+def test_a_cache_can_be_checked_and_inspected(a_cache: tuple[Dataset, Dataset, Path], tmp_path: Path) -> None:
+    config = alone(a_cache[1], camera=None).config
+    found = {finding.about: finding for finding in check_data(config)}
+    assert "latents (2, 3, 4, 8) bfloat16" in found["batch"].text
+    assert "camera exterior_1_left" in found["source"].text
+    assert "error" not in {finding.level for finding in found.values()}
+    dataset = open_dataset(config)
+    sheet = picture_data_set(dataset, inspect_dataset(dataset), tmp_path / "sheet.png", rows=2)
+    assert sheet.stat().st_size > 10_000

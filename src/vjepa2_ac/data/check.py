@@ -62,6 +62,7 @@ def check_data(
     """
     started = clock()
     dataset = open_dataset(config, progress=progress)
+    config = dataset.config
     seconds = clock() - started
     steps = int(dataset.table.num_steps.sum())
     yield Finding("ok", "source", f"{config.source}, {config.path}, camera {', '.join(config.cameras)}")

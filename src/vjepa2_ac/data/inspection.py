@@ -204,7 +204,8 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
 
 def sample_of(dataset: Dataset, count: int) -> list[int]:
     """Return at most `count` episodes of those that take part: a random draw that is always the same."""
-    members = dataset.episodes
+    # A latent cache has only the episodes of which clips are made.
+    members = dataset.starts.episodes if dataset.config.source == "latents" else dataset.episodes
     members = members[np.argsort(dataset.table.id_hash[members], kind="stable")]
     return [int(members[place]) for place in spread(len(members), count)]
 

@@ -127,9 +127,10 @@ def _short_names(names: Sequence[str]) -> list[str]:
 def _strip(dataset: Dataset, inspection: Inspection, one: ReadEpisode, name: str) -> Strip:
     episode = dataset.source.read(one.index)
     steps = len(one.states)
-    height, width = episode.read_frames([0]).shape[1:3]
-    count = min(pictures_per_row(height, width), steps)
-    at = ((np.arange(count) + 0.5) * steps / count).astype(np.int64)
+    pictured = np.arange(steps) if episode.frame_steps is None else episode.frame_steps
+    height, width = episode.read_frames([int(pictured[0])]).shape[1:3]
+    count = min(pictures_per_row(height, width), len(pictured))
+    at = pictured[((np.arange(count) + 0.5) * len(pictured) / count).astype(np.int64)].astype(np.int64)
     return Strip(
         name=name,
         success=episode.info.success,

@@ -111,6 +111,7 @@ class LatentSource:
             metadata=record.metadata,
             commands=record["commands"],
             read_latents=_LatentReader(record, checked, self._config.check_crc),
+            frame_steps=record.frame_steps,
         )
 
     def wrong_files(self) -> list[Problem]:

@@ -79,27 +79,19 @@ class CacheWriter:
             InputError: The folder cannot be written.
             ValueError: An episode is neither written nor broken.
         """
-        config, cameras = dataset.config, dataset.config.cameras
-        sizes = {size_column(place): self._sizes(len(dataset.table), camera) for place, camera in enumerate(cameras)}
-        names = (dataset.table.identity(number) for number in range(len(dataset.table)))
-        unread = [number for number, name in enumerate(names) if name in broken]
-        for column in sizes.values():
-            column[unread] = 0
-            lacking = np.setdiff1d(np.unique(dataset.starts.episode[column[dataset.starts.episode] == 0]), unread)
-            if len(lacking):
-                raise ValueError(f"{len(lacking)} episodes are not written: {lacking[:10].tolist()}")
-        widths = " ".join(map(str, dataset.widths))
-        texts = {**dataset.table.texts, "control_rate_hz": str(dataset.control_rate_hz), "widths": widths}
-        files = {EPISODES: replace(dataset.table, locators=sizes, texts=texts).to_bytes()}
-        if config.idle.rule != "none":
-            files[KEPT] = find_ranges(dataset.source, dataset.table, config, None).to_bytes()
+        sizes = self._sizes_without(broken, dataset)
+        texts = {"control_rate_hz": str(dataset.control_rate_hz), "widths": " ".join(map(str, dataset.widths))}
+        table = replace(dataset.table, locators=sizes, texts={**dataset.table.texts, **texts})
+        files = {EPISODES: table.to_bytes()}
+        if dataset.config.idle.rule != "none":
+            files[KEPT] = find_ranges(dataset.source, dataset.table, dataset.config, None).to_bytes()
         manifest = Manifest(
             key=self.key.parts,
             digest=self.key.digest,
             tokens=self.encoding.tokens,
             dim=self.encoding.dim,
             control_rate_hz=dataset.control_rate_hz,
-            episodes=len(dataset.table),
+            episodes=len(table),
             encoded=int((np.stack(list(sizes.values())) > 0).all(axis=0).sum()),
             frames=frames,
             bytes=sum(int(column.sum()) for column in sizes.values()),
@@ -112,6 +104,25 @@ class CacheWriter:
                 storage.write_atomically(self.folder / name, data)
             storage.write_atomically(self.folder / MANIFEST, manifest.to_text())
         return manifest
+
+    def _sizes_without(self, broken: Mapping[str, str], dataset: Dataset) -> dict[str, Int64[np.ndarray, " episodes"]]:
+        """Return the size of every file, a column for each camera.
+
+        Raises:
+            ValueError: One that clips need is not there, and its episode is not broken.
+        """
+        found = [dataset.table.find(name) for name in broken]
+        unread = np.array([place for place in found if place is not None], np.int64)
+        sizes = {}
+        for place, camera in enumerate(dataset.config.cameras):
+            column = self._sizes(len(dataset.table), camera)
+            column[unread] = 0
+            needed = dataset.starts.episodes
+            lacking = np.setdiff1d(needed[column[needed] == 0], unread)
+            if len(lacking):
+                raise ValueError(f"{len(lacking)} episodes are not written: {lacking[:10].tolist()}")
+            sizes[size_column(place)] = column
+        return sizes
 
     def _sizes(self, episodes: int, camera: str) -> Int64[np.ndarray, " episodes"]:
         paths = [path_of(self.folder, number, camera) for number in range(episodes)]
