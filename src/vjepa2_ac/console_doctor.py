@@ -19,7 +19,11 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
     eight_bits = "8 bits where a tensor has 4,096 elements" if training.optimizer == "adamw_8bit" else "float32"
     guess = f"a guess: four tensors as wide as the MLP{', a weight measured by DoRA' if config.adapter.dora else ''}"
     parts = [
-        ("encoder, frozen", estimate.encoder_weights, f"{counts.encoder:,} weights in {config.model.dtype}"),
+        (
+            "encoder, frozen", estimate.encoder_weights,
+            "none: latents come from a cache" if config.data.takes_latents
+            else f"{counts.encoder:,} weights in {config.model.dtype}",
+        ),
         (
             "predictor, frozen", estimate.predictor_weights,
             f"{counts.predictor:,} weights" if estimate.predictor_weights else "none: all of it is trained",
@@ -39,6 +43,7 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
             "validation", estimate.validating,
             f"instead of all that: {config.validation.batch_size} clips, and the keys and values of their rollout",
         ),
+        *([("encoding the cache", estimate.caching, "before all that: the encoder alone")] if estimate.caching else []),
         ("CUDA, cuBLAS, holes", ALLOWANCE, "an allowance, not computed"),
     ]  # fmt: skip
     lines = [f"  {name:<28}{size / GIGABYTE:8.3f} GB  {about}" for name, size, about in parts]

@@ -9,8 +9,9 @@ import torch
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset
-from vjepa2_ac.encoding.ahead import FRAMES_AT_ONCE, Part, Unreadable, Wanted, decoded_ahead
+from vjepa2_ac.encoding.ahead import Part, Unreadable, Wanted, decoded_ahead
 from vjepa2_ac.encoding.chunks import Chunks, Encoded
+from vjepa2_ac.encoding.room import FRAMES_AT_ONCE
 from vjepa2_ac.episode import Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError

@@ -115,3 +115,29 @@ def test_doctor_says_how_moments_are_kept(optimizer: str, words: str) -> None:
     config = run_config(training__optimizer=optimizer)
     (line,) = [line for line in memory_lines(config, estimate_memory(config, ModelSizes())) if "moments" in line]
     assert words in line
+
+
+def test_a_run_on_latents_has_no_encoder_beside_the_predictor() -> None:
+    sizes = ModelSizes()
+    config = run_config(data__frames=16)
+    on_pictures, on_latents = (
+        estimate_memory(config.model_copy(update={"data": config.data.model_copy(update={"cache": cache})}), sizes)
+        for cache in ("off", "auto")
+    )
+    assert on_latents.encoder_weights == on_latents.encoding == on_pictures.caching == 0
+    saved = on_pictures.total(checkpointing=False) - on_latents.total(checkpointing=False)
+    assert saved >= on_pictures.encoder_weights > 2e9
+    assert on_pictures.encoder_weights < on_latents.caching < on_latents.total(checkpointing=False)
+
+
+def test_encoding_a_cache_is_the_peak_where_the_predictor_is_small() -> None:
+    sizes = model_sizes(width=48)
+    estimate = estimate_memory(run_config(data__cache="auto", model__encode_chunk=256), sizes)
+    assert estimate.total(checkpointing=True) == estimate.caching
+
+
+def test_doctor_says_that_latents_come_from_a_cache() -> None:
+    config = run_config(data__cache="auto")
+    printed = "\n".join(memory_lines(config, estimate_memory(config, ModelSizes())))
+    assert "none: latents come from a cache" in printed
+    assert "encoding the cache" in printed

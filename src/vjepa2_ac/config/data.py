@@ -312,6 +312,11 @@ class DataConfig(Section):
         return (self.camera,) if isinstance(self.camera, str) else self.camera
 
     @property
+    def takes_latents(self) -> bool:
+        """Whether clips come from a latent cache, so that the encoder is not needed beside the predictor."""
+        return self.source == "latents" or self.cache != "off"
+
+    @property
     def clip_steps(self) -> int:
         """Control steps that a clip spans, first and last frame included.
 

@@ -15,11 +15,11 @@ from jaxtyping import Int32, UInt8
 from vjepa2_ac.data.actions import require_widths
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.transforms import view
+from vjepa2_ac.encoding.room import FRAMES_AT_ONCE
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
 
-FRAMES_AT_ONCE = 64  # of a part: a run of a video that is decoded in one go, and 180 MB of 720p at most
 _PARTS_AHEAD = 2  # for each thread: one that is made, and one that is ready
 
 

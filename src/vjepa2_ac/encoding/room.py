@@ -9,6 +9,7 @@ from pathlib import Path
 from vjepa2_ac.errors import InputError
 
 GIGABYTE = 10**9
+FRAMES_AT_ONCE = 64  # that are decoded in one go: a run of a video, and 180 MB of 720p at most
 PICTURE_SIDE = 192  # pixels, at most, of the small pictures for people to look at
 
 

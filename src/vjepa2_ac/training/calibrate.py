@@ -9,7 +9,7 @@ from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.calibration import Calibration
-from vjepa2_ac.latents import require_widths
+from vjepa2_ac.latents import require_same_encoder, require_widths
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.assembly import make_accelerator
@@ -30,6 +30,8 @@ def calibrate_config(
 ) -> Calibration:
     """Calibrate the model of a config, or another one, on the config's data.
 
+    A latent cache has the frames of one stride's clips only, so pictures are encoded on the fly.
+
     Args:
         config: The data, the model, the device and the precision.
         model: Another model: what `model.base` takes, or the folder of a run.
@@ -46,6 +48,7 @@ def calibrate_config(
     dataset = open_dataset(config.data, progress=indexing)
     world_model = _load(config, model)
     require_widths(world_model, dataset.widths, where=model or f"model.base: {config.model.base}")
+    require_same_encoder(world_model, dataset, config)
     world_model.to(accelerator.device)
     return calibrate_model(
         world_model, dataset, config, accelerator, clips=clips, split=split, frames=frames, progress=measuring

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.encoding.room import FRAMES_AT_ONCE
 from vjepa2_ac.training.kept import Kept
 from vjepa2_ac.training.kept_block import FLOAT32, HALF, Kind
 from vjepa2_ac.training.parameters import (
@@ -30,7 +31,7 @@ _SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # of bitsandbytes
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """Bytes on the GPU, part by part. `total` is the largest of four moments: they do not happen at once."""
+    """Bytes on the GPU, part by part. `total` is the largest of five moments: they do not happen at once."""
 
     parameters: Parameters
     checkpointing: bool  # what the config asks for
@@ -49,6 +50,7 @@ class MemoryEstimate:
     temporaries: int
     optimizer_temporaries: int
     validating: int  # all of a batch of validation
+    caching: int  # all of encoding a cache, which is over before the rest begins
 
     @property
     def standing(self) -> int:
@@ -61,7 +63,7 @@ class MemoryEstimate:
         kept = self.checkpointed if checkpointing else self.teacher_forcing + self.rollout + self.losses
         predicting = self.latents + kept + self.cast_cache + self.temporaries
         training = self.gradients + max(self.latents + self.encoding, predicting, self.optimizer_temporaries)
-        return self.standing + max(training, self.validating)
+        return max(self.standing + max(training, self.validating), self.caching)
 
 
 def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> MemoryEstimate:
@@ -78,7 +80,7 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
     return MemoryEstimate(
         parameters=parameters,
         checkpointing=config.training.gradient_checkpointing,
-        encoder_weights=parameters.encoder * number,
+        encoder_weights=0 if config.data.takes_latents else parameters.encoder * number,
         predictor_weights=parameters.predictor * number if config.adapter.kind == "lora" else 0,
         trained=parameters.trained * FLOAT32,
         gradients=parameters.trained * FLOAT32,
@@ -93,6 +95,7 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
         temporaries=_temporaries(config, sizes, config.training.batch_size) + _dora_temporaries(config, sizes),
         optimizer_temporaries=parameters.trained * FLOAT32 if config.training.optimizer == "adamw" else 0,
         validating=_validating(config, sizes),
+        caching=parameters.encoder * number + _caching(config, sizes) if config.data.cache != "off" else 0,
     )
 
 
@@ -117,6 +120,10 @@ def _with(config: Config, section: str, **changes: object) -> Config:
     return config.model_copy(update={section: getattr(config, section).model_copy(update=changes)})
 
 
+def _with_cache(config: Config) -> Config:
+    return config if config.data.takes_latents else _with(config, "data", cache="auto")
+
+
 _KNOBS: tuple[tuple[str, Callable[[Config], Config]], ...] = (
     ("training.gradient_checkpointing=true", lambda run: _with(run, "training", gradient_checkpointing=True)),
     (
@@ -128,6 +135,7 @@ _KNOBS: tuple[tuple[str, Callable[[Config], Config]], ...] = (
         lambda run: _with(_with(run, "model", dtype="bfloat16"), "training", precision="bf16"),
     ),
     ("model.encode_chunk=4", lambda run: _with(run, "model", encode_chunk=min(4, run.model.encode_chunk))),
+    ("data.cache=auto", lambda run: run if run.data.augment.is_on else _with_cache(run)),
     (
         "data.frames=8",
         lambda run: _with(run, "data", frames=min(run.data.frames, max(8, run.training.rollout_steps + 1))),
@@ -163,8 +171,18 @@ def _number(config: Config) -> int:
 
 def _encoding(config: Config, sizes: ModelSizes, clips: int) -> int:
     """Return the bytes that live at once in the larger half of an encoder block, the frames, and the features."""
+    return 0 if config.data.takes_latents else _at_work(config, sizes, clips * config.data.frames)
+
+
+def _caching(config: Config, sizes: ModelSizes) -> int:
+    """Return the bytes of encoding a cache beside the encoder's weights; a part of an episode waits as input."""
+    waiting = FRAMES_AT_ONCE * 3 * sizes.image_size**2 * (FLOAT32 + 1)
+    return ALLOWANCE + waiting + _at_work(config, sizes, config.model.encode_chunk)
+
+
+def _at_work(config: Config, sizes: ModelSizes, frames: int) -> int:
     width, hidden = sizes.encoder.width, int(sizes.encoder.width * sizes.encoder.mlp_ratio)
-    number, frames = _number(config), clips * config.data.frames
+    number = _number(config)
     tokens = min(config.model.encode_chunk, frames) * _tokens_per_frame(sizes)
     attention = width * (4 * number + 5 * FLOAT32)  # residual, query, key, value; normed, and four while rotating
     mlp = width * (2 * number + 2 * FLOAT32) + 2 * hidden * number  # residual and output; normed, cast; around GELU
