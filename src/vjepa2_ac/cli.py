@@ -14,6 +14,7 @@ from vjepa2_ac import __version__
 from vjepa2_ac.cli_data import add_data, count
 from vjepa2_ac.cli_doctor import add_doctor
 from vjepa2_ac.cli_encode import add_encode
+from vjepa2_ac.cli_evaluate import add_checkpoint, add_evaluate
 from vjepa2_ac.errors import InputError
 
 Handler = Callable[[argparse.Namespace], int | None]
@@ -63,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     _add_train(commands)
-    _add_evaluate(commands)
+    add_evaluate(commands)
     add_data(commands)
     add_encode(commands)
     add_doctor(commands)
@@ -136,44 +137,6 @@ def _train(options: argparse.Namespace) -> int:
     return 0
 
 
-def _add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
-        commands, "evaluate", _evaluate, "Measure a run on held-out episodes, beside its base and persistence."
-    )
-    parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="folder of a run; several: their spread too")
-    parser.add_argument("--split", choices=["test", "validation"], default="test", help="which held-out episodes")
-    parser.add_argument("--clips", type=count, default=256, help="at most this many clips, spread over the episodes")
-    _add_checkpoint(parser)
-
-
-def _add_checkpoint(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--checkpoint",
-        default="newest",
-        metavar="newest|best|STEP",
-        help="which one: the newest (default), the best by validation, or that of a step",
-    )
-
-
-def _evaluate(options: argparse.Namespace) -> None:
-    from vjepa2_ac.console import console, evaluation_table
-    from vjepa2_ac.evaluation.report import spread, verdict
-    from vjepa2_ac.training.runs import evaluate_run
-
-    evaluations = []
-    for run in options.runs:
-        measured = evaluate_run(run, split=options.split, clips=options.clips, checkpoint=options.checkpoint)
-        evaluation = measured.evaluation
-        evaluations.append(evaluation)
-        console.print(f"{run}: checkpoint {measured.checkpoint}")
-        console.print(evaluation_table(evaluation.models, evaluation.seconds_per_step))
-        console.print(verdict(evaluation))
-        for path in measured.files:
-            console.print(f"  {path}")
-    if len(evaluations) > 1:
-        console.print(spread(evaluations))
-
-
 def _add_export(commands: _Commands[argparse.ArgumentParser]) -> None:
     parser = _command(
         commands, "export", _export, "Write a run's model, adapter merged in, or its adapter, for others to use."
@@ -187,7 +150,7 @@ def _add_export(commands: _Commands[argparse.ArgumentParser]) -> None:
         help="merged: a folder that `model.base` takes. official: one .pt by Meta's names, for the official code."
         " hub: the adapter in PEFT's format with a model card, ready to upload",
     )
-    _add_checkpoint(parser)
+    add_checkpoint(parser)
 
 
 def _export(options: argparse.Namespace) -> None:

@@ -8,7 +8,7 @@ from datetime import timedelta
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
-from rich.table import Column, Table
+from rich.table import Column
 
 from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, ratios_by_horizon
 
@@ -177,23 +177,3 @@ class ConsoleReporter:
         self._encoding.close()
         if self._bar is not None:
             self._bar.close()
-
-
-def evaluation_table(models: Mapping[str, PredictionErrors], seconds_per_step: float) -> Table:
-    """Return the table of `evaluate`: error over persistence by horizon, then the use of the actions."""
-    horizons = next(iter(models.values())).rollout.shape[1]
-    table = Table(
-        title="Latent error / persistence on held-out episodes (95 % interval over episodes)", title_justify="left"
-    )
-    table.add_column("open loop", no_wrap=True)
-    for name in ("persistence", *models):
-        table.add_column(name, justify="right", no_wrap=True)
-    columns = {name: ratios_by_horizon(errors) for name, errors in models.items()}
-    for horizon in range(horizons):
-        seconds = (horizon + 1) * seconds_per_step
-        table.add_row(f"{seconds:.2f} s ahead", "1.000", *(str(ratios[horizon]) for ratios in columns.values()))
-    table.add_section()
-    used = {name: one_step_ratios(errors) for name, errors in models.items()}
-    for actions in ("true", "zero", "shuffled"):
-        table.add_row(f"one step, {actions} actions", "1.000", *(str(ratios[actions]) for ratios in used.values()))
-    return table

@@ -13,15 +13,16 @@ from vector_sets import write_vectors
 from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.report import evaluation_as_dict
+from vjepa2_ac.evaluation.metrics_file import metrics_as_dict
 from vjepa2_ac.model.folder import read_sizes
 from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.training.calibrate import calibrate_config
 from vjepa2_ac.training.checkpoint import newest_checkpoint
+from vjepa2_ac.training.evaluation import Asked, evaluate_subject
 from vjepa2_ac.training.export import export_run
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.runs import evaluate_run, load_run
+from vjepa2_ac.training.runs import load_run
 
 MakeConfig = Callable[..., Config]
 HEADS = ["action_encoder", "state_encoder"]
@@ -62,11 +63,11 @@ def test_from_recordings_to_a_model_of_its_own(
     run = load_run(folder)
     assert widths_of_model(run.world_model.sizes) == widths
 
-    evaluation = evaluate_run(folder, split="validation", clips=4).evaluation
+    evaluation = evaluate_subject(str(folder), Asked(split="validation", clips=4)).evaluation
     assert list(evaluation.models) == ["adapter" if kind == "lora" else "model"]
-    figures = evaluation_as_dict(evaluation)
+    figures = metrics_as_dict(evaluation)
     assert "no base to compare with" in figures["verdict"]
-    assert figures["improvement_over_base"] == []
+    assert figures["base"] is None
 
     merged = export_run(folder, tmp_path / "merged").path
     base = load_base(ModelConfig(base=str(merged), dtype="float32"), seed=5)
@@ -125,7 +126,7 @@ def test_what_it_learnt_is_a_base_that_the_same_robot_trains_on(
     folder = train(make_robot(training__steps=1, training__allow_weak_base=True, **second), again)
     assert not any("initialised anew" in note for note in again.notes)
     assert any("state encoder: the base's own" in note for note in again.notes)
-    evaluation = evaluate_run(folder, split="validation", clips=4).evaluation
+    evaluation = evaluate_subject(str(folder), Asked(split="validation", clips=4)).evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     tried = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), clips=4).tried
     assert [one.moved_cm for one in tried] == [None, None]
@@ -157,7 +158,7 @@ def test_vectors_as_wide_as_poses_keep_the_heads_and_must_prove_themselves(
         train(make_robot(widths, adapter__modules_to_save=[]), reporter)
     assert [note for note in reporter.notes if "encoder: the base's own" in note]
     folder = train(make_robot(widths, training__allow_weak_base=True, training__steps=1), reporter)
-    evaluation = evaluate_run(folder, split="validation", clips=4).evaluation
+    evaluation = evaluate_subject(str(folder), Asked(split="validation", clips=4)).evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     assert export_run(folder, tmp_path / "official.pt", "official").path.is_file()
 
@@ -169,7 +170,7 @@ def test_a_model_of_one_robot_is_not_measured_on_another(make_robot: MakeConfig,
     write_vectors(tmp_path / "other", width=8)
     path.write_text(path.read_text().replace(config.data.path, str(tmp_path / "other")))
     with pytest.raises(InputError, match=r"states of 8 and actions of 8 numbers\. needed: 14 and 14") as caught:
-        evaluate_run(folder, split="validation", clips=4)
+        evaluate_subject(str(folder), Asked(split="validation", clips=4))
     assert str(folder) in str(caught.value)
 
 

@@ -27,18 +27,23 @@ from vjepa2_ac.training.checkpoint import checkpoint_name
 from vjepa2_ac.training.export import CARD, OFFICIAL_NAME, Exported, export_run
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.manifest import seal
-from vjepa2_ac.training.runs import EVALUATION, PLOT, load_run
+from vjepa2_ac.evaluation.metrics_file import METRICS_FILE
+from vjepa2_ac.training.evaluation import PLOT
+from vjepa2_ac.training.runs import load_run
 
 EVALUATED = {
-    "checkpoint": "somewhere/run/checkpoints/step-00000002",
-    "split": "test",
+    "format": 1,
     "verdict": "The adapter predicts better.",
-    "clips": 8,
-    "episodes": 3,
-    "seconds_per_step": 0.5,
+    "about": {
+        "subject": "somewhere/run",
+        "checkpoint_path": "somewhere/run/checkpoints/step-00000002",
+        "split": "test",
+        "seconds_per_step": 0.5,
+    },
+    "clips": {"count": 8, "episodes": 3},
     "models": {
-        "base": {"rollout_over_persistence": [{"value": 0.9, "low": 0.8, "high": 0.95}]},
-        "adapter": {"rollout_over_persistence": [{"value": 0.7, "low": None, "high": None}]},
+        "base": {"rollout": {"l1": {"over_persistence": [{"value": 0.9, "low": 0.8, "high": 0.95}]}}},
+        "adapter": {"rollout": {"l1": {"over_persistence": [{"value": 0.7, "low": None, "high": None}]}}},
     },
 }
 
@@ -177,7 +182,7 @@ def test_the_code_of_the_card_runs(trained, tmp_path: Path) -> None:
 
 def test_the_card_shows_what_was_measured(trained, tmp_path: Path) -> None:
     run = trained()
-    (run / EVALUATION).write_text(json.dumps(EVALUATED))
+    (run / METRICS_FILE).write_text(json.dumps(EVALUATED))
     (run / PLOT).write_bytes(b"a picture")
     export_run(run, tmp_path / "hub", "hub")
     card = (tmp_path / "hub" / CARD).read_text()
@@ -187,15 +192,16 @@ def test_the_card_shows_what_was_measured(trained, tmp_path: Path) -> None:
     assert "Not evaluated" not in card
     assert f"]({PLOT})" in card
     assert (tmp_path / "hub" / PLOT).read_bytes() == b"a picture"
-    assert (tmp_path / "hub" / EVALUATION).is_file()
+    assert "somewhere" not in (tmp_path / "hub" / METRICS_FILE).read_text(), "paths of this machine are nobody's business"
 
 
 def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(trained, tmp_path: Path) -> None:
     run = trained(checkpoint__every=1)
     assert main(["evaluate", str(run), "--clips", "4"]) == 0
-    measured = json.loads((run / EVALUATION).read_text())
-    old = measured["checkpoint"].replace("step-00000002", "step-00000001")
-    (run / EVALUATION).write_text(json.dumps({**measured, "checkpoint": old}))
+    measured = json.loads((run / METRICS_FILE).read_text())
+    about = measured["about"]
+    old = about["checkpoint_path"].replace("step-00000002", "step-00000001")
+    (run / METRICS_FILE).write_text(json.dumps({**measured, "about": {**about, "checkpoint_path": old}}))
     assert main(["export", str(run), str(tmp_path / "hub"), "--to", "hub"]) == 0
     card = (tmp_path / "hub" / CARD).read_text()
     assert measured["verdict"] in card
@@ -212,9 +218,9 @@ def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is
     seal(newest)
     for asked, step, words in [("best", 2, "step-00000002 (the best)"), ("1", 1, "step-00000001 (as asked for)")]:
         assert main(["evaluate", str(run), "--clips", "4", "--checkpoint", asked]) == 0
-        measured = json.loads((run / EVALUATION).read_text())
-        assert measured["checkpoint"] == str(run / "checkpoints" / f"step-{step:08d}")
-        assert measured["chosen"] == words
+        measured = json.loads((run / METRICS_FILE).read_text())
+        assert measured["about"]["checkpoint_path"] == str(run / "checkpoints" / f"step-{step:08d}")
+        assert measured["about"]["checkpoint"] == words
         assert main(["export", str(run), str(tmp_path / asked), "--to", "hub", "--checkpoint", asked]) == 0
         assert capsys.readouterr().out.count(f"checkpoint {words}") == 2, "both say which"
         card = (tmp_path / asked / CARD).read_text()
@@ -231,11 +237,11 @@ def weights_of(run: Path, step: int) -> dict[str, Tensor]:
     return load_file(run / "checkpoints" / checkpoint_name(step) / "adapter" / "adapter_model.safetensors")
 
 
-@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"checkpoint": "x", "verdict": 3}'])
+@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"format": 2}', '{"format": 1, "verdict": 3}'])
 def test_a_damaged_evaluation_is_named_and_nothing_is_written(trained, tmp_path: Path, content: str) -> None:
     run = trained()
-    (run / EVALUATION).write_text(content)
-    with pytest.raises(InputError, match=r"evaluation\.json.*vjepa2-ac evaluate"):
+    (run / METRICS_FILE).write_text(content)
+    with pytest.raises(InputError, match=r"metrics\.json.*vjepa2-ac evaluate"):
         export_run(run, tmp_path / "hub", "hub")
     assert not (tmp_path / "hub").exists()
 

@@ -19,7 +19,8 @@ from vjepa2_ac.data.loader import batches_of
 from vjepa2_ac.data.windows import Split, far_neighbours, spread
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.metrics import Predictor, Ratio, one_step_errors, ratio, ratio_difference
+from vjepa2_ac.evaluation.bootstrap import Estimate, ratio, ratio_difference
+from vjepa2_ac.evaluation.metrics import Predictor, one_step_errors
 
 FRAMES = 8  # of a clip at most: as the released weights were trained, and short enough for the widest stride
 _EPISODES_NEEDED = 2  # for an interval
@@ -32,7 +33,7 @@ class TriedStride:
 
     stride: int
     seconds_per_step: float
-    ratio: Ratio  # of the error to that of copying the frame before
+    ratio: Estimate  # of the error to that of copying the frame before
     error: float  # mean over clips
     persistence: float
     moved_cm: float | None  # median distance of the flange per model step; None: the states are no poses
@@ -49,7 +50,7 @@ class Calibration:
     frames: int
     split: Split
     runner_up: int | None  # the stride that comes second
-    difference: Ratio | None  # of the two best ratios, the best's minus the other's, paired by clip
+    difference: Estimate | None  # of the two best ratios, the best's minus the other's, paired by clip
 
     @property
     def best(self) -> TriedStride:
@@ -113,7 +114,7 @@ class Calibration:
 _FIGURES = ("stride", "seconds_per_step", "error", "persistence", "moved_cm", "clips", "episodes")
 
 
-def _interval(difference: Ratio) -> str:
+def _interval(difference: Estimate) -> str:
     return f" (95 % interval {-difference.high:.3f} to {-difference.low:.3f})" if difference.has_interval else ""
 
 
@@ -247,7 +248,7 @@ def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[
     return [stride for stride in fitting if stride not in reasons], dict(sorted(reasons.items()))
 
 
-def _compared(measured: dict[int, _Measured]) -> tuple[int | None, Ratio | None]:
+def _compared(measured: dict[int, _Measured]) -> tuple[int | None, Estimate | None]:
     """Return the stride that comes second, and how far the best ratio lies below its ratio."""
     if len(measured) < 2:
         return None, None

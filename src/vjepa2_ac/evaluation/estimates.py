@@ -68,6 +68,13 @@ def cost_of_actions(evaluation: Evaluation, name: str, actions: Actions, metric:
     return Estimate(grown.value - 1, grown.low - 1, grown.high - 1)
 
 
+def gap_of_actions(evaluation: Evaluation, name: str, actions: Actions, metric: Metric = "l1") -> Estimate:
+    """Return how much higher the teacher-forced error over persistence is with zero or shuffled actions, paired."""
+    tried, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
+    nothing = evaluation.persistence.teacher_forced.of(metric)
+    return ratio((tried - true).mean(axis=1), nothing.mean(axis=1), evaluation.clips.episode_ids)
+
+
 def stratum_over_persistence(evaluation: Evaluation, stratum: Stratum, name: str, metric: Metric = "l1") -> Estimate:
     """Return teacher-forced error over persistence of the steps of a stratum; NaN where there are none."""
     return _of_steps(evaluation, stratum, name, "persistence", metric)

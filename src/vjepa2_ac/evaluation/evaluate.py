@@ -1,137 +1,260 @@
-"""Did training help? The base and what was trained, side by side on held-out episodes."""
+"""Did training help? What was trained, its base and others side by side on clips of held-out episodes."""
 
 from __future__ import annotations
 
 import contextlib
-import math
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from einops import rearrange
 from jaxtyping import Float, UInt8
-from torch import Tensor
 
-from vjepa2_ac.data.transforms import pixels_to_input
-from vjepa2_ac.episode import Batch, LatentBatch
-from vjepa2_ac.evaluation.metrics import ErrorMeter, PredictionErrors
-from vjepa2_ac.latents import encode_batch
-from vjepa2_ac.model.adapter_end import base_only
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.data.windows import spread
+from vjepa2_ac.episode import LatentBatch, Progress
+from vjepa2_ac.evaluation.estimates import episode_scores
+from vjepa2_ac.evaluation.examples import chosen_clips, make_example, predicted_rollout
+from vjepa2_ac.evaluation.landscape import measure_landscapes
+from vjepa2_ac.evaluation.metrics import Predictor, measured, persistence_of, with_other_actions
+from vjepa2_ac.evaluation.probe import Start, start_of
+from vjepa2_ac.evaluation.result import (
+    About,
+    Clips,
+    EpisodeScore,
+    Errors,
+    Evaluation,
+    Example,
+    Landscapes,
+    ModelResult,
+    Predicted,
+    Role,
+    Sensitivity,
+)
+from vjepa2_ac.evaluation.sensitivity import ActionPool, measure_sensitivity
+from vjepa2_ac.evaluation.strata import clips_of, strata_of
 
-Variant = Callable[[WorldModel], contextlib.AbstractContextManager[object]]
-
-
-_NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
+ClipName = tuple[str, int]  # id of the episode, first control step
+Pictures = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the batch at hand
+_NO_LANDSCAPES = "No energy landscapes: an action has {} numbers, and a landscape is over three."
 
 
 @dataclass(frozen=True)
-class Example:
-    """One clip, frame by frame, and where the predictions of it are wrong."""
+class Contender:
+    """A model that is measured."""
 
-    frames: UInt8[np.ndarray, "time size size 3"]  # what the encoder saw
-    errors: dict[str, Float[np.ndarray, "horizon grid grid"]]  # model -> mean absolute error of each patch
-    episode_id: str
+    name: str
+    role: Role
+    model: Predictor
+    switched: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext  # on while it predicts
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """What was measured on held-out episodes; models are in the order of the table."""
+class Probes:
+    """How much is done beyond the errors; 0 clips: nothing."""
 
-    models: dict[str, PredictionErrors]
-    seconds_per_step: float
-    example: Example
-    why_no_base: str = ""  # where there would be a base, but not one to compare with
+    sensitivity_clips: int = 32
+    samples: int = 64  # other actions per clip, drawn in each of two ways
+    landscape_clips: int = 8
+    nodes: int = 9  # along each axis of a landscape
+    reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
+    examples: int = 4
+    at_once: int = 64  # samples that are computed together
 
-    @property
-    def trained(self) -> str:
-        """The name of what was trained: adapter, or model."""
-        return list(self.models)[-1]
 
-    @property
-    def horizon(self) -> int:
-        """How many model steps ahead was measured."""
-        return int(self.models[self.trained].rollout.shape[1])
+@dataclass(frozen=True)
+class ClipsAgain:
+    """Clips that can be read more than once: all of them, or some by name; batches of latents with their pictures."""
 
-    @property
-    def episodes(self) -> int:
-        """How many episodes the clips come from."""
-        return len(set(self.models[self.trained].episode_ids))
-
-    @property
-    def clips(self) -> int:
-        """How many clips were measured."""
-        return len(self.models[self.trained].episode_ids)
+    count: int
+    read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, Pictures]]]
 
 
 def evaluate(
-    world_model: WorldModel,
-    batches: Iterable[Batch],
+    contenders: Sequence[Contender],
+    clips: ClipsAgain,
+    about: About,
     *,
-    has_base: bool,
-    device: torch.device,
-    encode_chunk: int,
-    seconds_per_step: float,
+    probes: Probes | None = None,
+    stage: Callable[[str], Progress] | None = None,
 ) -> Evaluation:
-    """Measure a model on clips, with what was trained switched on and, where `has_base`, off.
+    """Measure models on the same clips.
 
-    A base whose input heads were replaced cannot predict on these clips: it is left out, and the result says why.
+    Args:
+        contenders: In the order of the table; one of them has the role trained.
+        clips: What to measure on.
+        about: What this is.
+        probes: How much is done beyond the errors.
+        stage: Gives a bar for a part of the work, by its title.
 
     Raises:
         ValueError: No clips.
     """
-    world_model.eval()
-    why_no_base = _NO_BASE if has_base and world_model.fresh_heads is not None else ""
-    variants: dict[str, Variant] = {"base": base_only} if has_base and not why_no_base else {}
-    variants["adapter" if _has_lora(world_model) else "model"] = contextlib.nullcontext
-    meters = {name: ErrorMeter() for name in variants}
-    chosen: tuple[Batch, LatentBatch, int] | None = None
-    most_motion = -1.0
-    for batch in batches:
-        latents = encode_batch(world_model, batch, device=device, chunk=encode_chunk)
-        for name, variant in variants.items():
-            with variant(world_model):
-                meters[name].add(world_model, latents)
-        motion = (latents.latents[:, -1] - latents.latents[:, 0]).abs().mean(dim=(1, 2))
-        if motion.max().item() > most_motion:
-            most_motion = motion.max().item()
-            chosen = batch, latents, int(motion.argmax())
-    if chosen is None:
+    probes = probes or Probes()
+    seen = _see_all(contenders, clips, probes, about, _bar(stage, "measuring"))
+    ids, seconds = tuple(seen.ids), about.seconds_per_step
+    known = clips_of(seen.actions, ids, tuple(seen.firsts), is_pose=about.is_pose, seconds_per_step=seconds)
+    pool = ActionPool(
+        actions=seen.actions.reshape(-1, seen.actions.shape[-1]),
+        episode_ids=tuple(np.repeat(np.array(ids), seen.actions.shape[1]).tolist()),
+        is_pose=about.is_pose,
+        reach=probes.reach_cm / 100,
+    )
+    models: dict[str, ModelResult] = {}
+    for contender in contenders:
+        true, zero, shuffled = (_joined(seen.errors[contender.name, kind]) for kind in ("true", "zero", "shuffled"))
+        result = ModelResult(contender.name, contender.role, true, zero, shuffled)
+        with contender.switched():
+            models[contender.name] = replace(
+                result,
+                sensitivity=_sensitivity(contender, seen.starts, pool, probes, about, stage),
+                landscapes=_landscapes(contender, seen.starts, known, pool, probes, about, stage),
+            )
+    nothing = _joined(seen.persistence)
+    evaluation = Evaluation(
+        about=about,
+        clips=known,
+        persistence=nothing,
+        models=models,
+        strata=strata_of(known, is_pose=about.is_pose),
+        episodes=(),
+        examples=(),
+    )
+    examples = _examples(contenders, clips, evaluation, probes)
+    notes: tuple[str, ...] = ()
+    if probes.landscape_clips and seen.actions.shape[-1] < 3:
+        notes = (_NO_LANDSCAPES.format(seen.actions.shape[-1]),)
+    return replace(evaluation, episodes=_episodes(evaluation), examples=examples, notes=notes)
+
+
+@dataclass
+class _Seen:
+    """What is kept of all clips: figures and actions, and one frame and the next of some."""
+
+    ids: list[str]
+    firsts: list[int]
+    actions: Float[np.ndarray, "clips horizon action_dim"]
+    errors: dict[tuple[str, str], list[Predicted]]  # by model and actions
+    persistence: list[Predicted]
+    starts: list[Start]
+
+
+def _see_all(
+    contenders: Sequence[Contender], clips: ClipsAgain, probes: Probes, about: About, progress: Progress | None
+) -> _Seen:
+    seen = _Seen([], [], np.zeros((0, 0, 0)), {}, [], [])
+    actions = []
+    probed = set(spread(clips.count, probes.sensitivity_clips)) if probes.sensitivity_clips else set()
+    for batch, others in with_other_actions(batch for batch, _ in clips.read(None)):
+        kinds = {"true": batch.actions, "zero": torch.zeros_like(batch.actions), "shuffled": others}
+        for contender in contenders:
+            with contender.switched():
+                for kind, tried in kinds.items():
+                    seen.errors.setdefault((contender.name, kind), []).append(measured(contender.model, batch, tried))
+        seen.persistence.append(persistence_of(batch))
+        first = len(seen.ids)
+        for row in range(len(batch.starts)):
+            if first + row in probed:
+                seen.starts.append(start_of(batch, row, _largest_step(batch.actions[row], about), first + row))
+        actions.append(batch.actions.cpu().numpy().astype(np.float64))
+        seen.ids += batch.episode_ids
+        seen.firsts += batch.starts
+        if progress is not None:
+            progress(len(seen.ids), clips.count)
+    if not seen.ids:
         raise ValueError("no clips to evaluate on")
-    models = {name: meter.result() for name, meter in meters.items()}
-    return Evaluation(models, seconds_per_step, _example(world_model, *chosen, variants), why_no_base)
+    seen.actions = np.concatenate(actions)
+    return seen
 
 
-@torch.no_grad()
-def _example(
-    world_model: WorldModel, batch: Batch, latents: LatentBatch, clip: int, variants: dict[str, Variant]
-) -> Example:
-    z, actions, states = (x[clip : clip + 1] for x in (latents.latents, latents.actions, latents.states))
-    extrinsics = None if latents.extrinsics is None else latents.extrinsics[clip : clip + 1, :-1]
-    grid = math.isqrt(world_model.num_tokens)
+def _largest_step(actions: Float[torch.Tensor, "time action_dim"], about: About) -> int:
+    """Return the step of a clip in which most is done: of poses the translation decides."""
+    return int((actions[:, :3] if about.is_pose else actions).norm(dim=-1).argmax())
 
-    def patch_errors(predicted: Tensor) -> np.ndarray:
-        error = (predicted.float() - z[:, 1:].float()).abs().mean(dim=-1)
-        return np.asarray(rearrange(error, "1 horizon (h w) -> horizon h w", h=grid).cpu().numpy())
 
-    errors = {"persistence": patch_errors(z[:, :1].expand_as(z[:, 1:]))}
-    for name, variant in variants.items():
-        with variant(world_model):
-            errors[name] = patch_errors(world_model.rollout(z[:, :1], actions, states[:, :-1], extrinsics))
-    return Example(
-        frames=_seen_by_the_encoder(batch.frames[clip], world_model.image_size),
-        errors=errors,
-        episode_id=latents.episode_ids[clip],
+def _joined(parts: Sequence[Predicted]) -> Predicted:
+    def join(errors: Sequence[Errors]) -> Errors:
+        return Errors(*(np.concatenate([getattr(part, name) for part in errors]) for name in ("l1", "l2", "cosine")))
+
+    return Predicted(join([part.teacher_forced for part in parts]), join([part.rollout for part in parts]))
+
+
+def _sensitivity(
+    contender: Contender,
+    starts: Sequence[Start],
+    pool: ActionPool,
+    probes: Probes,
+    about: About,
+    stage: Callable[[str], Progress] | None,
+) -> Sensitivity | None:
+    if not starts:
+        return None
+    return measure_sensitivity(
+        contender.model,
+        starts,
+        pool,
+        samples=probes.samples,
+        seed=about.seed,
+        at_once=probes.at_once,
+        progress=_bar(stage, f"other actions, {contender.name}"),
     )
 
 
-def _seen_by_the_encoder(frames: Tensor, size: int) -> UInt8[np.ndarray, "time size size 3"]:
-    inputs = pixels_to_input(frames[None], size)[0]
-    low, high = inputs.amin(), inputs.amax()
-    shown = (inputs - low) / (high - low).clamp(min=1e-6) * 255
-    return np.asarray(rearrange(shown, "time c h w -> time h w c").round().to(torch.uint8).cpu().numpy())
+def _landscapes(
+    contender: Contender,
+    starts: Sequence[Start],
+    clips: Clips,
+    pool: ActionPool,
+    probes: Probes,
+    about: About,
+    stage: Callable[[str], Progress] | None,
+) -> Landscapes | None:
+    moving = [start for start in starts if clips.moving[start.clip].any()] or list(starts)
+    if not probes.landscape_clips or not moving or pool.actions.shape[-1] < 3:
+        return None
+    chosen = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
+    return measure_landscapes(
+        contender.model,
+        chosen,
+        is_pose=about.is_pose,
+        nodes=probes.nodes,
+        reach=pool.reach if about.is_pose else 0.0,
+        at_once=probes.at_once,
+        progress=_bar(stage, f"energy landscapes, {contender.name}"),
+    )
 
 
-def _has_lora(world_model: WorldModel) -> bool:
-    return world_model.adaptation is not None and world_model.adaptation.kind == "lora"
+def _episodes(evaluation: Evaluation) -> tuple[EpisodeScore, ...]:
+    base, models = evaluation.base, evaluation.models
+    return episode_scores(
+        evaluation.clips.episode_ids,
+        models[evaluation.trained].true.rollout.l1[:, -1],
+        evaluation.persistence.rollout.l1[:, -1],
+        None if base is None else models[base].true.rollout.l1[:, -1],
+    )
+
+
+def _examples(
+    contenders: Sequence[Contender], clips: ClipsAgain, evaluation: Evaluation, probes: Probes
+) -> tuple[Example, ...]:
+    """Read the clips again that are worth a look: which ones these are is known only now."""
+    known = evaluation.clips
+    trained = evaluation.models[evaluation.trained].true.rollout
+    moved = known.action_size.sum(axis=1)
+    chosen = chosen_clips(trained, evaluation.persistence.rollout, moved, probes.examples)
+    if not chosen:
+        return ()
+    names = [(known.episode_ids[clip], known.starts[clip]) for clip in chosen]
+    reasons = dict(zip(names, chosen.values(), strict=True))
+    found = {}
+    for batch, pictures in clips.read(names):
+        for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
+            predicted = {}
+            for contender in contenders:
+                with contender.switched():
+                    predicted[contender.name] = predicted_rollout(contender.model, batch, row)
+            found[name] = make_example(reasons[name], batch, row, predicted, pictures(row))
+    return tuple(found[name] for name in names if name in found)
+
+
+def _bar(stage: Callable[[str], Progress] | None, title: str) -> Progress | None:
+    return None if stage is None else stage(title)

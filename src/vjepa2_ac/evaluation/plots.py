@@ -12,12 +12,15 @@ from jaxtyping import UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from vjepa2_ac.evaluation.evaluate import Evaluation, Example
-from vjepa2_ac.evaluation.metrics import Ratio, one_step_ratios, ratios_by_horizon
-from vjepa2_ac.evaluation.report import verdict
+from vjepa2_ac.evaluation.bootstrap import Estimate
+from vjepa2_ac.evaluation.comparison import Comparison
+from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Example
+from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.storage import atomic_writer
 
 _COLOURS = {"persistence": "#8a8a8a", "base": "#d1762a", "adapter": "#1f6fb4", "model": "#1f6fb4"}
+_OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
@@ -30,7 +33,30 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
         upper, lower = halves[0].subplots(2, 1, height_ratios=[3, 2])
         _curves(upper, evaluation)
         _use_of_actions(lower, evaluation)
-        _filmstrip(halves[1], evaluation.example, evaluation.seconds_per_step)
+        if evaluation.examples:
+            _filmstrip(halves[1], evaluation.examples[0], evaluation.about.seconds_per_step)
+        with atomic_writer(path) as file:
+            figure.savefig(file, format="png", dpi=110)
+    return path
+
+
+def plot_comparison(comparison: Comparison, path: Path) -> Path:
+    """Write the curves of several runs as PNG; it appears whole or not at all."""
+    with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(8, 4.5), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots()
+        axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--", label="persistence (doing nothing)")
+        for number, (name, curve) in enumerate(comparison.curves.items()):
+            colour = f"C{number}"
+            axes.plot(comparison.seconds, [one.value for one in curve], "o-", color=colour, label=name)
+            axes.fill_between(
+                comparison.seconds, [one.low for one in curve], [one.high for one in curve],
+                color=colour, alpha=0.15, linewidth=0,
+            )  # fmt: skip
+        axes.set(xlabel="seconds ahead (open loop)", ylabel="latent error / persistence", ylim=(0, None))
+        axes.legend(frameon=False, loc="lower right")
+        axes.set_title(f"{comparison.title} (band: 95 % over episodes)", loc="left", fontsize=9)
         with atomic_writer(path) as file:
             figure.savefig(file, format="png", dpi=110)
     return path
@@ -38,13 +64,13 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
 
 def _curves(axes: Any, evaluation: Evaluation) -> None:
     axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--", label="persistence (doing nothing)")
-    seconds = evaluation.seconds_per_step * np.arange(1, evaluation.horizon + 1)
+    seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
     shown = seconds[:: -(-len(seconds) // 8)]
-    for name, errors in evaluation.models.items():
-        ratios = ratios_by_horizon(errors)
-        axes.plot(seconds, [r.value for r in ratios], "o-", color=_COLOURS[name], label=name)
+    for name, colour in _colours(evaluation).items():
+        ratios = over_persistence(evaluation, name, "rollout")
+        axes.plot(seconds, [r.value for r in ratios], "o-", color=colour, label=name)
         axes.fill_between(
-            seconds, [r.low for r in ratios], [r.high for r in ratios], color=_COLOURS[name], alpha=0.2, linewidth=0
+            seconds, [r.low for r in ratios], [r.high for r in ratios], color=colour, alpha=0.2, linewidth=0
         )
     axes.set(xlabel="seconds ahead (open loop)", ylabel="latent error / persistence", ylim=(0, None))
     axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
@@ -54,19 +80,25 @@ def _curves(axes: Any, evaluation: Evaluation) -> None:
 
 def _use_of_actions(axes: Any, evaluation: Evaluation) -> None:
     width = 0.8 / len(evaluation.models)
-    for i, (name, errors) in enumerate(evaluation.models.items()):
-        ratios = one_step_ratios(errors)
+    for i, (name, colour) in enumerate(_colours(evaluation).items()):
+        ratios = {actions: one_step_over_persistence(evaluation, name, actions=actions) for actions in ACTIONS}
         places = np.arange(len(ratios)) + (i - (len(evaluation.models) - 1) / 2) * width
         values = [r.value for r in ratios.values()]
         spread = np.array([_reach(r) for r in ratios.values()]).T
-        axes.bar(places, values, width, color=_COLOURS[name], yerr=spread, error_kw={"elinewidth": 1}, label=name)
+        axes.bar(places, values, width, color=colour, yerr=spread, error_kw={"elinewidth": 1}, label=name)
     axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--")
     axes.set_xticks(range(3), ["true", "zero", "shuffled"])
     axes.set(xlabel="actions given", ylabel="one-step error / persistence")
     axes.set_title("Does it use the actions?", loc="left", fontsize=9)
 
 
-def _reach(value: Ratio) -> tuple[float, float]:
+def _colours(evaluation: Evaluation) -> dict[str, str]:
+    """Return a colour for each model."""
+    others = iter(_OTHERS * len(evaluation.models))
+    return {name: _COLOURS.get(name) or next(others) for name in evaluation.models}
+
+
+def _reach(value: Estimate) -> tuple[float, float]:
     """How far an error bar reaches down and up; never negative, which rounding could make it."""
     if not value.has_interval:
         return 0.0, 0.0
@@ -75,19 +107,20 @@ def _reach(value: Ratio) -> tuple[float, float]:
 
 def _filmstrip(figure: Any, example: Example, seconds_per_step: float) -> None:
     """Show one clip: the first frame and some later ones, and under each where a prediction of it is wrong."""
-    horizons = np.unique(np.linspace(1, len(example.frames) - 1, num=4).round().astype(int))
+    horizons = np.unique(np.linspace(1, len(example.true_colours) - 1, num=4).round().astype(int))
     grid = figure.subplots(1 + len(example.errors), 1 + len(horizons), squeeze=False)
     figure.suptitle("One held-out clip, and the error of each patch (brighter is worse)", x=0.02, ha="left", fontsize=9)
     largest = max(float(errors.max()) for errors in example.errors.values())
     for axes in grid.ravel():
         axes.set_axis_off()
     for column, time in enumerate([0, *horizons]):
-        grid[0][column].imshow(example.frames[time])
+        grid[0][column].imshow(example.true_colours[time] if example.frames is None else example.frames[time])
         grid[0][column].set_title("now" if time == 0 else f"+{time * seconds_per_step:.2f} s", fontsize=8)
     for row, (name, errors) in enumerate(example.errors.items(), start=1):
         grid[row][0].text(0.5, 0.5, f"{name}\nerror", ha="center", va="center", transform=grid[row][0].transAxes)
         for column, time in enumerate(horizons, start=1):
-            _overlay(grid[row][column], example.frames[time], errors[time - 1], largest)
+            frame = example.true_colours[time] if example.frames is None else example.frames[time]
+            _overlay(grid[row][column], frame, errors[time - 1], largest)
 
 
 def _overlay(axes: Any, frame: UInt8[np.ndarray, "size size 3"], errors: Any, largest: float) -> None:

@@ -15,6 +15,7 @@ from safetensors import safe_open
 from vjepa2_ac.config import Config
 from vjepa2_ac.episode import POSE_WIDTHS, Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.metrics_file import METRICS_FILE, read_metrics
 from vjepa2_ac.model.adapter_end import merge_adapter
 from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.lora import trainable_report
@@ -23,9 +24,10 @@ from vjepa2_ac.model.weights import to_official
 from vjepa2_ac.storage import atomic_writer, folder_writer, user_can_write, write_atomically
 from vjepa2_ac.training.checkpoint import ADAPTER, read_state
 from vjepa2_ac.training.chosen import NEWEST
+from vjepa2_ac.training.evaluation import PLOT
 from vjepa2_ac.training.model_card import AdapterFacts, model_card
 from vjepa2_ac.training.run_folder import read_run_config
-from vjepa2_ac.training.runs import EVALUATION, PLOT, TrainedRun, load_run
+from vjepa2_ac.training.runs import TrainedRun, load_run
 from vjepa2_ac.training.torch_file import write_torch
 
 Form = Literal["merged", "official", "hub"]
@@ -58,7 +60,7 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
     Raises:
         InputError: As `load_run`; the destination is occupied or cannot be written; official: the model is of another
             width than Meta's code; hub: the run has no adapter, or
-            its `evaluation.json` is damaged.
+            its `metrics.json` is damaged.
     """
     _check_free(destination)
     config = read_run_config(folder)
@@ -123,7 +125,7 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dic
         for path in (*sorted(adapter.iterdir()), *([plot] if plot else [])):
             shutil.copyfile(path, fresh / path.name)
         if evaluation is not None:
-            write_atomically(fresh / EVALUATION, json.dumps(evaluation, indent=1))
+            write_atomically(fresh / METRICS_FILE, json.dumps(evaluation, indent=1))
         write_atomically(fresh / CARD, card)
 
 
@@ -149,19 +151,20 @@ def _facts(run: TrainedRun, folder: Path, evaluation: dict[str, Any] | None, plo
 
 
 def _read_evaluation(folder: Path) -> dict[str, Any] | None:
-    """Return what `evaluate` wrote, the checkpoint by its name alone; None where it was never run."""
-    try:
-        evaluation = json.loads((folder / EVALUATION).read_text(encoding="utf-8"))
-        return {**evaluation, "checkpoint": Path(evaluation["checkpoint"]).name}
-    except FileNotFoundError:
+    """Return what `evaluate` wrote of a run, without paths of this machine; None where it was never run."""
+    if not (folder / METRICS_FILE).exists():
         return None
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise _damaged(folder, f"cannot be read ({error!r})") from None
+    figures = read_metrics(folder)
+    try:
+        about = {**figures["about"], "subject": folder.resolve().name}
+        return {**figures, "about": {**about, "checkpoint_path": Path(about["checkpoint_path"]).name}}
+    except (TypeError, KeyError) as error:
+        raise _damaged(folder, f"figures that cannot be used ({error!r})") from None
 
 
 def _damaged(folder: Path, found: str) -> InputError:
     return InputError(
-        where=str(folder / EVALUATION),
+        where=str(folder / METRICS_FILE),
         found=found,
         needed="what `vjepa2-ac evaluate` writes",
         fix=f"Write it again with `vjepa2-ac evaluate {folder}`, or delete it",

@@ -21,7 +21,7 @@ tags:
 ---
 """
 _NOT_EVALUATED = (
-    "**Not evaluated**: there was no `evaluation.json` in the run when this card was written. Nothing is known of how"
+    "**Not evaluated**: there was no `metrics.json` in the run when this card was written. Nothing is known of how"
     " good this adapter is."
 )
 
@@ -144,22 +144,24 @@ def _results(facts: AdapterFacts) -> str:
         return f"## Results\n\n{_NOT_EVALUATED}"
     measured = facts.evaluation
     lines = ["## Results", "", measured["verdict"], ""]
-    if measured["checkpoint"] != facts.checkpoint:
-        lines += [f"**Measured on another checkpoint**: `{measured['checkpoint']}`, not `{facts.checkpoint}`.", ""]
-    clips, episodes = _count(measured["clips"], "clip"), _count(measured["episodes"], "episode")
-    about = (
-        f"Split {measured['split']}: {clips} of {episodes}. Error of the rollout"
-        " over that of copying the first frame (1: as good as doing nothing), with a 95 % interval over episodes:"
+    about, clips = measured["about"], measured["clips"]
+    if about["checkpoint_path"] != facts.checkpoint:
+        lines += [f"**Measured on another checkpoint**: `{about['checkpoint_path']}`, not `{facts.checkpoint}`.", ""]
+    where = (
+        f"Split {about['split']}: {_count(clips['count'], 'clip')} of {_count(clips['episodes'], 'episode')}. L1"
+        " error of the rollout over that of copying the first frame (1: as good as doing nothing), with a 95 %"
+        " interval over episodes:"
     )
-    lines += [about, "", *_table(measured)]
+    lines += [where, "", *_table(measured)]
     return "\n".join(lines) + (f"\n\n![Error by horizon]({facts.plot})" if facts.plot else "")
 
 
 def _table(measured: Mapping[str, Any]) -> list[str]:
     models = measured["models"]
-    columns = [models[name]["rollout_over_persistence"] for name in models]
+    columns = [models[name]["rollout"]["l1"]["over_persistence"] for name in models]
+    seconds = measured["about"]["seconds_per_step"]
     rows = [
-        f"| {(step + 1) * measured['seconds_per_step']:.2f} s | " + " | ".join(_ratio(one) for one in ratios) + " |"
+        f"| {(step + 1) * seconds:.2f} s | " + " | ".join(_ratio(one) for one in ratios) + " |"
         for step, ratios in enumerate(zip(*columns, strict=True))
     ]
     return [f"| ahead | {' | '.join(models)} |", f"|---{'|---' * len(models)}|", *rows]

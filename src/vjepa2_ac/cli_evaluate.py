@@ -1,0 +1,174 @@
+"""What can be asked about how good something is, on the command line? evaluate, compare."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from vjepa2_ac.cli_data import count
+
+_Commands = argparse._SubParsersAction
+Handler = Callable[[argparse.Namespace], int | None]
+
+
+def add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
+    """Add `evaluate` and `compare` to a parser."""
+    _add_evaluate(commands)
+    _add_compare(commands)
+
+
+def add_checkpoint(parser: argparse.ArgumentParser) -> None:
+    """Add the option by which a checkpoint of a run is named."""
+    parser.add_argument(
+        "--checkpoint",
+        default="newest",
+        metavar="newest|best|STEP",
+        help="which one: the newest (default), the best by validation, or that of a step",
+    )
+
+
+def _command(
+    commands: _Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
+) -> argparse.ArgumentParser:
+    parser = commands.add_parser(name, help=text, description=text)
+    parser.set_defaults(handler=handler)
+    return parser
+
+
+def _count_or_none(text: str) -> int:
+    number = int(text)
+    if number < 0:
+        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 0")
+    return number
+
+
+def _nodes(text: str) -> int:
+    number = int(text)
+    if not 3 <= number <= 51:
+        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 3 to 51")
+    return number
+
+
+def _centimetres(text: str) -> float:
+    number = float(text)
+    if not 0 < number < 1000:
+        raise argparse.ArgumentTypeError(f"{text} is not a length in cm")
+    return number
+
+
+def _add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "evaluate",
+        _evaluate,
+        "Measure a run or a model on held-out episodes, beside its base, doing nothing and wrong actions.",
+    )
+    parser.add_argument(
+        "subjects",
+        metavar="RUN_OR_MODEL",
+        nargs="+",
+        help="folder of a run, or (with --data) what model.base takes; several: their spread, too",
+    )
+    parser.add_argument(
+        "--data", metavar="CONFIG", help="measure on the data of this config (and with its model.dtype, device, seed)"
+    )
+    parser.add_argument(
+        "--against",
+        metavar="base|RUN|MODEL",
+        nargs="+",
+        help="what to compare with, on the same latents; default: the base of a run, nothing for a model",
+    )
+    parser.add_argument("--out", metavar="FOLDER", type=Path, help="where figures go; default: the run's folder")
+    parser.add_argument("--split", choices=["test", "validation"], default="test", help="which held-out episodes")
+    parser.add_argument("--clips", type=count, default=256, help="at most this many clips, spread over the episodes")
+    add_checkpoint(parser)
+    parser.add_argument("--calibrate", action="store_true", help="measure the one-step error at other strides, too")
+    probes = parser.add_argument_group("use of the actions")
+    probes.add_argument(
+        "--sensitivity-clips", metavar="N", type=_count_or_none, default=32, help="clips to try other actions on (32)"
+    )
+    probes.add_argument("--samples", metavar="N", type=count, default=64, help="other actions for each of them (64)")
+    probes.add_argument(
+        "--landscapes",
+        metavar="N",
+        type=_count_or_none,
+        default=8,
+        help="clips of those with an energy landscape (8)",
+    )
+    probes.add_argument("--nodes", metavar="N", type=_nodes, default=9, help="of a landscape along each axis (9)")
+    probes.add_argument(
+        "--reach", metavar="CM", type=_centimetres, default=7.5, help="half the width of landscape and box, in cm (7.5)"
+    )
+    probes.add_argument("--examples", metavar="N", type=_count_or_none, default=4, help="clips to show (4)")
+    probes.add_argument(
+        "--at-once", metavar="N", type=count, default=64, help="actions computed together (64): lower it to save memory"
+    )
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config_file import load_config
+    from vjepa2_ac.console import console
+    from vjepa2_ac.console_evaluation import Stages, evaluation_tables
+    from vjepa2_ac.evaluation.evaluate import Probes
+    from vjepa2_ac.evaluation.verdict import spread, verdict
+    from vjepa2_ac.training.evaluation import Asked, evaluate_subject
+
+    probes = Probes(
+        sensitivity_clips=options.sensitivity_clips,
+        samples=options.samples,
+        landscape_clips=options.landscapes,
+        nodes=options.nodes,
+        reach_cm=options.reach,
+        examples=options.examples,
+        at_once=options.at_once,
+    )
+    data = load_config(options.data, []) if options.data else None
+    several, evaluations = len(options.subjects) > 1, []
+    for subject in options.subjects:
+        out = options.out / Path(subject).name if options.out and several else options.out
+        asked = Asked(
+            split=options.split,
+            clips=options.clips,
+            checkpoint=options.checkpoint,
+            data=data,
+            against=tuple(options.against) if options.against else None,
+            out=out,
+            probes=probes,
+            calibrate=options.calibrate,
+        )
+        with Stages() as stages:
+            measured = evaluate_subject(subject, asked, stage=stages)
+        evaluations.append(measured.evaluation)
+        console.print(f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject)
+        for table in evaluation_tables(measured.evaluation):
+            console.print(table)
+        console.print(verdict(measured.evaluation))
+        for path in measured.files:
+            console.print(f"  {path}")
+    if several:
+        console.print(spread(evaluations))
+
+
+def _add_compare(commands: _Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands,
+        "compare",
+        _compare,
+        "Put runs side by side that `evaluate` has measured on the same clips: one table, one picture.",
+    )
+    parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="folders with a metrics.json, two or more")
+    parser.add_argument("--out", metavar="PNG", type=Path, default=Path("comparison.png"), help="the picture")
+
+
+def _compare(options: argparse.Namespace) -> None:
+    from vjepa2_ac.console import console
+    from vjepa2_ac.console_evaluation import comparison_table
+    from vjepa2_ac.evaluation.comparison import compare
+    from vjepa2_ac.evaluation.plots import plot_comparison
+
+    comparison = compare(options.runs)
+    console.print(comparison_table(comparison))
+    for line in comparison.notes:
+        console.print(line)
+    console.print(f"  {plot_comparison(comparison, options.out)}")

@@ -1,0 +1,121 @@
+"""What do good and bad predictions look like? Clips in pictures: error of each patch, and latents as colours."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from einops import rearrange
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vjepa2_ac.data.transforms import pixels_to_input
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.metrics import Predictor
+from vjepa2_ac.evaluation.result import Errors, Example
+
+
+def chosen_clips(trained: Errors, nothing: Errors, moved: Float[np.ndarray, " clips"], count: int) -> dict[int, str]:
+    """Return which clips to show, and why: best, worst, median by L1 error over persistence, and most motion.
+
+    Args:
+        trained: Rollout errors of the model.
+        nothing: Of persistence.
+        moved: How far the robot goes in each clip.
+        count: How many to show at most.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = trained.l1.mean(axis=1) / nothing.l1.mean(axis=1)
+    order = np.argsort(np.nan_to_num(ratios, nan=np.inf, posinf=np.inf), kind="stable")
+    wanted = {
+        "most motion": int(np.argmax(moved)),
+        "best": int(order[0]),
+        "worst": int(order[-1]),
+        "median": int(order[len(order) // 2]),
+    }
+    chosen: dict[int, str] = {}
+    for why, clip in wanted.items():
+        chosen[clip] = f"{chosen[clip]}, {why}" if clip in chosen else why
+    return dict(list(chosen.items())[:count])
+
+
+@torch.no_grad()
+def predicted_rollout(model: Predictor, batch: LatentBatch, row: int) -> Float[Tensor, "horizon tokens dim"]:
+    """Return what a model predicts of one clip from its first frame, in float32 on the CPU."""
+    one = slice(row, row + 1)
+    camera = None if batch.extrinsics is None else batch.extrinsics[one, :-1]
+    rolled = model.rollout(batch.latents[one, :1], batch.actions[one], batch.states[one, :-1], camera)
+    return rolled[0].float().cpu()
+
+
+def make_example(
+    why: str,
+    batch: LatentBatch,
+    row: int,
+    predicted: Mapping[str, Float[Tensor, "horizon tokens dim"]],
+    frames: UInt8[np.ndarray, "time height width 3"] | None,
+) -> Example:
+    """Return one clip in pictures.
+
+    Args:
+        why: It was chosen.
+        batch: Where it is.
+        row: Its place there.
+        predicted: What each model makes of it.
+        frames: Its pictures, if there are any.
+    """
+    true = batch.latents[row].float().cpu()
+    grid = math.isqrt(true.shape[1])
+    nothing = true[:1].expand_as(true[1:])
+
+    def errors(values: Tensor) -> Float[np.ndarray, "horizon grid grid"]:
+        of_patch = (values - true[1:]).abs().mean(dim=-1)
+        return rearrange(of_patch, "horizon (h w) -> horizon h w", h=grid).numpy()
+
+    colours = Colours(true)
+    return Example(
+        why=why,
+        episode_id=batch.episode_ids[row],
+        start=batch.starts[row],
+        frames=frames,
+        errors={"persistence": errors(nothing)} | {name: errors(values) for name, values in predicted.items()},
+        true_colours=colours.of(true),
+        predicted_colours={name: colours.of(values) for name, values in predicted.items()},
+    )
+
+
+def seen_by_the_encoder(
+    frames: UInt8[Tensor, "time height width 3"], size: int
+) -> UInt8[np.ndarray, "time size size 3"]:
+    """Return frames as the encoder sees them, as pictures."""
+    inputs = pixels_to_input(frames[None], size)[0]
+    low, high = inputs.amin(), inputs.amax()
+    shown = (inputs - low) / (high - low).clamp(min=1e-6) * 255
+    return np.asarray(rearrange(shown, "time c h w -> time h w c").round().to(torch.uint8).cpu().numpy())
+
+
+class Colours:
+    """Turns latents into colours by the three principal components of some true latents: alike looks alike.
+
+    A component's range, from the 1st to the 99th percentile of the true latents, is that of its colour.
+    """
+
+    def __init__(self, true: Float[Tensor, "time tokens dim"]) -> None:
+        flat = true.flatten(0, 1).double()
+        self._mean = flat.mean(dim=0)
+        centred = flat - self._mean
+        _, vectors = torch.linalg.eigh(centred.T @ centred)
+        basis = vectors[:, -3:].flip(1)  # the largest first
+        largest = basis.gather(0, basis.abs().argmax(dim=0, keepdim=True))
+        self._basis = basis * largest.sign()  # else the sign would be the library's choice
+        seen = centred @ self._basis
+        self._low, self._high = (torch.quantile(seen, share, dim=0) for share in (0.01, 0.99))
+
+    def of(self, latents: Float[Tensor, "time tokens dim"]) -> UInt8[np.ndarray, "time grid grid 3"]:
+        """Return the colours of latents."""
+        seen = (latents.double() - self._mean) @ self._basis
+        shown = ((seen - self._low) / (self._high - self._low).clamp(min=1e-9)).clamp(0, 1) * 255
+        grid = math.isqrt(latents.shape[1])
+        return np.asarray(rearrange(shown, "time (h w) c -> time h w c", h=grid).round().to(torch.uint8).numpy())

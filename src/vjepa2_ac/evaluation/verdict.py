@@ -1,0 +1,85 @@
+"""What do the figures say, in words? Whether it helped, how sure that is, and whether actions are used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vjepa2_ac.evaluation.bootstrap import Estimate
+from vjepa2_ac.evaluation.estimates import gain_over, gap_of_actions, one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.result import Evaluation, Ranking
+
+
+def verdict(evaluation: Evaluation) -> str:
+    """Say whether what was trained helped, at the farthest horizon of the rollout, by its L1 error."""
+    error = over_persistence(evaluation, evaluation.trained, "rollout")[-1]
+    ahead = f"{evaluation.seconds_ahead:.1f} s ahead"
+    absolute = f"Its error {ahead} is {error.value:.2f} of doing nothing ({interval(error, '.2f')}): "
+    absolute += {-1: "better.", 0: "no clear difference.", 1: "NOT better."}[error.side(of=1.0)]
+    parts = [f"{_compared(evaluation, ahead)}.", absolute, _actions(evaluation), *evaluation.notes]
+    return " ".join(part for part in parts if part)
+
+
+def improvement(evaluation: Evaluation, horizon: int) -> Estimate | None:
+    """Return by which share of the base's error the trained model's is smaller at a horizon, paired; None: no base."""
+    if evaluation.base is None:
+        return None
+    return gain_over(evaluation, evaluation.trained, evaluation.base)[horizon - 1]
+
+
+def uses_actions(evaluation: Evaluation) -> bool:
+    """Return whether the true actions clearly beat another clip's, and clearly rank before others by their energy."""
+    model = evaluation.models[evaluation.trained]
+    rankings = () if model.sensitivity is None else model.sensitivity.rankings
+    gap = gap_of_actions(evaluation, evaluation.trained, "shuffled")
+    return gap.side(of=0.0) == 1 and all(ranking.mean_rank.side(of=0.5) == -1 for ranking in rankings)
+
+
+def spread(evaluations: Sequence[Evaluation]) -> str:
+    """Say how much the results of several runs differ, at the farthest horizon."""
+    errors = [over_persistence(one, one.trained, "rollout")[-1].value for one in evaluations]
+    gains = [gain.value for one in evaluations if (gain := improvement(one, one.horizon)) is not None]
+    words = f"{len(evaluations)} runs: error over persistence {_mean_and_range(errors, '.3f')}"
+    return words + (f"; better than the base by {_mean_and_range(gains, '.1%')}" if gains else "")
+
+
+def interval(value: Estimate, form: str) -> str:
+    """Say between which numbers a figure lies."""
+    if not value.has_interval:
+        return "one episode: no interval"
+    return f"95 % interval {value.low:{form}} to {value.high:{form}}"
+
+
+def _compared(evaluation: Evaluation, ahead: str) -> str:
+    episodes = evaluation.clips.episodes
+    where = f"on {len(evaluation.clips)} clips of {episodes} held-out episode{'s' * (episodes > 1)}"
+    gain = improvement(evaluation, evaluation.horizon)
+    if gain is None:
+        return f"The {evaluation.trained} was measured {where}"
+    direction = "better" if gain.value > 0 else "WORSE"
+    compared = f"{abs(gain.value):.0%} {direction} than the base (gain {interval(gain, '.0%')}), {where}"
+    if gain.side(of=0.0) == 0:
+        return f"The {evaluation.trained} did not clearly help: it predicts {ahead} {compared}"
+    return f"The {evaluation.trained} predicts {ahead} {compared}"
+
+
+def _actions(evaluation: Evaluation) -> str:
+    own, others = (
+        one_step_over_persistence(evaluation, evaluation.trained, actions=each).value for each in ("true", "shuffled")
+    )
+    gap = gap_of_actions(evaluation, evaluation.trained, "shuffled")
+    words = "It uses the actions" if uses_actions(evaluation) else "It does NOT clearly use the actions"
+    words += f": with another clip's its one-step error is {others:.2f} of doing nothing, with its own {own:.2f}"
+    words += f" (difference: {interval(gap, '.2f')})"
+    sensitivity = evaluation.models[evaluation.trained].sensitivity
+    return words + ("" if sensitivity is None else f", and {_ranked(sensitivity.rankings[0])}") + "."
+
+
+def _ranked(ranking: Ranking) -> str:
+    rank = ranking.mean_rank
+    return f"{rank.value:.0%} of other actions fit better than the true one ({interval(rank, '.0%')}; chance 50%)"
+
+
+def _mean_and_range(values: list[float], form: str) -> str:
+    return f"{np.mean(values):{form}} ({min(values):{form}} to {max(values):{form}})"

@@ -1,0 +1,287 @@
+"""How good is a run, or a model, on held-out episodes? Load it and what it is compared with, measure, write it down."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from vjepa2_ac import __version__
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.loader import batches_of
+from vjepa2_ac.data.windows import Split, far_neighbours, spread
+from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate import ClipName, ClipsAgain, Contender, Pictures, Probes, evaluate
+from vjepa2_ac.evaluation.examples import seen_by_the_encoder
+from vjepa2_ac.evaluation.metrics_file import METRICS_FILE, write_metrics
+from vjepa2_ac.evaluation.plots import plot_evaluation
+from vjepa2_ac.evaluation.result import About, Evaluation, TrainingCurve
+from vjepa2_ac.latents import encode_batch, require_widths
+from vjepa2_ac.model.adapter_end import base_only
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.storage import user_can_write
+from vjepa2_ac.training.assembly import make_accelerator
+from vjepa2_ac.training.cached import with_latents_if_there
+from vjepa2_ac.training.chosen import NEWEST, choose_checkpoint
+from vjepa2_ac.training.journal import read_journal
+from vjepa2_ac.training.run_folder import CONFIG, read_run_config
+from vjepa2_ac.training.runs import TrainedRun, load_run
+from vjepa2_ac.training.stride import calibrate_model
+
+PLOT = "evaluation.png"
+BASE = "base"
+_NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of an evaluation."""
+
+    split: Split = "test"
+    clips: int = 256  # at most, spread over the episodes
+    checkpoint: str = NEWEST  # of a run: newest, best, or a number of optimizer steps
+    data: Config | None = None  # other data than the run's own; a model has none of its own
+    against: tuple[str, ...] | None = None  # base, runs, models; None: the base of a run, nothing for a model
+    out: Path | None = None  # folder for what is written; None: the run's
+    probes: Probes = field(default_factory=Probes)
+    calibrate: bool = False  # measure the error at other strides, too
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """What was measured."""
+
+    evaluation: Evaluation
+    checkpoint: str  # which one, in words; "" of a model
+    files: tuple[Path, ...]  # that were written
+
+
+def evaluate_subject(
+    subject: str, asked: Asked | None = None, *, stage: Callable[[str], Progress] | None = None
+) -> Evaluated:
+    """Measure a run or a model on held-out episodes; write `metrics.json` and a picture. Cheap failures come first.
+
+    Args:
+        subject: The folder of a run; or a model: what `model.base` takes.
+        asked: How.
+        stage: Gives a bar for a part of the work, by its title.
+
+    Raises:
+        InputError: The subject, the data, or what to compare with cannot be used; the split is empty.
+    """
+    asked = asked or Asked()
+    config, folder = _config_of(subject, asked)
+    _check_writable(folder)
+    dataset = open_dataset(config.data, progress=stage("looking through the data") if stage else None)
+    windows = dataset.windows(asked.split)
+    chosen = [windows[index] for index in far_neighbours(spread(len(windows), asked.clips))]
+    run = load_run(Path(subject), asked.checkpoint) if is_run(subject) else None
+    world_model = run.world_model if run else _load_model(subject, config)
+    require_widths(world_model, dataset.widths, where=subject)
+    accelerator = make_accelerator(config)
+    contenders, notes = _contenders(subject, config, run, world_model, asked)
+    for each in contenders:  # the encoder of the first one is enough
+        if isinstance(each.model, WorldModel):
+            each.model.predictor.to(accelerator.device).eval()
+    world_model.to(accelerator.device).eval()
+    calibration = None
+    if asked.calibrate:
+        calibration = calibrate_model(
+            world_model,
+            dataset,
+            config,
+            accelerator,
+            clips=asked.clips,
+            split=asked.split,
+            progress=stage("calibrating strides") if stage else None,
+        ).as_dict()
+    dataset = with_latents_if_there(config, dataset, world_model)
+    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
+    clips = _clips(dataset, chosen, config.validation.batch_size, encode, world_model.image_size)
+    with accelerator.autocast():
+        evaluation = evaluate(
+            contenders, clips, _about(subject, run, config, dataset, asked), probes=asked.probes, stage=stage
+        )
+    evaluation = replace(
+        evaluation,
+        training=training_curves(Path(subject)) if run else (),
+        calibration=calibration,
+        notes=(*notes, *evaluation.notes),
+    )
+    return Evaluated(evaluation, run.chosen if run else "", _written(evaluation, folder))
+
+
+def is_run(subject: str) -> bool:
+    """Return whether this is the folder of a run; otherwise it names a model."""
+    return (Path(subject) / CONFIG).is_file()
+
+
+def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
+    """Return every figure of a run's metrics.jsonl that is one number, over optimizer steps."""
+    points: dict[str, list[tuple[int, float]]] = {}
+    for row in read_journal(folder / "metrics.jsonl"):
+        for name, value in row.items():
+            if name != "step" and isinstance(value, int | float):
+                points.setdefault(f"{row['kind']}/{name}", []).append((row["step"], float(value)))
+    return tuple(
+        TrainingCurve(name, tuple(step for step, _ in found), tuple(value for _, value in found))
+        for name, found in points.items()
+    )
+
+
+def _config_of(subject: str, asked: Asked) -> tuple[Config, Path]:
+    """Return the config to measure with, and the folder for what is found."""
+    if is_run(subject):
+        config = read_run_config(Path(subject))
+        choose_checkpoint(Path(subject), asked.checkpoint)
+        if asked.data is None:
+            return config, asked.out or Path(subject)
+        config = config.model_copy(update={"data": asked.data.data})
+    elif asked.data is None:
+        raise _nothing_to_measure(subject)
+    else:
+        config = asked.data
+    if asked.out is None:
+        raise InputError(
+            where="command line",
+            found=f"--data without --out: {METRICS_FILE} of a run's own folder tells of its own data",
+            needed="a folder for what is found on these data",
+            fix="Add --out FOLDER",
+        )
+    if config.data.stride == "auto":
+        raise InputError(
+            where="data.stride",
+            found="auto",
+            needed="a number, to evaluate",
+            fix="`vjepa2-ac data calibrate CONFIG` tells which",
+        )
+    return config, asked.out
+
+
+def _nothing_to_measure(subject: str) -> InputError:
+    path = Path(subject)
+    found = "no config.yaml: not the folder of a run" if path.exists() else "no such folder"
+    return InputError(
+        where=subject,
+        found=found,
+        needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
+        fix="To measure a model, name the data with --data CONFIG and a folder with --out",
+    )
+
+
+def _check_writable(folder: Path) -> None:
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+
+
+def _load_model(name: str, config: Config) -> WorldModel:
+    return load_base(config.model.model_copy(update={"base": name, "random": None}), seed=config.seed)
+
+
+def _contenders(
+    subject: str, config: Config, run: TrainedRun | None, world_model: WorldModel, asked: Asked
+) -> tuple[list[Contender], tuple[str, ...]]:
+    """Return the models to measure, the base first and the subject last; and what a reader must know of them."""
+    against = asked.against if asked.against is not None else (BASE,) * (run is not None)
+    found: list[Contender] = []
+    notes: tuple[str, ...] = ()
+    if BASE in against and run is not None and config.model.base is not None:
+        if world_model.fresh_heads is not None:
+            notes = (_NO_BASE,)
+        else:
+            found.append(Contender(BASE, "base", world_model, partial(base_only, world_model)))
+    elif BASE in against and run is None:
+        if config.model.base is None:
+            raise InputError(
+                where="--against base", found="a config without model.base", needed="a base to compare with"
+            )
+        found.append(Contender(BASE, "base", _like(world_model, config.model.base, config, subject)))
+    name = "adapter" if world_model.adaptation is not None and world_model.adaptation.kind == "lora" else "model"
+    for other in against:
+        if other != BASE:
+            taken = {each.name for each in found} | {name, BASE, "persistence"}
+            called = Path(other).name if Path(other).name not in taken else other
+            found.append(Contender(called, "other", _like(world_model, other, config, subject)))
+    return [*found, Contender(name, "trained", world_model)], notes
+
+
+def _like(world_model: WorldModel, other: str, config: Config, subject: str) -> WorldModel:
+    """Load another run or model that can be measured on the same latents.
+
+    Raises:
+        InputError: It has another encoder, or takes other states or actions.
+    """
+    loaded = load_run(Path(other)).world_model if is_run(other) else _load_model(other, config)
+    same = loaded.image_size == world_model.image_size
+    if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
+        raise InputError(
+            where=f"--against {other}",
+            found=f"another encoder than that of {subject}",
+            needed="the same one: errors are compared on the same latents",
+            fix="Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`",
+        )
+    ours, theirs = world_model.sizes.predictor, loaded.sizes.predictor
+    if (ours.state_dim, ours.action_dim) != (theirs.state_dim, theirs.action_dim):
+        raise InputError(
+            where=f"--against {other}",
+            found=f"a model of states of {theirs.state_dim} and actions of {theirs.action_dim} numbers",
+            needed=f"{ours.state_dim} and {ours.action_dim}, as {subject} takes",
+        )
+    return loaded
+
+
+def _clips(
+    dataset: Dataset,
+    windows: Sequence[tuple[int, int]],
+    batch_size: int,
+    encode: Callable[[Batch], LatentBatch],
+    image_size: int,
+) -> ClipsAgain:
+    """Return the clips at these windows, to be read as often as it takes."""
+    by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
+
+    def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, Pictures]]:
+        wanted = windows if names is None else [by_name[name] for name in names]
+        for batch in batches_of(dataset, wanted, batch_size=batch_size):
+            yield encode(batch), partial(_pictures, batch, image_size)
+
+    return ClipsAgain(len(windows), read)
+
+
+def _pictures(batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"] | None:
+    return None if batch.frames is None else seen_by_the_encoder(batch.frames[row], size)
+
+
+def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Dataset, asked: Asked) -> About:
+    data = dataset.config
+    return About(
+        subject=subject,
+        checkpoint=run.chosen if run else "",
+        checkpoint_path=str(run.checkpoint) if run else "",
+        source=data.source,
+        data=data.path,
+        cameras=tuple(data.cameras),
+        split=asked.split,
+        frames=data.frames,
+        stride=data.model_stride,
+        seconds_per_step=data.model_stride / dataset.control_rate_hz,
+        is_pose=data.states == "pose",
+        seed=config.seed,
+        version=__version__,
+        time=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    )
+
+
+def _written(evaluation: Evaluation, folder: Path) -> tuple[Path, ...]:
+    return plot_evaluation(evaluation, folder / PLOT), write_metrics(evaluation, folder / METRICS_FILE)

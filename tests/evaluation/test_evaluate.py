@@ -1,0 +1,222 @@
+"""An oracle is found perfect, a copier as good as doing nothing and deaf to its actions, every time."""
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from vjepa2_ac.evaluation.bootstrap import Estimate
+from vjepa2_ac.evaluation.estimates import (
+    difference_to,
+    gain_over,
+    gap_of_actions,
+    mean_error,
+    one_step_over_persistence,
+    over_persistence,
+    stratum_gain,
+    stratum_over_persistence,
+)
+from vjepa2_ac.evaluation.evaluate import Contender, Probes, evaluate
+from vjepa2_ac.evaluation.metrics_file import metrics_as_dict
+from vjepa2_ac.evaluation.result import METRICS, MODES, Evaluation
+from vjepa2_ac.evaluation.verdict import improvement, uses_actions, verdict
+from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, about, again, clips_batch
+
+PROBES = Probes(sensitivity_clips=6, samples=20, landscape_clips=3, nodes=5, examples=3, at_once=7)
+
+
+def evaluated(trained: object, base: object | None = None, *, size: int = 4, **changes: object) -> Evaluation:
+    contenders = [] if base is None else [Contender("base", "base", base)]  # type: ignore[arg-type]
+    contenders.append(Contender("adapter", "trained", trained))  # type: ignore[arg-type]
+    batch = clips_batch(actions=changes.pop("actions", None))  # type: ignore[arg-type]
+    return evaluate(contenders, again(batch, size), about(**changes), probes=PROBES)
+
+
+@pytest.fixture(scope="module")
+def oracle() -> Evaluation:
+    return evaluated(Oracle(), Copier())
+
+
+def test_a_perfect_predictor_scores_zero_in_every_metric(oracle: Evaluation) -> None:
+    for mode in MODES:
+        for metric in METRICS:
+            for one in over_persistence(oracle, "adapter", mode, metric):
+                assert one.value == pytest.approx(0.0, abs=1e-5)
+    assert [one.value for one in gain_over(oracle, "adapter", "base")] == pytest.approx([1.0] * (TIME - 1))
+    assert "100% better than the base" in verdict(oracle)
+    assert uses_actions(oracle)
+
+
+def test_persistence_scores_exactly_one_relative_to_itself_in_every_metric(oracle: Evaluation) -> None:
+    for mode in MODES:
+        for metric in METRICS:
+            assert {(r.value, r.low, r.high) for r in over_persistence(oracle, "base", mode, metric)} == {
+                (1.0, 1.0, 1.0)
+            }
+
+
+def test_a_model_that_ignores_actions_has_no_sensitivity_and_the_rank_of_chance() -> None:
+    found = evaluated(Copier())
+    sensitivity = found.models["adapter"].sensitivity
+    assert sensitivity is not None
+    assert sensitivity.change == Estimate(0.0, 0.0, 0.0)
+    for ranking in sensitivity.rankings:
+        assert set(ranking.rank) == {0.5}
+        assert {k: share.value for k, share in ranking.top.items()} == pytest.approx(
+            {k: ranking.chance_of_top(k) for k in ranking.top}
+        )
+    assert gap_of_actions(found, "adapter", "shuffled") == Estimate(0.0, 0.0, 0.0)
+    assert not uses_actions(found)
+    assert "does NOT clearly use the actions" in verdict(found)
+
+
+def test_an_oracle_ranks_the_true_action_first(oracle: Evaluation) -> None:
+    sensitivity = oracle.models["adapter"].sensitivity
+    assert sensitivity is not None
+    assert [set(ranking.rank) for ranking in sensitivity.rankings] == [{0.0}, {0.0}]
+    assert all(share.value == 1.0 for ranking in sensitivity.rankings for share in ranking.top.values())
+    assert sensitivity.change.value > 0.5
+
+
+def test_a_difference_is_what_is_computed_by_hand() -> None:
+    found = evaluated(Halfway(), Copier())
+    assert [one.value for one in over_persistence(found, "adapter", "teacher_forced")] == pytest.approx([0.5] * 4)
+    assert [one.value for one in over_persistence(found, "adapter", "rollout", "l2")] == pytest.approx([0.25] * 4)
+    gains = gain_over(found, "adapter", "base")
+    assert [(one.low, one.value, one.high) for one in gains] == [pytest.approx((0.5, 0.5, 0.5))] * 4
+    differences = difference_to(found, "adapter", "base", "teacher_forced")
+    nothing = mean_error(found, "persistence", "teacher_forced")
+    assert [one.value for one in differences] == pytest.approx([-one.value / 2 for one in nothing])
+    last = improvement(found, 4)
+    assert last is not None
+    assert last.value == pytest.approx(0.5)
+
+
+def test_figures_depend_on_neither_the_size_of_a_batch_nor_on_what_is_measured_beside(oracle: Evaluation) -> None:
+    others = evaluated(Oracle(), size=1)
+    one, two = (metrics_as_dict(found)["models"]["adapter"] for found in (oracle, others))
+    for mode in MODES:
+        assert values(one[mode]["l1"]["error"]) == pytest.approx(values(two[mode]["l1"]["error"]), abs=1e-6)
+        shuffled = "over_persistence_shuffled_actions"
+        assert values(one[mode]["l1"][shuffled]) == pytest.approx(values(two[mode]["l1"][shuffled]), abs=1e-6)
+    assert values(one["sensitivity"]) == pytest.approx(values(two["sensitivity"]), abs=1e-6)
+    assert values(one["landscapes"]) == pytest.approx(values(two["landscapes"]), abs=1e-6)
+
+
+def test_the_same_evaluation_twice_gives_the_same_file_and_another_seed_other_actions(oracle: Evaluation) -> None:
+    assert metrics_as_dict(evaluated(Oracle(), Copier())) == metrics_as_dict(oracle)
+    first, second = (found.models["adapter"].sensitivity for found in (oracle, evaluated(Oracle(), seed=1)))
+    assert first is not None
+    assert second is not None
+    assert not np.array_equal(first.change_by_clip, second.change_by_clip)
+
+
+def values(figures: object) -> list[float]:
+    """Return every number in there, in order."""
+    if isinstance(figures, dict):
+        return [number for one in figures.values() for number in values(one)]
+    if isinstance(figures, list):
+        return [number for one in figures for number in values(one)]
+    return [float(figures)] if isinstance(figures, int | float) else []
+
+
+def test_episodes_are_ranked_by_how_well_they_are_predicted() -> None:
+    found = evaluated(Halfway(), Copier())
+    assert [score.clips for score in found.episodes] == [2] * 6
+    ratios = [score.over_persistence for score in found.episodes]
+    assert ratios == sorted(ratios)
+    assert all(score.gain_over_base == pytest.approx(0.5) for score in found.episodes)
+    assert evaluated(Halfway()).episodes[0].gain_over_base is None
+
+
+def test_steps_are_split_by_motion_and_size_and_each_is_in_one_part_of_each_kind() -> None:
+    batch = clips_batch()
+    actions = batch.actions.clone()
+    actions[:, :2] = 0.0
+    found = evaluated(Halfway(), Copier(), actions=actions)
+    for kind in ("motion", "action size"):
+        parts = [part.steps for part in found.strata if part.kind == kind]
+        assert np.array_equal(sum(part.astype(int) for part in parts), np.ones((12, TIME - 1)))
+    idle = next(part for part in found.strata if part.name == "idle")
+    assert idle.steps[:, :2].all()
+    moving = next(part for part in found.strata if part.name == "moving")
+    assert stratum_over_persistence(found, moving, "adapter").value == pytest.approx(0.5, abs=1e-3)
+    assert stratum_gain(found, moving, "adapter", "base").value == pytest.approx(0.5, abs=1e-3)
+    sizes = [found.clips.action_size[part.steps] for part in found.strata if part.kind == "action size"]
+    assert all(small.max() <= large.min() for small, large in pairwise(sizes))
+
+
+def test_examples_are_the_best_the_worst_and_the_liveliest_with_their_errors(oracle: Evaluation) -> None:
+    found = evaluated(Halfway(), Copier())
+    reasons = " ".join(example.why for example in found.examples)
+    assert "most motion" in reasons
+    assert "best" in reasons
+    for example in found.examples:
+        assert example.frames is not None
+        assert example.frames.shape == (TIME, 8, 8, 3)
+        assert list(example.errors) == ["persistence", "base", "adapter"]
+        np.testing.assert_allclose(example.errors["base"], example.errors["persistence"])
+        np.testing.assert_allclose(example.errors["adapter"], example.errors["base"] / 2, rtol=1e-3)
+        assert example.true_colours.shape == (TIME, 2, 2, 3)
+        assert example.predicted_colours["adapter"].shape == (TIME - 1, 2, 2, 3)
+    shown = oracle.examples[0]
+    np.testing.assert_array_equal(shown.predicted_colours["adapter"], shown.true_colours[1:])
+    assert not np.array_equal(shown.predicted_colours["base"], shown.true_colours[1:])
+
+
+def test_vectors_have_no_centimetres_and_too_few_numbers_no_landscape() -> None:
+    contenders = [Contender("model", "trained", Oracle())]
+    vectors = evaluate(contenders, again(clips_batch(width=4)), about(is_pose=False), probes=PROBES)
+    landscapes = vectors.models["model"].landscapes
+    assert landscapes is not None
+    assert (landscapes.unit, landscapes.axis_names[0]) == ("", "action 0")
+    narrow = evaluate(contenders, again(clips_batch(width=2)), about(is_pose=False), probes=PROBES)
+    assert narrow.models["model"].landscapes is None
+    assert "an action has 2 numbers" in verdict(narrow)
+    json.dumps(metrics_as_dict(narrow), allow_nan=False)
+
+
+def test_each_model_is_measured_only_while_it_is_switched_on() -> None:
+    on: list[str] = []
+
+    @contextmanager
+    def switch() -> Iterator[None]:
+        on.append("base")
+        yield
+        on.pop()
+
+    class Watched(Copier):
+        def predict(self, *inputs, **more):  # type: ignore[no-untyped-def]
+            assert on == ["base"]
+            return super().predict(*inputs, **more)
+
+    class Unwatched(Oracle):
+        def predict(self, *inputs, **more):  # type: ignore[no-untyped-def]
+            assert not on
+            return super().predict(*inputs, **more)
+
+    contenders = [Contender("base", "base", Watched(), switch), Contender("adapter", "trained", Unwatched())]
+    evaluate(contenders, again(clips_batch()), about(), probes=PROBES)
+
+
+def test_progress_names_each_part_of_the_work() -> None:
+    told: dict[str, tuple[int, int]] = {}
+
+    def stage(title: str):  # type: ignore[no-untyped-def]
+        return lambda done, total: told.__setitem__(title, (done, total))
+
+    evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=PROBES, stage=stage)
+    assert told == {"measuring": (12, 12), "other actions, model": (6, 6), "energy landscapes, model": (3, 3)}
+
+
+def test_nothing_but_errors_is_measured_where_nothing_else_is_asked_for() -> None:
+    probes = Probes(sensitivity_clips=0, landscape_clips=0, examples=0)
+    found = evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=probes)
+    assert found.models["model"].sensitivity is None
+    assert found.models["model"].landscapes is None
+    assert found.examples == ()
+    assert one_step_over_persistence(found, "model").value == pytest.approx(0.0, abs=1e-5)
+    assert (TOKENS, DIM) == (4, 6)

@@ -1,0 +1,114 @@
+"""The words say what the figures say."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vjepa2_ac.evaluation.plots import plot_evaluation
+from vjepa2_ac.evaluation.result import Errors, Evaluation, Example, ModelResult, Predicted
+from vjepa2_ac.evaluation.strata import clips_of
+from vjepa2_ac.evaluation.verdict import improvement, spread, uses_actions, verdict
+from worlds import about
+
+CLIPS, HORIZON = 24, 3
+
+
+def errors(level: float, noise: float = 0.0) -> Errors:
+    """Return errors of about `level` times those of persistence, 0.5."""
+    rng = np.random.default_rng(int(level * 1000))
+    values = 0.5 * (level + noise * rng.standard_normal((CLIPS, HORIZON)))
+    return Errors(values, values, values)
+
+
+def model(name: str, level: float, *, noise: float = 0.02, shuffled: float | None = None) -> ModelResult:
+    of_true, others = (errors(one, noise) for one in (level, level if shuffled is None else shuffled))
+    true, wrong = Predicted(of_true, of_true), Predicted(others, others)
+    return ModelResult(name, "base" if name == "base" else "trained", true, wrong, wrong)
+
+
+def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
+    ids = tuple(f"episode {clip % episodes}" for clip in range(CLIPS))
+    actions = np.full((CLIPS, HORIZON, 7), 0.01)
+    example = Example(
+        why="best",
+        episode_id="episode 0",
+        start=0,
+        frames=None,
+        errors={name: np.ones((HORIZON, 2, 2)) for name in ("persistence", *(each.name for each in models))},
+        true_colours=np.zeros((HORIZON + 1, 2, 2, 3), np.uint8),
+        predicted_colours={},
+    )
+    return Evaluation(
+        about=about(frames=HORIZON + 1, seconds_per_step=0.5),
+        clips=clips_of(actions, ids, tuple(range(CLIPS)), is_pose=True, seconds_per_step=0.5),
+        persistence=Predicted(errors(1.0), errors(1.0)),
+        models={each.name: each for each in models},
+        strata=(),
+        episodes=(),
+        examples=(example,),
+    )
+
+
+def test_a_better_adapter_is_called_better_by_its_share() -> None:
+    words = verdict(evaluation(model("base", 1.0), model("adapter", 0.75)))
+    assert words.startswith("The adapter predicts 1.5 s ahead 25% better than the base (gain 95 % interval")
+    assert "24 clips of 8 held-out episodes" in words
+    assert ": better." in words
+
+
+def test_a_worse_adapter_is_called_worse() -> None:
+    words = verdict(evaluation(model("base", 0.8, noise=0.0), model("adapter", 1.2, noise=0.0)))
+    assert "50% WORSE than the base" in words
+    assert ": NOT better." in words
+
+
+def test_a_difference_within_the_noise_is_not_called_one() -> None:
+    words = verdict(evaluation(model("base", 1.0, noise=0.3), model("adapter", 0.999, noise=0.3)))
+    assert words.startswith("The adapter did not clearly help")
+    assert "no clear difference." in words
+
+
+def test_a_model_without_a_base_is_measured_against_doing_nothing_only() -> None:
+    words = verdict(evaluation(model("model", 0.5)))
+    assert words.startswith("The model was measured on 24 clips")
+    assert "than the base" not in words
+
+
+def test_actions_are_called_used_only_where_wrong_ones_are_clearly_worse() -> None:
+    deaf = evaluation(model("model", 0.5))
+    assert not uses_actions(deaf)
+    assert "It does NOT clearly use the actions" in verdict(deaf)
+    listening = evaluation(model("model", 0.5, shuffled=0.9))
+    assert uses_actions(listening)
+    assert (
+        "It uses the actions: with another clip's its one-step error is 0.90 of doing nothing, with its own 0.50"
+        in (verdict(listening))
+    )
+
+
+def test_what_a_reader_must_know_is_said() -> None:
+    assert verdict(replace(evaluation(model("model", 0.5)), notes=("There is no base.",))).endswith("There is no base.")
+
+
+def test_one_episode_gives_no_interval_and_no_certainty(tmp_path) -> None:
+    one = evaluation(model("base", 1.0), model("adapter", 0.5), episodes=1)
+    words = verdict(one)
+    assert "one episode: no interval" in words
+    assert "did not clearly help" in words
+    assert plot_evaluation(one, tmp_path / "picture.png").stat().st_size > 1000
+
+
+def test_improvement_is_one_minus_the_ratio_of_errors() -> None:
+    gain = improvement(evaluation(model("base", 1.0, noise=0.0), model("adapter", 0.75)), horizon=2)
+    assert gain is not None
+    assert gain.value == pytest.approx(0.25, abs=0.02)
+    assert gain.low < gain.value < gain.high
+    assert improvement(evaluation(model("model", 0.5)), horizon=2) is None
+
+
+def test_the_spread_names_mean_and_range() -> None:
+    words = spread([evaluation(model("base", 1.0, noise=0.0), model("adapter", a, noise=0.0)) for a in (0.7, 0.8)])
+    assert words == (
+        "2 runs: error over persistence 0.750 (0.700 to 0.800); better than the base by 25.0% (20.0% to 30.0%)"
+    )
