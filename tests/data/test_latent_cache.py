@@ -2,9 +2,10 @@
 
 import json
 import os
+import pickle
 import shutil
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -23,16 +24,17 @@ from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import BrokenEpisodes
 from vjepa2_ac.data.check import check_data
-from vjepa2_ac.data.clips import pictures_of
+from vjepa2_ac.data.clips import clip_at, pictures_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.inspection import inspect_dataset
-from vjepa2_ac.data.kept import KeptSteps
+from vjepa2_ac.data.kept import KeptSteps, clip_starts
 from vjepa2_ac.data.latent_cache import needed_frames, require_encoding, through_cache
 from vjepa2_ac.data.loader import batches_of, training_loader, validation_batches
 from vjepa2_ac.data.sources.latents.folder import EPISODES, KEPT, MANIFEST, path_of
 from vjepa2_ac.data.sources.latents.precision import CacheType, decoded, stored
 from vjepa2_ac.data.sources.latents.record import Layout, Record, write_record
 from vjepa2_ac.data.sources.rlds.writer import write_droid_rlds
+from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, StoredLatents
 from vjepa2_ac.errors import InputError
@@ -324,6 +326,38 @@ def test_one_phase_needs_a_frame_in_every_stride(droid_with_rests: Path, tmp_pat
         assert phases[1] <= {(0,), (1,)}
 
 
+def test_clips_start_at_multiples_of_start_every_from_the_first_kept_step() -> None:
+    table = EpisodeTable.of([EpisodeInfo("a", 40), EpisodeInfo("b", 20)])
+    kept = KeptSteps(
+        *(np.array(column, np.int32) for column in ([0, 0, 1], [3, 20, 0], [16, 31, 20])), np.ones(2, bool)
+    )
+    config = DataConfig(path="nowhere", frames=3, stride=2, start_every=4)
+    starts = clip_starts(table, kept, config)
+    found = [
+        (int(starts.episode[run]), step)
+        for run in range(len(starts.first))
+        for step in starts.steps_of(run, table.id_hash, 0.0).tolist()
+    ]
+    assert found == [(0, 3), (0, 7), (0, 11), (0, 23), (1, 0), (1, 4), (1, 8), (1, 12)]
+
+
+@pytest.mark.parametrize(("when", "caught"), [("never", [0, 0]), ("once", [0, 1]), ("always", [1, 1])])
+def test_frames_are_checked_as_often_as_the_config_says(
+    droid_with_rests: Path, tmp_path: Path, when: str, caught: list[int]
+) -> None:
+    """A frame is damaged after it was read: `always` finds it, `once` does where another process reads it."""
+    _, through = cached(droid_with_rests, tmp_path, check_crc=when)
+    path = path_of(Path(through.config.path), 3, "exterior_1_left")
+    clip_at(through, 3, 0)
+    with path.open("r+b") as file:  # in place: the bytes that are mapped change, too
+        file.seek(place_of(path, "latents", byte=7))
+        file.write(b"\x55")
+    another_process = pickle.loads(pickle.dumps(through))  # noqa: S301 - our own
+    for reader, is_caught in zip((through, another_process), caught, strict=True):
+        with pytest.raises(InputError, match="control step 0 is wrong") if is_caught else nullcontext():
+            clip_at(reader, 3, 0)
+
+
 def test_needed_frames_are_those_of_the_clips_of_all_splits(droid_with_rests: Path, tmp_path: Path) -> None:
     for knobs in EVERYTHING.values():
         dataset = open_dataset(config_of(droid_with_rests, tmp_path, **knobs))
@@ -514,6 +548,12 @@ def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_p
         with pytest.raises(InputError, match=name):
             through_cache(original, NUMBERS)
         flipped(folder / name, place)
+    sound = (folder / EPISODES).read_bytes()
+    table = EpisodeTable.from_bytes(sound)
+    (folder / EPISODES).write_bytes(replace(table, num_steps=table.num_steps + 1).to_bytes())
+    with pytest.raises(InputError, match=r"not the one in cache\.json"):  # sound, but not this cache's
+        alone(through)
+    (folder / EPISODES).write_bytes(sound)
     (folder / MANIFEST).unlink()
     with pytest.raises(InputError, match="it is unfinished"):
         through_cache(original, NUMBERS)
