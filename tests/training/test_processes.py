@@ -20,7 +20,7 @@ from vjepa2_ac.training.assembly import assemble, batches_from
 from vjepa2_ac.training.checkpoint import RunState, newest_checkpoint, read_state
 from vjepa2_ac.training.journal import read_journal
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.preemption import EXIT_STATUS
+from vjepa2_ac.training.preemption import EXIT_STATUS, StoppedError
 from vjepa2_ac.training.resume import micro_batches_of
 
 
@@ -45,6 +45,18 @@ def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
             assert same["grad_norm"] == pytest.approx(row["grad_norm"], rel=1e-4)
 
 
+def stopping_after(last_step: int, reporter):
+    stepped = reporter.stepped
+
+    def stop(step: int, seen: dict) -> None:
+        stepped(step, seen)
+        if step == last_step:
+            os.kill(os.getpid(), signal.SIGUSR1)
+
+    reporter.stepped = stop
+    return reporter
+
+
 def test_two_processes_stopped_and_gone_on_as_one_make_the_run_of_one(without_dropout, reporter, tmp_path) -> None:
     """One rank is signalled, both stop after the same step; one process goes on with all clips of a step."""
     whole = train(without_dropout("whole", training__steps=16, training__accumulation=4), type(reporter)())
@@ -66,9 +78,11 @@ def test_two_processes_stopped_and_gone_on_as_one_make_the_run_of_one(without_dr
     state = read_state(newest_checkpoint(tmp_path / "shared/checkpoints"))
     assert 1 <= state.step < 16
     assert (state.processes, state.clips_per_step, state.clips_done) == (2, 8, 8 * state.step)
-    train(config, reporter)
-    assert reporter.steps[0] == state.step + 1
-    assert any("1 processes instead of 2: 4 micro-batches of 2 in each" in note for note in reporter.notes)
+    with pytest.raises(StoppedError):
+        train(config, stopping_after(state.step + 1, type(reporter)()))
+    train(config, reporter)  # once more: the number of processes is not another any more, and a step not the config's
+    assert reporter.steps[0] == state.step + 2
+    assert any("4 micro-batches of 2 in each" in note for note in reporter.notes)
     assert_equal_up_to_rounding(whole, tmp_path / "shared")
 
 
@@ -113,6 +127,16 @@ def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
     assert bool(notes) == (before != now)
 
 
+@pytest.mark.parametrize("starts", [(2, 1, 1, 2), (1, 4, 4, 2), (4, 2, 8, 8, 1)])
+def test_a_step_keeps_its_clips_however_often_the_run_goes_on(make_config, starts: tuple[int, ...], reporter) -> None:
+    config, state = make_config(training__batch_size=2, training__accumulation=4), RunState(step=0)
+    for processes in starts:
+        micro_batches = micro_batches_of(config, state, processes, reporter.note)
+        clips = micro_batches * processes * 2
+        state = replace(state, processes=processes, clips_per_step=clips, clips_asked=8)
+        assert clips == 8 * starts[0]
+
+
 def test_processes_that_cannot_share_a_step_are_refused(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
     with pytest.raises(InputError, match="3 processes of 2 clips for a run with 8 clips per step"):
@@ -121,7 +145,8 @@ def test_processes_that_cannot_share_a_step_are_refused(make_config, reporter) -
 
 def test_accumulation_changed_on_purpose_counts_as_it_is_written(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=3)
-    assert micro_batches_of(config, RunState(step=3, clips_per_step=8), 2, reporter.note) == 3
+    for state in (RunState(step=3, clips_per_step=8), RunState(step=3, clips_per_step=8, clips_asked=4, processes=1)):
+        assert micro_batches_of(config, state, 2, reporter.note) == 3
 
 
 def test_a_run_whose_step_changes_goes_on_in_the_row_of_clips_where_it_stood(make_config, reporter) -> None:

@@ -178,6 +178,7 @@ def save_checkpoint(run: Run, folder: Path) -> None:
         broken=broken,
         windows=len(run.dataset.windows("train")),
         clips_per_step=run.clips_per_step,
+        clips_asked=run.config.training.batch_size * run.config.training.accumulation,
         processes=run.accelerator.num_processes,
         loss_scale=run.scaler.state_dict() if run.scaler.is_enabled() else None,
     )

@@ -38,6 +38,7 @@ class RunState:
     run_id: str = ""  # a random name that stays with the run for good, wherever it goes on
     clips_done: int = 0  # place in the row of clips of the whole run
     clips_per_step: int | None = None  # of all processes together
+    clips_asked: int | None = None  # of one process, by the config: batch_size * accumulation
     processes: int = 1
     broken: Mapping[str, str] = field(default_factory=dict)  # episodes that clips could not be read from, and why
     windows: int | None = None  # clips of an epoch: with another number, their order is another

@@ -51,14 +51,17 @@ def take_up(
 def micro_batches_of(config: Config, state: RunState, processes: int, note: Callable[[str], None]) -> int:
     """Return how many micro-batches a process does per step.
 
-    They are the config's; but on another number of processes than before so many that a step has the clips it had.
+    They are the config's, at the first start and where batch_size * accumulation was changed on purpose; else so many
+    that a step has the clips it had, on whatever number of processes, however often the run goes on.
 
     Raises:
         InputError: So many processes cannot share a step's clips evenly.
     """
     batch_size, accumulation = config.training.batch_size, config.training.accumulation
-    as_configured = state.clips_per_step in {None, batch_size * accumulation * state.processes}
-    if state.clips_per_step is None or processes == state.processes or not as_configured:
+    if state.clips_per_step is None:
+        return accumulation
+    asked_before = state.clips_asked or state.clips_per_step // state.processes
+    if asked_before != batch_size * accumulation or state.clips_per_step == batch_size * accumulation * processes:
         return accumulation
     micro_batches, rest = divmod(state.clips_per_step, batch_size * processes)
     if rest or not micro_batches:
@@ -66,10 +69,11 @@ def micro_batches_of(config: Config, state: RunState, processes: int, note: Call
             where="training.batch_size",
             found=f"{processes} processes of {batch_size} clips for a run with {state.clips_per_step} clips per step",
             needed="a number of processes and a batch_size whose product divides the clips of a step",
-            fix="Start another number of processes, or set a smaller training.batch_size and --allow-config-change",
+            fix="Start another number of processes; or set training.batch_size and training.accumulation to what each"
+            " is to do, with --allow-config-change",
         )
     note(
-        f"{processes} processes instead of {state.processes}: {micro_batches} micro-batches of {batch_size} in each, so"
+        f"{processes} processes, before {state.processes}: {micro_batches} micro-batches of {batch_size} in each, so"
         f" that a step has the same {state.clips_per_step} clips."
     )
     return micro_batches
