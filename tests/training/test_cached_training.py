@@ -11,8 +11,12 @@ from same_run import assert_same_run, figures, trained_weights
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.dataset import open_dataset
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate import Probes
+from vjepa2_ac.evaluation.metrics_file import metrics_as_dict
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.calibrate import calibrate_config
+from vjepa2_ac.training.evaluation import Asked, evaluate_subject
 from vjepa2_ac.training.loop import train
 
 
@@ -115,3 +119,28 @@ def test_the_weights_move(make_config, reporter, tmp_path) -> None:
     """What is compared above is not nothing."""
     train(make_config(training__steps=1), reporter)
     assert any(weight.abs().max() > 0 for name, weight in trained_weights(tmp_path / "run").items() if "lora_B" in name)
+
+
+def test_a_run_is_evaluated_from_its_cache_as_from_its_data(make_config, reporter, tmp_path) -> None:
+    changes = {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches"), "training__steps": 2}
+    config = make_config(run_dir=str(tmp_path / "run"), data__cache="auto", **changes)
+    train(config, reporter)
+    asked = Asked(clips=6, probes=Probes(sensitivity_clips=2, samples=4, landscape_clips=1, nodes=3))
+    folder = next((tmp_path / "caches").iterdir())
+    from_cache = evaluate_subject(str(tmp_path / "run"), asked).evaluation
+    folder.rename(tmp_path / "elsewhere")
+    from_data = evaluate_subject(str(tmp_path / "run"), asked).evaluation
+    found = [metrics_as_dict(one) for one in (from_cache, from_data)]
+    assert [examples.frames is not None for examples in from_cache.examples] == [True] * len(from_data.examples)
+    for cached, original in zip(from_cache.examples, from_data.examples, strict=True):
+        difference = cached.frames.astype(float) - original.frames
+        assert abs(difference).mean() < 12  # small and JPEG, but the same pictures
+    for one in found:
+        one.pop("about")
+    assert found[0] == found[1]
+
+
+def test_a_cache_alone_cannot_tell_the_stride(make_config, tmp_path) -> None:
+    config = make_config(data__cache_dir=str(tmp_path / "caches"))
+    with pytest.raises(InputError, match="encoded for clips at stride 2"):
+        calibrate_config(make_config(**of_cache(encoded(config))))

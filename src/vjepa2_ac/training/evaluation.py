@@ -10,10 +10,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips import pictures_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of
 from vjepa2_ac.data.windows import Split, far_neighbours, spread
@@ -254,13 +256,14 @@ def _clips(
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, Pictures]]:
         wanted = windows if names is None else [by_name[name] for name in names]
         for batch in batches_of(dataset, wanted, batch_size=batch_size):
-            yield encode(batch), partial(_pictures, batch, image_size)
+            yield encode(batch), partial(_pictures, dataset, batch, image_size)
 
     return ClipsAgain(len(windows), read)
 
 
-def _pictures(batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"] | None:
-    return None if batch.frames is None else seen_by_the_encoder(batch.frames[row], size)
+def _pictures(dataset: Dataset, batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"]:
+    """Return what the encoder sees of a clip; of cached latents, small pictures made large."""
+    return seen_by_the_encoder(torch.from_numpy(pictures_of(dataset, batch, row)), size)
 
 
 def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Dataset, asked: Asked) -> About:

@@ -106,8 +106,15 @@ def calibrate_model(
     """Calibrate a model that is on the accelerator's device, in the run's precision.
 
     Raises:
-        InputError: As `calibrate`.
+        InputError: As `calibrate`; or the data is a latent cache.
     """
+    if dataset.config.source == "latents":
+        raise InputError(
+            where=f"data.path: {dataset.config.path}",
+            found=f"latents that were encoded for clips at stride {dataset.config.stride}",
+            needed="frames at every stride that is tried",
+            fix="Calibrate on the data set itself, with data.cache: off",
+        )
     world_model.eval()
 
     def encode(batch: Batch) -> LatentBatch:
