@@ -105,3 +105,21 @@ def test_no_ratio_is_printed_to_a_predictor_that_computes_something_else(
     printed = capsys.readouterr().out
     assert "official: NO RATIO" in printed
     assert [way for way, _, _ in rows(printed)] == ["dense", "auto"]
+
+
+def test_quick_benchmark_of_latents_tells_speed_size_and_added_error(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("mujoco", reason="the arm is simulated")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    import_module("latents").main(["--quick"])
+    monkeypatch.delitem(sys.modules, "latents")
+    printed = capsys.readouterr().out
+    assert re.search(r"^ +4 +\d+\.\d+ +\d+ +\d+ +\d+\.\d\dx$", printed, re.MULTILINE)
+    hours = [float(hour) for hour in re.findall(r"^ +(?:int8|bf16|fp32) +\S+ +(\d\.\d\d) +\S+$", printed, re.MULTILINE)]
+    bf16, fp32, int8 = hours
+    assert int8 < bf16 < fp32
+    added = re.findall(r"^ +random +(\w+) +\S+ +(\S+)% +\S+ +(\S+)%", printed, re.MULTILINE)
+    assert [kind for kind, *_ in added] == ["fp32", "bf16", "int8"]
+    assert all(float(one) == 0 for kind, *percent in added if kind == "fp32" for one in percent)
+    assert all(abs(float(one)) < 2 for _, *percent in added for one in percent)
