@@ -1,5 +1,6 @@
 """Laws of the loop: exact, resumable, and nothing but the adapter moves."""
 
+import importlib.util
 import json
 import re
 from pathlib import Path
@@ -203,6 +204,24 @@ def test_another_config_on_purpose_is_written_and_what_changes_is_said(make_conf
     assert [start.get("config_changes") for start in starts] == [None, said]
     assert reporter.steps == [*range(1, 7), 7, 8]
     train(changed, reporter)
+
+
+def test_what_the_optimizer_is_told_anew_on_purpose_counts(make_config, reporter) -> None:
+    """Its saved state knows the old settings, and would bring them back."""
+    train(make_config(training__steps=2, training__weight_decay=0.04), reporter)
+    run = assemble(make_config(training__weight_decay=0.5, training__betas=[0.8, 0.9]), reporter.note)
+    assert [(group["weight_decay"], group["betas"]) for group in run.optimizer.param_groups] == [(0.5, (0.8, 0.9))]
+    assert all(moments["step"] == 2 for moments in run.optimizer.state_dict()["state"].values())
+
+
+@pytest.mark.skipif(importlib.util.find_spec("bitsandbytes") is None, reason="needs the 8bit extra")
+@pytest.mark.parametrize(("before", "then"), [("adamw", "adamw_8bit"), ("adamw_8bit", "adamw")])
+def test_moments_of_another_optimizer_are_refused_before_the_first_step(make_config, reporter, before, then) -> None:
+    config = make_config(training__steps=2, training__optimizer=before)
+    train(config, reporter)
+    with pytest.raises(InputError, match=r"another training\.optimizer"):
+        train(make_config(training__optimizer=then), reporter, allow_config_change=True)
+    assert (Path(config.run_dir) / "config.yaml").read_text() == config_as_yaml(config)
 
 
 def test_workers_and_logging_may_change_within_a_run(make_config, reporter) -> None:

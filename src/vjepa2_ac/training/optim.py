@@ -48,6 +48,21 @@ def _adamw_8bit() -> Any:
     return AdamW8bit
 
 
+def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
+    """Take up the state of an optimizer of the same kind; weight decay and betas stay those that it was made with.
+
+    Raises:
+        ValueError: The state is of another kind of optimizer, or of other parameters.
+    """
+    first = "exp_avg" if isinstance(optimizer, torch.optim.AdamW) else "state1"  # PyTorch's and bitsandbytes' names
+    if any(first not in moments for moments in state["state"].values()):
+        raise ValueError("its moments are of another training.optimizer")
+    asked = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
+    optimizer.load_state_dict(state)
+    for group, own in zip(optimizer.param_groups, asked, strict=True):
+        group.update(own)
+
+
 def learning_rate_at(step: int, training: TrainingConfig) -> float:
     """Return the learning rate of optimizer step 1..steps: a pure function, so there is no scheduler to save.
 

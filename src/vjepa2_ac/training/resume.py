@@ -16,6 +16,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.lora import load_trained
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, read_state
+from vjepa2_ac.training.optim import load_moments
 from vjepa2_ac.training.processes import from_first, require_same, take_from_first
 from vjepa2_ac.training.run_folder import CHECKPOINTS, run_id
 from vjepa2_ac.training.torch_file import read_torch
@@ -44,7 +45,7 @@ def take_up(
     take_from_first(accelerator, world_model.predictor.state_dict().values())
     moments = from_first(accelerator, moments)
     if moments is not None and not accelerator.is_main_process:
-        optimizer.load_state_dict(moments)
+        load_moments(optimizer, moments)
     return state
 
 
@@ -101,9 +102,11 @@ def _read(
     load_trained(world_model, checkpoint / ADAPTER, trainable=True)
     try:
         moments = read_torch(checkpoint / OPTIMIZER)
-        optimizer.load_state_dict(moments)
+        load_moments(optimizer, moments)
         return read_state(checkpoint), moments
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:
         raise InputError(
-            where=str(checkpoint), found=f"not the state of this run ({error})", fix="Delete it to use an older one"
+            where=str(checkpoint),
+            found=f"not the state of this run ({error})",
+            fix="Set back what was changed in the config; or delete this checkpoint, to use an older one",
         ) from None
