@@ -24,7 +24,7 @@ from vjepa2_ac.evaluation.html_report.heatmaps import MapAxis, heat_map
 from vjepa2_ac.evaluation.html_report.markup import element, text
 from vjepa2_ac.evaluation.html_report.numbers import decimal, percent, signed
 from vjepa2_ac.evaluation.html_report.page import report_page, write_report
-from vjepa2_ac.evaluation.html_report.pictures import png_url
+from vjepa2_ac.evaluation.html_report.pictures import jpeg_urls, png_url
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
 
 VOID = {"br", "hr", "img", "input", "meta", "wbr"}
@@ -235,6 +235,18 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
     assert "against" not in page.tables
 
 
+def test_of_a_long_clip_the_first_the_last_and_frames_between_are_shown() -> None:
+    html = page_of(evaluation(frames=40, size=32))
+    page = Page(html)
+    shown = [int(name) for name in re.findall(r'<image id="e0f(\d+)"', html)]
+    assert shown[0] == 0
+    assert shown[-1] == 39
+    assert 16 <= len(shown) < 40
+    assert {int(name) for name in re.findall(r'href="#e0f(\d+)"', html)} == set(shown)
+    assert html.count("animation:turn-16 ") == 16
+    assert "+10.40\xa0s" in page.shown
+
+
 def test_clips_without_photographs_show_their_latents_and_errors() -> None:
     one, _, _ = usual()
     html = page_of(replace(one, examples=tuple(replace(example, frames=None) for example in one.examples)))
@@ -339,6 +351,17 @@ def test_png_holds_the_pixels_it_was_given() -> None:
     pixels = np.random.default_rng(0).integers(0, 256, size=(5, 7, 3), dtype=np.uint8)
     image = Image.open(io.BytesIO(base64.b64decode(png_url(pixels).partition("base64,")[2])))
     assert np.array_equal(np.asarray(image), pixels)
+
+
+def test_photographs_take_the_best_quality_in_which_all_of_them_fit_or_are_left_out() -> None:
+    rng = np.random.default_rng(0)
+    clips = [[rng.integers(0, 256, size=(300, 600, 3), dtype=np.uint8) for _ in range(2)] for _ in range(2)]
+    fine, coarse, none = ([len("".join(clip)) for clip in jpeg_urls(clips, at_most=n)] for n in (10**6, 30_000, 1000))
+    assert 30_000 < sum(fine) <= 10**6
+    assert 0 < sum(coarse) <= 30_000
+    assert none == [0, 0]
+    image = Image.open(io.BytesIO(base64.b64decode(jpeg_urls(clips, at_most=10**6)[0][0].partition("base64,")[2])))
+    assert image.size == (200, 100)
 
 
 def test_the_darkest_place_of_a_map_lies_under_the_ring() -> None:

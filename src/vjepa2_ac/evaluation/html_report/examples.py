@@ -43,6 +43,16 @@ class _Shown:
         """The largest error of a patch: the brightest colour in every picture of the example."""
         return max(float(errors.max()) for errors in self.example.errors.values())
 
+    @property
+    def columns(self) -> list[int]:
+        """The times that stand one beside the other."""
+        return _spread(self.times, _MOST_COLUMNS)
+
+    @property
+    def turns(self) -> list[int]:
+        """The times of the moving picture."""
+        return _spread(self.times, MOST_FRAMES)
+
     def when(self, time: int) -> str:
         return "now" if time == 0 else f"+{seconds(time * self.seconds_per_step)}"
 
@@ -53,18 +63,18 @@ def examples_section(evaluation: Evaluation) -> Section:
     examples = evaluation.examples[:MOST_EXAMPLES]
     if not examples:
         return Section("pictures", title, not_measured("Example clips", "This evaluation made no pictures."))
-    photographs = jpeg_urls([_frames(example) for example in examples], at_most=_BYTES)
+    photographs = jpeg_urls([list(_frames(example).values()) for example in examples], at_most=_BYTES)
     models = tuple(one.model for one in models_of(evaluation))
     parts = []
     for number, (example, urls) in enumerate(zip(examples, photographs, strict=True)):
         shown = _Shown(number, example, models, evaluation.about.seconds_per_step, bool(urls))
-        parts.append(joined(_definitions(shown, urls), _example(shown)))
+        parts.append(joined(_definitions(shown, urls) if urls else Markup(), _example(shown)))
     return Section("pictures", title, joined(_how(), *parts))
 
 
 def animation_style(examples: Sequence[Example]) -> str:
     """Return the CSS that shows one frame of n after the other, for each n that occurs."""
-    counts = sorted({_moving_frames(example) for example in examples[:MOST_EXAMPLES]})
+    counts = sorted({len(_spread(len(example.true_colours), MOST_FRAMES)) for example in examples[:MOST_EXAMPLES]})
     rules = []
     for count in counts:
         rules.append(f"@keyframes turn-{count}{{0%{{opacity:1}}{100 / count:.4f}%{{opacity:0}}100%{{opacity:0}}}}")
@@ -94,8 +104,19 @@ def _how() -> Markup:
     )
 
 
-def _frames(example: Example) -> list[UInt8[np.ndarray, "height width 3"]]:
-    return [] if example.frames is None else list(example.frames)
+def _spread(times: int, most: int) -> list[int]:
+    """Return some of the times, the first and the last among them."""
+    return sorted({round(x) for x in np.linspace(0, times - 1, min(most, times))})
+
+
+def _frames(example: Example) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
+    """Return the photographs that are shown, by time."""
+    if example.frames is None:
+        return {}
+    times = len(example.true_colours)
+    return {
+        time: example.frames[time] for time in sorted({*_spread(times, _MOST_COLUMNS), *_spread(times, MOST_FRAMES)})
+    }
 
 
 def _definitions(shown: _Shown, urls: Sequence[str]) -> Markup:
@@ -103,9 +124,9 @@ def _definitions(shown: _Shown, urls: Sequence[str]) -> Markup:
     size = {"width": _SIZE, "height": _SIZE}
     images = [
         element("image", id=f"e{shown.number}f{time}", href=url, preserveAspectRatio="none", **size)
-        for time, url in enumerate(urls)
+        for time, url in zip(_frames(shown.example), urls, strict=True)
     ]
-    return element("svg", element("defs", *images), class_="definitions", aria_hidden="true") if images else Markup()
+    return element("svg", element("defs", *images), class_="definitions", aria_hidden="true")
 
 
 def _example(shown: _Shown) -> Markup:
@@ -113,14 +134,14 @@ def _example(shown: _Shown) -> Markup:
     name = f"{example.episode_id}, from control step {example.start}"
     parts = [element("h3", f"{example.why}: ", element("span", name, class_="id"))]
     if not shown.has_frames:
-        parts.append(not_measured("Photographs", "The latents come from a cache that holds no pictures."))
+        why = "The latents come from a cache that holds no pictures."
+        parts.append(not_measured("Photographs", why if example.frames is None else "They do not fit into a page."))
     parts.append(element("div", _film(shown, name), _strip(shown, name), class_="still-and-moving"))
     return element("article", *parts, class_="example")
 
 
 def _strip(shown: _Shown, name: str) -> Markup:
-    last = shown.times - 1
-    columns = sorted({round(x) for x in np.linspace(0, last, min(_MOST_COLUMNS, shown.times))})
+    columns = shown.columns
     head = element("tr", element("td"), *(element("th", shown.when(time), scope="col") for time in columns))
     rows = []
     if shown.has_frames:
@@ -147,8 +168,8 @@ def _measured(given: Mapping[str, object], order: Sequence[str]) -> list[str]:
 
 def _film(shown: _Shown, name: str) -> Markup:
     """Return the moving pictures, with a box to halt them; no script is needed."""
-    count = _moving_frames(shown.example)
-    times = [round(x) for x in np.linspace(0, shown.times - 1, count)]
+    times = shown.turns
+    count = len(times)
     trained = shown.models[-1]
     panels = []
     if shown.has_frames:
@@ -164,10 +185,6 @@ def _film(shown: _Shown, name: str) -> Markup:
     says = f"Moving picture of {name}: {count} frames, repeated. The same frames stand below, one beside the other."
     parts = element("div", *panels, class_="panels", role="img", aria_label=says)
     return element("div", controls, parts, class_=f"film film-{count}")
-
-
-def _moving_frames(example: Example) -> int:
-    return min(len(example.true_colours), MOST_FRAMES)
 
 
 def _panel(name: str, frames: Sequence[Markup]) -> Markup:
