@@ -1,10 +1,12 @@
 """Rows are appended, survive a kill, and are not written twice."""
 
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 
 from vjepa2_ac.training.journal import Journal, read_journal
+from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.trackers import Trackers
 
 
@@ -34,6 +36,34 @@ def test_a_line_left_by_halves_is_dropped(tmp_path: Path) -> None:
     with Journal(tmp_path, first_step=5):
         pass
     assert steps(tmp_path) == [1]
+
+
+def test_bytes_that_are_no_text_are_dropped_with_their_line(tmp_path: Path) -> None:
+    rows = b'{"kind": "train", "step": 1}\n', b"\x00\xff\xfe\n", b'{"kind": "train", "step": 2}\n'
+    (tmp_path / "metrics.jsonl").write_bytes(b"".join(rows))
+    assert steps(tmp_path) == [1, 2]
+
+
+def test_rows_are_on_the_disk_before_the_checkpoint_after_them(make_config, reporter, monkeypatch) -> None:
+    """Else a power cut could leave a run that goes on behind rows that it does not have."""
+    flushed: list[str] = []
+    real = os.fsync
+
+    def fsync(handle: int) -> None:
+        path = Path(f"/proc/self/fd/{handle}").readlink()
+        rows = f" {path.stat().st_size}" if path.name == "metrics.jsonl" else ""
+        flushed.append(path.name + rows)
+        real(handle)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    folder = train(make_config(training__steps=2, checkpoint__every=1), reporter)
+    states = [place for place, name in enumerate(flushed) if name == "state.json"]
+    sizes = [row["step"] for row in read_journal(folder / "metrics.jsonl")]
+    assert sizes == [0, 1, 2, 2], "a validation, a step, a step and its validation"
+    lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    ends = [len("".join(lines[:2])), len("".join(lines))]
+    for place, end in zip(states, ends, strict=True):
+        assert f"metrics.jsonl {end}" in flushed[:place]
 
 
 def test_what_json_cannot_hold_becomes_null(tmp_path: Path) -> None:

@@ -175,6 +175,7 @@ def _loop(
             # Agreed among all processes, and read once: a signal after this waits for the next step.
             stopped_by, due = largest(run.accelerator, [stop.number, clock.is_due(step) or is_best or last])
             if due or stopped_by:
+                journal.sync()
                 save_checkpoint(run, folder)
                 clock.restart()
             mirror.tick()

@@ -36,6 +36,9 @@ class QuietJournal:
     def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
         """Write nothing."""
 
+    def sync(self) -> None:
+        """Do nothing."""
+
     def __enter__(self) -> QuietJournal:
         """Return the journal."""
         return self
