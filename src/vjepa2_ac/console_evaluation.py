@@ -54,12 +54,20 @@ def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 def comparison_table(comparison: Comparison) -> Table:
     """Return the table of `compare`, a row per run."""
     table = Table(title=comparison.title, title_justify="left")
-    table.add_column("run", no_wrap=True)
+    table.add_column("run", overflow="fold", min_width=8)
     for column in comparison.columns:
-        table.add_column(column, justify="right", no_wrap=True)
+        table.add_column(column, justify="right")
     for name, cells in comparison.rows.items():
-        table.add_row(name, *(cell if isinstance(cell, str) else str(cell) for cell in cells))
+        shown = zip(comparison.columns, cells, strict=True)
+        table.add_row(name, *(_share(cell) if title.startswith("gain") else str(cell) for title, cell in shown))
     return table
+
+
+def _share(cell: Estimate | str) -> str:
+    """Return a gain in percent."""
+    if isinstance(cell, str) or not cell.has_interval:
+        return cell if isinstance(cell, str) else f"{cell.value:.1%}"
+    return f"{cell.value:.1%} [{cell.low:.1%}, {cell.high:.1%}]"
 
 
 def _errors(evaluation: Evaluation) -> Table:

@@ -67,7 +67,7 @@ def _compared(measured: Mapping[str, dict[str, Any]], folders: Mapping[str, Path
     ahead = f"{(about['frames'] - 1) * about['seconds_per_step']:.2f} s"
     return Comparison(
         title=f"L1 error over persistence on {clips['count']} {about['split']} clips of {clips['episodes']} episodes",
-        columns=(f"{ahead} ahead", f"gain over {names[0]}", "gain over its base", "one step", "shuffled", "rank (0.5)"),
+        columns=(f"{ahead} ahead", f"gain over {names[0]}", "gain over its base", "one step", "shuffled", "rank"),
         rows={name: _row(figures, first, ids) for name, figures in measured.items()},
         seconds=about["seconds_per_step"] * np.arange(1, about["frames"]),
         curves={name: _curve(figures) for name, figures in measured.items()},
@@ -104,8 +104,8 @@ def _row(figures: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> 
         "" if figures is first else _gain(figures, first, ids),
         "no base" if base_gain is None else _estimate(base_gain[-1]),
         _estimate(model["one_step_by_actions"]["true"]),
-        _estimate(model["one_step_by_actions"]["shuffled"]),
-        "" if sensitivity is None else _estimate(sensitivity["rankings"][0]["mean_rank"]),
+        f"{model['one_step_by_actions']['shuffled']['value']:.3f}",
+        "" if sensitivity is None else f"{sensitivity['rankings'][0]['mean_rank']['value']:.3f}",
     )
 
 

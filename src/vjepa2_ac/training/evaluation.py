@@ -23,9 +23,11 @@ from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import ClipName, ClipsAgain, Contender, Pictures, Probes, evaluate
 from vjepa2_ac.evaluation.examples import seen_by_the_encoder
+from vjepa2_ac.evaluation.html_report.page import write_report
 from vjepa2_ac.evaluation.metrics_file import METRICS_FILE, write_metrics
 from vjepa2_ac.evaluation.plots import plot_evaluation
 from vjepa2_ac.evaluation.result import About, Evaluation, TrainingCurve
+from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.latents import encode_batch, require_widths
 from vjepa2_ac.model.adapter_end import base_only
 from vjepa2_ac.model.load import load_base
@@ -39,7 +41,7 @@ from vjepa2_ac.training.run_folder import CONFIG, read_run_config
 from vjepa2_ac.training.runs import TrainedRun, load_run
 from vjepa2_ac.training.stride import calibrate_model
 
-PLOT = "evaluation.png"
+PLOT, REPORT = "evaluation.png", "report.html"
 BASE = "base"
 _NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
 
@@ -70,7 +72,7 @@ class Evaluated:
 def evaluate_subject(
     subject: str, asked: Asked | None = None, *, stage: Callable[[str], Progress] | None = None
 ) -> Evaluated:
-    """Measure a run or a model on held-out episodes; write `metrics.json` and a picture. Cheap failures come first.
+    """Measure a run or a model on held-out episodes; write metrics.json, report and picture. Cheap failures first.
 
     Args:
         subject: The folder of a run; or a model: what `model.base` takes.
@@ -89,8 +91,11 @@ def evaluate_subject(
     run = load_run(Path(subject), asked.checkpoint) if is_run(subject) else None
     world_model = run.world_model if run else _load_model(subject, config)
     require_widths(world_model, dataset.widths, where=subject)
+    through_cache = with_latents_if_there(config, dataset, world_model)
     accelerator = make_accelerator(config)
     contenders, notes = _contenders(subject, config, run, world_model, asked)
+    if through_cache.config.source == "latents" and not asked.calibrate:
+        world_model.set_encoder_aside()
     for each in contenders:  # the encoder of the first one is enough
         if isinstance(each.model, WorldModel):
             each.model.predictor.to(accelerator.device).eval()
@@ -106,9 +111,8 @@ def evaluate_subject(
             split=asked.split,
             progress=stage("calibrating strides") if stage else None,
         ).as_dict()
-    dataset = with_latents_if_there(config, dataset, world_model)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
-    clips = _clips(dataset, chosen, config.validation.batch_size, encode, world_model.image_size)
+    clips = _clips(through_cache, chosen, config.validation.batch_size, encode, world_model.image_size)
     with accelerator.autocast():
         evaluation = evaluate(
             contenders, clips, _about(subject, run, config, dataset, asked), probes=asked.probes, stage=stage
@@ -287,4 +291,8 @@ def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Datase
 
 
 def _written(evaluation: Evaluation, folder: Path) -> tuple[Path, ...]:
-    return plot_evaluation(evaluation, folder / PLOT), write_metrics(evaluation, folder / METRICS_FILE)
+    return (
+        plot_evaluation(evaluation, folder / PLOT),
+        write_metrics(evaluation, folder / METRICS_FILE),
+        write_report(evaluation, verdict(evaluation), folder / REPORT),
+    )
