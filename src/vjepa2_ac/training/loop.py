@@ -99,8 +99,15 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             if not check_only and Path(config.run_dir).is_dir():  # a new one is made, and locked, when all else is well
                 lock.take()
             # What is checked only is fetched to where it does not last.
-            into = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run") if check_only else None
-            remote = open_remote(config, reporter.note, allow_config_change=allow_config_change, into=into)
+            trial = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run") if check_only else None
+            # Taken before anything is fetched into the run's folder: whoever else came to it would still be writing.
+            remote = open_remote(
+                config,
+                reporter.note,
+                claim=lock.take if trial is None else lambda: None,
+                allow_config_change=allow_config_change,
+                into=trial,
+            )
             config = with_settled_stride(remote.config if remote else config)
         else:
             reporter = QuietReporter()

@@ -22,6 +22,7 @@ from vjepa2_ac.training.checkpoint import (
 )
 from vjepa2_ac.training.mirror.start import Remote, open_remote
 from vjepa2_ac.training.run_folder import check_run_folder
+from vjepa2_ac.training.run_lock import RunLock
 
 PLACE = "gs://bucket/run"
 NOTHING: Callable[[str], None] = [].append
@@ -286,6 +287,21 @@ def test_a_check_fetches_elsewhere_and_leaves_the_runs_folder_alone(
     shutil.rmtree(local(config))
     write(local(config), 30)
     assert open_remote(config, NOTHING, into=tmp_path / "other").config == config
+
+
+def test_a_folder_is_claimed_before_anything_is_fetched_into_it(bucket: Gcs, config: Config) -> None:
+    """Two that start at once in a new folder: the second would put older figures over those of the first."""
+    run_there(bucket, config, 10)
+    with RunLock(local(config)) as first, RunLock(local(config)) as second:
+        first.take()
+        before = files_of(local(config))
+        with pytest.raises(InputError, match="being trained right now"):
+            open_remote(config, NOTHING, claim=second.take)
+        assert files_of(local(config)) == before
+    with RunLock(local(config)) as lock:
+        open_remote(config, NOTHING, claim=lock.take)
+        with RunLock(local(config)) as other, pytest.raises(InputError, match="being trained right now"):
+            other.take()
 
 
 def test_who_is_killed_while_fetching_fetches_again(

@@ -35,6 +35,7 @@ def fetch_newest(
     config: Config,
     note: Callable[[str], None],
     *,
+    claim: Callable[[], None],
     allow_config_change: bool = False,
 ) -> list[str]:
     """Download a run into `config.run_dir`, from the first of its checkpoints that is whole.
@@ -44,6 +45,7 @@ def fetch_newest(
         names: Its checkpoints that are further on than this machine's, the newest first.
         config: The run.
         note: Told what a person should know.
+        claim: Called before the first file is written; raises where the folder is somebody else's.
         allow_config_change: The run there may have another config.
 
     Returns:
@@ -58,6 +60,7 @@ def fetch_newest(
         small = Path(temporary)
         _fetch_small_files(remote.place, small)
         _require_this_config(config, small, remote.place, allow_config_change=allow_config_change)
+        claim()
         for name in SMALL_FILES:  # config.yaml first: without it the folder would be no run's
             if (small / name).is_file():
                 write_atomically(folder / name, (small / name).read_bytes())

@@ -41,7 +41,12 @@ class Remote:
 
 
 def open_remote(
-    config: Config, note: Callable[[str], None], *, allow_config_change: bool = False, into: Path | None = None
+    config: Config,
+    note: Callable[[str], None],
+    *,
+    claim: Callable[[], None] = lambda: None,
+    allow_config_change: bool = False,
+    into: Path | None = None,
 ) -> Remote | None:
     """Try `checkpoint.remote`, and fetch what is further on there; None where there is none.
 
@@ -50,6 +55,7 @@ def open_remote(
     Args:
         config: The run.
         note: Told what a person should know.
+        claim: Called before the first file is fetched; raises where the folder is somebody else's.
         allow_config_change: The run there may have another config.
         into: The folder to fetch into, new or empty, where it is not to be the run's own.
 
@@ -77,7 +83,7 @@ def open_remote(
         return remote
     target = config if into is None else config.model_copy(update={"run_dir": str(into)})
     try:
-        damaged = fetch_newest(checkpoints, further, target, note, allow_config_change=allow_config_change)
+        damaged = fetch_newest(checkpoints, further, target, note, claim=claim, allow_config_change=allow_config_change)
     except UnreachableError as error:
         if step is None:
             raise
