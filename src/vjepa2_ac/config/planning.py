@@ -1,0 +1,154 @@
+"""Which knobs has a decision: how far ahead, by which planner, within which limits, towards what?"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from vjepa2_ac.config.section import PositiveInt, Section, Share
+
+NotNegative = Annotated[float, Field(ge=0.0)]
+Positive = Annotated[float, Field(gt=0.0)]
+
+
+class LimitsConfig(Section):
+    """What no action goes beyond, whatever the model says. All of one model step; `action_repeat` repeats it."""
+
+    xyz: tuple[NotNegative, NotNegative, NotNegative] = (0.05, 0.05, 0.05)
+    """Largest dx, dy, dz in metres; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075."""
+    ball: Literal["none", "l1", "l2"] = "none"
+    """Whether (dx, dy, dz) stays, besides, in a ball: sum of sizes (l1) or length (l2)."""
+    radius: Positive = 0.05
+    """Of the ball, in metres."""
+    rotation: NotNegative = 0.0
+    """Largest turn about each axis, in radians; 0: the rotation is held, as upstream does."""
+    gripper: Annotated[float, Field(ge=0.0, le=1.0)] = 0.75
+    """Largest change of the gripper's closedness."""
+    gripper_mode: Literal["rounded", "free", "held", "open", "close"] = "rounded"
+    """rounded: small changes of a finished plan become none, as upstream. free: left as they are. held: no change.
+    open, close: a change of -1 or 1, whatever `gripper` says, from model step `gripper_from` on; rounded before."""
+    gripper_rounding: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
+    """Changes below this become none."""
+    gripper_from: Annotated[int, Field(ge=0)] = 0
+    """Model step of the plan at which open or close begins; a multiple of action_repeat."""
+
+    @model_validator(mode="after")
+    def _something_is_free(self) -> LimitsConfig:
+        held = self.gripper_mode in {"held", "open", "close"} or not self.gripper
+        if not any(self.xyz) and not self.rotation and held:
+            raise ValueError("nothing is left to plan: xyz, rotation and gripper are all held")
+        return self
+
+
+class EnergyConfig(Section):
+    """How far a prediction is from the goal."""
+
+    distance: Literal["l1", "l2", "cosine"] = "l1"
+    """Of predicted and wanted latents: mean absolute difference (upstream), mean square, or 1 - cosine of a token."""
+    steps: Literal["last", "sum"] = "last"
+    """last: of the plan's last step (upstream). sum: of all its steps, added."""
+    samples_at_once: PositiveInt = 64
+    """Action sequences that go through the predictor at once: bounds its memory."""
+
+
+class CemConfig(Section):
+    """Cross-entropy method; the defaults are upstream's."""
+
+    elites: Annotated[int, Field(ge=2)] = 10
+    """Best samples, which decide the next mean and standard deviation."""
+    momentum_mean: Share = 0.15
+    """Share of the old mean in the new one."""
+    momentum_std: Share = 0.15
+    """Share of the old standard deviation in the new one."""
+    momentum_mean_gripper: Share = 0.15
+    """The same, of the gripper."""
+    momentum_std_gripper: Share = 0.15
+    """The same, of the gripper."""
+    answer: Literal["mean", "best"] = "mean"
+    """The mean of the last distribution (upstream), or the best sample of all."""
+
+
+class IcemConfig(Section):
+    """Improved cross-entropy method (arXiv 2008.06389); the defaults are the paper's."""
+
+    elites: Annotated[int, Field(ge=2)] = 10
+    """Best samples, which decide the next mean and standard deviation."""
+    momentum: Share = 0.1
+    """Share of the old mean and standard deviation in the new ones."""
+    noise_exponent: Annotated[float, Field(ge=0.0, le=8.0)] = 2.0
+    """Power spectrum 1 / frequency^exponent along the plan: 0 is white, more is smoother."""
+    shrink: Annotated[float, Field(ge=1.0)] = 1.25
+    """Each iteration has as many samples as the last divided by this, and at least twice the elites."""
+    kept: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
+    """Share of the elites that take part again, in the next iteration and, shifted, in the next decision."""
+
+
+class MppiConfig(Section):
+    """Model predictive path integral control."""
+
+    temperature: Positive = 0.1
+    """Of the weights exp(-energy / temperature), in standard deviations of the samples' energies: no unit to know."""
+    std_decay: Annotated[float, Field(gt=0.0, le=1.0)] = 0.8
+    """What the standard deviation is multiplied by after each iteration; 1: it stays."""
+
+
+class GradientConfig(Section):
+    """Gradient descent through the model."""
+
+    starts: PositiveInt = 8
+    """Sequences that descend at once: the first from the previous plan (or no motion), the others from random ones."""
+    learning_rate: Positive = 0.1
+    """Of Adam at the first iteration, as a share of the limits; it falls in a line to nothing."""
+
+
+class PlanningConfig(Section):
+    """One decision, from what is seen now to an action."""
+
+    planner: Literal["cem", "icem", "mppi", "gradient"] = "cem"
+    """How actions are searched."""
+    horizon: PositiveInt = 1
+    """Model steps that a plan spans."""
+    action_repeat: PositiveInt = 1
+    """Model steps for which one action is repeated; the horizon is a multiple of it."""
+    samples: Annotated[int, Field(ge=2)] = 800
+    """Action sequences an iteration; gradient has `gradient.starts`."""
+    iterations: PositiveInt = 10
+    """Rounds of trying and learning."""
+    start_std: Positive = 1.0
+    """Standard deviation of the first samples, as a share of the limits of position and rotation."""
+    gripper_start_std: Positive = 1.0
+    """The same of the gripper, in closedness: beyond its limit as upstream, where samples then gather."""
+    budget_s: Positive | None = None
+    """Seconds after which the best plan so far is taken: no iteration begins that would not end by then. The first
+    always runs. null: all iterations run."""
+    warm_start: bool = True
+    """Whether a decision begins from the last one's plan, shifted by what was done of it."""
+    context: PositiveInt = 1
+    """Frames that the model sees, the present one included (upstream: 1); fewer at the start."""
+    limits: LimitsConfig = LimitsConfig()
+    """What no action goes beyond."""
+    energy: EnergyConfig = EnergyConfig()
+    """How far a prediction is from the goal."""
+    cem: CemConfig = CemConfig()
+    """Of planner cem only."""
+    icem: IcemConfig = IcemConfig()
+    """Of planner icem only."""
+    mppi: MppiConfig = MppiConfig()
+    """Of planner mppi only."""
+    gradient: GradientConfig = GradientConfig()
+    """Of planner gradient only."""
+
+    @model_validator(mode="after")
+    def _numbers_fit(self) -> PlanningConfig:
+        if self.horizon % self.action_repeat:
+            raise ValueError(f"horizon {self.horizon} is not a multiple of action_repeat {self.action_repeat}")
+        if self.limits.gripper_from % self.action_repeat:
+            raise ValueError(
+                f"limits.gripper_from {self.limits.gripper_from} is not a multiple of action_repeat"
+                f" {self.action_repeat}"
+            )
+        elites = {"cem": self.cem.elites, "icem": self.icem.elites}.get(self.planner, 0)
+        if elites > self.samples:
+            raise ValueError(f"{self.planner}.elites {elites} are more than {self.samples} samples")
+        return self

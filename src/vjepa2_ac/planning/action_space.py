@@ -1,0 +1,143 @@
+"""Which actions are allowed? Limits per axis, a ball, axes that are held, and how a finished plan is rounded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
+from vjepa2_ac.episode import ACTION_DIM
+
+GRIPPER = 6
+_ROUNDING = 4 * torch.finfo(torch.float32).eps  # a norm is rounded more than once
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball around no motion, over the first numbers of an action."""
+
+    norm: Literal["l1", "l2"]
+    radius: float
+    axes: int = 3
+
+
+@dataclass(frozen=True)
+class ActionSpace:
+    """Limits of each number of each decision; where both are the same, it is held there.
+
+    Raises:
+        ValueError: Limits cross or are not finite, or a ball is asked for and no motion is not allowed.
+    """
+
+    lower: Float[Tensor, "decisions dim"]
+    upper: Float[Tensor, "decisions dim"]
+    std: Float[Tensor, "decisions dim"]  # of first samples
+    repeat: int = 1  # model steps of a decision
+    ball: Ball | None = None
+    gripper: int | None = None  # which number, where one is
+    gripper_rounding: float = 0.0  # changes below this become none in a finished plan
+
+    def __post_init__(self) -> None:
+        if not (torch.isfinite(self.lower) & torch.isfinite(self.upper) & (self.lower <= self.upper)).all():
+            raise ValueError("limits must be finite, the lower ones not above the upper ones")
+        if self.ball is not None:
+            inside = (self.lower <= 0) & (self.upper >= 0)
+            if not inside[:, : self.ball.axes].all():
+                raise ValueError("a ball is around no motion, which the limits do not allow")
+
+    @property
+    def decisions(self) -> int:
+        """How many actions are chosen."""
+        return int(self.lower.shape[0])
+
+    @property
+    def dim(self) -> int:
+        """Numbers of an action."""
+        return int(self.lower.shape[1])
+
+    @property
+    def steps(self) -> int:
+        """Model steps of a plan."""
+        return self.decisions * self.repeat
+
+    @property
+    def free(self) -> Tensor:
+        """Which numbers are not held, at one decision at least: the places along dim."""
+        return (self.lower < self.upper).any(dim=0).nonzero()[:, 0]
+
+    @property
+    def first_std(self) -> Float[Tensor, "decisions dim"]:
+        """The standard deviation of first samples, nothing where a number is held."""
+        return torch.where(self.lower < self.upper, self.std, 0.0)
+
+    def allowed(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch decisions dim"]:
+        """Return each decision, or the allowed one it is cut back to; nothing else comes out, not even for NaN.
+
+        First to the limits of each axis, then towards no motion until it is in the ball.
+        """
+        cut = torch.nan_to_num(decisions, nan=0.0).clamp(self.lower, self.upper)
+        if self.ball is None:
+            return cut
+        inner, outer = cut[..., : self.ball.axes], cut[..., self.ball.axes :]
+        length = torch.linalg.vector_norm(inner, ord=1 if self.ball.norm == "l1" else 2, dim=-1, keepdim=True)
+        share = self.ball.radius * (1 - _ROUNDING) / length
+        return torch.cat([torch.where(share < 1, inner * share, inner), outer], dim=-1)
+
+    def finished(self, decisions: Float[Tensor, "decisions dim"]) -> Float[Tensor, "decisions dim"]:
+        """Return decisions as a robot gets them: allowed, small changes of the gripper rounded to none.
+
+        A gripper that is held somewhere (opened, closed) stays there.
+
+        Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, round_small_elements.
+        """
+        done = self.allowed(decisions)
+        if self.gripper is not None:
+            one = done[:, self.gripper]
+            small = one.abs() < self.gripper_rounding
+            held = self.lower[:, self.gripper] == self.upper[:, self.gripper]
+            done[:, self.gripper] = torch.where(small & ~held, 0.0, one)
+        return done
+
+    def over_steps(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch steps dim"]:
+        """Return the action of each model step."""
+        return decisions.repeat_interleave(self.repeat, dim=-2)
+
+
+def pose_space(config: PlanningConfig) -> ActionSpace:
+    """Return the allowed actions of an arm: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`)."""
+    limits, decisions = config.limits, config.horizon // config.action_repeat
+    gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
+    reach = _towards_zero([*limits.xyz, *[limits.rotation] * 3, gripper])
+    upper = reach.repeat(decisions, 1)
+    lower = -upper
+    if limits.gripper_mode in {"open", "close"}:
+        first = limits.gripper_from // config.action_repeat
+        lower[first:, GRIPPER] = upper[first:, GRIPPER] = 1.0 if limits.gripper_mode == "close" else -1.0
+    std = config.start_std * reach
+    std[GRIPPER] = config.gripper_start_std
+    return ActionSpace(
+        lower=lower,
+        upper=upper,
+        std=std.repeat(decisions, 1),
+        repeat=config.action_repeat,
+        ball=None if limits.ball == "none" else Ball(limits.ball, limits.radius),
+        gripper=GRIPPER,
+        gripper_rounding=_rounding(limits),
+    )
+
+
+def _rounding(limits: LimitsConfig) -> float:
+    return 0.0 if limits.gripper_mode == "free" else limits.gripper_rounding
+
+
+def _towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
+    """Return values in float32, none larger than it was: float32's 0.05 is above 0.05."""
+    if len(values) != ACTION_DIM:
+        raise ValueError(f"{len(values)} limits for an action of {ACTION_DIM} numbers")
+    exact = torch.tensor(values, dtype=torch.float64)
+    nearest = exact.float()
+    return torch.where(nearest.double() > exact, torch.nextafter(nearest, torch.zeros_like(nearest)), nearest)

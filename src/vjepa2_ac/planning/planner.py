@@ -1,0 +1,156 @@
+"""Which actions cost least? The loop around every search: a time budget, bad energies, limits, a record of it all."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.planning.action_space import ActionSpace, pose_space
+from vjepa2_ac.planning.cem import CemSearch
+from vjepa2_ac.planning.gradient import GradientSearch
+from vjepa2_ac.planning.icem import IcemSearch
+from vjepa2_ac.planning.mppi import MppiSearch
+from vjepa2_ac.planning.plan import Cost, Iteration, Plan, Start, Stopped
+from vjepa2_ac.planning.search import Search, Tried
+
+Clock = Callable[[], float]  # seconds, from anywhere
+
+
+class Planner:
+    """Searches the action sequence of least cost, and knows nothing else of what it plans for.
+
+    Whatever the cost says, the actions of a plan are within the limits; where it says nothing finite, they are zero.
+    """
+
+    def __init__(
+        self, config: PlanningConfig, space: ActionSpace | None = None, clock: Clock = time.perf_counter
+    ) -> None:
+        """Choose a planner.
+
+        Args:
+            config: Which one, and how long it searches.
+            space: What is allowed; None: an arm's actions within `config.limits`.
+            clock: What the time budget is measured by.
+        """
+        self.config = config
+        self.space = pose_space(config) if space is None else space
+        self._clock = clock
+
+    def plan(self, cost: Cost, generator: Generator, start: Start | None = None) -> Plan:
+        """Return the best plan that was found.
+
+        Args:
+            cost: What an action sequence costs. Called without gradients but for planner gradient.
+            generator: On the CPU; the same seed gives the same plan. Its first seed is recorded.
+            start: What an earlier plan left (`Plan.start_after`).
+
+        Raises:
+            ValueError: The cost gives other than one number a sample, or `start` is of another shape.
+        """
+        began = self._clock()
+        if start is not None and start.mean.shape != self.space.lower.shape:
+            raise ValueError(f"a start of {tuple(start.mean.shape)} for {tuple(self.space.lower.shape)} decisions")
+        search = self._search(generator, start)
+        record: list[Iteration] = []
+        best = _Best()
+        while len(record) < self.config.iterations and self._has_time(began, record):
+            record.append(self._iterate(search, cost, best))
+        stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"
+        actions, energy, tried = self._chosen(search.answer(), best, cost)
+        if actions is None:
+            actions, stopped = torch.zeros(self.space.steps, self.space.dim), "no finite energy"
+        return Plan(
+            actions=actions,
+            energy=energy,
+            stopped=stopped,
+            iterations=tuple(record),
+            mean=search.mean,
+            repeat=self.space.repeat,
+            planner=self.config.planner,
+            seed=generator.initial_seed(),
+            evaluations=sum(one.samples for one in record) + tried,
+            seconds=self._clock() - began,
+        )
+
+    def _search(self, generator: Generator, start: Start | None) -> Search:
+        config, space = self.config, self.space
+        if config.planner == "cem":
+            return CemSearch(space, config.cem, config.samples, generator, start)
+        if config.planner == "icem":
+            return IcemSearch(space, config.icem, config.samples, config.iterations, generator, start)
+        if config.planner == "mppi":
+            return MppiSearch(space, config.mppi, config.samples, generator, start)
+        return GradientSearch(space, config.gradient, config.iterations, generator, start)
+
+    def _has_time(self, began: float, record: list[Iteration]) -> bool:
+        """Say whether an iteration as long as the longest so far would end within the budget."""
+        if self.config.budget_s is None or not record:
+            return True
+        return self._clock() - began + max(one.seconds for one in record) <= self.config.budget_s
+
+    def _iterate(self, search: Search, cost: Cost, best: _Best) -> Iteration:
+        began = self._clock()
+        decisions = search.propose()
+        tried = self._try(cost, decisions, gradients=search.uses_gradients)
+        elites = tried.best(search.elites)
+        if len(elites.energies) and float(elites.energies[0]) < best.energy:
+            best.decisions, best.energy = elites.decisions[0], float(elites.energies[0])
+        search.learn(tried)
+        found = bool(len(elites.energies))
+        return Iteration(
+            samples=len(decisions),
+            finite=len(tried.energies),
+            lowest=float(elites.energies[0]) if found else math.inf,
+            elite_energy=float(elites.energies.mean()) if found else math.inf,
+            elites=elites.decisions,
+            elite_energies=elites.energies,
+            mean=search.mean,
+            std=search.std,
+            seconds=self._clock() - began,
+        )
+
+    def _try(self, cost: Cost, decisions: Float[Tensor, "samples decisions dim"], *, gradients: bool) -> Tried:
+        decisions = decisions.detach().requires_grad_(gradients)
+        with torch.set_grad_enabled(gradients):
+            energies = cost(self.space.over_steps(decisions))
+            if energies.shape != (len(decisions),):
+                raise ValueError(f"energies of shape {tuple(energies.shape)} for {len(decisions)} action sequences")
+            finite = torch.isfinite(energies)
+            downhill = None
+            if gradients:
+                (downhill,) = torch.autograd.grad(energies.where(finite, 0.0).sum(), decisions)
+                downhill = torch.nan_to_num(downhill, nan=0.0, posinf=0.0, neginf=0.0)
+        finite = finite.cpu()
+        return Tried(decisions.detach()[finite], energies.detach().float().cpu()[finite], downhill)
+
+    def _chosen(
+        self, answer: Tensor | None, best: _Best, cost: Cost
+    ) -> tuple[Float[Tensor, "steps dim"] | None, float, int]:
+        """Return actions, their energy, and how many more were tried: the answer, or else the best that was tried."""
+        tried = 0
+        for decisions in (answer, best.decisions):
+            if decisions is None or best.decisions is None:
+                continue
+            done = self.space.finished(decisions)
+            if decisions is best.decisions and torch.equal(done, decisions):
+                return self.space.over_steps(done), best.energy, tried
+            energies = self._try(cost, done[None], gradients=False).energies
+            tried += 1
+            if len(energies):
+                return self.space.over_steps(done), float(energies[0]), tried
+        return None, math.nan, tried
+
+
+@dataclass
+class _Best:
+    """The best decisions that were tried so far."""
+
+    decisions: Tensor | None = None
+    energy: float = math.inf

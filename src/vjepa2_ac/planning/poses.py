@@ -1,0 +1,60 @@
+"""Where does an arm get to? Poses integrated with actions, batched, on any device, and differentiable.
+
+The same as `geometry.apply_action` (NumPy, SciPy), but that the gripper stays between open and closed.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw can be told
+
+
+def apply_actions(states: Float[Tensor, "*batch 7"], actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
+    """Return the states that actions lead to: xyz and gripper add, R' = R_delta @ R, the gripper is cut to 0 .. 1.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.
+    """
+    rotation = matrices_from_euler(actions[..., 3:6]) @ matrices_from_euler(states[..., 3:6])
+    gripper = (states[..., 6:] + actions[..., 6:]).clamp(0.0, 1.0)
+    return torch.cat([states[..., :3] + actions[..., :3], euler_from_matrices(rotation), gripper], dim=-1)
+
+
+def states_along(
+    state: Float[Tensor, " 7"], actions: Float[Tensor, "samples steps 7"]
+) -> Float[Tensor, "samples steps+1 7"]:
+    """Return the states before and after every action, from one state on."""
+    states = [state.expand(len(actions), -1)]
+    for step in range(actions.shape[1]):
+        states.append(apply_actions(states[-1], actions[:, step]))
+    return torch.stack(states, dim=1)
+
+
+def matrices_from_euler(angles: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Return rotation matrices of extrinsic xyz Euler angles in radians: R = Rz(yaw) @ Ry(pitch) @ Rx(roll)."""
+    (sr, sp, sy), (cr, cp, cy) = angles.sin().unbind(-1), angles.cos().unbind(-1)
+    rows = [
+        torch.stack([cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr], dim=-1),
+        torch.stack([sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr], dim=-1),
+        torch.stack([-sp, cp * sr, cp * cr], dim=-1),
+    ]
+    return torch.stack(rows, dim=-2)
+
+
+def euler_from_matrices(matrices: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Return extrinsic xyz Euler angles in radians; where the pitch is pi/2 or -pi/2, the yaw is zero.
+
+    Gradients are finite everywhere.
+    """
+    flat = torch.hypot(matrices[..., 0, 0], matrices[..., 1, 0])  # cos(pitch), which is never negative
+    locked = flat < _LOCKED
+    cosine = torch.hypot(*(torch.where(locked, 1.0, matrices[..., row, 0]) for row in (0, 1)))
+    pitch = torch.atan2(-matrices[..., 2, 0], torch.where(locked, 0.0, cosine))
+    roll = torch.atan2(
+        torch.where(locked, -matrices[..., 1, 2], matrices[..., 2, 1]),
+        torch.where(locked, matrices[..., 1, 1], matrices[..., 2, 2]),
+    )
+    yaw = torch.atan2(torch.where(locked, 0.0, matrices[..., 1, 0]), torch.where(locked, 1.0, matrices[..., 0, 0]))
+    return torch.stack([roll, pitch, yaw], dim=-1)

@@ -1,0 +1,105 @@
+"""What is allowed comes out as it went in; what is not comes out allowed."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from planning.problems import space
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
+from vjepa2_ac.planning.action_space import ActionSpace, Ball, pose_space
+
+LIMITS = (0.05, 0.03, 0.07, 0.2, 0.2, 0.2, 0.75)
+
+
+def pose(horizon: int = 1, action_repeat: int = 1, **limits: object) -> ActionSpace:
+    given = {"xyz": LIMITS[:3], "rotation": 0.2} | limits
+    return pose_space(
+        PlanningConfig(horizon=horizon, action_repeat=action_repeat, limits=LimitsConfig(**given))  # type: ignore[arg-type]
+    )
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    values=st.lists(st.floats(width=32), min_size=7, max_size=7),
+    ball=st.sampled_from(["none", "l1", "l2"]),
+    radius=st.floats(1e-3, 0.1),
+)
+def test_nothing_beyond_the_limits_comes_out(values: list[float], ball: str, radius: float) -> None:
+    found = pose(ball=ball, radius=radius).allowed(torch.tensor([values]))[0].double()
+    assert torch.isfinite(found).all()
+    assert (found.abs() <= torch.tensor(LIMITS, dtype=torch.float64)).all()
+    if ball != "none":
+        assert torch.linalg.vector_norm(found[:3], ord=int(ball[1])) <= radius
+
+
+def test_what_is_allowed_stays_as_it_is() -> None:
+    inside = torch.tensor([[0.01, -0.02, 0.0, 0.1, -0.1, 0.19, -0.7]])
+    assert torch.equal(pose(ball="l1", radius=0.031).allowed(inside), inside)
+
+
+def test_a_ball_keeps_the_direction() -> None:
+    found = space(dim=3, reach=9.0, ball=Ball("l2", 1.0)).allowed(torch.tensor([[3.0, 0.0, -4.0]]))
+    torch.testing.assert_close(found, torch.tensor([[0.6, 0.0, -0.8]]))
+
+
+def test_rotation_is_held_unless_it_is_asked_for() -> None:
+    wild = torch.full((1, 7), 9.0)
+    assert not pose(rotation=0.0).allowed(wild)[:, 3:6].any()
+    assert pose(rotation=0.1).allowed(wild)[:, 3:6].all()
+    assert pose(rotation=0.0).free.tolist() == [0, 1, 2, 6]
+
+
+@pytest.mark.parametrize(
+    ("mode", "given", "expected"),
+    [
+        ("rounded", 0.24, 0.0), ("rounded", -0.24, 0.0), ("rounded", 0.26, 0.26), ("rounded", 2.0, 0.75),
+        ("free", 0.24, 0.24), ("held", 0.5, 0.0), ("open", 0.5, -1.0), ("close", -0.5, 1.0),
+    ],
+)  # fmt: skip
+def test_each_gripper_mode_does_what_it_says(mode: str, given: float, expected: float) -> None:
+    decisions = torch.zeros(1, 7)
+    decisions[0, 6] = given
+    assert float(pose(gripper_mode=mode).finished(decisions)[0, 6]) == pytest.approx(expected)
+
+
+def test_the_gripper_closes_from_the_step_that_was_asked_for() -> None:
+    where = pose(horizon=6, action_repeat=2, gripper_mode="close", gripper_from=2)
+    done = where.over_steps(where.finished(torch.full((3, 7), 0.3)))
+    torch.testing.assert_close(done[:, 6], torch.tensor([0.3, 0.3, 1.0, 1.0, 1.0, 1.0]))
+    assert where.first_std[:, 6].tolist() == [1.0, 0.0, 0.0]
+
+
+def test_an_action_is_repeated_for_consecutive_steps() -> None:
+    where = ActionSpace(-torch.ones(2, 1), torch.ones(2, 1), torch.ones(2, 1), repeat=3)
+    assert where.over_steps(torch.tensor([[[1.0], [2.0]]])).flatten().tolist() == [1, 1, 1, 2, 2, 2]
+    assert where.steps == 6
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "ball"), [(1.0, 0.0, None), (0.0, math.inf, None), (math.nan, 0.0, None), (0.1, 0.2, "l2")]
+)
+def test_impossible_limits_are_refused(lower: float, upper: float, ball: str | None) -> None:
+    ones = torch.ones(1, 3)
+    with pytest.raises(ValueError, match="limits"):
+        ActionSpace(ones * lower, ones * upper, ones, ball=None if ball is None else Ball("l2", 1.0))
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        ({"horizon": 3, "action_repeat": 2}, "multiple of action_repeat"),
+        ({"horizon": 4, "action_repeat": 2, "limits": {"gripper_from": 1}}, "multiple of action_repeat"),
+        ({"samples": 5}, "more than 5 samples"),
+        ({"limits": {"xyz": (0.0, 0.0, 0.0), "gripper_mode": "held"}}, "nothing is left"),
+        ({"limits": {"xyz": (-0.1, 0.0, 0.0)}}, "greater than or equal to 0"),
+        ({"limits": {"radius": 0.0}}, "greater than 0"),
+        ({"budget_s": 0.0}, "greater than 0"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(values: dict, complaint: str) -> None:  # type: ignore[type-arg]
+    with pytest.raises(ValidationError, match=complaint):
+        PlanningConfig.model_validate(values)
