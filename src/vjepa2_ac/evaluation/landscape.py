@@ -50,7 +50,7 @@ def measure_landscapes(
         raise ValueError(f"{len(starts)} starts, {nodes} nodes")
     unit = _CM if is_pose else 1.0
     trues = np.stack([start.action[:3].cpu().numpy().astype(np.float64) for start in starts])
-    half = max(reach, _ROOM * float(np.abs(trues).max()))
+    half = max(reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
     maps = []
     for done, (start, true) in enumerate(zip(starts, trues, strict=True), start=1):
         maps.append(_landscape(model, start, grid_axes(true, half, nodes), true, unit, at_once))

@@ -5,6 +5,7 @@ RUN/environment.json    versions, machine and command of every start
 RUN/calibration.json    figures of each stride, where data.stride was auto
 RUN/run_id              a name that no other run has
 RUN/metrics.jsonl       figures, a row per line
+RUN/metrics.json        what `evaluate` measured; report.html and evaluation.png show it
 RUN/checkpoints/        step-XXXXXXXX folders
 RUN/tensorboard/        event files; RUN/wandb/ likewise
 RUN/not_finite/         clips of a step that could not be done
