@@ -158,6 +158,28 @@ def test_strata_ranks_landscapes_and_episodes_are_those_of_the_result() -> None:
     assert [row[2] for row in episodes] == [decimal(score.over_persistence) for score in one.episodes]
 
 
+def test_strides_are_shown_with_their_errors_and_those_that_could_not_be_tried_with_the_reason() -> None:
+    error = {"value": 0.9, "low": 0.8, "high": 1.0}
+    tried = {"stride": 4, "seconds_per_step": 0.25, "error_over_persistence": error, "clips": 7, "episodes": 3}
+    found = {"verdict": "Best: stride 4.", "strides": [tried], "impossible": {"15": "episodes are too short"}}
+    page = Page(page_of(replace(usual()[0], calibration=found)))
+    assert table_of(page, "One-step, teacher-forced error at each stride")[1] == (
+        ["4", "0.25", "0.900 [0.800, 1.000]", "7", "3"]
+    )
+    assert "Best: stride 4." in page.shown
+    assert "Stride 15 could not be tried: episodes are too short." in page.shown
+
+
+def test_curves_of_training_stand_in_charts_by_what_they_show_speed_folded_away() -> None:
+    _, html, page = usual()
+    assert "training loss over optimizer steps: train/loss from 0.7 to 0.4" in html
+    main, _, folded = html.partition("Speed, memory and other figures")
+    assert "<h3>validation: error / persistence</h3>" in main
+    assert "<h3>learning rate</h3>" in main
+    assert "<h3>data wait share</h3>" in folded
+    assert "rollout over persistence last" in page.shown
+
+
 def test_of_many_episodes_the_best_and_the_worst_are_shown() -> None:
     one = evaluation(episodes=40, clips=80)
     page = Page(page_of(one))

@@ -8,7 +8,7 @@ from typing import Any
 
 from vjepa2_ac.evaluation.html_report.charts import Line, legend, line_chart, nice_axis
 from vjepa2_ac.evaluation.html_report.histograms import episode_chart
-from vjepa2_ac.evaluation.html_report.layout import Section, figure, folded, not_measured, paragraph, table
+from vjepa2_ac.evaluation.html_report.layout import Section, figure, folded, listed, not_measured, paragraph, table
 from vjepa2_ac.evaluation.html_report.markup import Markup, element, joined
 from vjepa2_ac.evaluation.html_report.numbers import NOT_MEASURED, decimal, percent, seconds
 from vjepa2_ac.evaluation.result import EpisodeScore, Evaluation, TrainingCurve
@@ -72,7 +72,9 @@ def calibration_section(evaluation: Evaluation) -> Section:
     rows = [_stride(one) for one in found.get("strides", ())]
     head = ["stride (control steps)", "seconds per model step", "one-step L1 error / persistence", "clips", "episodes"]
     body = table("One-step, teacher-forced error at each stride (value [95 % interval])", head, rows)
-    return Section("strides", title, joined(paragraph(str(found.get("verdict", ""))), body))
+    untried = [f"Stride {stride} could not be tried: {why}." for stride, why in found.get("impossible", {}).items()]
+    parts = [paragraph(str(found.get("verdict", ""))), body, listed(*untried) if untried else Markup()]
+    return Section("strides", title, joined(*parts))
 
 
 def _episodes(caption: str, scores: Sequence[EpisodeScore]) -> Markup:
