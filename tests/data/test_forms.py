@@ -16,12 +16,13 @@ import pytest
 from lerobot_sets import STATE, Recorded, write_v21, write_v30
 from recordings import write_raw_droid
 from synthetic import draw_frame, synthetic_episode
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.sources.rlds.writer import write_droid_rlds
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.remote import UnreachableError
+from vjepa2_ac.training.encode import encode_config
 
 LENGTHS = (14, 17, 15, 12)
 SIZE = (36, 64)
@@ -158,3 +159,26 @@ def test_a_file_that_the_system_refuses_is_named_and_its_episode_not_called_brok
             with pytest.raises(UnreachableError, match=f"{os.strerror(errno.EACCES)}.*permissions"):
                 action()
     assert len(opened(tmp_path, form, disk_cache=new).table) == len(LENGTHS)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_is_encoded_whole(forms: Path, form: str, tmp_path: Path) -> None:
+    sizes = {
+        "image_size": 32, "encoder": {"width": 12, "depth": 1, "heads": 1},
+        "predictor": {"width": 12, "depth": 1, "heads": 1},
+    }  # fmt: skip
+    data = opened(forms, form).config
+    config = Config.model_validate(
+        {"run_dir": "none", "data": data, "model": {"random": sizes, "dtype": "float32", "encode_chunk": 9},
+         "adapter": {"kind": "none"}, "training": {"device": "cpu", "precision": "fp32"}},
+    )  # fmt: skip
+    manifest = encode_config(config, lambda _: None, out=tmp_path / "latents").manifest
+    assert manifest is not None
+    assert (manifest.encoded, manifest.frames, dict(manifest.broken)) == (len(LENGTHS), sum(LENGTHS), {})
+    through = data.model_copy(update={"source": "latents", "path": str(tmp_path / "latents"), "camera": None})
+    expected_order, expected = clips(opened(forms, form), 8)
+    order, found = clips(open_dataset(through), 8)
+    assert order == expected_order
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.states, other.states)
+        np.testing.assert_array_equal(one.actions, other.actions)

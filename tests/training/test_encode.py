@@ -93,6 +93,7 @@ def test_every_needed_frame_is_encoded_once_in_whole_chunks(
     assert told[-1] == (frames, frames)
     assert read_manifest(tmp_path / "out").frames == frames
     assert "GB per hour of robot data" in notes[0]
+    assert "GB free on its disk" in notes[1]
     encoded_frames.clear()
     assert encode(config, tmp_path / "out") == [f"Everything is encoded already, in {tmp_path / 'out'}"]
     assert not encoded_frames
@@ -160,7 +161,7 @@ def test_a_kill_costs_one_episode_at_most(
     encoded_frames.clear()
     notes = encode(config, out)
     assert sum(encoded_frames) == -(-(8 - before) * per_episode // 16) * 16  # whole chunks
-    assert f"{before * per_episode:,} frames are there already; {(8 - before) * per_episode:,} are left" in notes[1]
+    assert f"{before * per_episode:,} frames are there already; {(8 - before) * per_episode:,} are left" in notes[2]
     assert contents(out) == expected
 
 

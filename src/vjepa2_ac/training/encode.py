@@ -20,7 +20,7 @@ from vjepa2_ac.data.latent_cache import folder_of, key_for
 from vjepa2_ac.data.sources.latents.folder import Manifest, is_whole, read_manifest
 from vjepa2_ac.data.sources.latents.writer import CacheWriter
 from vjepa2_ac.encoding.build import EncoderAtWork, build
-from vjepa2_ac.encoding.room import require_room
+from vjepa2_ac.encoding.room import GIGABYTE, free_bytes, require_room
 from vjepa2_ac.encoding.work import Share, Work, take_folder
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
@@ -130,7 +130,9 @@ def encode_share(
         InputError: As `encode_config`.
     """
     work = Work.of(dataset, writer, share)
-    note(f"Encoding {config.data.path}: {work.room} as {config.data.cache_dtype}, in {writer.folder}")
+    free = free_bytes(writer.folder) / GIGABYTE
+    note(f"Encoding {config.data.path}: {work.room} as {config.data.cache_dtype}")
+    note(f"The latents go into {writer.folder}, with {free:.4g} GB free on its disk")
     if work.left_of_all < work.frames:
         note(f"{work.frames - work.left_of_all:,} frames are there already; {work.left_of_all:,} are left")
     require_room(work.room, writer.folder, smaller=smaller_caches(config))
