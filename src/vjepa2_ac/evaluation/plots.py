@@ -20,12 +20,16 @@ from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.storage import atomic_writer
 
 _COLOURS = {"persistence": "#8a8a8a", "base": "#d1762a", "adapter": "#1f6fb4", "model": "#1f6fb4"}
+_RUNS = ("#1f6fb4", "#d1762a", "#2b8a3e", "#8f5bb0", "#b3246b", "#0b7f8a", "#8a6d0b", "#333333")
+_DASHES = ("-", "--", ":")  # after all colours
+# What people call things is shown as it is: a dollar sign begins no formula.
+_STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False}
 _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
     """Write the picture of an evaluation as PNG; it appears whole or not at all."""
-    with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+    with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(13, 6.2), layout="constrained")
         FigureCanvasAgg(figure)
         figure.suptitle("\n".join(textwrap.wrap(verdict(evaluation), 150)), fontsize=10.5, x=0.01, ha="left")
@@ -42,21 +46,21 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
 
 def plot_comparison(comparison: Comparison, path: Path) -> Path:
     """Write the curves of several runs as PNG; it appears whole or not at all."""
-    with mpl.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(8, 4.5), layout="constrained")
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(9.5, 4.5), layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.subplots()
-        axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--", label="persistence (doing nothing)")
-        for number, (name, curve) in enumerate(comparison.curves.items()):
-            colour = f"C{number}"
-            axes.plot(comparison.seconds, [one.value for one in curve], "o-", color=colour, label=name)
-            axes.fill_between(
-                comparison.seconds, [one.low for one in curve], [one.high for one in curve],
-                color=colour, alpha=0.15, linewidth=0,
-            )  # fmt: skip
+        drawn = [axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--")]
+        for number, curve in enumerate(comparison.curves.values()):
+            colour, dashes = _RUNS[number % len(_RUNS)], _DASHES[number // len(_RUNS) % len(_DASHES)]
+            low, high = [one.low for one in curve], [one.high for one in curve]
+            axes.fill_between(comparison.seconds, low, high, color=colour, alpha=0.13, linewidth=0)
+            values = [one.value for one in curve]
+            drawn += axes.plot(comparison.seconds, values, marker="o", color=colour, linestyle=dashes)
+        names = ["persistence (doing nothing)", *(textwrap.fill(name, 34) for name in comparison.curves)]
         axes.set(xlabel="seconds ahead (open loop)", ylabel="latent error / persistence", ylim=(0, None))
-        axes.legend(frameon=False, loc="lower right")
         axes.set_title(f"{comparison.title} (band: 95 % over episodes)", loc="left", fontsize=9)
+        figure.legend(drawn, names, frameon=False, loc="outside right upper")
         with atomic_writer(path) as file:
             figure.savefig(file, format="png", dpi=110)
     return path
