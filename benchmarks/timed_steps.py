@@ -32,7 +32,7 @@ from vjepa2_ac.model.weights import to_official
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.assembly import Run, make_accelerator
 from vjepa2_ac.training.checkpoint import RunState
-from vjepa2_ac.training.flops import clip_flops
+from vjepa2_ac.training.cost.flops import clip_flops
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer
 from vjepa2_ac.training.step import training_step

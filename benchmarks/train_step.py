@@ -11,8 +11,8 @@ the same loss and gradients on the same weights, else there is no ratio to it. W
 own step with a dense mask. A ratio over 1 means faster than the baseline.
 
 All take turns, so that a busy machine slows them alike. On a CPU the process's own time over its threads counts, else
-wall time. MFU: the model FLOPs of `training.flops` over what the device does in a product of matrices, measured first.
-Peak memory, weights included, is of two steps in a process of its own for each line.
+wall time. MFU: the model FLOPs of `training.cost.flops` over what the device does in a product of matrices, measured
+first. Peak memory, weights included, is of two steps in a process of its own for each line.
 """
 
 from __future__ import annotations

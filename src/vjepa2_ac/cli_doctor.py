@@ -26,7 +26,7 @@ def _doctor(options: argparse.Namespace) -> int:
     from vjepa2_ac.console import console
     from vjepa2_ac.console_doctor import memory_lines, verdict
     from vjepa2_ac.model.load import base_sizes
-    from vjepa2_ac.training.memory import USUAL_GPU, estimate_memory, ways_to_fit
+    from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
 
     config = load_config(options.config, options.overrides)
     sizes = base_sizes(config.model)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.training.memory import ALLOWANCE, GIGABYTE, MemoryEstimate
+from vjepa2_ac.training.cost.memory import ALLOWANCE, GIGABYTE, MemoryEstimate
 
 UNTESTED = (
     "This is arithmetic. What autograd keeps was compared with PyTorch on a CPU; the total has not been compared with"

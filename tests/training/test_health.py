@@ -15,7 +15,7 @@ from vjepa2_ac.data.clips import no_clips
 from vjepa2_ac.episode import POSE_WIDTHS, Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training import health
-from vjepa2_ac.training.flops import clip_flops
+from vjepa2_ac.training.cost.flops import clip_flops
 from vjepa2_ac.training.health import MEASURED, Throughput, TimedBatches, Update, matmul_speed, peak_memory_gb
 from vjepa2_ac.training.journal import read_journal
 from vjepa2_ac.training.loop import train

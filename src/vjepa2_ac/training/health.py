@@ -4,7 +4,7 @@ update_to_weight    norm of the update over the norm of the weights before it, o
 data_wait_share     share of the step's wall time that was spent waiting for the loader
 samples_per_second  clips, of all processes
 tokens_per_second   patch tokens of the frames of these clips
-mfu                 model FLOPs per second (`training.flops`) over the ceiling: what this device does in a large
+mfu                 model FLOPs per second (`training.cost.flops`) over the ceiling: what this device does in a large
                     product of matrices in the run's precision, measured for a fraction of a second at the start
 memory_gb           peak so far in 10^9 bytes: of PyTorch's allocator on CUDA, resident elsewhere
 """
@@ -24,7 +24,7 @@ from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.episode import Batch
-from vjepa2_ac.training.flops import clip_flops
+from vjepa2_ac.training.cost.flops import clip_flops
 
 MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "memory_gb"})
 """Figures of the machine: two runs that are the same differ in them."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.training.kept_block import FLOAT32, Kind, Setting, adapter_casts, block_bytes, layer_bytes
+from vjepa2_ac.training.cost.kept_block import FLOAT32, Kind, Setting, adapter_casts, block_bytes, layer_bytes
 
 _HEADS = ("predictor_embed", "action_encoder", "state_encoder", "extrinsics_encoder")
 

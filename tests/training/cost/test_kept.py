@@ -16,8 +16,8 @@ from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.key_value_cache import KeyValueCache
 from vjepa2_ac.model.positions import TokenLayout, rotary_tables
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.training.kept import Kept
-from vjepa2_ac.training.kept_block import Setting, adapter_casts, block_bytes
+from vjepa2_ac.training.cost.kept import Kept
+from vjepa2_ac.training.cost.kept_block import Setting, adapter_casts, block_bytes
 from vjepa2_ac.training.loss import distance_of, prediction_losses
 
 TOLERANCE = 0.015

@@ -16,7 +16,7 @@ from functools import cached_property
 from typing import Literal
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.training.parameters import CONDITIONS, Layer, adapter_ranks, linear_layers
+from vjepa2_ac.training.cost.parameters import CONDITIONS, Layer, adapter_ranks, linear_layers
 
 Kind = Literal["cpu", "cuda"]
 

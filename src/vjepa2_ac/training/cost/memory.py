@@ -1,7 +1,7 @@
 """Will a run fit on the GPU? Its memory, part by part, by arithmetic: no model is built and torch is not needed.
 
-The counts of parameters are exact. What autograd keeps (`training.kept`) is held by a test to what PyTorch really keeps
-on a CPU. The whole has not yet been compared with the peak that a GPU measures.
+The counts of parameters are exact. What autograd keeps (`training.cost.kept`) is held by a test to what PyTorch
+really keeps on a CPU. The whole has not yet been compared with the peak that a GPU measures.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.encoding.room import FRAMES_AT_ONCE
-from vjepa2_ac.training.kept import Kept
-from vjepa2_ac.training.kept_block import FLOAT32, HALF, Kind
-from vjepa2_ac.training.parameters import (
+from vjepa2_ac.training.cost.kept import Kept
+from vjepa2_ac.training.cost.kept_block import FLOAT32, HALF, Kind
+from vjepa2_ac.training.cost.parameters import (
     CONDITIONS,
     Parameters,
     adapter_ranks,

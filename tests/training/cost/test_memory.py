@@ -11,7 +11,7 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.console_doctor import memory_lines
 from vjepa2_ac.model.key_value_cache import KeyValueCache
-from vjepa2_ac.training.memory import USUAL_GPU, estimate_memory, ways_to_fit
+from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
 from vjepa2_ac.training.optim import make_optimizer
 
 
@@ -92,7 +92,7 @@ def test_a_run_that_fits_needs_no_knob_and_a_large_one_is_told_which() -> None:
 
 
 def test_the_arithmetic_does_without_torch() -> None:
-    code = "import sys, vjepa2_ac.training.memory; assert 'torch' not in sys.modules"
+    code = "import sys, vjepa2_ac.training.cost.memory; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

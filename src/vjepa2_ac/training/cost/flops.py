@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.training.parameters import adapter_ranks, linear_layers
+from vjepa2_ac.training.cost.parameters import adapter_ranks, linear_layers
 
 _TUBELET = 2  # frames that the encoder's first layer takes at once
 

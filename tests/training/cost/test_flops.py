@@ -15,7 +15,7 @@ from vjepa2_ac.config_file import load_config, parse_config
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.lora import add_adapter
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.training.flops import clip_flops, frame_flops
+from vjepa2_ac.training.cost.flops import clip_flops, frame_flops
 from vjepa2_ac.training.loss import Objective
 
 SIZES = ModelSizes.model_validate({
@@ -88,5 +88,5 @@ def test_the_default_run_has_the_flops_that_were_worked_out_by_hand() -> None:
 
 
 def test_the_arithmetic_does_without_torch() -> None:
-    code = "import sys, vjepa2_ac.training.flops; assert 'torch' not in sys.modules"
+    code = "import sys, vjepa2_ac.training.cost.flops; assert 'torch' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
