@@ -1,0 +1,142 @@
+"""How far from the goal would these actions lead? The energy of action sequences in a world model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import cosine_similarity
+from torch.utils.checkpoint import checkpoint
+
+from vjepa2_ac.config.planning import EnergyConfig
+from vjepa2_ac.model.key_value_cache import KeyValueCache
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.planning.goal import Goal
+from vjepa2_ac.planning.poses import states_along
+
+Motion = Callable[[Float[Tensor, " state_dim"], Float[Tensor, "samples steps action_dim"]], Tensor]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What is known when a decision is made: the last frames, up to the present one."""
+
+    latents: Float[Tensor, "context tokens dim"]
+    states: Float[Tensor, "context state_dim"]
+    actions: Float[Tensor, "context-1 action_dim"]
+    extrinsics: Float[Tensor, " 6"] | None = None  # of the camera, which stays where it is
+
+
+class WorldModelCost:
+    """The energy of action sequences from a scene towards a goal.
+
+    Keys and values of frames before the present one are computed here, once. Those of the present frame depend on the
+    action that is tried beside it, and are computed for every sample.
+    """
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        scene: Scene,
+        goal: Goal,
+        config: EnergyConfig,
+        *,
+        done: int = 0,
+        motion: Motion = states_along,
+    ) -> None:
+        """Compute what all samples share.
+
+        Args:
+            world_model: In eval mode: dropout would make energies differ from call to call.
+            scene: Where the actions begin.
+            goal: Where they are to lead.
+            config: What far means, and how many samples are computed at once.
+            done: Model steps since the goal was set: which of several goals counts.
+            motion: Which states actions lead to, the first one included; for poses, or what a vector is.
+
+        Raises:
+            ValueError: The model is in training mode.
+        """
+        if world_model.predictor.training:
+            raise ValueError("a model in training mode: dropout would change energies; call eval() first")
+        device = world_model.device
+        self._model, self._config, self._motion, self._done = world_model, config, motion, done
+        self._goal = Goal(
+            goal.latents.to(device), goal.durations, None if goal.weights is None else goal.weights.to(device)
+        )
+        self._frame, self._state = scene.latents[-1].to(device), scene.states[-1].to(device)
+        self._camera = None if scene.extrinsics is None else scene.extrinsics.to(device)
+        self._cache = self._past(scene)
+
+    def __call__(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
+        """Return energies on the device of the actions; gradients flow to them if they are asked for.
+
+        With gradients, predictions of each part but the only one are computed again in the backward pass: memory stays
+        bounded then, too.
+        """
+        parts = actions.to(self._model.device).split(self._config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
+        again = torch.is_grad_enabled() and len(parts) > 1
+        energies = [
+            checkpoint(self._energies, part, use_reentrant=False) if again else self._energies(part) for part in parts
+        ]
+        return torch.cat(energies).to(actions.device)
+
+    def imagine(
+        self, actions: Float[Tensor, "samples steps action_dim"]
+    ) -> tuple[Float[Tensor, "samples steps tokens dim"], Float[Tensor, "samples steps+1 state_dim"]]:
+        """Return the latents after each action, and the states before and after them. All samples at once."""
+        samples, steps = actions.shape[:2]
+        actions = actions.to(self._state)
+        states = self._motion(self._state, actions)
+        camera = None if self._camera is None else self._camera.expand(samples, steps, -1)
+        frame = self._frame.expand(samples, 1, -1, -1)
+        cache = None if self._cache is None else self._cache.expanded(samples)
+        return self._model.rollout(frame, actions, states[:, :-1], camera, cache=cache), states
+
+    def _energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
+        predicted, _ = self.imagine(actions)
+        wanted = self._goal.ahead(self._done, actions.shape[1])
+        if self._config.steps == "last":
+            predicted, wanted = predicted[:, -1:], wanted[-1:]
+        far = distance(predicted, wanted, self._config.distance, self._goal.weights)
+        return far.sum(dim=1)
+
+    @torch.no_grad()
+    def _past(self, scene: Scene) -> KeyValueCache | None:
+        before = len(scene.latents) - 1
+        if not before:
+            return None
+        cache = KeyValueCache()
+        device = self._model.device
+        latents, actions, states = (
+            value.to(device)[None] for value in (scene.latents[:-1], scene.actions, scene.states[:-1])
+        )
+        camera = None if self._camera is None else self._camera.expand(1, before, -1)
+        self._model.predict(latents, actions, states, camera, cache=cache)
+        return cache
+
+
+def distance(
+    predicted: Float[Tensor, "*batch tokens dim"],
+    wanted: Float[Tensor, "*wanted tokens dim"],
+    kind: Literal["l1", "l2", "cosine"],
+    weights: Float[Tensor, " tokens"] | None = None,
+) -> Float[Tensor, "*batch"]:
+    """Return how far latents are from others, over patches by weight (all the same: None).
+
+    l1: mean absolute difference. l2: mean square. cosine: 1 - cosine of each token.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, l1.
+    """
+    if kind == "cosine":
+        by_token = 1 - cosine_similarity(predicted, wanted, dim=-1)
+    else:
+        difference = predicted - wanted
+        by_token = (difference.abs() if kind == "l1" else difference.square()).mean(dim=-1)
+    if weights is None:
+        return by_token.mean(dim=-1)
+    return (by_token * (weights / weights.sum())).sum(dim=-1)

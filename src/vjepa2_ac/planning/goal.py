@@ -1,0 +1,67 @@
+"""What is wanted, and when? One goal picture or a sequence of them, perhaps only in a part of the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
+
+_EVERYWHERE = 1e-12
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Latents to reach, one after the other: each for so many model steps, the last one for good.
+
+    Raises:
+        ValueError: No goals, another number of durations than there are goals before the last, a duration below 1, or
+            weights that are negative, not finite, or all zero.
+    """
+
+    latents: Float[Tensor, "goals tokens dim"]
+    durations: tuple[int, ...] = ()  # model steps of each goal but the last
+    weights: Float[Tensor, " tokens"] | None = None  # how much each patch counts; None: all the same
+
+    def __post_init__(self) -> None:
+        if not len(self.latents) or len(self.durations) != len(self.latents) - 1 or min(self.durations, default=1) < 1:
+            raise ValueError(f"{len(self.latents)} goals with durations {self.durations}: one for each but the last")
+        if self.weights is not None:
+            usable = torch.isfinite(self.weights).all() and (self.weights >= 0).all() and self.weights.any()
+            if self.weights.shape != self.latents.shape[1:2] or not usable:
+                raise ValueError("one weight for each patch, none negative, and not all zero")
+
+    def place(self, step: int) -> int:
+        """Return which goal counts after this many model steps since the start."""
+        for place, duration in enumerate(self.durations):
+            step -= duration
+            if step < 0:
+                return place
+        return len(self.latents) - 1
+
+    def ahead(self, done: int, steps: int) -> Float[Tensor, "steps tokens dim"]:
+        """Return what is wanted after each of the next steps, when some are done.
+
+        The frame that a goal's last step leads to is still to be that goal.
+        """
+        return self.latents[[self.place(done + step) for step in range(steps)]]
+
+
+def patch_weights(
+    mask: Bool[Tensor, "height width"] | Float[Tensor, "height width"], grid: int
+) -> Float[Tensor, " tokens"]:
+    """Return how much each patch counts: the mean of a mask over what it covers, patches row by row.
+
+    Args:
+        mask: Over the picture as the model sees it (cropped), of any resolution; 1 counts, 0 does not.
+        grid: Patches along one side.
+
+    Raises:
+        ValueError: Nothing counts.
+    """
+    weights = adaptive_avg_pool2d(mask.float()[None], grid).flatten()
+    if weights.sum() <= _EVERYWHERE:
+        raise ValueError("the mask leaves nothing of the image")
+    return weights

@@ -1,0 +1,200 @@
+"""The energy of actions is what the plain computation says, however it is cut up and whatever is kept."""
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from planning.tiny import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_model
+from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.geometry import apply_action
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
+from vjepa2_ac.planning.goal import Goal, patch_weights
+from vjepa2_ac.planning.planner import Planner
+
+
+@torch.no_grad()
+def plain_predictions(model: WorldModel, start: Scene, tried: Tensor) -> Tensor:
+    """Compute everything again for each prediction of one sample, poses by NumPy."""
+    states = [state.double().numpy() for state in start.states]
+    for action in tried.double().numpy():
+        after = apply_action(states[-1], action)
+        after[6] = np.clip(after[6], 0, 1)
+        states.append(after)
+    poses = torch.from_numpy(np.stack(states)).float()[None]
+    done = torch.cat([start.actions, tried])[None]
+    latents = start.latents[None]
+    for _ in tried:
+        time = latents.shape[1]
+        camera = None if start.extrinsics is None else start.extrinsics.expand(1, time, -1)
+        following = model.predict(latents, done[:, :time], poses[:, :time], camera)[:, -1:]
+        latents = torch.cat([latents, following], dim=1)
+    return latents[0, len(start.latents) :]
+
+
+@pytest.mark.parametrize("context", [1, 2, 4])
+@pytest.mark.parametrize(("adapted", "extrinsics"), [(False, False), (True, False), (False, True)])
+def test_predictions_are_those_of_the_plain_computation(context: int, adapted: bool, extrinsics: bool) -> None:
+    model, start, tried = (
+        tiny_model(adapted=adapted, extrinsics=extrinsics),
+        scene(context, extrinsics=extrinsics),
+        actions(3, 3),
+    )
+    with torch.no_grad():
+        found, states = WorldModelCost(model, start, goal(), EnergyConfig()).imagine(tried)
+    expected = torch.stack([plain_predictions(model, start, one) for one in tried])
+    torch.testing.assert_close(found, expected, rtol=2e-5, atol=2e-5)
+    assert states.shape == (3, 4, 7)
+    assert (found[0] - found[1]).abs().mean() > 1e-3  # it heeds its actions
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("context", [1, 3])
+def test_energies_do_not_depend_on_how_many_are_computed_at_once(context: int) -> None:
+    model, tried = tiny_model(), actions(7, 2)
+    expected = cost(model, context, samples_at_once=7)(tried)
+    for at_once in (1, 3, 100):
+        torch.testing.assert_close(cost(model, context, samples_at_once=at_once)(tried), expected, rtol=1e-5, atol=1e-6)
+    assert expected.unique().numel() == 7
+
+
+@torch.no_grad()
+def test_an_energy_is_upstreams_mean_absolute_difference_of_the_last_step() -> None:
+    model, tried = tiny_model(), actions(4, 2)
+    measure = cost(model)
+    predicted, _ = measure.imagine(tried)
+    expected = (predicted[:, -1].flatten(1) - goal().latents.flatten(1)).abs().mean(dim=-1)
+    torch.testing.assert_close(measure(tried), expected)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("kind", ["l1", "l2", "cosine"])
+def test_a_sum_over_steps_adds_the_energies_of_shorter_plans(kind: str) -> None:
+    model, tried = tiny_model(), actions(4, 3)
+    last = cost(model, distance=kind)
+    expected = sum(last(tried[:, :steps]) for steps in (1, 2, 3))
+    torch.testing.assert_close(cost(model, distance=kind, steps="sum")(tried), expected)
+
+
+def test_each_distance_is_its_formula() -> None:
+    found, wanted = draw(5, TOKENS, DIM, seed=1), draw(TOKENS, DIM, seed=2)
+    torch.testing.assert_close(distance(found, wanted, "l1"), (found - wanted).abs().mean(dim=(1, 2)))
+    torch.testing.assert_close(distance(found, wanted, "l2"), ((found - wanted) ** 2).mean(dim=(1, 2)))
+    cosine = torch.einsum("std,td->st", found, wanted) / found.norm(dim=-1) / wanted.norm(dim=-1)
+    torch.testing.assert_close(distance(found, wanted, "cosine"), 1 - cosine.mean(dim=1))
+    for kind in ("l1", "l2", "cosine"):
+        assert float(distance(wanted, wanted, kind)) == pytest.approx(0, abs=1e-6)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["l1", "l2", "cosine"])
+def test_patches_without_weight_do_not_count(kind) -> None:
+    found, wanted = draw(5, TOKENS, DIM, seed=1), draw(TOKENS, DIM, seed=2)
+    weights = torch.zeros(TOKENS)
+    weights[[2, 5]] = 3.0
+    torch.testing.assert_close(distance(found, wanted, kind, weights), distance(found[:, [2, 5]], wanted[[2, 5]], kind))
+    torch.testing.assert_close(distance(found, wanted, kind, torch.ones(TOKENS)), distance(found, wanted, kind))
+
+
+def test_a_mask_over_the_image_weighs_its_patches_row_by_row() -> None:
+    mask = torch.zeros(48, 48, dtype=torch.bool)
+    mask[:16, 16:32] = True  # a whole patch
+    mask[16:32, 40:] = True  # half of one
+    assert patch_weights(mask, 3).tolist() == [0, 1, 0, 0, 0, 0.5, 0, 0, 0]
+    with pytest.raises(ValueError, match="leaves nothing"):
+        patch_weights(mask & False, 3)
+
+
+@torch.no_grad()
+def test_the_goals_weights_are_heeded() -> None:
+    model, tried = tiny_model(), actions(3, 1)
+    weights = torch.arange(float(TOKENS))
+    measure = WorldModelCost(model, scene(), goal(weights=weights), EnergyConfig())
+    predicted, _ = measure.imagine(tried)
+    torch.testing.assert_close(measure(tried), distance(predicted[:, 0], goal().latents[0], "l1", weights))
+
+
+def test_goals_follow_one_another_after_their_durations() -> None:
+    wanted = goal(3, durations=(2, 1))
+    assert [wanted.place(step) for step in range(5)] == [0, 0, 1, 2, 2]
+    torch.testing.assert_close(wanted.ahead(1, 3), wanted.latents)
+
+
+@torch.no_grad()
+def test_the_goal_that_counts_depends_on_what_was_done() -> None:
+    model, tried, wanted = tiny_model(), actions(3, 1), goal(2, durations=(4,))
+    energies = [WorldModelCost(model, scene(), wanted, EnergyConfig(), done=done)(tried) for done in (0, 3, 4)]
+    single = [WorldModelCost(model, scene(), Goal(one[None]), EnergyConfig())(tried) for one in wanted.latents]
+    for found, expected in zip(energies, (single[0], single[0], single[1]), strict=True):
+        torch.testing.assert_close(found, expected)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"durations": (1,)},
+        {"weights": torch.zeros(TOKENS)},
+        {"weights": -torch.ones(TOKENS)},
+    ],
+)
+def test_a_goal_that_cannot_be_is_refused(wrong) -> None:
+    with pytest.raises(ValueError, match=r"durations|weight"):
+        goal(**wrong)
+
+
+@pytest.mark.parametrize("context", [1, 3])
+def test_gradients_flow_to_the_actions_the_same_for_every_cut(context: int) -> None:
+    model, found = tiny_model(), []
+    for at_once in (5, 2):
+        tried = actions(5, 3).requires_grad_()
+        energies = cost(model, context, distance="l2", samples_at_once=at_once)(tried)
+        found.append(torch.autograd.grad(energies.sum(), tried)[0])
+    torch.testing.assert_close(found[0], found[1], rtol=1e-4, atol=1e-6)
+    assert (found[0].abs().sum(dim=-1) > 0).all()  # the first action matters through every later step
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    measure, tried = cost(tiny_model(), 2, distance="l2"), actions(1, 2).requires_grad_()
+    (gradient,) = torch.autograd.grad(measure(tried).sum(), tried)
+    for number in (0, 4, 6):
+        step = torch.zeros_like(tried)
+        step[0, 0, number] = 2e-3
+        with torch.no_grad():
+            slope = (measure(tried + step) - measure(tried - step)) / 4e-3
+        torch.testing.assert_close(slope[0], gradient[0, 0, number], rtol=0.05, atol=2e-3)
+
+
+@pytest.mark.parametrize("planner", ["cem", "icem", "mppi", "gradient"])
+def test_every_planner_goes_downhill_in_a_world_model(planner: str) -> None:
+    settings = PlanningConfig(
+        planner=planner, horizon=2, samples=32, iterations=6, limits=LimitsConfig(rotation=0.1),
+        gradient=GradientConfig(starts=4),
+    )  # fmt: skip
+    measure = cost(tiny_model(), distance="l2")
+    plan = Planner(settings).plan(measure, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        still = float(measure(torch.zeros(1, 2, 7))[0])
+        assert plan.energy == pytest.approx(float(measure(plan.actions[None])[0]), rel=1e-4)
+    assert plan.energy < still
+    assert plan.iterations[-1].elite_energy < plan.iterations[0].elite_energy
+
+
+def test_planning_leaves_no_gradient_in_the_model() -> None:
+    model = tiny_model(adapted=True)
+    settings = PlanningConfig(planner="gradient", iterations=2)
+    Planner(settings).plan(cost(model), torch.Generator())
+    assert all(value.grad is None for value in model.parameters())
+
+
+def test_a_model_that_says_nothing_leads_to_no_motion() -> None:
+    model = tiny_model()
+    with torch.no_grad():
+        model.base_predictor.predictor_proj.weight.fill_(float("nan"))
+    plan = Planner(PlanningConfig(samples=8, cem={"elites": 2}, iterations=2)).plan(cost(model), torch.Generator())
+    assert plan.stopped == "no finite energy"
+    assert not plan.actions.any()
+
+
+def test_a_model_in_training_mode_is_refused() -> None:
+    with pytest.raises(ValueError, match="eval"):
+        cost(tiny_model(adapted=True).train())
