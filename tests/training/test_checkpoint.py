@@ -136,10 +136,13 @@ def test_the_best_stays_besides_the_newest_until_there_is_a_better_one(tmp_path:
     assert names(tmp_path) == [checkpoint_name(50), checkpoint_name(60)]
 
 
-def test_a_best_checkpoint_that_somebody_removed_is_not_waited_for(tmp_path: Path) -> None:
-    write_checkpoint(tmp_path, RunState(10).measured(0.5), write_weights, keep=2)
+def test_a_best_checkpoint_that_is_gone_or_damaged_is_not_what_others_must_beat(tmp_path: Path) -> None:
+    best = write_checkpoint(tmp_path, RunState(10).measured(0.5), write_weights, keep=2)
     newest = write_checkpoint(tmp_path, RunState(20, best_step=10, best_error=0.5), write_weights, keep=2)
-    shutil.rmtree(tmp_path / checkpoint_name(10))
+    assert read_state(newest) == RunState(20, best_step=10, best_error=0.5)
+    (best / "optimizer.pt").write_bytes(b"torn")
+    assert read_state(newest) == RunState(20)
+    shutil.rmtree(best)
     assert read_state(newest) == RunState(20)
 
 

@@ -143,12 +143,12 @@ def damage(checkpoint: Path) -> str | None:
 
 
 def read_state(checkpoint: Path) -> RunState:
-    """Return where the run stood when the checkpoint was written; a best one that is not there any more is no best."""
+    """Return where the run stood when the checkpoint was written; a best one that is gone or damaged is no best."""
     values = json.loads((checkpoint / STATE).read_text())
     if "clips_done" not in values:  # or the run would begin the row of clips again
         raise ValueError(f"{STATE} is of an older version of this program, without clips_done")
     state = RunState(**values)
-    if state.best_step is None or (checkpoint.parent / checkpoint_name(state.best_step)).is_dir():
+    if state.best_step in {None, state.step} or damage(checkpoint.parent / checkpoint_name(state.best_step)) is None:
         return state
     return replace(state, best_step=None, best_error=None)
 
