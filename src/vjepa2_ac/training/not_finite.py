@@ -19,8 +19,6 @@ from vjepa2_ac.data.sources.latents.precision import decoded
 from vjepa2_ac.episode import Batch, StoredLatents
 from vjepa2_ac.storage import atomic_writer
 
-NOT_FINITE = "not_finite"
-
 MOST_CLIPS = 16
 MOST_BYTES = 512 * 10**6  # of frames, which are kept until the step is known to be well
 

@@ -34,6 +34,7 @@ CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
 RUN_ID = "run_id"
 CHECKPOINTS = "checkpoints"
+NOT_FINITE = "not_finite"  # each process writes its own, on the disk that it sees
 
 # Settings that may change between two starts of one run. They do not change what is computed, but for those by which a
 # broken episode is left out: data.exclude changes the order of the clips that are still to come, data.broken_episodes
@@ -71,7 +72,7 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
     if (folder / CONFIG).exists():
         if not allow_config_change:
             _refuse_another_config(folder, config)
-    elif folder.exists() and not all(_is_of_a_start(path) for path in folder.iterdir()):
+    elif folder.exists() and not all(_is_without_config(path) for path in folder.iterdir()):
         raise InputError(
             where=str(folder),
             found="a folder with other things in it, and no config.yaml",
@@ -150,9 +151,9 @@ def environment() -> dict[str, object]:
     }
 
 
-def _is_of_a_start(path: Path) -> bool:
-    """Return whether a file is what a start leaves that was killed before its config stood there."""
-    return path.name == LOCK or (path.name.startswith(f".{CONFIG}.") and path.name.endswith(".partial"))
+def _is_without_config(path: Path) -> bool:
+    """Return whether a file may be where no config is: after a start that was killed, or of a process not the first."""
+    return path.name in {LOCK, NOT_FINITE} or (path.name.startswith(f".{CONFIG}.") and path.name.endswith(".partial"))
 
 
 def _earlier_starts(path: Path) -> list[object]:

@@ -18,9 +18,10 @@ from vjepa2_ac.storage import is_url
 from vjepa2_ac.training.assembly import Run, encode
 from vjepa2_ac.training.checkpoint import checkpoint_name
 from vjepa2_ac.training.health import Update
-from vjepa2_ac.training.not_finite import NOT_FINITE, LookBack
+from vjepa2_ac.training.not_finite import LookBack
 from vjepa2_ac.training.optim import learning_rate_at, set_learning_rate, trained_parameters
 from vjepa2_ac.training.processes import add_up_gradients, sums
+from vjepa2_ac.training.run_folder import NOT_FINITE
 
 SMALLEST_LOSS_SCALE = 1.0  # fp16: where gradients overflow even so, they are not finite for another reason
 
