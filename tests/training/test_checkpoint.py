@@ -235,6 +235,31 @@ def test_whatever_operation_fails_older_checkpoints_stay_and_nothing_half_is_lef
         assert newest_checkpoint(folder) == path, "with room again"
 
 
+def test_what_survives_a_power_cut_is_whole_and_is_there_before_an_older_one_goes(tmp_path, monkeypatch) -> None:
+    write(tmp_path, 10, keep=1)
+    happened: list[str] = []
+
+    def noting(what: str, real):
+        def operation(*arguments, **options):
+            path = Path(f"/proc/self/fd/{arguments[0]}").readlink() if what == "flush" else Path(arguments[0])
+            happened.append(f"{what} {path.relative_to(tmp_path)}")
+            return real(*arguments, **options)
+
+        return operation
+
+    monkeypatch.setattr(os, "fsync", noting("flush", os.fsync))
+    monkeypatch.setattr(os, "rename", noting("rename", os.rename))
+    monkeypatch.setattr(shutil, "rmtree", noting("remove", shutil.rmtree))
+    written = write(tmp_path, 20, keep=1)
+    temporary = f".writing-{checkpoint_name(20)}"
+    renamed = happened.index(f"rename {temporary}")
+    parts = [written, *written.rglob("*")]
+    assert {f"flush {temporary}/{part.relative_to(written)}".removesuffix("/.") for part in parts} < set(
+        happened[:renamed]
+    )
+    assert happened[renamed + 1 :] == ["flush .", f"remove {checkpoint_name(10)}"]
+
+
 @contextmanager
 def files_end_at(size: int) -> Iterator[None]:
     """Let no file grow beyond a size: a full disk for Python, torch and safetensors alike."""
