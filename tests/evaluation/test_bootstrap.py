@@ -53,6 +53,12 @@ def test_figures_are_those_of_each_column_by_itself() -> None:
         assert (one.low, one.high) == pytest.approx((alone.low, alone.high))
 
 
+def test_an_episode_is_drawn_with_all_of_its_clips() -> None:
+    """Two episodes: each alone or both are all that can be drawn, and the interval reaches from end to end."""
+    found = mean_of(np.array([1.0, 1.0, 5.0]), ("a", "a", "b"))
+    assert (found.low, found.value, found.high) == pytest.approx((1.0, 7 / 3, 5.0), abs=0.01)
+
+
 def test_one_episode_has_no_interval_and_what_is_not_a_number_is_none_in_json() -> None:
     alone = mean_of(np.array([1.0, 2.0]), ("a", "a"))
     assert alone.as_dict() == {"value": 1.5, "low": None, "high": None}

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -21,7 +22,7 @@ from vjepa2_ac.evaluation.estimates import (
 )
 from vjepa2_ac.evaluation.evaluate import Contender, Probes, evaluate
 from vjepa2_ac.evaluation.metrics_file import metrics_as_dict
-from vjepa2_ac.evaluation.result import METRICS, MODES, Evaluation
+from vjepa2_ac.evaluation.result import METRICS, MODES, Errors, Evaluation, Predicted, Stratum
 from vjepa2_ac.evaluation.verdict import improvement, uses_actions, verdict
 from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, about, again, clips_batch
 
@@ -93,6 +94,29 @@ def test_a_difference_is_what_is_computed_by_hand() -> None:
     last = improvement(found, 4)
     assert last is not None
     assert last.value == pytest.approx(0.5)
+
+
+def test_wrong_actions_give_the_errors_that_they_give(oracle: Evaluation) -> None:
+    zero = over_persistence(oracle, "adapter", "teacher_forced", actions="zero")
+    assert [one.value for one in zero] == pytest.approx([1.0] * (TIME - 1), rel=1e-5), "nothing done, nothing moves"
+    batch = clips_batch()
+    others = batch.actions[[1, *range(11)]]
+    expected = (others - batch.actions)[..., :DIM].abs().mean(dim=(0, 2)) * 100
+    shuffled = mean_error(oracle, "adapter", "teacher_forced", actions="shuffled")
+    assert [one.value for one in shuffled] == pytest.approx(expected.tolist(), rel=1e-4)
+
+
+def test_a_part_counts_its_own_steps_only(oracle: Evaluation) -> None:
+    first = np.zeros((12, TIME - 1), bool)
+    first[:, 0] = True
+    nothing = oracle.persistence.teacher_forced.l1
+    made_up = np.where(first, 2 * nothing, nothing / 4)
+    errors = Errors(made_up, made_up, made_up)
+    model = replace(oracle.models["adapter"], true=Predicted(errors, errors))
+    changed = replace(oracle, models={**oracle.models, "adapter": model})
+    for part, value in ((Stratum("first", "motion", first), 2.0), (Stratum("rest", "motion", ~first), 0.25)):
+        assert stratum_over_persistence(changed, part, "adapter").value == pytest.approx(value)
+        assert stratum_gain(changed, part, "adapter", "base").value == pytest.approx(1 - value)
 
 
 def test_figures_depend_on_neither_the_size_of_a_batch_nor_on_what_is_measured_beside(oracle: Evaluation) -> None:

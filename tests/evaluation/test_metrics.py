@@ -39,6 +39,7 @@ def test_distances_equal_a_case_computed_by_hand() -> None:
     assert found.l1.tolist() == [[(1 + 1 + 0 + 1) / 4]]
     assert found.l2.tolist() == [[(1 + 1 + 0 + 1) / 4]]
     assert found.cosine[0, 0] == pytest.approx((1 + 0) / 2), "at a right angle, and in line"
+    assert distances(predicted * 3, predicted).cosine[0, 0] == pytest.approx(0.0, abs=1e-6), "length does not matter"
     assert distances(predicted * 3, predicted).l2.tolist() == [[(4 + 16) / 4]], "squared, no root"
 
 
