@@ -1,0 +1,181 @@
+"""What should the robot do now? A goal picture once, then an action for every picture and state."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.data.transforms import Crop, pixels_to_input, view
+from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.model.heads import widths_of_model
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
+from vjepa2_ac.planning.goal import Goal, patch_weights
+from vjepa2_ac.planning.observation import require_picture, require_pose
+from vjepa2_ac.planning.plan import Plan
+from vjepa2_ac.planning.planner import Clock, Planner
+from vjepa2_ac.planning.poses import states_along
+
+Why = Literal["planned", "out of time", "at the goal", "no finite energy"]
+
+_REACHED = 1e-6  # the energy of a picture that is the goal's, to rounding
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What was decided, and why."""
+
+    action: Float[np.ndarray, " 7"]  # for the next model step; zero where `why` says so
+    why: Why  # out of time: the best plan so far. at the goal, no finite energy: do nothing
+    energy_now: float  # of doing nothing, if nothing then moves: present picture against goal
+    goal: int  # which of several goals counted
+    plan: Plan | None  # None at the goal
+    states: Float[np.ndarray, "time 7"] | None  # where the plan leads, the present state first
+    cost: WorldModelCost | None  # to look at other actions
+
+
+class Controller:
+    """Plans towards a goal, one model step at a time, and remembers what was seen.
+
+    The same seed, pictures and states give the same actions: the n-th decision after a reset (from 0) is drawn with
+    seed + n. Actions are within `config.limits`, whatever the model says.
+    """
+
+    def __init__(
+        self,
+        world_model: WorldModel,
+        config: PlanningConfig,
+        *,
+        seed: int = 0,
+        crop: Crop = "released",
+        extrinsics: Float[np.ndarray, " 6"] | None = None,
+        clock: Clock = time.perf_counter,
+    ) -> None:
+        """Prepare to control.
+
+        Args:
+            world_model: A base, one with an adapter, or merged; it is put into eval mode.
+            config: How to plan.
+            seed: Of all decisions.
+            crop: As in training (`data.crop`).
+            extrinsics: Pose of the camera, where the model uses it.
+            clock: What the time budget is measured by.
+
+        Raises:
+            InputError: The model's states and actions are no poses, or it needs a camera pose and there is none.
+        """
+        if widths_of_model(world_model.sizes) != POSE_WIDTHS:
+            raise InputError(
+                where="model", found="states and actions that are no poses", needed="a model of 7 and 7 numbers"
+            )
+        if world_model.sizes.predictor.use_extrinsics != (extrinsics is not None):
+            raise InputError(
+                where="model: predictor.use_extrinsics",
+                found=f"{world_model.sizes.predictor.use_extrinsics}, camera pose given: {extrinsics is not None}",
+                needed="a camera pose exactly where the model uses it",
+            )
+        self._model, self.config, self._seed, self._crop = world_model.eval(), config, seed, crop
+        self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
+        self._planner = Planner(config, clock=clock)
+        self._goal: Goal | None = None
+        self._like = np.zeros(0)
+        self._seen: deque[tuple[Tensor, np.ndarray]] = deque(maxlen=config.context)
+        self._done = 0
+        self.decision: Decision | None = None  # the last one
+
+    def reset(self, *goals: np.ndarray, durations: tuple[int, ...] = (), mask: np.ndarray | None = None) -> None:
+        """Set a goal, or several in order, and forget what was seen.
+
+        Args:
+            goals: RGB pictures, height x width x 3, uint8, all of one size.
+            durations: Model steps for which each goal but the last counts.
+            mask: What of the picture counts: height x width, true or 1 where it does; None: all.
+
+        Raises:
+            InputError: A picture is none, sizes differ, or the mask leaves nothing.
+            ValueError: There is not one duration for each goal but the last.
+        """
+        for place, picture in enumerate(goals):
+            require_picture(picture, where=f"goal {place}", like=goals[0] if place else None)
+        if not goals:
+            raise ValueError("no goal")
+        latents = torch.stack([self._encoded(picture) for picture in goals])
+        self._goal = Goal(latents, durations, self._weights(mask, goals[0]))
+        self._like, self._done, self.decision = goals[0], 0, None
+        self._seen.clear()
+
+    def act(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " 7"]:
+        """Return the action of the next model step: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`).
+
+        Call it once every model step. `decision` then says why.
+
+        Args:
+            frame: What the camera sees, of the goal picture's size.
+            state: Measured pose and gripper.
+
+        Raises:
+            InputError: The picture or the state cannot be used.
+            ValueError: No goal was set.
+        """
+        if self._goal is None:
+            raise ValueError("no goal: call reset first")
+        require_picture(frame, where="frame", like=self._like)
+        state = np.asarray(state, dtype=np.float64)
+        require_pose(state, where="state")
+        self._seen.append((self._encoded(frame), state))
+        before = self.decision
+        self.decision = self._decided(self._goal, None if before is None else before.plan)
+        self._done += 1
+        return self.decision.action
+
+    def _decided(self, goal: Goal, before: Plan | None) -> Decision:
+        latents, state = self._seen[-1]
+        place = goal.place(self._done)
+        energy = float(distance(latents, goal.latents[place], self.config.energy.distance, goal.weights))
+        if energy <= _REACHED and goal.place(self._done + self.config.horizon - 1) == place:
+            return Decision(np.zeros(ACTION_DIM), "at the goal", energy, place, None, None, None)
+        cost = WorldModelCost(self._model, self._scene(), goal, self.config.energy, done=self._done)
+        generator = torch.Generator().manual_seed(self._seed + self._done)
+        start = before.start_after(1) if before is not None and self.config.warm_start else None
+        plan = self._planner.plan(cost, generator, start)
+        why: Why = "planned" if plan.stopped == "finished" else plan.stopped
+        states = states_along(torch.from_numpy(state), plan.actions.double()[None])[0]
+        return Decision(plan.actions[0].double().numpy(), why, energy, place, plan, states.numpy(), cost)
+
+    def _scene(self) -> Scene:
+        states = np.stack([state for _, state in self._seen])
+        actions = actions_from_states(states) if len(states) > 1 else np.zeros((0, ACTION_DIM))
+        return Scene(
+            latents=torch.stack([latents for latents, _ in self._seen]),
+            states=torch.from_numpy(states).float(),
+            actions=torch.from_numpy(actions).float(),
+            extrinsics=self._camera,
+        )
+
+    def _encoded(self, picture: np.ndarray) -> Float[Tensor, "tokens dim"]:
+        frames = torch.from_numpy(np.ascontiguousarray(view(picture[None], self._crop)))[None]
+        frames = frames.to(self._model.device)
+        return self._model.encode(pixels_to_input(frames, self._model.image_size))[0, 0]
+
+    def _weights(self, mask: np.ndarray | None, like: np.ndarray) -> Float[Tensor, " tokens"] | None:
+        if mask is None:
+            return None
+        if mask.shape != like.shape[:2]:
+            raise InputError(where="mask", found=f"shape {mask.shape}", needed=f"{like.shape[:2]}, as the goal")
+        grid = self._model.image_size // self._model.sizes.patch_size
+        picture = np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1)
+        seen = torch.from_numpy(np.ascontiguousarray(view(picture, self._crop)[0, ..., 0]))
+        try:
+            return patch_weights(seen > 0, grid).to(self._model.device)
+        except ValueError:
+            raise InputError(where="mask", found="nothing of what the model sees counts") from None

@@ -1,0 +1,65 @@
+"""Can this be planned from? Pictures and states as a robot gives them, refused before they do harm."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vjepa2_ac.episode import STATE_DIM
+from vjepa2_ac.errors import InputError
+
+_LEAST_SIDE = 16  # pixels
+_REACH_M = 5.0  # beyond this it is no arm's reach in metres
+_ANGLE = 2 * math.pi + 0.01
+_GRIPPER_SLACK = 0.1  # what a measured closedness may be beyond 0 .. 1
+
+
+def require_picture(picture: np.ndarray, *, where: str, like: np.ndarray | None = None) -> None:
+    """Refuse what is no RGB picture, or not of another's size.
+
+    Args:
+        picture: As given.
+        where: What it is called.
+        like: A picture that it is compared with later, and that the same camera should have made.
+
+    Raises:
+        InputError: Says what was found.
+    """
+    found = f"an array of shape {picture.shape} and type {picture.dtype}"
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8 or min(picture.shape[:2]) < _LEAST_SIDE:
+        raise InputError(
+            where=where, found=found, needed=f"an RGB picture: height x width x 3, uint8, {_LEAST_SIDE} pixels or more"
+        )
+    if like is not None and picture.shape != like.shape:
+        raise InputError(
+            where=where,
+            found=f"{picture.shape[1]} x {picture.shape[0]} pixels (width x height)",
+            needed=f"{like.shape[1]} x {like.shape[0]}, as the goal's picture",
+            fix="Take both with the same camera, at the same place and resolution",
+        )
+
+
+def require_pose(state: np.ndarray, *, where: str) -> None:
+    """Refuse a state that is not a pose in metres and radians with a gripper's closedness.
+
+    Raises:
+        InputError: Says what was found.
+    """
+    needed = f"{STATE_DIM} finite numbers: x, y, z in metres, roll, pitch, yaw in radians, closedness 0 .. 1"
+    if state.shape != (STATE_DIM,):
+        raise InputError(where=where, found=f"{state.size} numbers in the shape {state.shape}", needed=needed)
+    shown = ", ".join(f"{number:g}" for number in state)
+    if not np.isfinite(state).all():
+        raise InputError(where=where, found=shown, needed=needed)
+    if np.abs(state[3:6]).max() > _ANGLE:
+        raise InputError(where=where, found=f"{shown}: angles beyond a whole turn", needed=needed, fix=_FROM_DEGREES)
+    if np.abs(state[:3]).max() > _REACH_M:
+        raise InputError(where=where, found=f"{shown}: beyond {_REACH_M:g} m", needed=needed, fix=_FROM_MILLIMETRES)
+    if not -_GRIPPER_SLACK <= state[6] <= 1 + _GRIPPER_SLACK:
+        raise InputError(where=where, found=f"{shown}: a closedness of {state[6]:g}", needed=needed, fix=_FROM_WIDTH)
+
+
+_FROM_DEGREES = "These look like degrees: multiply the angles by pi / 180"
+_FROM_MILLIMETRES = "These look like millimetres: divide the position by 1000"
+_FROM_WIDTH = "Give 0 for open and 1 for closed"

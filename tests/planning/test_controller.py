@@ -1,0 +1,200 @@
+"""A robot's loop: pictures and states in, actions within the limits out, with a reason."""
+
+import numpy as np
+import pytest
+import torch
+
+from planning.tiny import tiny_model
+from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import actions_from_states, apply_action
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.planning.controller import Controller
+
+STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
+QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))
+
+
+def picture(seed: int, height: int = 60, width: int = 48) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
+
+
+def controller(model: WorldModel | None = None, seed: int = 0, **changes: object) -> Controller:
+    config = QUICK.model_copy(update=changes)
+    return Controller(tiny_model() if model is None else model, config, seed=seed)
+
+
+def actions(run: Controller, frames: int = 3) -> np.ndarray:
+    run.reset(picture(100))
+    return np.stack([run.act(picture(seed), STATE) for seed in range(frames)])
+
+
+def test_actions_are_within_the_limits_and_lower_the_energy() -> None:
+    run = controller(limits=LimitsConfig(xyz=(0.05, 0.02, 0.0)), iterations=5)
+    found = actions(run)
+    assert (np.abs(found) <= [0.05, 0.02, 0, 0, 0, 0, 0.75]).all()
+    assert found[:, :2].all()
+    assert run.decision is not None
+    assert run.decision.why == "planned"
+    assert run.decision.plan is not None
+    assert run.decision.cost is not None
+    with torch.no_grad():
+        still = float(run.decision.cost(torch.zeros(1, 2, 7)))
+    assert run.decision.plan.energy < still
+
+
+def test_the_same_seed_gives_the_same_actions_again() -> None:
+    run = controller()
+    first = actions(run)
+    np.testing.assert_array_equal(actions(run), first)
+    np.testing.assert_array_equal(actions(controller()), first)
+    assert not np.array_equal(actions(controller(seed=1)), first)
+
+
+def test_a_decision_tells_where_its_plan_leads() -> None:
+    run = controller()
+    actions(run, 1)
+    assert run.decision is not None
+    assert run.decision.plan is not None
+    expected = [STATE]
+    for action in run.decision.plan.actions.double().numpy():
+        after = apply_action(expected[-1], action)
+        expected.append(np.append(after[:6], after[6].clip(0, 1)))
+    np.testing.assert_allclose(run.decision.states, expected, atol=1e-6)
+
+
+def test_a_decision_begins_from_the_last_ones_plan() -> None:
+    frames = (picture(1), picture(1))
+    found = []
+    for warm in (True, False):
+        run = controller(warm_start=warm, iterations=6)
+        run.reset(picture(100))
+        run.act(frames[0], STATE)
+        before = run.decision
+        run.act(frames[1], STATE)
+        assert before is not None
+        assert before.plan is not None
+        assert run.decision is not None
+        assert run.decision.plan is not None
+        found.append(run.decision.plan.iterations[0].elites[:, 0, :3].mean(dim=0))
+        found.append(before.plan.start_after(1).mean[0, :3])
+    assert (found[0] - found[1]).norm() < (found[2] - found[3]).norm()
+
+
+def test_earlier_frames_are_seen_with_the_actions_that_were_done() -> None:
+    run, model = controller(context=3), tiny_model()
+    run.reset(picture(100))
+    states = np.stack([STATE + 0.01 * step for step in range(5)])
+    for step, state in enumerate(states):
+        run.act(picture(step), state)
+    scene = run._scene()
+    assert len(scene.latents) == 3
+    np.testing.assert_allclose(scene.states, states[2:], atol=1e-6)
+    np.testing.assert_allclose(scene.actions, actions_from_states(states[2:]), atol=1e-6)
+    alone = controller(model=model)
+    alone.reset(picture(100))
+    alone.act(picture(4), states[4])
+    assert alone.decision is not None
+    assert run.decision is not None
+    tried = torch.full((1, 1, 7), 0.02)
+    with torch.no_grad():
+        assert not torch.allclose(run.decision.cost(tried), alone.decision.cost(tried))  # type: ignore[misc]
+
+
+def test_sub_goals_follow_one_another() -> None:
+    run = controller()
+    run.reset(picture(100), picture(101), durations=(2,))
+    goals = []
+    for seed in range(4):
+        run.act(picture(seed), STATE)
+        goals.append(run.decision.goal)  # type: ignore[union-attr]
+    assert goals == [0, 0, 1, 1]
+
+
+def test_at_the_goal_nothing_is_done() -> None:
+    run = controller()
+    run.reset(picture(100))
+    assert not run.act(picture(100), STATE).any()
+    assert run.decision is not None
+    assert run.decision.why == "at the goal"
+    assert run.act(picture(1), STATE).any()
+
+
+def test_a_broken_model_leads_to_no_motion_with_a_reason() -> None:
+    model = tiny_model()
+    with torch.no_grad():
+        model.base_predictor.predictor_proj.weight.fill_(float("nan"))
+    run = controller(model)
+    assert not actions(run).any()
+    assert run.decision is not None
+    assert run.decision.why == "no finite energy"
+
+
+def test_a_mask_decides_what_counts_of_the_picture() -> None:
+    run = controller()
+    mask = np.zeros((60, 48), bool)
+    mask[:20, :16] = True
+    run.reset(picture(100), mask=mask)
+    assert run._goal is not None
+    assert run._goal.weights is not None
+    assert run._goal.weights.nonzero().flatten().tolist() == [0]
+
+
+def test_what_does_not_count_may_differ_at_the_goal() -> None:
+    run = controller()
+    mask = np.zeros((60, 48), bool)
+    with pytest.raises(InputError, match="nothing of what the model sees"):
+        run.reset(picture(100), mask=mask)
+    with pytest.raises(InputError, match="mask"):
+        run.reset(picture(100), mask=mask.T)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("planner", ["cem", "gradient"])
+def test_a_model_in_bfloat16_plans_as_well(planner: str) -> None:
+    model = tiny_model().to(torch.bfloat16)
+    assert actions(controller(model, planner=planner), 2).any()
+
+
+@pytest.mark.parametrize(
+    ("frame", "complaint"),
+    [
+        (picture(0, 48, 60), "as the goal's picture"), (picture(0)[..., 0], "RGB picture"),
+        (picture(0).astype(np.float32), "RGB picture"), (picture(0)[:4, :4], "RGB picture"),
+    ],
+)  # fmt: skip
+def test_a_picture_that_cannot_be_used_is_refused(frame: np.ndarray, complaint: str) -> None:
+    run = controller()
+    run.reset(picture(100))
+    with pytest.raises(InputError, match=complaint):
+        run.act(frame, STATE)
+    with pytest.raises(InputError, match=r"goal 1.*" + complaint):
+        run.reset(picture(100), frame, durations=(1,))
+
+
+@pytest.mark.parametrize(
+    ("state", "complaint"),
+    [
+        (STATE[:6], "6 numbers"), (STATE * np.nan, "finite"), (STATE * [1, 1, 1, 57.3, 57.3, 57.3, 1], "degrees"),
+        (STATE * [1000, 1000, 1000, 1, 1, 1, 1], "millimetres"), (np.append(STATE[:6], 7.0), "0 for open"),
+    ],
+)  # fmt: skip
+def test_a_state_that_cannot_be_used_is_refused(state: np.ndarray, complaint: str) -> None:
+    run = controller()
+    run.reset(picture(100))
+    with pytest.raises(InputError, match=complaint):
+        run.act(picture(0), state)
+
+
+def test_a_camera_pose_is_needed_exactly_where_the_model_uses_it() -> None:
+    with pytest.raises(InputError, match="camera pose"):
+        controller(tiny_model(extrinsics=True))
+    run = Controller(tiny_model(extrinsics=True), QUICK, extrinsics=np.zeros(6))
+    assert actions(run, 1).any()
+
+
+def test_acting_without_a_goal_is_an_error() -> None:
+    with pytest.raises(ValueError, match="reset"):
+        controller().act(picture(0), STATE)
+    with pytest.raises(ValueError, match="no goal"):
+        controller().reset()
