@@ -10,6 +10,7 @@ from vjepa2_ac.config.data import (
     RldsFields,
 )
 from vjepa2_ac.config.model import AdapterConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.config.run import Config
 from vjepa2_ac.config.section import Section
 from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
@@ -22,10 +23,13 @@ __all__ = [
     "DataConfig",
     "DiskCacheConfig",
     "EncoderSizes",
+    "EnergyConfig",
     "IdleConfig",
     "LeRobotFields",
+    "LimitsConfig",
     "ModelConfig",
     "ModelSizes",
+    "PlanningConfig",
     "PredictorSizes",
     "RawDroidOptions",
     "RldsFields",
