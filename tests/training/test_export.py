@@ -18,17 +18,17 @@ from paths import GOLDEN
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.metrics_file import METRICS_FILE
 from vjepa2_ac.model.adapter_end import base_only
 from vjepa2_ac.model.lora import load_trained
 from vjepa2_ac.model.weights import load_official
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training import export
 from vjepa2_ac.training.checkpoint import checkpoint_name
+from vjepa2_ac.training.evaluation import PLOT
 from vjepa2_ac.training.export import CARD, OFFICIAL_NAME, Exported, export_run
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.manifest import seal
-from vjepa2_ac.evaluation.metrics_file import METRICS_FILE
-from vjepa2_ac.training.evaluation import PLOT
 from vjepa2_ac.training.runs import load_run
 
 EVALUATED = {
@@ -192,7 +192,7 @@ def test_the_card_shows_what_was_measured(trained, tmp_path: Path) -> None:
     assert "Not evaluated" not in card
     assert f"]({PLOT})" in card
     assert (tmp_path / "hub" / PLOT).read_bytes() == b"a picture"
-    assert "somewhere" not in (tmp_path / "hub" / METRICS_FILE).read_text(), "paths of this machine are nobody's business"
+    assert "somewhere" not in (tmp_path / "hub" / METRICS_FILE).read_text(), "a path of this machine"
 
 
 def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(trained, tmp_path: Path) -> None:
