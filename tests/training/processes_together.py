@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,9 +12,9 @@ from vjepa2_ac.config_file import load_config
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.training.assembly import Run, assemble, make_accelerator
+from vjepa2_ac.training.assembly import Run, assemble, make_accelerator, save_checkpoint
 from vjepa2_ac.training.processes import from_first, largest, of_all, require_same, sums
-from vjepa2_ac.training.step import gradients
+from vjepa2_ac.training.step import gradients, training_step
 
 
 def some_clips(batch: Batch, chosen: list[int]) -> Batch:
@@ -72,6 +73,23 @@ def main() -> None:
     assert none == []
     one_has_none, _ = gradient_of(run, [[0, 1], [0, 1]] if rank == 0 else [[], []])
     assert one_has_none.clips == 4
+
+    # What only the first process has on its disk, all go on from.
+    run.optimizer.zero_grad(set_to_none=True)
+    training_step(run, batches(run, [[0, 1], [0, 1]]), step=1)
+    run.state = replace(run.state, step=1, clips_done=8)
+    save_checkpoint(run, Path(config.run_dir))
+    own_disk = config.model_copy(update={"run_dir": config.run_dir if rank == 0 else f"{config.run_dir}-elsewhere"})
+    again = assemble(own_disk, lambda _: None, accelerator=accelerator)
+    assert (again.state.step, again.state.clips_done, again.state.run_id) == (1, 8, run.state.run_id)
+    for before, after in zip(run.world_model.parameters(), again.world_model.parameters(), strict=True):
+        assert torch.equal(before, after)
+    moments, expected_moments = again.optimizer.state_dict()["state"], run.optimizer.state_dict()["state"]
+    assert moments.keys() == expected_moments.keys() != set()
+    assert all(
+        torch.equal(value, moments[key][name]) for key, own in expected_moments.items() for name, value in own.items()
+    )
+    assert not Path(f"{config.run_dir}-elsewhere").exists()
     accelerator.end_training()
 
 

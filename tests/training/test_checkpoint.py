@@ -94,12 +94,13 @@ def test_a_full_disk_leaves_the_older_checkpoints_and_no_debris(tmp_path: Path) 
     assert damage(older) is None
 
 
-def test_what_a_killed_writer_left_behind_is_never_resumed_from_and_is_cleaned_up(tmp_path: Path) -> None:
+@pytest.mark.parametrize("step", [30, 40])
+def test_what_a_killed_writer_left_behind_is_never_resumed_from_and_is_cleaned_up(tmp_path: Path, step: int) -> None:
     debris = tmp_path / f".writing-{checkpoint_name(30)}"
     debris.mkdir()
     write_weights(debris)
     assert newest_checkpoint(tmp_path) is None
-    path = write(tmp_path, 40)
+    path = write(tmp_path, step)
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from same_run import assert_same_run, figures, trained_weights
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import CheckpointConfig, Config
 from vjepa2_ac.config_file import config_as_yaml
 from vjepa2_ac.data import loader
 from vjepa2_ac.data.clips import Wish
@@ -19,7 +19,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.training import loop
 from vjepa2_ac.training.assembly import assemble, batches_from
-from vjepa2_ac.training.checkpoint import checkpoint_name, newest_checkpoint, read_state
+from vjepa2_ac.training.checkpoint import CheckpointClock, checkpoint_name, newest_checkpoint, read_state
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.runs import load_run
 from vjepa2_ac.training.step import step_seed, training_step
@@ -68,6 +68,14 @@ def test_how_often_a_run_is_measured_and_saved_changes_nothing(make_config, repo
     assert all(rows[row["kind"], row["step"]] == row for row in figures(tmp_path / "seldom"))
     one, other = trained_weights(tmp_path / "seldom"), trained_weights(tmp_path / "often")
     assert all(torch.equal(one[key], other[key]) for key in one)
+
+
+def test_minutes_count_from_the_last_checkpoint(make_config, reporter, monkeypatch) -> None:
+    """A step takes 25 s here: a minute is over after steps 3 and 6."""
+    clock = CheckpointClock(CheckpointConfig(every=100, every_minutes=1.0), now_s=lambda: 25.0 * len(reporter.steps))
+    monkeypatch.setattr(loop, "CheckpointClock", lambda _: clock)
+    folder = train(make_config(checkpoint__keep_best=False), reporter)
+    assert sorted(path.name for path in (folder / "checkpoints").iterdir()) == [checkpoint_name(3), checkpoint_name(6)]
 
 
 def test_the_best_by_validation_is_written_kept_and_remembered(make_config, reporter, tmp_path, monkeypatch) -> None:

@@ -156,6 +156,13 @@ def test_a_run_whose_step_changes_goes_on_in_the_row_of_clips_where_it_stood(mak
     assert next(batches_from(run)).starts == next(expected).starts
 
 
+def test_a_run_whose_step_changes_counts_on_from_the_clips_it_has_had(make_config, reporter) -> None:
+    train(make_config(training__steps=2), reporter)
+    changed = make_config(training__steps=4, training__accumulation=1)
+    folder = train(changed, reporter, allow_config_change=True)
+    assert read_state(newest_checkpoint(folder / "checkpoints")).clips_done == 2 * 4 + 2 * 2
+
+
 def test_fp16_on_a_cpu_is_refused(make_config, reporter) -> None:
     with pytest.raises(InputError, match="fp16 on a CPU"):
         train(make_config(training__precision="fp16", model__dtype="bfloat16"), reporter)

@@ -104,10 +104,12 @@ def with_loss_scale(run: Run, scale: float) -> Run:
 def test_scaling_losses_by_a_power_of_two_changes_nothing(make_config, reporter) -> None:
     plain, scaled = prepared(make_config, reporter, 2, 2), prepared(make_config, reporter, 2, 2)
     with_loss_scale(scaled, 1024.0)
+    rows: list[list[dict[str, float]]] = []
     for run in (plain, scaled):
         batches = training_loader(run.dataset, seed=0, batch_size=2)
-        rows = [training_step(run, batches, step) for step in (1, 2, 3)]
-    assert [row["loss_scale"] for row in [rows[-1]]] == [2048.0], "it has grown after two good steps"
+        rows.append([training_step(run, batches, step) for step in (1, 2, 3)])
+    assert [row["grad_norm"] for row in rows[0]] == [row["grad_norm"] for row in rows[1]], "clipped by the true norm"
+    assert rows[1][-1]["loss_scale"] == 2048.0, "it has grown after two good steps"
     weights = zip(plain.world_model.parameters(), scaled.world_model.parameters(), strict=True)
     assert all(torch.equal(one, other) for one, other in weights)
 
