@@ -59,6 +59,8 @@ def test_within_a_process_too_it_is_held_once_and_given_back(tmp_path: Path) -> 
             other.take()
     with RunLock(tmp_path) as lock:
         lock.take()
+        with RunLock(tmp_path) as other, pytest.raises(InputError, match=rf"by process {os.getpid()} on"):
+            other.take()  # the last to sign is named, not those before
 
 
 def test_a_lock_that_nobody_took_leaves_no_trace(tmp_path: Path) -> None:
