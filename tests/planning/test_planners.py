@@ -13,9 +13,10 @@ from planning.problems import PLANNERS, config, parabola, rosenbrock, solve, spa
 from vjepa2_ac.config.planning import CemConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
 from vjepa2_ac.planning.action_space import ActionSpace, Ball
 from vjepa2_ac.planning.icem import coloured_noise
+from vjepa2_ac.planning.mppi import MppiSearch
 from vjepa2_ac.planning.plan import Start
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.search import white_noise
+from vjepa2_ac.planning.search import Tried, white_noise
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
@@ -227,6 +228,26 @@ def test_icems_elites_take_part_again() -> None:
     assert torch.equal(shown[1][32:35], plan.iterations[0].elites[:3])  # 40 / 1.25 fresh ones stand before
     torch.testing.assert_close(shown[1][35], plan.iterations[0].mean)  # the last iteration tries the mean
     assert all(later.lowest <= earlier.lowest for earlier, later in pairwise(plan.iterations))
+
+
+def test_mppi_tries_its_mean_and_weighs_by_energy() -> None:
+    search = MppiSearch(space(), MppiConfig(temperature=0.5, std_decay=0.5), 3, torch.Generator(), None)
+    assert torch.equal(search.propose()[0], search.mean)
+    tried = torch.tensor([[[0.0, 0.0]], [[1.0, 0.0]], [[0.0, 1.0]]])
+    energies = torch.tensor([1.0, 3.0, 2.0])
+    search.learn(Tried(tried, energies))
+    weights = torch.exp(-energies / (0.5 * (2 / 3) ** 0.5))
+    torch.testing.assert_close(search.mean, (weights[1:] / weights.sum())[None])
+    torch.testing.assert_close(search.std, torch.full((1, 2), 0.5))
+
+
+def test_the_first_descent_begins_where_the_last_best_one_ended() -> None:
+    before = solve("gradient", two_basins, space())
+    after = Planner(config("gradient", iterations=1), space()).plan(
+        two_basins, torch.Generator(), before.start_after(0)
+    )
+    torch.testing.assert_close(after.iterations[0].elites[0], before.iterations[-1].elites[0])
+    assert (before.mean - before.actions).norm() > 0.1
 
 
 @pytest.mark.parametrize("decisions", [1, 2, 7, 8])

@@ -26,7 +26,7 @@ class GradientSearch:
         self.elites = config.starts
         noise = white_noise(space, config.starts, generator)
         noise[0] = 0.0
-        origin = torch.zeros_like(space.lower) if start is None else start.mean
+        origin = torch.zeros_like(space.lower) if start is None else _best_of(start)
         self._space = space
         half = (space.upper - space.lower) / 2
         self._unit = torch.where(half > 0, half, 1.0)
@@ -65,3 +65,8 @@ class GradientSearch:
     def answer(self) -> Float[Tensor, "decisions dim"] | None:
         """Ask for the best that was tried."""
         return None
+
+
+def _best_of(start: Start) -> Float[Tensor, "decisions dim"]:
+    """Return the last best descent: the middle of several that lead to different places leads nowhere."""
+    return start.elites[0] if len(start.elites) else start.mean
