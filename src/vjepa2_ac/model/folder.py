@@ -52,19 +52,20 @@ def read_sizes(folder: Path) -> ModelSizes:
         InputError: The folder is not a world model.
     """
     where = str(folder / CONFIG)
-    needed = "a folder written by WorldModel.save_pretrained"
+    needed = "a folder written by `vjepa2-ac export` or WorldModel.save_pretrained"
+    fix = "Of a run, `vjepa2-ac export RUN FOLDER` makes one"
     try:
         card = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(where=where, found="no such file", needed=needed) from None
+        raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
     except (OSError, ValueError) as error:
-        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed) from None
+        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed, fix=fix) from None
     if not isinstance(card, dict) or card.get("format") != FORMAT:
-        raise InputError(where=where, found="not the config of a world model", needed=needed)
+        raise InputError(where=where, found="not the config of a world model", needed=needed, fix=fix)
     try:
         return ModelSizes.model_validate_json(json.dumps(card["sizes"]))
     except (KeyError, ValidationError) as error:
-        raise InputError(where=where, found=f"sizes that cannot be used ({error})", needed=needed) from None
+        raise InputError(where=where, found=f"sizes that cannot be used ({error})", needed=needed, fix=fix) from None
 
 
 def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -> None:
@@ -80,7 +81,12 @@ def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -
             check_tensors(found, needed, where=str(path))
             weights = {name: _cast(file.get_tensor(name), dtype) for name in needed}
     except FileNotFoundError:
-        raise InputError(where=str(path), found="no such file", needed="the weights of a world model") from None
+        raise InputError(
+            where=str(path),
+            found="no such file",
+            needed="the weights of a world model",
+            fix="Copy or write the folder again",
+        ) from None
     except (SafetensorError, OSError) as error:
         raise InputError(
             where=str(path), found=f"not a whole safetensors file ({error})", fix="Copy or write it again"
