@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.training import loop
+from vjepa2_ac.training.checkpoint import newest_checkpoint
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.run_lock import LOCK, RunLock
 
@@ -119,3 +121,18 @@ def test_a_check_needs_no_lock(make_config, reporter) -> None:
         lock.take()
         train(config, reporter, check_only=True)
     assert "Everything is in place" in reporter.notes[-1]
+
+
+def test_a_start_that_another_one_overtook_leaves_its_run_alone(make_config, reporter, monkeypatch) -> None:
+    config, assemble = make_config(), loop.assemble
+
+    def overtaken(*arguments, **keywords):
+        run = assemble(*arguments, **keywords)
+        monkeypatch.setattr(loop, "assemble", assemble)
+        train(config, type(reporter)())
+        return run
+
+    monkeypatch.setattr(loop, "assemble", overtaken)
+    with pytest.raises(InputError, match="step 6, which another start wrote while this one stood at 0"):
+        train(config, reporter)
+    assert newest_checkpoint(Path(config.run_dir) / "checkpoints").name == "step-00000006"

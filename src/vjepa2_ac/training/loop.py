@@ -34,6 +34,7 @@ from vjepa2_ac.training.mirror.start import Remote, open_remote
 from vjepa2_ac.training.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.training.processes import from_first, largest, require_same
 from vjepa2_ac.training.quiet import QuietJournal, QuietReporter
+from vjepa2_ac.training.resume import refuse_if_overtaken
 from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open_run_folder
 from vjepa2_ac.training.run_lock import RunLock
 from vjepa2_ac.training.step import gradients, training_step
@@ -139,6 +140,7 @@ def _train(
         return folder
     if writes:
         lock.take()
+        refuse_if_overtaken(folder, run.state)
         open_run_folder(config, run.state.run_id, allow_config_change=allow_config_change)
     if run.calibration is not None and writes:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())

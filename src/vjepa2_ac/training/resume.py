@@ -80,6 +80,21 @@ def micro_batches_of(config: Config, state: RunState, processes: int, note: Call
     return micro_batches
 
 
+def refuse_if_overtaken(folder: Path, state: RunState) -> None:
+    """See that nobody trained in a new run's folder between its first look at it and its lock.
+
+    Raises:
+        InputError: Somebody did.
+    """
+    newest = newest_checkpoint(folder / CHECKPOINTS)
+    if newest is not None and (found := read_state(newest)).step > state.step:
+        raise InputError(
+            where=str(newest),
+            found=f"a checkpoint of step {found.step}, which another start wrote while this one stood at {state.step}",
+            fix="Start again: the run goes on from there",
+        )
+
+
 def take_up_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
     """Let losses be scaled as they were when the checkpoint was written."""
     if state.loss_scale is not None and scaler.is_enabled():
