@@ -10,8 +10,9 @@ from torch import Tensor
 
 from paths import GOLDEN
 from planning.problems import PLANNERS, config, parabola, rosenbrock, solve, space, two_basins
-from vjepa2_ac.config.planning import CemConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
+from vjepa2_ac.config.planning import CemConfig, GradientConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
 from vjepa2_ac.planning.action_space import ActionSpace, Ball
+from vjepa2_ac.planning.gradient import GradientSearch
 from vjepa2_ac.planning.icem import coloured_noise
 from vjepa2_ac.planning.mppi import MppiSearch
 from vjepa2_ac.planning.plan import Start
@@ -213,6 +214,17 @@ def test_a_warm_start_begins_where_the_last_plan_led(planner: str) -> None:
     assert first(start) < first(None)
 
 
+@pytest.mark.parametrize(("done", "places"), [(0, [0, 1, 2]), (1, [0, 1, 2]), (2, [1, 2, 2]), (5, [2, 2, 2])])
+def test_what_was_done_of_a_plan_is_gone_and_its_end_is_repeated(done: int, places: list[int]) -> None:
+    settings = config("icem", iterations=2, samples=20, horizon=6, action_repeat=2)
+    plan = Planner(settings).plan(lambda actions: actions.square().sum(dim=(1, 2)), torch.Generator())
+    start = plan.start_after(done)
+    assert torch.equal(start.mean, plan.mean[places])
+    assert torch.equal(start.elites, plan.iterations[-1].elites[:, places])
+    with pytest.raises(ValueError, match="-1 steps"):
+        plan.start_after(-1)
+
+
 def test_icems_elites_take_part_again() -> None:
     before = solve("icem", rosenbrock, space(2), iterations=3)
     start = before.start_after(1)
@@ -239,6 +251,28 @@ def test_mppi_tries_its_mean_and_weighs_by_energy() -> None:
     weights = torch.exp(-energies / (0.5 * (2 / 3) ** 0.5))
     torch.testing.assert_close(search.mean, (weights[1:] / weights.sum())[None])
     torch.testing.assert_close(search.std, torch.full((1, 2), 0.5))
+
+
+def test_descents_survive_a_cost_that_once_says_nothing() -> None:
+    target, calls = torch.tensor([[0.3, -0.2]]), []
+
+    def cost(actions: Tensor) -> Tensor:
+        calls.append(len(actions))
+        nothing = torch.sqrt(-1 - actions.square().sum(dim=(1, 2)))  # its gradient is not a number, either
+        return nothing if len(calls) == 1 else parabola(target)(actions)
+
+    plan = solve("gradient", cost, space(), iterations=40)
+    assert [one.finite for one in plan.iterations[:2]] == [0, 16]
+    torch.testing.assert_close(plan.actions, target, atol=0.03, rtol=0)
+    assert plan.iterations[-1].elite_energy < 0.02  # every descent got there
+
+
+def test_a_descent_at_the_limits_turns_back_at_once() -> None:
+    search = GradientSearch(space(), GradientConfig(starts=1, learning_rate=0.1), 1000, torch.Generator(), None)
+    nothing, slope = torch.zeros(0, 1, 2), torch.ones(1, 1, 2)
+    for towards in [-1.0] * 40 + [1.0] * 20:
+        search.learn(Tried(nothing, torch.zeros(0), towards * slope))
+    assert (search.propose() < 0.9).all()
 
 
 def test_the_first_descent_begins_where_the_last_best_one_ended() -> None:

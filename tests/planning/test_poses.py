@@ -50,6 +50,16 @@ def test_angles_at_and_near_gimbal_lock_are_still_the_rotation(pitch: float) -> 
     torch.testing.assert_close(matrices_from_euler(euler_from_matrices(matrices)), matrices, atol=2e-6, rtol=0)
 
 
+def test_at_gimbal_lock_the_yaw_is_zero_and_gradients_are_finite() -> None:
+    up = torch.tensor([[0.0, 0.6, 0.8], [0.0, 0.8, -0.6], [-1.0, 0.0, 0.0]], requires_grad=True)
+    angles = euler_from_matrices(up)
+    assert not angles[2].detach()
+    torch.testing.assert_close(matrices_from_euler(angles), up)
+    angles.sum().backward()
+    assert up.grad is not None
+    assert torch.isfinite(up.grad).all()
+
+
 @pytest.mark.parametrize("pitch", [np.pi / 2, 0.3])
 def test_gradients_are_finite_everywhere(pitch: float) -> None:
     state = torch.tensor([0.4, 0.0, 0.3, np.pi, pitch, 0.2, 0.5], dtype=torch.float64)

@@ -90,16 +90,12 @@ class ActionSpace:
     def finished(self, decisions: Float[Tensor, "decisions dim"]) -> Float[Tensor, "decisions dim"]:
         """Return decisions as a robot gets them: allowed, small changes of the gripper rounded to none.
 
-        A gripper that is held somewhere (opened, closed) stays there.
-
         Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, round_small_elements.
         """
         done = self.allowed(decisions)
         if self.gripper is not None:
             one = done[:, self.gripper]
-            small = one.abs() < self.gripper_rounding
-            held = self.lower[:, self.gripper] == self.upper[:, self.gripper]
-            done[:, self.gripper] = torch.where(small & ~held, 0.0, one)
+            done[:, self.gripper] = torch.where(one.abs() < self.gripper_rounding, 0.0, one)
         return done
 
     def over_steps(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch steps dim"]:

@@ -136,7 +136,7 @@ class Planner:
         """Return actions, their energy, and how many more were tried: the answer, or else the best that was tried."""
         tried = 0
         for decisions in (answer, best.decisions):
-            if decisions is None or best.decisions is None:
+            if decisions is None:
                 continue
             done = self.space.finished(decisions)
             if decisions is best.decisions and torch.equal(done, decisions):
