@@ -55,7 +55,7 @@ def serve_hub(datasets: Mapping[str, Path], gated: Mapping[str, str] | None = No
             patch.setenv("HF_ENDPOINT", hub.url)  # read once, at import: so the constants, too
             patch.setattr(constants, "ENDPOINT", hub.url)
             patch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", hub.url + _URL_TEMPLATE)
-            patch.setattr(constants, "HF_TOKEN_PATH", "/nowhere")
+            patch.setattr(constants, "HF_TOKEN_PATH", f"{__file__}.no-token")
             patch.delenv("HF_TOKEN", raising=False)
             patch.setattr(hf_file_system, "http_backoff", partial(hf_file_system.http_backoff, max_retries=0))
             patch.setattr(filesystems, "_filesystems", {})

@@ -266,7 +266,7 @@ def cached(path: Path, tmp_path: Path, **knobs: Any) -> tuple[Dataset, Dataset]:
 
 def alone(through: Dataset, **knobs: Any) -> Dataset:
     """Return what a cache is without its data set, as a config that was changed in two places opens it."""
-    changes = {"source": "latents", "cache": "off", "disk_cache": {"dir": "/nowhere"}} | knobs
+    changes = {"source": "latents", "cache": "off", "disk_cache": {"dir": f"{through.config.cache_dir}-other"}} | knobs
     config = through.config.model_dump() | changes
     return open_dataset(DataConfig.model_validate(config))
 
