@@ -13,7 +13,8 @@ def add_encode(commands: _Commands[argparse.ArgumentParser]) -> None:
     """Add `encode` to a parser."""
     text = (
         "Run the frozen encoder once over every frame that the clips of a config need, and keep the latents. Whoever"
-        " stops it loses an episode at most: the same command goes on. Several processes (torchrun) share the work."
+        " stops it loses the few episodes under way at most: the same command goes on. Several processes"
+        " (torchrun) share the work."
     )
     parser = commands.add_parser("encode", help=text.split(".", maxsplit=1)[0] + ".", description=text)
     parser.set_defaults(handler=_encode)

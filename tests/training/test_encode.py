@@ -265,6 +265,13 @@ def test_a_folder_that_cannot_be_written_is_refused(make_config: MakeConfig, tmp
         encode(make_config(), tmp_path / "file" / "out")
 
 
+def test_a_folder_of_other_things_is_refused_and_left_as_it_is(make_config: MakeConfig, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").touch()
+    with pytest.raises(InputError, match=r"other things in it, such as config\.yaml"):
+        encode(make_config(), tmp_path)
+    assert [path.name for path in tmp_path.iterdir() if path.is_file()] == ["config.yaml"]
+
+
 def test_a_folder_of_another_cache_is_refused_and_what_differs_is_named(
     make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
 ) -> None:
@@ -353,6 +360,24 @@ def test_an_episode_that_was_mended_is_encoded_by_the_next_start(
     encode(config, out)
     assert sum(encoded_frames) == 32  # its 24
     assert not read_manifest(out).broken
+
+
+def test_what_a_damaged_file_is_said_to_need_makes_the_cache_sound_again(
+    make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
+) -> None:
+    out = tmp_path / "out"
+    encode(make_config(), out)
+    sound, damaged = contents(out), sorted(out.rglob("*.safetensors"))[0]
+    with damaged.open("r+b") as file:
+        file.truncate(100)
+    with pytest.raises(InputError, match=r"Delete the file and the cache's cache\.json, and run `vjepa2-ac encode`"):
+        open_dataset(make_config(data__source="latents", data__path=str(out)).data)
+    damaged.unlink()
+    (out / "cache.json").unlink()
+    encoded_frames.clear()
+    encode(make_config(), out)
+    assert contents(out) == sound
+    assert 0 < len(encoded_frames) < chunks(needed(make_config()), make_config())
 
 
 @pytest.mark.usefixtures("mend")

@@ -216,6 +216,13 @@ def test_what_cannot_be_measured_is_said_before_a_model_is_loaded(
         evaluate_subject(run, make(config))
 
 
+def test_what_to_compare_with_and_is_not_there_is_named_as_it_was_given(run: str, tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"--against \S*nowhere: no such file or folder\. needed: base, the folder of a run"
+    ):
+        evaluate_subject(run, asked(against=(str(tmp_path / "nowhere"),)))
+
+
 def test_a_model_without_data_and_a_file_in_the_way_are_errors(run: str, tmp_path: Path, base_folder: Path) -> None:
     with pytest.raises(InputError, match=r"no config\.yaml.*--data CONFIG"):
         evaluate_subject(str(base_folder), asked())

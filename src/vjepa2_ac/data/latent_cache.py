@@ -87,7 +87,7 @@ def _no_cache(folder: Path, key: CacheKey) -> InputError:
             differing = read_manifest(other).cache_key.differences(key.parts)
             others.append((len(differing), f"{other.name} was made otherwise: {'; '.join(differing)}"))
     unfinished = ": it is unfinished" if folder.is_dir() else ""
-    nearest = f". {len(others)} others are there; {min(others)[1]}" if others else ""
+    nearest = f". Other caches there: {len(others)}; {min(others)[1]}" if others else ""
     return InputError(
         where=f"data.cache: require: {folder}",
         found=f"no whole latent cache of this model and these settings{unfinished}{nearest}",

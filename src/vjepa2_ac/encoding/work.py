@@ -97,8 +97,23 @@ def take_folder(writer: CacheWriter) -> None:
             fix="Name another folder, or delete this one",
         )
     if there is None:
+        _require_empty(writer.folder)
         with storage.user_can_write(writer.folder):
             storage.write_atomically(path, json.dumps(dict(writer.key.parts), indent=1) + "\n")
+
+
+def _require_empty(folder: Path) -> None:
+    """Keep a cache out of a folder of other things, such as that of a run; `.` and what other processes begin pass."""
+    others = sorted(path.name for path in folder.iterdir() if path.name[0] != ".") if folder.is_dir() else []
+    ours = (_KEY, _BROKEN, "episodes")
+    strange = [name for name in others if not name.startswith(ours)]
+    if strange:
+        raise InputError(
+            where=str(folder),
+            found=f"a folder with other things in it, such as {strange[0]}",
+            needed="a new or empty one for a latent cache",
+            fix="Name another folder",
+        )
 
 
 def _begun(path: Path) -> CacheKey | None:

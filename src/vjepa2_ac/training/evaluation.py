@@ -228,6 +228,12 @@ def _like(world_model: WorldModel, other: str, config: Config, subject: str) -> 
     Raises:
         InputError: It has another encoder, or takes other states or actions.
     """
+    if not (other.startswith("builtin:") or Path(other).expanduser().exists()):
+        raise InputError(
+            where=f"--against {other}",
+            found="no such file or folder",
+            needed="base, the folder of a run, or a model: what model.base takes",
+        )
     loaded = load_run(Path(other)).world_model if is_run(other) else _load_model(other, config)
     same = loaded.image_size == world_model.image_size
     if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():

@@ -29,7 +29,9 @@ T = TypeVar("T")
 FORMAT = "vjepa2-ac latent cache 1"
 MANIFEST, EPISODES, KEPT = "cache.json", "episodes.npz", "kept.npz"
 
-_AGAIN = "Run `vjepa2-ac encode` again, with the config that it was made with, or copy the cache again"
+_AGAIN = (
+    "Delete cache.json and run `vjepa2-ac encode` again, with the config that it was made with; or copy the cache again"
+)
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ def read_manifest(folder: Path) -> Manifest:
         damaged = manifest.cache_key.digest != manifest.digest
     except (FileNotFoundError, NotADirectoryError):
         found = "an unfinished latent cache" if (folder / "episodes").is_dir() else "no latent cache"
+        found = found if folder.is_dir() else f"no such folder, seen from {Path.cwd()}"
         fix = "Run `vjepa2-ac encode`, which goes on where it was stopped"
         raise InputError(where=str(folder), found=found, needed=f"a folder with {MANIFEST}", fix=fix) from None
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -21,7 +21,7 @@ from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges, StoredLatents
 from vjepa2_ac.errors import InputError
 
-_ENCODE = "Run `vjepa2-ac encode` again"
+_ENCODE = "Delete the file and the cache's cache.json, and run `vjepa2-ac encode` again"
 
 
 @dataclass(frozen=True)
