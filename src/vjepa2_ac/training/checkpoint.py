@@ -144,13 +144,18 @@ def damage(checkpoint: Path) -> str | None:
 
 def read_state(checkpoint: Path) -> RunState:
     """Return where the run stood when the checkpoint was written; a best one that is gone or damaged is no best."""
-    values = json.loads((checkpoint / STATE).read_text())
-    if "clips_done" not in values:  # or the run would begin the row of clips again
-        raise ValueError(f"{STATE} is of an older version of this program, without clips_done")
-    state = RunState(**values)
+    state = written_state(checkpoint)
     if state.best_step in {None, state.step} or damage(checkpoint.parent / checkpoint_name(state.best_step)) is None:
         return state
     return replace(state, best_step=None, best_error=None)
+
+
+def written_state(checkpoint: Path) -> RunState:
+    """Return where the run stood, as it was written, whatever became of the best checkpoint since."""
+    values = json.loads((checkpoint / STATE).read_text())
+    if "clips_done" not in values:  # or the run would begin the row of clips again
+        raise ValueError(f"{STATE} is of an older version of this program, without clips_done")
+    return RunState(**values)
 
 
 def _listed(folder: Path) -> list[Path]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.training.checkpoint import checkpoint_name, damage, newest_checkpoint, read_state
+from vjepa2_ac.training.checkpoint import checkpoint_name, damage, newest_checkpoint, written_state
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 
 NEWEST, BEST = "newest", "best"
@@ -56,7 +56,7 @@ def choose_checkpoint(run: Path, by: str = NEWEST) -> Chosen:
 
 def _best_step(newest: Path) -> int:
     try:
-        step = read_state(newest).best_step
+        step = written_state(newest).best_step
     except (OSError, ValueError, TypeError) as error:
         raise InputError(where=str(newest), found=f"not the state of a run ({error})") from None
     if step is None:
