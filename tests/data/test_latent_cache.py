@@ -522,7 +522,7 @@ def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
 ) -> None:
     original, through, _ = a_cache
     encoding = replace(NUMBERS, **change)
-    with pytest.raises(InputError, match=f"no whole latent cache.*1 others.*{said}.*vjepa2-ac encode"):
+    with pytest.raises(InputError, match=f"no whole latent cache.*Other caches there: 1; .*{said}.*vjepa2-ac encode"):
         through_cache(original, encoding)
     with pytest.raises(InputError, match=said):
         require_encoding(alone(through), encoding)
