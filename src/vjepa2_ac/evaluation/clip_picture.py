@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from vjepa2_ac.evaluation.inches import Page
 from vjepa2_ac.storage import atomic_writer
 
 _WIDTH, _SIDE, _TITLE = 16.0, 0.3, 0.6  # inches, as all below
@@ -43,8 +44,8 @@ def plot_clips(title: str, clips: Sequence[ClipPicture], path: Path) -> Path:
     with mpl.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
         figure = Figure(figsize=(_WIDTH, height), facecolor="white")
         FigureCanvasAgg(figure)
-        page = _Page(figure, height)
-        page.text(0.2, title, size=12.0)
+        page = Page(figure, _WIDTH, height)
+        page.text(_SIDE, 0.2, title, size=12.0)
         for number, clip in enumerate(clips):
             _draw(page, clip, top=_TITLE + row * number)
         with atomic_writer(path) as file:
@@ -52,24 +53,8 @@ def plot_clips(title: str, clips: Sequence[ClipPicture], path: Path) -> Path:
     return path
 
 
-@dataclass(frozen=True, eq=False)
-class _Page:
-    """A figure that is measured in inches from the top left."""
-
-    figure: Any
-    height: float
-
-    def axes(self, left: float, top: float, width: float, height: float) -> Any:
-        return self.figure.add_axes(
-            (left / _WIDTH, 1 - (top + height) / self.height, width / _WIDTH, height / self.height)
-        )
-
-    def text(self, top: float, words: str, size: float) -> None:
-        self.figure.text(_SIDE / _WIDTH, 1 - top / self.height, words, fontsize=size, va="top")
-
-
-def _draw(page: _Page, clip: ClipPicture, top: float) -> None:
-    page.text(top, clip.name, size=9.0)
+def _draw(page: Page, clip: ClipPicture, top: float) -> None:
+    page.text(_SIDE, top, clip.name, size=9.0)
     film = page.axes(_SIDE, top + _NAME, _WIDTH - 2 * _SIDE, _FILM)
     film.imshow(_film(clip.frames))
     film.set_anchor("W")

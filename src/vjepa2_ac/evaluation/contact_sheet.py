@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.transforms import CropBox
+from vjepa2_ac.evaluation.inches import Page
 from vjepa2_ac.storage import atomic_writer
 
 _INK, _FAINT, _SPEED, _GRIPPER, _IDLE = "#222222", "#8a8a8a", "#1f6fb4", "#d1762a", "#c9c9c9"
@@ -75,10 +76,18 @@ def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
     head = _TITLE + _LINE * len(facts) + 0.3 + _PANELS + 0.75
     row = _PICTURE + _PLOT + _AXIS + _BETWEEN
     height = head + row * len(sheet.strips) + 0.15
-    with mpl.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False, "axes.linewidth": 0.6}):
+    with mpl.rc_context(
+        {
+            "text.color": _INK,
+            "font.size": 8,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.linewidth": 0.6,
+        }
+    ):
         figure = Figure(figsize=(_WIDTH, height), facecolor="white")
         FigureCanvasAgg(figure)
-        page = _Page(figure, height)
+        page = Page(figure, _WIDTH, height)
         page.text(_SIDE, 0.16, sheet.title, size=13, weight="bold")
         for number, line in enumerate(facts):
             page.text(_SIDE, _TITLE + 0.06 + _LINE * number, line, size=9)
@@ -92,24 +101,7 @@ def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
     return path
 
 
-@dataclass(frozen=True, eq=False)
-class _Page:
-    """A figure that is measured in inches from the top left."""
-
-    figure: Any
-    height: float
-
-    def axes(self, left: float, top: float, width: float, height: float) -> Any:
-        return self.figure.add_axes(
-            (left / _WIDTH, 1 - (top + height) / self.height, width / _WIDTH, height / self.height)
-        )
-
-    def text(self, left: float, top: float, words: str, **style: Any) -> None:
-        style = {"color": _INK, "va": "top", "ha": "left", **style}
-        self.figure.text(left / _WIDTH, 1 - top / self.height, words, **style)
-
-
-def _panels(page: _Page, sheet: ContactSheet, top: float) -> None:
+def _panels(page: Page, sheet: ContactSheet, top: float) -> None:
     """Draw the three small plots of the whole set: lengths, motion per model step, places."""
     lengths = page.axes(0.6, top, 3.6, _PANELS)
     lengths.hist(sheet.lengths_s, bins=min(40, max(5, len(sheet.lengths_s) // 2)), color=_FAINT)
@@ -122,7 +114,7 @@ def _panels(page: _Page, sheet: ContactSheet, top: float) -> None:
         _ranges(page.axes(11.1, top, 4.3, _PANELS), sheet.ranges)
 
 
-def _places(page: _Page, places_m: Float[np.ndarray, "points 3"], top: float) -> None:
+def _places(page: Page, places_m: Float[np.ndarray, "points 3"], top: float) -> None:
     places = page.axes(11.1, top, 4.3, _PANELS)
     shown = places.scatter(-places_m[:, 1], places_m[:, 0], c=places_m[:, 2], s=2, cmap="viridis", linewidths=0)
     places.set_aspect("equal", adjustable="datalim")
@@ -161,7 +153,7 @@ def _motion(axes: Any, sheet: ContactSheet) -> None:
     axes.legend(framealpha=0.85, edgecolor="none", fontsize=8, loc="lower right")
 
 
-def _legend(page: _Page, sheet: ContactSheet, top: float) -> None:
+def _legend(page: Page, sheet: ContactSheet, top: float) -> None:
     speed = "speed (cm/s)" if sheet.places_m is not None else "fastest number (% of its range per second)"
     entries = [(speed, _SPEED)]
     if sheet.places_m is not None:
@@ -180,7 +172,7 @@ def _fastest(strips: Sequence[Strip]) -> float:
     return max(float(np.percentile(speeds, 99.5)) * 1.15, 1.0)
 
 
-def _strip(page: _Page, strip: Strip, control_rate_hz: float, fastest: float, top: float) -> None:
+def _strip(page: Page, strip: Strip, control_rate_hz: float, fastest: float, top: float) -> None:
     left, across = _SIDE + _LABEL, _WIDTH - 2 * _SIDE - _LABEL
     words, colour = _OUTCOME[strip.success]
     steps = len(strip.speed)
