@@ -15,7 +15,15 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.lora import load_trained
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, read_state
+from vjepa2_ac.training.checkpoint import (
+    ADAPTER,
+    OPTIMIZER,
+    RunState,
+    checkpoint_name,
+    damage,
+    newest_checkpoint,
+    read_state,
+)
 from vjepa2_ac.training.optim import load_moments
 from vjepa2_ac.training.processes import from_first, require_same, take_from_first
 from vjepa2_ac.training.run_folder import CHECKPOINTS, run_id
@@ -86,11 +94,14 @@ def refuse_if_overtaken(folder: Path, state: RunState) -> None:
     Raises:
         InputError: Somebody did.
     """
-    newest = newest_checkpoint(folder / CHECKPOINTS)
-    if newest is not None and (found := read_state(newest)).step > state.step:
+    here = checkpoint_name(state.step)  # it and those before it were looked at when the run was taken up
+    further = [path for path in (folder / CHECKPOINTS).glob("step-*") if path.name > here and damage(path) is None]
+    if further:
+        newest = max(further)
         raise InputError(
             where=str(newest),
-            found=f"a checkpoint of step {found.step}, which another start wrote while this one stood at {state.step}",
+            found=f"a checkpoint of step {read_state(newest).step}, which another start wrote while this one stood at"
+            f" {state.step}",
             fix="Start again: the run goes on from there",
         )
 
