@@ -27,7 +27,7 @@ def states_of(
     joined = np.concatenate([column.astype(np.float64) for column in columns], axis=1)
     if fields.select is not None:
         joined = joined[:, fields.select]
-    _require_finite(joined, where)
+    require_finite(joined, where, fix=_FIX)
     gripper = (joined[:, -1:] - fields.gripper_open) / (fields.gripper_closed - fields.gripper_open)
     states = np.concatenate([joined[:, :3], _euler(joined[:, 3:-1], fields, where), gripper], axis=1)
     require_plausible(states, where, fix=_FIX)
@@ -63,14 +63,3 @@ def _euler(rotation: Float[np.ndarray, "steps _"], fields: LeRobotFields, where:
         )
     x_first = rotation if fields.rotation == "quaternion_xyzw" else np.roll(rotation, -1, axis=1)
     return np.asarray(Rotation.from_quat(x_first).as_euler("xyz")) if len(rotation) else np.zeros((0, 3))
-
-
-def _require_finite(joined: Float[np.ndarray, "steps _"], where: str) -> None:
-    if (wrong := ~np.isfinite(joined).all(axis=1)).any():
-        step = int(wrong.argmax())
-        raise InputError(
-            where=f"{where}: step {step}",
-            found=f"the numbers {np.array2string(joined[step], precision=4, max_line_width=200)}",
-            needed="finite numbers",
-            fix=_FIX,
-        )
