@@ -16,8 +16,8 @@ RANK = {
     "__init__": 0, "errors": 0, "remote": 0.5, "config": 1, "config_file": 1.5, "episode": 1, "geometry": 1,
     "storage": 1, "data": 2, "model": 2, "latents": 3, "encoding": 3.5, "planning": 4, "evaluation": 5,
     "training": 6, "simulation": 7,
-    "console": 8, "console_data": 8.2, "console_doctor": 8.2, "cli_data": 8.5, "cli_doctor": 8.5, "cli_encode": 8.5,
-    "console_evaluation": 8.2, "cli_evaluate": 8.7, "cli": 9,
+    "console": 8, "console_data": 8.2, "console_doctor": 8.2, "cli_parts": 8.4, "cli_data": 8.5, "cli_doctor": 8.5,
+    "cli_encode": 8.5, "console_evaluation": 8.2, "cli_evaluate": 8.7, "cli": 9,
 }  # fmt: skip
 
 HOMES = {

@@ -7,17 +7,16 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from vjepa2_ac import __version__
-from vjepa2_ac.cli_data import add_data, count
+from vjepa2_ac.cli_data import add_data
 from vjepa2_ac.cli_doctor import add_doctor
 from vjepa2_ac.cli_encode import add_encode
 from vjepa2_ac.cli_evaluate import add_checkpoint, add_evaluate
+from vjepa2_ac.cli_parts import Commands, Handler, command, count
 from vjepa2_ac.errors import InputError
-
-Handler = Callable[[argparse.Namespace], int | None]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -75,19 +74,8 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-_Commands = argparse._SubParsersAction
-
-
-def _command(
-    commands: _Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
-) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=text, description=text)
-    parser.set_defaults(handler=handler)
-    return parser
-
-
-def _add_train(commands: _Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
+def _add_train(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = command(
         commands,
         "train",
         _train,
@@ -137,8 +125,8 @@ def _train(options: argparse.Namespace) -> int:
     return 0
 
 
-def _add_export(commands: _Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
+def _add_export(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = command(
         commands, "export", _export, "Write a run's model, adapter merged in, or its adapter, for others to use."
     )
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a run")
@@ -164,10 +152,8 @@ def _export(options: argparse.Namespace) -> None:
         console.print("The card names base and data by their paths on this machine: read it before you upload it.")
 
 
-def _add_config(commands: _Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
-        commands, "config", _config, "Print the JSON schema of configs, or one config with every default."
-    )
+def _add_config(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = command(commands, "config", _config, "Print the JSON schema of configs, or one config with every default.")
     parser.add_argument("what", choices=["schema", "show"])
     parser.add_argument("config", metavar="CONFIG", nargs="?", help="for show: a YAML config")
     parser.add_argument("overrides", nargs="*", metavar="key=value")
@@ -186,8 +172,8 @@ def _config(options: argparse.Namespace) -> None:
         print(config_as_yaml(load_config(options.config, options.overrides)), end="")
 
 
-def _add_download(commands: _Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
+def _add_download(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = command(
         commands, "download", _download, "Fetch the official checkpoint (11.7 GB); goes on where it stopped."
     )
     parser.add_argument("path", metavar="PATH", type=Path, nargs="?", default=Path("checkpoints/vjepa2-ac-vitg.pt"))
@@ -203,8 +189,8 @@ def _download(options: argparse.Namespace) -> None:
     console.print(f"The checkpoint is in {options.path}")
 
 
-def _add_simulate(commands: _Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(commands, "simulate", _simulate, "Record demonstrations of a simulated arm as a DROID data set.")
+def _add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = command(commands, "simulate", _simulate, "Record demonstrations of a simulated arm as a DROID data set.")
     parser.add_argument("what", choices=["record"])
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="where the data set goes")
     parser.add_argument(

@@ -9,13 +9,11 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from vjepa2_ac.cli_parts import Commands, Handler, command, count
 from vjepa2_ac.errors import InputError
 
-_Commands = argparse._SubParsersAction
-Handler = Callable[[argparse.Namespace], int | None]
 
-
-def add_data(commands: _Commands[argparse.ArgumentParser]) -> None:
+def add_data(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add `data` with its commands to a parser."""
     text = "Look at a data set before training on it."
     parser = commands.add_parser("data", help=text, description=text)
@@ -26,14 +24,6 @@ def add_data(commands: _Commands[argparse.ArgumentParser]) -> None:
     _add_calibrate(inner)
 
 
-def count(text: str) -> int:
-    """Read a number of things: a whole number from 1."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 1")
-    return number
-
-
 def _frames(text: str) -> int:
     number = int(text)
     if not 2 <= number <= 256:
@@ -42,16 +32,15 @@ def _frames(text: str) -> int:
 
 
 def _command(
-    commands: _Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
+    commands: Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
 ) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=text, description=text)
-    parser.set_defaults(handler=handler)
+    parser = command(commands, name, handler, text)
     parser.add_argument("config", metavar="CONFIG", help="a YAML config")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as data.camera=wrist_left")
     return parser
 
 
-def _add_check(commands: _Commands[argparse.ArgumentParser]) -> None:
+def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = _command(
         commands, "check", _check,
         "Open the data, load some clips as training would, and look at every number. Exit status 0: all is well or"
@@ -81,7 +70,7 @@ def _check(options: argparse.Namespace) -> int:
     return 1 if wrong else 0
 
 
-def _add_index(commands: _Commands[argparse.ArgumentParser]) -> None:
+def _add_index(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = _command(
         commands, "index", _index, "Build the index of a data set, or show the one that is kept on this machine."
     )
@@ -103,7 +92,7 @@ def _index(options: argparse.Namespace) -> None:
         console.print(line, markup=False)
 
 
-def _add_inspect(commands: _Commands[argparse.ArgumentParser]) -> None:
+def _add_inspect(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = _command(
         commands, "inspect", _inspect, "Say what is in a data set, and picture it: text, inspect.json, a contact sheet."
     )
@@ -144,7 +133,7 @@ def _inspect(options: argparse.Namespace) -> None:
     console.print(f"  {picture}\n  {options.out / 'inspect.json'}", markup=False)
 
 
-def _add_calibrate(commands: _Commands[argparse.ArgumentParser]) -> None:
+def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = _command(
         commands, "calibrate", _calibrate,
         "Let a model say how many control steps its model step is: its error over persistence at each stride.",

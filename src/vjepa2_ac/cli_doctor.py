@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 
-_Commands = argparse._SubParsersAction
+from vjepa2_ac.cli_parts import Commands, command
 
 
-def add_doctor(commands: _Commands[argparse.ArgumentParser]) -> None:
+def add_doctor(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add `doctor` to a parser."""
     text = (
         "Estimate the GPU memory of a run, part by part, by arithmetic: nothing is loaded. Exit status 0: it fits,"
         " 1: it does not, 2: something cannot be used."
     )
-    parser = commands.add_parser("doctor", help=text, description=text)
-    parser.set_defaults(handler=_doctor)
+    parser = command(commands, "doctor", _doctor, text)
     parser.add_argument("config", metavar="CONFIG", help="a YAML config")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as training.batch_size=4")
 

@@ -6,10 +6,10 @@ import argparse
 import os
 from pathlib import Path
 
-_Commands = argparse._SubParsersAction
+from vjepa2_ac.cli_parts import Commands
 
 
-def add_encode(commands: _Commands[argparse.ArgumentParser]) -> None:
+def add_encode(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add `encode` to a parser."""
     text = (
         "Run the frozen encoder once over every frame that the clips of a config need, and keep the latents. Whoever"

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
 
-from vjepa2_ac.cli_data import count
-
-_Commands = argparse._SubParsersAction
-Handler = Callable[[argparse.Namespace], int | None]
+from vjepa2_ac.cli_parts import Commands, command, count
 
 
-def add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
+def add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add `evaluate` and `compare` to a parser."""
     _add_evaluate(commands)
     _add_compare(commands)
@@ -26,14 +22,6 @@ def add_checkpoint(parser: argparse.ArgumentParser) -> None:
         metavar="newest|best|STEP",
         help="which one: the newest (default), the best by validation, or that of a step",
     )
-
-
-def _command(
-    commands: _Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
-) -> argparse.ArgumentParser:
-    parser = commands.add_parser(name, help=text, description=text)
-    parser.set_defaults(handler=handler)
-    return parser
 
 
 def _count_or_none(text: str) -> int:
@@ -57,8 +45,8 @@ def _centimetres(text: str) -> float:
     return number
 
 
-def _add_evaluate(commands: _Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
+def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = command(
         commands,
         "evaluate",
         _evaluate,
@@ -150,8 +138,8 @@ def _evaluate(options: argparse.Namespace) -> None:
         console.print(spread(evaluations))
 
 
-def _add_compare(commands: _Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
+def _add_compare(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = command(
         commands,
         "compare",
         _compare,
