@@ -1,5 +1,6 @@
 """The words say what the figures say."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -85,6 +86,47 @@ def test_actions_are_called_used_only_where_wrong_ones_are_clearly_worse() -> No
         "It uses the actions: with another clip's its one-step error is 0.90 of doing nothing, with its own 0.50"
         in (verdict(listening))
     )
+
+
+def by(l1: float, others: float, *, noise: float = 0.02) -> Predicted:
+    """Return errors that stand otherwise to persistence by L1 than by L2 and cosine."""
+    one, two = errors(l1, noise).l1, errors(others, noise).l1
+    return Predicted(*[Errors(one, two, two)] * 2)
+
+
+def with_errors(found: Evaluation, name: str, predicted: Predicted) -> Evaluation:
+    return replace(found, models={**found.models, name: replace(found.models[name], true=predicted)})
+
+
+def test_the_words_say_where_l2_and_cosine_contradict_l1() -> None:
+    found = evaluation(model("base", 0.95), model("adapter", 0.8))
+    assert "another matter" not in verdict(found)
+    denied = verdict(with_errors(found, "adapter", by(0.8, 1.25)))
+    assert denied.startswith("The adapter predicts 1.5 s ahead 16% better than the base")
+    assert "By L2 and cosine it is another matter: 32% WORSE than the base (gain 95 % interval -3" in denied
+    assert " and 1.25 of doing nothing (95 % interval 1.2" in denied
+    assert "): NOT better. It does NOT" in denied
+
+
+def test_the_words_say_where_only_l2_or_only_l1_is_sure() -> None:
+    found = evaluation(model("base", 0.8), model("adapter", 0.6))
+    predicted = by(0.6, 0.79, noise=0.3)
+    unsure = verdict(with_errors(found, "adapter", predicted))
+    assert "By L2 and cosine it is another matter: no clear difference to the base (gain 95 % interval -" in unsure
+    assert "of doing nothing" not in unsure.split("another matter")[1].split(". It")[0], "both are better than that"
+    cosine_alone = replace(predicted.rollout, l2=predicted.rollout.l1)
+    alone = verdict(with_errors(found, "adapter", Predicted(cosine_alone, cosine_alone)))
+    assert "By cosine it is another matter" in alone
+    sure = verdict(
+        with_errors(evaluation(model("base", 0.8, noise=0.3), model("adapter", 0.79)), "adapter", by(0.79, 0.3))
+    )
+    assert sure.startswith("The adapter did not clearly help")
+    assert re.search(r"By L2 and cosine it is another matter: \d\d% better than the base \(gain", sure)
+
+
+def test_l2_is_compared_with_doing_nothing_where_there_is_no_base() -> None:
+    found = with_errors(evaluation(model("model", 0.8)), "model", by(0.8, 1.2))
+    assert "By L2 and cosine it is another matter: 1.20 of doing nothing" in verdict(found)
 
 
 def test_what_a_reader_must_know_is_said() -> None:

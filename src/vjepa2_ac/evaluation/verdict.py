@@ -8,17 +8,19 @@ import numpy as np
 
 from vjepa2_ac.evaluation.bootstrap import Estimate
 from vjepa2_ac.evaluation.estimates import gain_over, gap_of_actions, one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.result import Evaluation, Ranking
+from vjepa2_ac.evaluation.result import METRICS, Evaluation, Metric, Ranking
+
+_SIDES = {-1: "better", 0: "no clear difference", 1: "NOT better"}  # of an error over persistence
+_WORDS: dict[Metric, str] = {"l1": "L1", "l2": "L2", "cosine": "cosine"}
 
 
 def verdict(evaluation: Evaluation) -> str:
-    """Say whether what was trained helped, at the farthest horizon of the rollout, by its L1 error."""
+    """Say whether what was trained helped, at the farthest horizon by L1, and what L2 and cosine deny."""
     error = over_persistence(evaluation, evaluation.trained, "rollout")[-1]
     ahead = f"{evaluation.seconds_ahead:.1f} s ahead"
-    absolute = f"Its error {ahead} is {error.value:.2f} of doing nothing ({interval(error, '.2f')}): "
-    absolute += {-1: "better.", 0: "no clear difference.", 1: "NOT better."}[error.side(of=1.0)]
-    parts = [f"{_compared(evaluation, ahead)}.", absolute, _actions(evaluation), *evaluation.notes]
-    return " ".join(part for part in parts if part)
+    absolute = f"Its error {ahead} is {_over_nothing(error)}."
+    parts = [f"{_compared(evaluation, ahead)}.", absolute, *_denied(evaluation), _actions(evaluation)]
+    return " ".join(part for part in (*parts, *evaluation.notes) if part)
 
 
 def improvement(evaluation: Evaluation, horizon: int) -> Estimate | None:
@@ -62,6 +64,35 @@ def _compared(evaluation: Evaluation, ahead: str) -> str:
     if gain.side(of=0.0) == 0:
         return f"The {evaluation.trained} did not clearly help: it predicts {ahead} {compared}"
     return f"The {evaluation.trained} predicts {ahead} {compared}"
+
+
+def _denied(evaluation: Evaluation) -> tuple[str, ...]:
+    """Return a sentence for what L2 or cosine say otherwise than L1: better, worse, or not sure."""
+    found: dict[str, list[str]] = {}
+    for metric in METRICS[1:]:
+        if words := _otherwise(evaluation, metric):
+            found.setdefault(" and ".join(words), []).append(_WORDS[metric])
+    return tuple(f"By {' and '.join(metrics)} it is another matter: {words}." for words, metrics in found.items())
+
+
+def _otherwise(evaluation: Evaluation, metric: Metric) -> list[str]:
+    words = []
+    if evaluation.base is not None:
+        by_l1, by_other = (
+            gain_over(evaluation, evaluation.trained, evaluation.base, metric=each)[-1] for each in ("l1", metric)
+        )
+        if by_other.side(of=0.0) != by_l1.side(of=0.0):
+            share = f"{abs(by_other.value):.0%}"
+            how = {-1: f"{share} WORSE than", 0: "no clear difference to", 1: f"{share} better than"}
+            words.append(f"{how[by_other.side(of=0.0)]} the base (gain {interval(by_other, '.0%')})")
+    by_l1, by_other = (over_persistence(evaluation, evaluation.trained, "rollout", each)[-1] for each in ("l1", metric))
+    if by_other.side(of=1.0) != by_l1.side(of=1.0):
+        words.append(_over_nothing(by_other))
+    return words
+
+
+def _over_nothing(error: Estimate) -> str:
+    return f"{error.value:.2f} of doing nothing ({interval(error, '.2f')}): {_SIDES[error.side(of=1.0)]}"
 
 
 def _actions(evaluation: Evaluation) -> str:
