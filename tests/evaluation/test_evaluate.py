@@ -236,9 +236,30 @@ def test_progress_names_each_part_of_the_work() -> None:
     assert told == {"measuring": (12, 12), "other actions, model": (6, 6), "energy landscapes, model": (3, 3)}
 
 
+@pytest.mark.parametrize(
+    ("nothing", "note"),
+    [
+        (
+            {"sensitivity_clips": 0},
+            "--sensitivity-clips is 0: no other actions and no energy landscapes were asked for.",
+        ),
+        ({"landscape_clips": 0}, "--landscapes is 0: no energy landscapes were asked for."),
+        ({"examples": 0}, "--examples is 0: no example clips were asked for."),
+        ({}, None),
+    ],
+)
+def test_what_was_not_asked_for_is_noted(nothing: dict[str, int], note: str | None) -> None:
+    probes = replace(PROBES, sensitivity_clips=2, samples=3, landscape_clips=1, nodes=3, examples=1)
+    contender = Contender("model", "trained", Oracle())
+    found = evaluate([contender], again(clips_batch()), about(), probes=replace(probes, **nothing))
+    assert found.notes == (() if note is None else (note,))
+    assert note is None or note in verdict(found)
+
+
 def test_nothing_but_errors_is_measured_where_nothing_else_is_asked_for() -> None:
     probes = Probes(sensitivity_clips=0, landscape_clips=0, examples=0)
     found = evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=probes)
+    assert len(found.notes) == 2
     assert found.models["model"].sensitivity is None
     assert found.models["model"].landscapes is None
     assert found.examples == ()

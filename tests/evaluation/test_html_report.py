@@ -255,6 +255,9 @@ def test_what_was_not_measured_is_named_with_the_reason() -> None:
         assert f"{what}: not measured." in page.shown
     assert "data calibrate" in page.shown
     assert "against" not in page.tables
+    asked = replace(bare, notes=("--sensitivity-clips is 0: no other actions and no energy landscapes.",))
+    assert page_of(asked).count("--sensitivity-clips is 0") == 2, "where ranks and landscapes would be"
+    assert page_of(replace(bare, notes=("No example clips.",))).count("No example clips.") == 1
 
 
 def test_of_a_long_clip_the_first_the_last_and_frames_between_are_shown() -> None:

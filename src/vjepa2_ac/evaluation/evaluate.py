@@ -35,6 +35,7 @@ from vjepa2_ac.evaluation.strata import clips_of, strata_of
 
 ClipName = tuple[str, int]  # id of the episode, first control step
 Pictures = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the batch at hand
+_NOT_ASKED = "{} is 0: no {} were asked for."
 _NO_LANDSCAPES = "No energy landscapes: an action has {} numbers, and a landscape is over three."
 
 
@@ -120,10 +121,22 @@ def evaluate(
         examples=(),
     )
     examples = _examples(contenders, clips, evaluation, probes)
-    notes: tuple[str, ...] = ()
-    if probes.landscape_clips and seen.actions.shape[-1] < 3:
-        notes = (_NO_LANDSCAPES.format(seen.actions.shape[-1]),)
+    notes = _left_out(probes, action_dim=seen.actions.shape[-1])
     return replace(evaluation, episodes=_episodes(evaluation), examples=examples, notes=notes)
+
+
+def _left_out(probes: Probes, *, action_dim: int) -> tuple[str, ...]:
+    """Return what a reader must know of what was not measured: by an option, or as there is no such thing."""
+    notes = []
+    if not probes.sensitivity_clips:
+        notes.append(_NOT_ASKED.format("--sensitivity-clips", "other actions and no energy landscapes"))
+    elif not probes.landscape_clips:
+        notes.append(_NOT_ASKED.format("--landscapes", "energy landscapes"))
+    elif action_dim < 3:
+        notes.append(_NO_LANDSCAPES.format(action_dim))
+    if not probes.examples:
+        notes.append(_NOT_ASKED.format("--examples", "example clips"))
+    return tuple(notes)
 
 
 @dataclass

@@ -21,6 +21,7 @@ from vjepa2_ac.evaluation.html_report.layout import (
     side_by_side,
     table,
     value,
+    why_not,
 )
 from vjepa2_ac.evaluation.html_report.markup import Markup, element, joined, text
 from vjepa2_ac.evaluation.html_report.numbers import NOT_MEASURED, decimal, percent
@@ -52,9 +53,7 @@ def landscape_section(evaluation: Evaluation) -> Section:
     title = "Energy landscapes"
     measured = {name: model.landscapes for name, model in evaluation.models.items() if model.landscapes is not None}
     if not measured:
-        why = "This evaluation made none" + (
-            "." if evaluation.about.is_pose else ": actions of this robot have no directions in space."
-        )
+        why = why_not(evaluation, "energy landscapes", "This evaluation made none.")
         return Section("landscapes", title, not_measured("Energy landscapes", why))
     shown = measured.get(evaluation.trained) or next(iter(measured.values()))
     drawn = {name: one for name, one in measured.items() if one is shown or name == evaluation.base}
@@ -89,7 +88,9 @@ def _costs(evaluation: Evaluation) -> Markup:
 def _sensitivity(evaluation: Evaluation) -> Markup:
     measured = {name: model.sensitivity for name, model in evaluation.models.items() if model.sensitivity is not None}
     if not measured:
-        return not_measured("Action sensitivity and ranks", "This evaluation left them out.")
+        return not_measured(
+            "Action sensitivity and ranks", why_not(evaluation, "other actions", "This evaluation left them out.")
+        )
     tops = sorted({k for one in measured.values() for ranking in one.rankings for k in ranking.top})
     rows = [
         [

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.evaluation.html_report.layout import Section, not_measured, paragraph, scrolling
+from vjepa2_ac.evaluation.html_report.layout import Section, not_measured, paragraph, scrolling, why_not
 from vjepa2_ac.evaluation.html_report.markup import Markup, element, joined
 from vjepa2_ac.evaluation.html_report.numbers import decimal, seconds
 from vjepa2_ac.evaluation.html_report.pictures import colours_of, css_gradient, jpeg_urls, png_url
@@ -62,7 +62,8 @@ def examples_section(evaluation: Evaluation) -> Section:
     title = "Pictures"
     examples = evaluation.examples[:MOST_EXAMPLES]
     if not examples:
-        return Section("pictures", title, not_measured("Example clips", "This evaluation made no pictures."))
+        why = why_not(evaluation, "example clips", "This evaluation made no pictures.")
+        return Section("pictures", title, not_measured("Example clips", why))
     photographs = jpeg_urls([list(_frames(example).values()) for example in examples], at_most=_BYTES)
     models = tuple(one.model for one in models_of(evaluation))
     parts = []

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from vjepa2_ac.evaluation.bootstrap import Estimate
 from vjepa2_ac.evaluation.html_report.markup import Markup, element, joined, text
 from vjepa2_ac.evaluation.html_report.numbers import decimal, percent, signed
+from vjepa2_ac.evaluation.result import Evaluation
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,11 @@ class Section:
 def paragraph(*words: str, class_: str | None = None) -> Markup:
     """Return a paragraph."""
     return element("p", *words, class_=class_)
+
+
+def why_not(evaluation: Evaluation, what: str, otherwise: str) -> str:
+    """Return the note of an evaluation that says why something was not measured."""
+    return next((note for note in evaluation.notes if what in note), otherwise)
 
 
 def not_measured(what: str, why: str) -> Markup:
