@@ -15,7 +15,7 @@ from vjepa2_ac.cli_data import add_data
 from vjepa2_ac.cli_doctor import add_doctor
 from vjepa2_ac.cli_encode import add_encode
 from vjepa2_ac.cli_evaluate import add_checkpoint, add_evaluate
-from vjepa2_ac.cli_parts import Commands, Handler, command, count
+from vjepa2_ac.cli_parts import Commands, Handler, command, count, whole_number
 from vjepa2_ac.errors import InputError
 
 
@@ -198,8 +198,10 @@ def _add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument("--episodes", type=count, default=40)
     parser.add_argument("--steps", type=count, default=41, help="control steps of an episode, 15 per second")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--cameras", type=int, choices=[1, 3], default=1, help="1: all three pictures are the same one")
+    parser.add_argument("--seed", type=whole_number(0, 2**31 - 1), default=0)
+    parser.add_argument(
+        "--cameras", type=whole_number(1, 3), choices=[1, 3], default=1, help="1: all three pictures are the same one"
+    )
     parser.add_argument(
         "--renderer", choices=["rays", "opengl"], default="rays", help="opengl needs a working MUJOCO_GL"
     )

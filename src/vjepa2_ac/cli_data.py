@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from vjepa2_ac.cli_parts import Commands, Handler, command, count
+from vjepa2_ac.cli_parts import Commands, Handler, command, count, whole_number
 from vjepa2_ac.errors import InputError
 
 
@@ -22,13 +22,6 @@ def add_data(commands: Commands[argparse.ArgumentParser]) -> None:
     _add_index(inner)
     _add_inspect(inner)
     _add_calibrate(inner)
-
-
-def _frames(text: str) -> int:
-    number = int(text)
-    if not 2 <= number <= 256:
-        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 2 to 256")
-    return number
 
 
 def _command(
@@ -141,7 +134,7 @@ def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--model", metavar="MODEL", help="another than model.base: a .pt, a folder, or a run")
     parser.add_argument("--split", choices=["train", "validation", "test"], default="validation", help="(validation)")
     parser.add_argument("--limit", metavar="N", type=count, default=64, help="clips at each stride (64)")
-    parser.add_argument("--frames", metavar="N", type=_frames, help="of a clip (the config's, 8 at most)")
+    parser.add_argument("--frames", metavar="N", type=whole_number(2, 256), help="of a clip (the config's, 8 at most)")
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path("inspection"), help="where to (inspection)")
 
 

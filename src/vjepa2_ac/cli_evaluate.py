@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vjepa2_ac.cli_parts import Commands, command, count
+from vjepa2_ac.cli_parts import Commands, command, count, number_between, whole_number
 
 
 def add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -22,27 +22,6 @@ def add_checkpoint(parser: argparse.ArgumentParser) -> None:
         metavar="newest|best|STEP",
         help="which one: the newest (default), the best by validation, or that of a step",
     )
-
-
-def _count_or_none(text: str) -> int:
-    number = int(text)
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 0")
-    return number
-
-
-def _nodes(text: str) -> int:
-    number = int(text)
-    if not 3 <= number <= 51:
-        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 3 to 51")
-    return number
-
-
-def _centimetres(text: str) -> float:
-    number = float(text)
-    if not 0 < number < 1000:
-        raise argparse.ArgumentTypeError(f"{text} is not a length in cm")
-    return number
 
 
 def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -74,21 +53,27 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--calibrate", action="store_true", help="measure the one-step error at other strides, too")
     probes = parser.add_argument_group("use of the actions")
     probes.add_argument(
-        "--sensitivity-clips", metavar="N", type=_count_or_none, default=32, help="clips to try other actions on (32)"
+        "--sensitivity-clips", metavar="N", type=whole_number(0), default=32, help="clips to try other actions on (32)"
     )
     probes.add_argument("--samples", metavar="N", type=count, default=64, help="other actions for each of them (64)")
     probes.add_argument(
         "--landscapes",
         metavar="N",
-        type=_count_or_none,
+        type=whole_number(0),
         default=8,
         help="clips of those with an energy landscape (8)",
     )
-    probes.add_argument("--nodes", metavar="N", type=_nodes, default=9, help="of a landscape along each axis (9)")
     probes.add_argument(
-        "--reach", metavar="CM", type=_centimetres, default=7.5, help="half the width of landscape and box, in cm (7.5)"
+        "--nodes", metavar="N", type=whole_number(3, 51), default=9, help="of a landscape along each axis (9)"
     )
-    probes.add_argument("--examples", metavar="N", type=_count_or_none, default=4, help="clips to show (4)")
+    probes.add_argument(
+        "--reach",
+        metavar="CM",
+        type=number_between(0.0, 1000.0, "cm"),
+        default=7.5,
+        help="half the width of landscape and box, in cm (7.5)",
+    )
+    probes.add_argument("--examples", metavar="N", type=whole_number(0), default=4, help="clips to show (4)")
     probes.add_argument(
         "--at-once", metavar="N", type=count, default=64, help="actions computed together (64): lower it to save memory"
     )

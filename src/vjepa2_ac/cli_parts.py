@@ -1,8 +1,9 @@
-"""What do the commands of the command line have in common? How one is added, and how a number of things is read."""
+"""What do the commands of the command line have in common? How one is added, and how numbers are read."""
 
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Callable
 
 Commands = argparse._SubParsersAction
@@ -18,9 +19,35 @@ def command(
     return parser
 
 
-def count(text: str) -> int:
-    """Read a number of things: a whole number from 1."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"{number} is not a whole number from 1")
-    return number
+def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Return what reads an option that is a whole number from `least` to `most`."""
+    meant = f"a whole number from {least}" + ("" if most is None else f" to {most}")
+
+    def read(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {meant}") from None
+        if number < least or (most is not None and number > most):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {meant}")
+        return number
+
+    return read
+
+
+def number_between(least: float, most: float, unit: str) -> Callable[[str], float]:
+    """Return what reads an option that is a number of some unit; the bounds themselves are not among them."""
+
+    def read(text: str) -> float:
+        try:
+            number = float(text)
+        except ValueError:
+            number = math.nan
+        if not least < number < most:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number of {unit} above {least:g} and below {most:g}")
+        return number
+
+    return read
+
+
+count = whole_number(1)  # a number of things
