@@ -11,6 +11,7 @@ from torch import Tensor
 from paths import GOLDEN
 from planning.problems import PLANNERS, config, parabola, rosenbrock, solve, space, two_basins
 from vjepa2_ac.config.planning import CemConfig, GradientConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
+from vjepa2_ac.evaluation.planning_score import SCORED
 from vjepa2_ac.planning.action_space import ActionSpace, Ball
 from vjepa2_ac.planning.gradient import GradientSearch
 from vjepa2_ac.planning.icem import coloured_noise
@@ -98,6 +99,21 @@ def test_cem_gives_upstreams_plan_for_upstreams_seed(case: dict) -> None:  # typ
     if closing is not None:  # there a mean on its way to 1
         expected[closing:, 6] = 1.0
     torch.testing.assert_close(plan.actions, expected, atol=1e-6, rtol=1e-5)
+
+
+def jepa_wms_cost(actions: Tensor) -> Tensor:
+    """Return the energies of the world in which JEPA-WMs' planner was run (golden/DATA_ORIGIN.md)."""
+    goal = torch.tensor([0.12, -0.05, 0.3, 0.02, 0.0, -0.04, 0.6])
+    far = (actions.sum(dim=1) - goal).square().sum(dim=-1)
+    return far + 0.1 * (actions[:, 0, 0] * actions[:, 1, 1]).abs() + 0.05 * actions[:, :, 3].square().sum(dim=1)
+
+
+@pytest.mark.parametrize("case", json.loads((GOLDEN / "cem_jepa_wms.json").read_text()), ids=lambda c: str(c["seed"]))
+def test_cem_with_the_action_scores_settings_gives_jepa_wms_plan(case: dict) -> None:  # type: ignore[type-arg]
+    settings = SCORED.model_copy(update={"samples": 304})  # then their one draw and our three give the same numbers
+    plan = Planner(settings).plan(jepa_wms_cost, torch.Generator().manual_seed(case["seed"]))
+    torch.testing.assert_close([one.lowest for one in plan.iterations], case["losses"], rtol=1e-3, atol=1e-7)
+    torch.testing.assert_close(plan.actions, torch.tensor(case["actions"]), atol=1e-5, rtol=1e-3)
 
 
 @pytest.mark.parametrize("planner", PLANNERS)

@@ -65,6 +65,8 @@ class CemConfig(Section):
     """The same, of the gripper."""
     momentum_std_gripper: Share = 0.15
     """The same, of the gripper."""
+    try_mean: bool = False
+    """Whether the mean itself takes the place of an iteration's first sample (facebookresearch/jepa-wms)."""
     answer: Literal["mean", "best"] = "mean"
     """The mean of the last distribution (upstream), or the best sample of all."""
 

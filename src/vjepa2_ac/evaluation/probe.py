@@ -34,8 +34,7 @@ class Start:
 
     def generator(self, seed: int) -> np.random.Generator:
         """Return randomness that depends on the seed and on this clip alone, not on those before it."""
-        digest = hashlib.blake2b(f"{self.episode_id} {self.first_step}".encode(), digest_size=8).digest()
-        return np.random.default_rng([seed, int.from_bytes(digest, "big")])
+        return clip_generator(seed, self.episode_id, self.first_step)
 
 
 @dataclass(frozen=True)
@@ -44,6 +43,12 @@ class Tried:
 
     energy: Float[np.ndarray, " samples"]  # L1 distance of the prediction to the true next frame
     change: Float[np.ndarray, " samples"]  # L1 distance of the prediction to that with the true action
+
+
+def clip_generator(seed: int, episode_id: str, first_step: int) -> np.random.Generator:
+    """Return randomness that depends on the seed and on the name of a clip alone, not on the clips before it."""
+    digest = hashlib.blake2b(f"{episode_id} {first_step}".encode(), digest_size=8).digest()
+    return np.random.default_rng([seed, int.from_bytes(digest, "big")])
 
 
 def start_of(batch: LatentBatch, row: int, step: int, clip: int) -> Start:

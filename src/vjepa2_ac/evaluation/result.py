@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.evaluation.bootstrap import Estimate
 
 Metric = Literal["l1", "l2", "cosine"]
@@ -157,6 +158,35 @@ class Landscapes:
 
 
 @dataclass(frozen=True)
+class Plans:
+    """What one way of planning does from each start; several draws of it, where it is random."""
+
+    one_step: Float[np.ndarray, "draws starts 7"]  # towards the next frame; an action as in `vjepa2_ac.episode`
+    three_steps: Float[np.ndarray, "draws starts 3 7"]  # towards the frame three steps on
+    empty: int = 0  # plans that found no finite energy, so that nothing is done
+    seconds: float = 0.0  # for all of them
+
+
+@dataclass(frozen=True)
+class PlanningStudy:
+    """From where models planned, what was demonstrated there, and plans that take no model. Of poses only."""
+
+    clips: tuple[int, ...]  # places in Clips
+    places: tuple[int, ...]  # frame of each clip at which planning begins
+    episode_ids: tuple[str, ...]
+    demonstrated: Float[np.ndarray, "starts 3 7"]
+    zero: Plans
+    random: Plans  # every number uniform within its limits
+    within_limits: Plans  # what was demonstrated, cut to the limits: no plan can come closer
+    one_step_beyond: float  # share of the demonstrated steps that go beyond the limits along x, y or z
+    three_steps_beyond: float
+    settings: PlanningConfig  # of the one-step plans
+
+    def __len__(self) -> int:
+        return len(self.clips)
+
+
+@dataclass(frozen=True)
 class ModelResult:
     """What was measured of one model."""
 
@@ -167,6 +197,7 @@ class ModelResult:
     shuffled: Predicted  # with those of another clip
     sensitivity: Sensitivity | None = None
     landscapes: Landscapes | None = None
+    plans: Plans | None = None
 
     def with_actions(self, actions: Actions) -> Predicted:
         """Return what was predicted with the true, zero or shuffled actions."""
@@ -228,6 +259,7 @@ class Evaluation:
     training: tuple[TrainingCurve, ...] = ()
     calibration: Mapping[str, Any] | None = None  # what `Calibration.as_dict` gives
     notes: tuple[str, ...] = ()  # what a reader must know: why there is no base, no landscape ...
+    planning: PlanningStudy | None = None
 
     @property
     def trained(self) -> str:

@@ -30,13 +30,15 @@ class CemSearch:
         self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
         self.std = space.first_std
         self._space, self._samples, self._generator = space, samples, generator
-        self._answers_mean = config.answer == "mean"
+        self._answers_mean, self._tries_mean = config.answer == "mean", config.try_mean
         self._keep_mean = _momentum(space, config.momentum_mean, config.momentum_mean_gripper)
         self._keep_std = _momentum(space, config.momentum_std, config.momentum_std_gripper)
 
     def propose(self) -> Float[Tensor, "samples decisions dim"]:
         """Return samples of the distribution, cut back to what is allowed."""
         noise = white_noise(self._space, self._samples, self._generator)
+        if self._tries_mean:
+            noise[0] = 0.0
         return self._space.allowed(self.mean + self.std * noise)
 
     def learn(self, tried: Tried) -> None:
