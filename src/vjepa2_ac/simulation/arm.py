@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac.geometry import euler_from_matrices
 from vjepa2_ac.simulation.camera import FRAME_HEIGHT, FRAME_WIDTH, RayCamera
 from vjepa2_ac.simulation.domains import Domain
-from vjepa2_ac.simulation.kinematics import forward_kinematics, inverse_kinematics
+from vjepa2_ac.simulation.kinematics import UnreachableError, forward_kinematics, inverse_kinematics
 from vjepa2_ac.simulation.motion import GRIPPER_LAG_S, rest_joints, tracking_share
 from vjepa2_ac.simulation.opengl import OpenGlCamera
 from vjepa2_ac.simulation.scene import FINGER_TRAVEL_M, compile_scene, load_mujoco
@@ -74,6 +74,14 @@ class SimulatedArm:
         """
         rest = rest_joints(self.domain)
         self.set_joints(inverse_kinematics(state[:6], self.joints, rest=rest), float(state[6]))
+
+    def can_reach(self, state: Float[np.ndarray, " 7"]) -> bool:
+        """Return whether a command for the flange to go there from here would be followed."""
+        try:
+            inverse_kinematics(state[:6], self.joints, rest=rest_joints(self.domain))
+        except UnreachableError:
+            return False
+        return True
 
     def command(self, target: Float[np.ndarray, " 7"], control_steps: int = 1) -> Float[np.ndarray, " 7"]:
         """Send the flange towards a state for some control steps and return the state that is measured then.

@@ -64,7 +64,7 @@ def random_reaching(domain: Domain, steps: int, rng: np.random.Generator, recipe
     positions, turns, closed = _waypoints(ways, rng, recipe)
     path = PchipInterpolator(times, np.concatenate([positions, turns[:, None]], axis=1))(np.arange(steps + 1))
     gripper = closed[np.arange(steps + 1) // recipe.stride]
-    commanded = _joints_along(poses_in_base(_downward(path), domain), domain)
+    commanded = _joints_along(poses_in_base(downward_poses(path), domain), domain)
     return Motion(
         commanded_joints=commanded[1:],
         commanded_gripper=gripper[1:],
@@ -78,6 +78,12 @@ def rest_joints(domain: Domain) -> Float[np.ndarray, " 7"]:
     joints = HOME.copy()
     joints[0] -= np.deg2rad(domain.base_yaw_deg)
     return joints
+
+
+def downward_poses(path: Float[np.ndarray, "steps 4"]) -> Float[np.ndarray, "steps 6"]:
+    """Return poses with the gripper pointing down; a turn of 0 holds the fingers across the robot's front."""
+    down = np.tile([np.pi, 0.0], (len(path), 1))
+    return np.concatenate([path[:, :3], down, path[:, 3:] - np.pi / 4], axis=1)
 
 
 def poses_in_base(poses: Float[np.ndarray, "steps 6"], domain: Domain) -> Float[np.ndarray, "steps 6"]:
@@ -118,12 +124,6 @@ def _waypoints(
         closed.append(1.0 - closed[-1] if rng.uniform() < recipe.gripper_share else closed[-1])
     path = np.array(points)
     return path[:, :3], path[:, 3], np.array(closed)
-
-
-def _downward(path: Float[np.ndarray, "steps 4"]) -> Float[np.ndarray, "steps 6"]:
-    """Return poses with the gripper pointing down; a turn of 0 holds the fingers across the robot's front."""
-    down = np.tile([np.pi, 0.0], (len(path), 1))
-    return np.concatenate([path[:, :3], down, path[:, 3:] - np.pi / 4], axis=1)
 
 
 def _joints_along(poses: Float[np.ndarray, "steps 6"], domain: Domain) -> Float[np.ndarray, "steps 7"]:

@@ -1,0 +1,256 @@
+"""How well does a policy do what it is asked, when it sees what its actions lead to? Episodes and their figures.
+
+Every model step the policy sees a picture and the measured state and names an action; the state it leads to is sent as
+the command for `stride` control steps. What counts is where things are at the *end*: "once on the way" flatters.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from vjepa2_ac.episode import ACTION_DIM, Progress
+from vjepa2_ac.evaluation.bootstrap import Estimate, mean_of
+from vjepa2_ac.evaluation.proportion import share_of
+from vjepa2_ac.geometry import apply_action
+from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.domains import Domain, named_domain
+from vjepa2_ac.simulation.kinematics import UnreachableError
+from vjepa2_ac.simulation.motion import rest_joints
+from vjepa2_ac.simulation.policies import Policy
+from vjepa2_ac.simulation.tasks import SUCCESS_M, Problem, TaskName, make_problem
+
+_PARTS = 8  # of a way that cannot be gone to its end
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """What happened. Index 0 of `states`, `distances_m` and `pictures` is before the first action."""
+
+    problem: Problem
+    states: Float[np.ndarray, "time 7"]  # measured, in the robot base frame
+    actions: Float[np.ndarray, "steps 7"]  # as the policy named them
+    distances_m: Float[np.ndarray, " time"]  # of what the task moves, to its goal
+    seconds: Float[np.ndarray, " steps"]  # that the policy took
+    whys: tuple[str, ...]  # of each action
+    unreachable: int  # commands that the arm could not follow to their end
+    goal_picture: UInt8[np.ndarray, "height width 3"]
+    pictures: UInt8[np.ndarray, "time height width 3"] | None  # where they are kept
+
+    @property
+    def success(self) -> bool:
+        """Whether it is done at the end."""
+        return bool(self.distances_m[-1] < SUCCESS_M[self.problem.task])
+
+    @property
+    def success_ever(self) -> bool:
+        """Whether it was done after any of the steps, perhaps in passing."""
+        return bool(self.distances_m[1:].min() < SUCCESS_M[self.problem.task])
+
+
+@dataclass(frozen=True)
+class ClosedLoopResult:
+    """A policy's episodes of a task; arrays hold one row per episode, estimates have 95 % intervals over episodes."""
+
+    task: TaskName
+    domain: str
+    policy: str
+    seed: int
+    steps: int  # model steps of an episode
+    stride: int  # control steps of a model step
+    episodes: tuple[EpisodeResult, ...]
+
+    @property
+    def distance_cm(self) -> Float[np.ndarray, "episodes time"]:
+        """Distance to the goal before the first step and after each."""
+        return np.stack([episode.distances_m for episode in self.episodes]) * 100
+
+    @property
+    def final_distances_cm(self) -> Float[np.ndarray, " episodes"]:
+        """Distance to the goal at the end."""
+        return self.distance_cm[:, -1]
+
+    @property
+    def successes(self) -> Bool[np.ndarray, " episodes"]:
+        """Whether it is done at the end."""
+        return np.array([episode.success for episode in self.episodes])
+
+    @property
+    def seconds(self) -> Float[np.ndarray, "episodes steps"]:
+        """What each decision took."""
+        return np.stack([episode.seconds for episode in self.episodes])
+
+    @property
+    def unreachable(self) -> Int[np.ndarray, " episodes"]:
+        """Commands that the arm could not follow to their end."""
+        return np.array([episode.unreachable for episode in self.episodes])
+
+    @property
+    def success_rate(self) -> Estimate:
+        """Share of episodes that are done at the end."""
+        return share_of(int(self.successes.sum()), len(self.episodes))
+
+    @property
+    def success_ever_rate(self) -> Estimate:
+        """Share that was done after any step: the flattering number, to compare with others' only."""
+        return share_of(sum(episode.success_ever for episode in self.episodes), len(self.episodes))
+
+    @property
+    def final_distance_cm(self) -> Estimate:
+        """Mean distance to the goal at the end."""
+        return self._mean(self.final_distances_cm)
+
+    @property
+    def seconds_per_decision(self) -> Estimate:
+        """Mean time of a decision."""
+        return self._mean(self.seconds.mean(axis=1))
+
+    @property
+    def why_counts(self) -> dict[str, int]:
+        """How often each reason was given for an action, the commonest first."""
+        return dict(Counter(why for episode in self.episodes for why in episode.whys).most_common())
+
+    def _mean(self, values: Float[np.ndarray, " episodes"]) -> Estimate:
+        return mean_of(values, [f"{number:06d}" for number in range(len(values))])
+
+
+def run_task(
+    task: TaskName,
+    domain: str | Domain,
+    policy: Policy,
+    *,
+    episodes: int = 50,
+    seed: int = 0,
+    steps: int = 8,
+    stride: int = 4,
+    keep_pictures: int = 0,
+    arm: SimulatedArm | None = None,
+    progress: Progress | None = None,
+) -> ClosedLoopResult:
+    """Let a policy do a task again and again. Every policy gets the same problems, so figures can be paired by row.
+
+    Args:
+        task: What to do.
+        domain: Where: A, B, or a domain.
+        policy: Who does it.
+        episodes: How many problems, from number 0 on.
+        seed: Which problems. Settings that were chosen on one seed are to be reported on another.
+        steps: Model steps of an episode.
+        stride: Control steps of a model step (15 per second).
+        keep_pictures: Of so many episodes, the first ones, for a video.
+        arm: In this domain, to be used again; None: a new one.
+        progress: Told how many episodes are done.
+
+    Raises:
+        InputError: MuJoCo is not installed, or no such domain.
+        ValueError: No episodes, or an action that is no action.
+    """
+    if isinstance(domain, str):
+        domain = named_domain(domain)
+    if episodes < 1:
+        raise ValueError(f"{episodes} episodes")
+    arm = arm or SimulatedArm(domain)
+    done: list[EpisodeResult] = []
+    for index in range(episodes):
+        problem = make_problem(task, domain, seed, index)
+        kept = index < keep_pictures
+        done.append(run_episode(arm, policy, problem, steps=steps, stride=stride, keep_pictures=kept))
+        if progress:
+            progress(index + 1, episodes)
+    return ClosedLoopResult(task, domain.name, policy.name, seed, steps, stride, tuple(done))
+
+
+def run_episode(
+    arm: SimulatedArm, policy: Policy, problem: Problem, *, steps: int = 8, stride: int = 4, keep_pictures: bool = False
+) -> EpisodeResult:
+    """Let a policy solve a problem, and return what happened.
+
+    A command that no joint angles lead to takes the arm as far on the straight way there as they do; it is counted.
+
+    Args:
+        arm: In the problem's domain; where it stands does not matter.
+        policy: Who does it.
+        problem: What is to be done.
+        steps: Model steps.
+        stride: Control steps of each.
+        keep_pictures: Whether the result holds what the camera saw.
+
+    Raises:
+        UnreachableError: The problem's own start or goal cannot be reached.
+        ValueError: No steps, or an action that is not 7 finite numbers.
+    """
+    if min(steps, stride) < 1:
+        raise ValueError(f"{steps} model steps of {stride} control steps")
+    goal_picture = _put(arm, problem.goal).picture()
+    _put(arm, problem.start)
+    policy.reset(problem, goal_picture)
+    states, pictures = [arm.state], [arm.picture()]
+    actions, seconds, whys, unreachable = [], [], [], 0
+    for _ in range(steps):
+        began = time.perf_counter()
+        action = np.asarray(policy.act(pictures[-1], states[-1]), dtype=np.float64)
+        seconds.append(time.perf_counter() - began)
+        actions.append(_checked(action, policy))
+        whys.append(policy.why)
+        unreachable += not _send(arm, action, stride)
+        states.append(arm.state)
+        pictures.append(arm.picture())
+    return EpisodeResult(
+        problem=problem,
+        states=np.stack(states),
+        actions=np.stack(actions),
+        distances_m=np.array([problem.distance_m(state) for state in states]),
+        seconds=np.array(seconds),
+        whys=tuple(whys),
+        unreachable=unreachable,
+        goal_picture=goal_picture,
+        pictures=np.stack(pictures) if keep_pictures else None,
+    )
+
+
+def ways_along(
+    state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], parts: int = _PARTS
+) -> Sequence[Float[np.ndarray, " 7"]]:
+    """Return states at even distances on the straight way of an action, the nearest first."""
+    shares = np.arange(1, parts + 1)[:, None] / parts
+    return list(apply_action(np.tile(state, (parts, 1)), shares * action))
+
+
+def _put(arm: SimulatedArm, state: Float[np.ndarray, " 7"]) -> SimulatedArm:
+    """Put the arm in a state by way of its rest, so that its spare joint does not depend on what was before."""
+    arm.set_joints(rest_joints(arm.domain), 0.0)
+    arm.set_state(state)
+    return arm
+
+
+def _checked(action: Float[np.ndarray, " dim"], policy: Policy) -> Float[np.ndarray, " 7"]:
+    if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
+        raise ValueError(f"{policy.name}: {action.tolist()} is no action of {ACTION_DIM} finite numbers")
+    return action
+
+
+def _send(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int) -> bool:
+    """Command the state that an action leads to, its closedness within 0 .. 1; return whether it can be reached."""
+    target = _with_real_gripper(apply_action(arm.state, action))
+    try:
+        arm.command(target, stride)
+    except UnreachableError:
+        pass
+    else:
+        return True
+    reachable = arm.state
+    for way in ways_along(arm.state, action):
+        if not arm.can_reach(way):
+            break
+        reachable = way
+    arm.command(_with_real_gripper(reachable), stride)
+    return False
+
+
+def _with_real_gripper(state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+    return np.append(state[:6], np.clip(state[6], 0.0, 1.0))
