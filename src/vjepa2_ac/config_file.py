@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import json
 import re
@@ -22,16 +23,16 @@ def load_config(path: str | Path, overrides: Iterable[str] = ()) -> Config:
     Raises:
         InputError: The file cannot be read or is not a valid config; names every key that is wrong.
     """
-    where = str(path)
-    values = _read_yaml(Path(path))
-    for override in overrides:
-        key, separator, text = override.partition("=")
-        if not separator or not key:
-            raise InputError(
-                where="command line", found=f"{override!r}", needed="an override such as training.steps=100"
-            )
-        _set(values, key.split("."), _parse_yaml(text, where=f"command line: {key}"), override)
-    return parse_config(values, where=where)
+    return parse_config(_overridden(_read_yaml(Path(path)), overrides), where=str(path))
+
+
+def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str) -> Config:
+    """Return a config of plain values with `key.sub=value` overrides, without a file.
+
+    Raises:
+        InputError: Names every key that is wrong.
+    """
+    return parse_config(_overridden(copy.deepcopy(dict(values)), overrides), where=where)
 
 
 def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
@@ -121,6 +122,17 @@ def _parse_yaml(text: str, *, where: str) -> Any:
         return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - a SafeLoader
     except yaml.YAMLError as error:
         raise InputError(where=where, found=f"not YAML: {error}") from None
+
+
+def _overridden(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+    for override in overrides:
+        key, separator, text = override.partition("=")
+        if not separator or not key:
+            raise InputError(
+                where="command line", found=f"{override!r}", needed="an override such as training.steps=100"
+            )
+        _set(values, key.split("."), _parse_yaml(text, where=f"command line: {key}"), override)
+    return values
 
 
 def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> None:

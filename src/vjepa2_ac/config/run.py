@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from vjepa2_ac.config.data import DataConfig
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
+from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.config.section import Section
 from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
 
@@ -33,6 +34,8 @@ class Config(Section):
     """What is kept of a run."""
     tracking: TrackingConfig = TrackingConfig()
     """Where figures go."""
+    planning: PlanningConfig = PlanningConfig()
+    """How a robot is steered afterwards; training does not heed it."""
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Config:

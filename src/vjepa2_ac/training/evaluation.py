@@ -37,8 +37,8 @@ from vjepa2_ac.training.assembly import make_accelerator
 from vjepa2_ac.training.cached import with_latents_if_there
 from vjepa2_ac.training.chosen import NEWEST, choose_checkpoint
 from vjepa2_ac.training.journal import read_journal
-from vjepa2_ac.training.run_folder import CONFIG, read_run_config
-from vjepa2_ac.training.runs import TrainedRun, load_run
+from vjepa2_ac.training.run_folder import read_run_config
+from vjepa2_ac.training.runs import TrainedRun, is_run, load_run
 from vjepa2_ac.training.stride import calibrate_model
 
 PLOT, REPORT = "evaluation.png", "report.html"
@@ -124,11 +124,6 @@ def evaluate_subject(
         notes=(*notes, *evaluation.notes),
     )
     return Evaluated(evaluation, run.chosen if run else "", _written(evaluation, folder))
-
-
-def is_run(subject: str) -> bool:
-    """Return whether this is the folder of a run; otherwise it names a model."""
-    return (Path(subject) / CONFIG).is_file()
 
 
 def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:

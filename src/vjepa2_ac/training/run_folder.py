@@ -51,6 +51,7 @@ _FREE_TO_CHANGE = (
     "data.broken_episodes",
     "checkpoint.",
     "tracking.",
+    "planning.",
     "training.log_every",
     "training.allow_weak_base",
 )

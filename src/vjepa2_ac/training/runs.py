@@ -11,7 +11,7 @@ from vjepa2_ac.model.lora import load_trained
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.checkpoint import ADAPTER
 from vjepa2_ac.training.chosen import NEWEST, choose_checkpoint
-from vjepa2_ac.training.run_folder import read_run_config
+from vjepa2_ac.training.run_folder import CONFIG, read_run_config
 
 
 @dataclass(frozen=True)
@@ -24,17 +24,23 @@ class TrainedRun:
     chosen: str  # which checkpoint it is, in words
 
 
-def load_run(folder: Path, checkpoint: str = NEWEST) -> TrainedRun:
+def is_run(subject: str) -> bool:
+    """Return whether this is the folder of a run; otherwise it names a model."""
+    return (Path(subject) / CONFIG).is_file()
+
+
+def load_run(folder: Path, checkpoint: str = NEWEST, config: Config | None = None) -> TrainedRun:
     """Load the model of a run: its base with the trained weights of a whole checkpoint.
 
     Args:
         folder: The run.
         checkpoint: newest, best, or a number of optimizer steps; see `training.chosen`.
+        config: Its own with other settings of how it is loaded; None: its own.
 
     Raises:
         InputError: Not the folder of a run, no such checkpoint, or its base cannot be loaded.
     """
-    config = read_run_config(folder)
+    config = config or read_run_config(folder)
     chosen = choose_checkpoint(folder, checkpoint)
     world_model = load_base(config.model, seed=config.seed)
     load_trained(world_model, chosen.path / ADAPTER, trainable=False)

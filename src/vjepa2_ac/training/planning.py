@@ -1,0 +1,122 @@
+"""What is planned with? A model of its own or what a run has learned, and the settings that go with it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.config_file import config_from, load_config
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.training.chosen import NEWEST
+from vjepa2_ac.training.device import is_on_cpu
+from vjepa2_ac.training.run_folder import CONFIG
+from vjepa2_ac.training.runs import is_run, load_run
+
+# Settings that planning heeds; the others are of training, and changing them here would do nothing.
+_HEEDED = ("planning.", "seed", "data.crop", "data.stride", "model.dtype", "model.sizes.", "training.device")
+
+
+@dataclass(frozen=True)
+class Steering:
+    """A world model on its device, in eval mode, its adapter on; and how to plan with it."""
+
+    world_model: WorldModel
+    config: Config  # of it: planning, seed, data.crop and data.stride count
+    subject: str  # what was named
+    checkpoint: str  # which one, in words; "" of a model
+
+    def controller(self, *, seed: int | None = None, extrinsics: Float[np.ndarray, " 6"] | None = None) -> Controller:
+        """Return a controller with these settings.
+
+        Args:
+            seed: Of all decisions; None: the config's.
+            extrinsics: Pose of the camera, where the model uses it.
+
+        Raises:
+            InputError: The model's states are no poses, or it needs a camera pose and there is none.
+        """
+        return Controller(
+            self.world_model,
+            self.config.planning,
+            seed=self.config.seed if seed is None else seed,
+            crop=self.config.data.crop,
+            extrinsics=extrinsics,
+        )
+
+
+def load_to_plan(
+    subject: str, *, checkpoint: str = NEWEST, config: str | Path | None = None, overrides: Sequence[str] = ()
+) -> Steering:
+    """Load what to plan with.
+
+    The settings of a run are those of its config: planning, seed, crop, stride, type of the weights. Those of a model
+    are the given config's; without one the defaults, and float32 weights on a CPU.
+
+    Args:
+        subject: The folder of a run; or a model: what `model.base` takes.
+        checkpoint: Of a run: newest, best, or a number of optimizer steps.
+        config: A config file, for a model.
+        overrides: Such as planning.horizon=2.
+
+    Raises:
+        InputError: There is no such thing, it cannot be planned with, or a setting is wrong or does not matter.
+    """
+    _require_heeded(overrides)
+    its = _run_config(subject, config, overrides) if is_run(subject) else _model_config(subject, config, overrides)
+    if its.data.states == "vector":
+        raise InputError(
+            where=subject, found="data.states: vector", needed="a model of poses: actions are limited in metres"
+        )
+    device = torch.device("cpu" if is_on_cpu(its.training) else "cuda")
+    if is_run(subject):
+        run = load_run(Path(subject), checkpoint, its)
+        return Steering(run.world_model.to(device).eval(), its, subject, run.chosen)
+    if checkpoint != NEWEST:
+        raise InputError(
+            where=f"--checkpoint {checkpoint}",
+            found=f"{subject}, which is not the folder of a run",
+            needed="a run: a model has no checkpoints to choose from",
+        )
+    return Steering(load_base(its.model, seed=its.seed).to(device).eval(), its, subject, "")
+
+
+def _run_config(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
+    if config is not None:
+        raise InputError(
+            where=f"--config {config}",
+            found=f"{subject}, a run, which has a config of its own",
+            needed="one config",
+            fix="Change single settings behind the run's name, such as planning.horizon=2",
+        )
+    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(subject)}"])
+
+
+def _model_config(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
+    if config is None:
+        dtype = "bfloat16" if torch.cuda.is_available() else "float32"
+        plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
+        return config_from(plain, overrides, where="command line")
+    its = load_config(config, overrides)
+    return its.model_copy(update={"model": its.model.model_copy(update={"base": subject, "random": None})})
+
+
+def _require_heeded(overrides: Sequence[str]) -> None:
+    for override in overrides:
+        key = override.partition("=")[0]
+        is_heeded = any(key == known or (known.endswith(".") and key.startswith(known)) for known in _HEEDED)
+        if key.split(".")[0] in Config.model_fields and not is_heeded:  # of others the config says what is wrong
+            raise InputError(
+                where=f"command line: {override}",
+                found="a setting that planning does not heed",
+                needed=f"one of {', '.join(known + '…' * known.endswith('.') for known in _HEEDED)}",
+            )
