@@ -13,8 +13,8 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 
 # A room imports only rooms of a lower rank; rooms of one rank do not know each other.
 RANK = {
-    "__init__": 0, "errors": 0, "remote": 0.5, "config": 1, "config_file": 1.5, "episode": 1, "geometry": 1,
-    "storage": 1, "data": 2, "model": 2, "latents": 3, "encoding": 3.5, "planning": 4, "evaluation": 5,
+    "__init__": 0, "errors": 0, "remote": 0.5, "config": 1, "config_errors": 1.4, "config_file": 1.5, "episode": 1,
+    "geometry": 1, "storage": 1, "data": 2, "model": 2, "latents": 3, "encoding": 3.5, "planning": 4, "evaluation": 5,
     "training": 6, "simulation": 7,
     "console": 8, "console_data": 8.2, "console_doctor": 8.2, "cli_parts": 8.4, "cli_data": 8.5, "cli_doctor": 8.5,
     "cli_encode": 8.5, "console_evaluation": 8.2, "cli_evaluate": 8.7, "cli": 9,
@@ -27,10 +27,12 @@ HOMES = {
     "google": {"data/sources/rlds/tfrecord.py"},
     "google_crc32c": {"data/sources/rlds/tfrecord.py"},
     "simplejpeg": {"data/"},
+    "PIL": {"data/picture_file.py"},
     "mujoco": {"simulation/"},
-    "matplotlib": {"evaluation/plots.py", "evaluation/contact_sheet.py", "evaluation/clip_picture.py"},
+    "matplotlib": {"evaluation/plots.py", "evaluation/contact_sheet.py", "evaluation/clip_picture.py",
+        "evaluation/captioned.py"},
     "fsspec": {"remote/"},
-    "av": {"data/video.py"},
+    "av": {"data/video.py", "data/video_writing.py"},
     "h5py": {"data/sources/droid_raw/trajectory.py"},
     "pyarrow": {"data/sources/lerobot/"},
     "rich": {"console.py", "console_data.py", "console_evaluation.py"},

@@ -8,8 +8,8 @@ import yaml
 
 from paths import ROOT
 from vjepa2_ac.config import Config, DataConfig, IdleConfig
+from vjepa2_ac.config_errors import all_keys
 from vjepa2_ac.config_file import (
-    _all_keys,
     changed_keys,
     config_as_dict,
     config_as_yaml,
@@ -148,7 +148,7 @@ def test_schema_documents_every_knob() -> None:
 
 def test_every_knob_is_read_somewhere() -> None:
     source = "\n".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
-    for key in _all_keys():
+    for key in all_keys():
         *sections, name = key.split(".")
         owners = "|".join(["config", "sizes", "self", *sections[-1:]])
         assert re.search(rf"\b_?({owners})\.{name}\b", source), f"nobody reads {key}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import json
 import re
 from collections.abc import Iterable, Mapping
@@ -11,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.config_errors import wrong_values
 from vjepa2_ac.errors import InputError
 
 
@@ -44,7 +44,7 @@ def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
     try:
         return Config.model_validate_json(json.dumps(values))
     except ValidationError as error:
-        lines = [_explain(detail) for detail in error.errors()]
+        lines = wrong_values(values, error)
         raise InputError(
             where=where,
             found=f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n"
@@ -146,58 +146,6 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
             )
         values = inner
     values[keys[-1]] = value
-
-
-def _explain(detail: Any) -> str:
-    path = ".".join(str(part) for part in detail["loc"])
-    if detail["type"] == "extra_forbidden":
-        known = _keys_at(detail["loc"][:-1])
-        close = difflib.get_close_matches(str(detail["loc"][-1]), known, n=1)
-        elsewhere = [key for key in _all_keys() if key.split(".")[-1] == str(detail["loc"][-1])]
-        hint = (
-            f"did you mean {close[0]}?"
-            if close
-            else f"did you mean {elsewhere[0]}?"
-            if elsewhere
-            else f"known here: {', '.join(known)}"
-        )
-        return f"{path}: unknown key; {hint}"
-    if detail["type"] == "missing":
-        return f"{path}: missing; it has no default"
-    message = str(detail["msg"]).removeprefix("Value error, ")
-    found = detail.get("input")
-    shown = "" if isinstance(found, dict) else f" (found {found!r})"
-    return f"{path}: {message}{shown}" if path else message
-
-
-def _section_at(location: Iterable[Any]) -> type[BaseModel] | None:
-    section: type[BaseModel] | None = Config
-    for part in location:
-        if section is None or part not in section.model_fields:
-            return None
-        section = _section_of(section.model_fields[part].annotation)
-    return section
-
-
-def _section_of(annotation: Any) -> type[BaseModel] | None:
-    for candidate in (annotation, *getattr(annotation, "__args__", ())):
-        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
-            return candidate
-    return None
-
-
-def _keys_at(location: Iterable[Any]) -> list[str]:
-    section = _section_at(location)
-    return list(section.model_fields) if section else []
-
-
-def _all_keys(section: type[BaseModel] = Config, prefix: str = "") -> list[str]:
-    keys = []
-    for name, info in section.model_fields.items():
-        keys.append(prefix + name)
-        if inner := _section_of(info.annotation):
-            keys += _all_keys(inner, f"{prefix}{name}.")
-    return keys
 
 
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -260,7 +260,9 @@ class DataConfig(Section):
             raise ValueError("camera: an empty list; name one or more, or null for the source's first")
         for camera in self.cameras:
             if known is not None and camera not in known:
-                raise ValueError(f"camera {camera!r} is not one of {', '.join(known)}")
+                raise ValueError(
+                    f"camera {camera!r} is not one of the cameras of source {self.source}: {', '.join(known)}"
+                )
         if self.source == "latents" and isinstance(self.stride, str):
             raise ValueError("stride auto: a latent cache has one stride; give its number")
         if self.source == "latents" and (self.cache != "off" or "://" in self.path):
@@ -291,8 +293,8 @@ class DataConfig(Section):
             raise ValueError("actions recorded needs states vector: the action of a pose is its difference to the next")
         if self.actions == "recorded" and self.stride != 1 and self.join_actions is None:
             raise ValueError(
-                "actions recorded: a model step has a command for each of its control steps; set join_actions to sum"
-                " (deltas), mean (velocities) or last (absolute targets)"
+                f"actions recorded at stride {self.stride}: a model step has a command for each of its control steps;"
+                " set join_actions to sum (deltas), mean (velocities) or last (absolute targets)"
             )
         if self.actions != "recorded" and self.join_actions is not None:
             raise ValueError("join_actions belongs to actions recorded")

@@ -62,7 +62,7 @@ class ModelSizes(Section):
                 raise ValueError(f"{name}.width {part.width} is not a multiple of {name}.heads {part.heads}")
             if part.width // part.heads < 6 or (part.width // part.heads) % 2:
                 raise ValueError(
-                    f"{name}: a head of {part.width // part.heads} does not fit 3D RoPE (even, at least 6)"
+                    f"{name}: heads of width / heads = {part.width // part.heads} do not fit 3D RoPE (even, at least 6)"
                 )
         return self
 
