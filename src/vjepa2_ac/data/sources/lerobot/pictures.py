@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import simplejpeg
 from jaxtyping import UInt8
 
 from vjepa2_ac.data import video
+from vjepa2_ac.data.picture_file import decode_picture
 from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.data.sources.lerobot.parquet import Opener
 from vjepa2_ac.errors import InputError
-
-_JPEG = b"\xff\xd8"
 
 
 @dataclass(frozen=True)
@@ -64,7 +61,7 @@ class StoredPictures:
             ValueError: No steps, or a step outside the episode.
         """
         _require_within(steps, self.num_steps, self.where)
-        frames = [_decoded(self._pictures[step], f"{self.where}: step {step}") for step in steps]
+        frames = [decode_picture(self._pictures[step], f"{self.where}: step {step}") for step in steps]
         for step, frame in zip(steps, frames, strict=True):
             if frame.shape != frames[0].shape:
                 raise InputError(
@@ -82,22 +79,6 @@ class StoredPictures:
                 where=self.where, found=f"{len(pictures)} pictures", needed=f"one for each of {self.num_steps} steps"
             )
         return pictures
-
-
-def _decoded(picture: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    from PIL import Image
-
-    try:
-        if picture.startswith(_JPEG):
-            return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB"))
-        with Image.open(io.BytesIO(picture), formats=["PNG"]) as image:
-            return np.array(image.convert("RGB"))
-    except (OSError, ValueError, SyntaxError) as error:
-        raise InputError(
-            where=where,
-            found=f"{len(picture)} bytes that are no picture, starting with {picture[:4]!r} ({error})",
-            needed="PNG or JPEG",
-        ) from None
 
 
 def _require_within(steps: Sequence[int], num_steps: int, where: str) -> None:

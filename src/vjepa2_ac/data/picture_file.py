@@ -1,0 +1,55 @@
+"""How does a picture in a file become pixels? PNG and JPEG, in RGB."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import simplejpeg
+from jaxtyping import UInt8
+from PIL import Image
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import read_bytes, unreadable
+
+_JPEG = b"\xff\xd8"
+_EIGHT_BIT = {"1", "L", "LA", "P", "RGB", "RGBA"}  # Pillow's modes of at most 8 bits a channel
+
+
+def read_picture(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
+    """Return the RGB pixels of a PNG or JPEG file.
+
+    Raises:
+        InputError: There is no such file, it cannot be read, or it is no such picture.
+    """
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        raise unreadable(str(path), error, needed="a picture: PNG or JPEG") from None
+    return decode_picture(data, str(path))
+
+
+def decode_picture(picture: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Return the RGB pixels of PNG or JPEG bytes; transparency is left out.
+
+    Raises:
+        InputError: They are neither, damaged, or of more than 8 bits a channel.
+    """
+    try:
+        if picture.startswith(_JPEG):
+            return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB"))
+        with Image.open(io.BytesIO(picture), formats=["PNG"]) as image:
+            return _as_rgb(image)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(
+            where=where,
+            found=f"{len(picture)} bytes that are no picture, starting with {picture[:4]!r} ({error})",
+            needed="PNG or JPEG",
+        ) from None
+
+
+def _as_rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:
+    if image.mode not in _EIGHT_BIT:
+        raise ValueError(f"pixels of the kind {image.mode}, not 8 bits a channel")
+    return np.array(image.convert("RGB"))
