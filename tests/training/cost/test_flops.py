@@ -11,11 +11,14 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from paths import ROOT
 from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.config_file import load_config, parse_config
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.lora import add_adapter
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.training.cost.flops import clip_flops, frame_flops
+from vjepa2_ac.planning.energy import Scene, WorldModelCost
+from vjepa2_ac.planning.goal import Goal
+from vjepa2_ac.training.cost.flops import clip_flops, frame_flops, plan_flops
 from vjepa2_ac.training.loss import Objective
 
 SIZES = ModelSizes.model_validate({
@@ -85,6 +88,29 @@ def test_the_default_run_has_the_flops_that_were_worked_out_by_hand() -> None:
     assert flops.encoder == pytest.approx(8.5e12, rel=0.01)
     assert flops.predictor == pytest.approx(7.5e12, rel=0.05)
     assert flops.total == pytest.approx(16e12, rel=0.02)
+
+
+@pytest.mark.parametrize("extrinsics", [False, True])
+@pytest.mark.parametrize(("steps", "before"), [(1, 0), (3, 0), (2, 2)])
+def test_a_plan_is_what_pytorch_counts(steps: int, before: int, extrinsics: bool) -> None:
+    predictor = SIZES.predictor.model_copy(update={"use_extrinsics": extrinsics})
+    sizes = SIZES.model_copy(update={"predictor": predictor})
+    model, samples = WorldModel.random(sizes, seed=0), 3
+    latents = torch.randn(before + 1, model.num_tokens, model.latent_dim)
+    camera = torch.randn(6) if extrinsics else None
+    scene = Scene(latents, torch.randn(before + 1, 7), torch.randn(before, 7), camera)
+    with torch.no_grad(), sdpa_kernel(SDPBackend.MATH):
+        cost = WorldModelCost(model, scene, Goal(latents[:1]), EnergyConfig())
+        with FlopCounterMode(display=False) as counter:
+            cost(torch.randn(samples, steps, 7))
+    poses = 54 * samples * steps  # products of 3 x 3 matrices
+    assert samples * plan_flops(sizes, steps, before) == counter.get_total_flops() - poses
+
+
+def test_the_papers_decision_has_the_flops_that_were_worked_out_by_hand() -> None:
+    assert 8000 * plan_flops(ModelSizes(), steps=1) == pytest.approx(
+        1.31e15, rel=0.002
+    )  # 1.25 in the weights of blocks
 
 
 def test_the_arithmetic_does_without_torch() -> None:

@@ -1,4 +1,4 @@
-"""How much arithmetic is one clip? Floating-point operations by formula: no model is built and torch is not needed.
+"""How much arithmetic is one clip, or one plan? Operations by formula: no model is built and torch is not needed.
 
 What counts is what the mathematics asks for, once (model FLOPs): a product of matrices is two operations per pair of
 numbers; forward, backward with respect to inputs wherever a gradient has to pass, with respect to weights only for what
@@ -11,6 +11,7 @@ Not counted: the norms of weights that DoRA needs.
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
@@ -45,12 +46,27 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
         config: What is trained, frames and rollout.
         sizes: Sizes of its model, such as `model.load.base_sizes` gives.
     """
-    passes = _Passes(config, sizes)
+    passes = _Passes.of(config, sizes)
     frames, training = config.data.frames, config.training
     total = passes.over(frames - 1, keys=range(1, frames), fed_back=False)
     for step in range(2, 1 + (training.rollout_steps if training.rollout_weight else 1)):
         total += passes.over(1, keys=range(step, step + 1), fed_back=True)  # earlier keys and values are there
     return ClipFlops(frames * frame_flops(sizes), total.forward, total.backward)
+
+
+def plan_flops(sizes: ModelSizes, steps: int, before: int = 0) -> int:
+    """Return the operations of predicting where one action sequence leads, with no adapter beside the weights.
+
+    Args:
+        sizes: Of the model.
+        steps: Actions of the sequence.
+        before: Frames seen before the present one, whose keys and values are there already.
+    """
+    passes = _Passes(sizes)
+    return sum(
+        passes.over(1, keys=range(seen, seen + 1), fed_back=False).forward
+        for seen in range(before + 1, before + 1 + steps)
+    )
 
 
 def frame_flops(sizes: ModelSizes) -> int:
@@ -72,14 +88,28 @@ class _Work:
 
 
 class _Passes:
-    """Counts passes of one clip through the predictor."""
+    """Counts passes of one clip or plan through the predictor."""
 
-    def __init__(self, config: Config, sizes: ModelSizes) -> None:
-        self._sizes = sizes
-        self._layers, self._ranks = linear_layers(sizes), adapter_ranks(config, sizes)
-        self._whole = frozenset(self._layers) if config.adapter.kind == "none" else config.adapter.modules_to_save
+    def __init__(
+        self, sizes: ModelSizes, ranks: Mapping[str, int] | None = None, whole: Collection[str] = frozenset()
+    ) -> None:
+        """Take a model.
+
+        Args:
+            sizes: Of the model.
+            ranks: Of the adapter of each layer that has one.
+            whole: Layers whose own weights are trained.
+        """
+        self._sizes, self._layers, self._ranks, self._whole = sizes, linear_layers(sizes), ranks or {}, whole
         extrinsics = ("extrinsics_encoder",) if sizes.predictor.use_extrinsics else ()
         self._conditions = ("action_encoder", "state_encoder", *extrinsics)
+
+    @classmethod
+    def of(cls, config: Config, sizes: ModelSizes) -> _Passes:
+        """Take the model as a run trains it."""
+        everything = config.adapter.kind == "none"
+        whole = linear_layers(sizes) if everything else config.adapter.modules_to_save
+        return cls(sizes, adapter_ranks(config, sizes), whole)
 
     def over(self, steps: int, *, keys: range, fed_back: bool) -> _Work:
         """Return the work of a pass.
