@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from planning.tiny import tiny_model
-from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states, apply_action
 from vjepa2_ac.model.world_model import WorldModel
@@ -198,3 +198,23 @@ def test_acting_without_a_goal_is_an_error() -> None:
         controller().act(picture(0), STATE)
     with pytest.raises(ValueError, match="no goal"):
         controller().reset()
+
+
+@pytest.mark.parametrize("steps", ["last", "sum"])
+def test_the_present_energy_is_that_of_a_picture_that_stays(steps: str) -> None:
+    run = controller(energy=EnergyConfig(steps=steps))
+    run.reset(picture(100), picture(101), durations=(1,))
+    run.act(picture(1), STATE)
+    assert run._goal is not None
+    assert run.decision is not None
+    seen = run._seen[-1][0]
+    first, second = (float((seen - wanted).abs().mean()) for wanted in run._goal.latents)
+    expected = {"last": second, "sum": first + second}[steps]
+    assert run.decision.energy_now == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_goal_that_is_reached_on_the_way_to_another_is_left() -> None:
+    for steps in ("last", "sum"):
+        run = controller(energy=EnergyConfig(steps=steps))
+        run.reset(picture(100), picture(101), durations=(1,))
+        assert run.act(picture(100), STATE).any()

@@ -11,12 +11,12 @@ from torch import Tensor
 from paths import GOLDEN
 from planning.problems import PLANNERS, config, parabola, rosenbrock, solve, space, two_basins
 from vjepa2_ac.config.planning import CemConfig, GradientConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
-from vjepa2_ac.evaluation.planning_score import SCORED
+from vjepa2_ac.evaluation.planning_protocol import SCORED
 from vjepa2_ac.planning.action_space import ActionSpace, Ball
 from vjepa2_ac.planning.gradient import GradientSearch
 from vjepa2_ac.planning.icem import coloured_noise
 from vjepa2_ac.planning.mppi import MppiSearch
-from vjepa2_ac.planning.plan import Start
+from vjepa2_ac.planning.plan import Plan, Start
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.search import Tried, white_noise
 
@@ -230,15 +230,29 @@ def test_a_warm_start_begins_where_the_last_plan_led(planner: str) -> None:
     assert first(start) < first(None)
 
 
-@pytest.mark.parametrize(("done", "places"), [(0, [0, 1, 2]), (1, [0, 1, 2]), (2, [1, 2, 2]), (5, [2, 2, 2])])
+@pytest.mark.parametrize(("done", "places"), [(0, [0, 1, 2]), (2, [1, 2, 2]), (5, [2, 2, 2])])
 def test_what_was_done_of_a_plan_is_gone_and_its_end_is_repeated(done: int, places: list[int]) -> None:
-    settings = config("icem", iterations=2, samples=20, horizon=6, action_repeat=2)
-    plan = Planner(settings).plan(lambda actions: actions.square().sum(dim=(1, 2)), torch.Generator())
+    plan = repeated_plan()
     start = plan.start_after(done)
     assert torch.equal(start.mean, plan.mean[places])
     assert torch.equal(start.elites, plan.iterations[-1].elites[:, places])
     with pytest.raises(ValueError, match="-1 steps"):
         plan.start_after(-1)
+
+
+def test_within_a_repeated_action_the_next_plan_begins_with_what_is_left_of_it() -> None:
+    plan = repeated_plan()
+    start = plan.start_after(1)
+    torch.testing.assert_close(start.mean[0], (plan.mean[0] + plan.mean[1]) / 2)
+    torch.testing.assert_close(start.mean[2], plan.mean[2])
+    elites = plan.iterations[-1].elites
+    torch.testing.assert_close(start.elites[:, 1], (elites[:, 1] + elites[:, 2]) / 2)
+    assert len(set(plan.mean[:, 0].tolist())) == 3
+
+
+def repeated_plan() -> Plan:
+    settings = config("icem", iterations=2, samples=20, horizon=6, action_repeat=2)
+    return Planner(settings).plan(lambda actions: actions.square().sum(dim=(1, 2)), torch.Generator())
 
 
 def test_icems_elites_take_part_again() -> None:

@@ -112,7 +112,8 @@ class PlanningConfig(Section):
     horizon: PositiveInt = 1
     """Model steps that a plan spans."""
     action_repeat: PositiveInt = 1
-    """Model steps for which one action is repeated; the horizon is a multiple of it."""
+    """Model steps for which one action is repeated; the horizon is a multiple of it. A controller decides anew at each
+    of them all the same."""
     samples: Annotated[int, Field(ge=2)] = 800
     """Action sequences an iteration; gradient has `gradient.starts`."""
     iterations: PositiveInt = 10

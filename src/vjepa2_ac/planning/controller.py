@@ -19,7 +19,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
+from vjepa2_ac.planning.energy import Scene, WorldModelCost, energies_of
 from vjepa2_ac.planning.goal import Goal, patch_weights
 from vjepa2_ac.planning.observation import require_picture, require_pose
 from vjepa2_ac.planning.plan import Plan
@@ -37,7 +37,7 @@ class Decision:
 
     action: Float[np.ndarray, " 7"]  # for the next model step; zero where `why` says so
     why: Why  # out of time: the best plan so far. at the goal, no finite energy: do nothing
-    energy_now: float  # of doing nothing, if nothing then moves: present picture against goal
+    energy_now: float  # of the present picture, if it stayed: to compare with the plan's
     goal: int  # which of several goals counted
     plan: Plan | None  # None at the goal
     states: Float[np.ndarray, "time 7"] | None  # where the plan leads, the present state first
@@ -141,7 +141,8 @@ class Controller:
     def _decided(self, goal: Goal, before: Plan | None) -> Decision:
         latents, state = self._seen[-1]
         place = goal.place(self._done)
-        energy = float(distance(latents, goal.latents[place], self.config.energy.distance, goal.weights))
+        still = latents.expand(1, self.config.horizon, -1, -1)
+        energy = float(energies_of(still, goal, self.config.energy, done=self._done)[0])
         if energy <= _REACHED and goal.place(self._done + self.config.horizon - 1) == place:
             return Decision(np.zeros(ACTION_DIM), "at the goal", energy, place, None, None, None)
         cost = WorldModelCost(self._model, self._scene(), goal, self.config.energy, done=self._done)

@@ -66,7 +66,9 @@ class Plan:
     def start_after(self, done: int) -> Start:
         """Return where the next decision begins when some model steps of this plan were done.
 
-        The last decision is repeated for what the plan did not reach.
+        A decision of the next plan begins at the mean of what this one would have done in its model steps: within an
+        action that is repeated, a decision begins between two of this plan's. The last decision is repeated for what
+        the plan did not reach.
 
         Raises:
             ValueError: A negative number of steps.
@@ -74,10 +76,12 @@ class Plan:
         if done < 0:
             raise ValueError(f"{done} steps were done")
         elites = self.iterations[-1].elites if self.iterations else self.mean[None][:0]
-        return Start(_shifted(self.mean[None], done // self.repeat)[0], _shifted(elites, done // self.repeat))
+        return Start(_later(self.mean[None], done, self.repeat)[0], _later(elites, done, self.repeat))
 
 
-def _shifted(decisions: Float[Tensor, "samples decisions dim"], by: int) -> Float[Tensor, "samples decisions dim"]:
-    count = decisions.shape[1]
-    places = (torch.arange(count) + by).clamp(max=count - 1)
-    return decisions[:, places]
+def _later(
+    decisions: Float[Tensor, "samples decisions dim"], by: int, repeat: int
+) -> Float[Tensor, "samples decisions dim"]:
+    steps = decisions.shape[1] * repeat
+    places = (torch.arange(steps) + by).clamp(max=steps - 1) // repeat
+    return decisions[:, places].unflatten(1, (-1, repeat)).mean(dim=2)
