@@ -14,7 +14,7 @@ def add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
     _add_compare(commands)
 
 
-def add_checkpoint(parser: argparse.ArgumentParser) -> None:
+def add_checkpoint(parser: argparse._ActionsContainer) -> None:
     """Add the option by which a checkpoint of a run is named."""
     parser.add_argument(
         "--checkpoint",
@@ -77,6 +77,15 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
     probes.add_argument(
         "--at-once", metavar="N", type=count, default=64, help="actions computed together (64): lower it to save memory"
     )
+    planning = parser.add_argument_group("plans (they take long: see docs/evaluation.md)")
+    planning.add_argument(
+        "--planning",
+        action="store_true",
+        help="plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score",
+    )
+    planning.add_argument(
+        "--planning-clips", metavar="N", type=count, default=32, help="clips to plan from, one frame of each (32)"
+    )
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -95,6 +104,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         reach_cm=options.reach,
         examples=options.examples,
         at_once=options.at_once,
+        planning_clips=options.planning_clips if options.planning else 0,
     )
     data = load_config(options.data, []) if options.data else None
     several, evaluations = len(options.subjects) > 1, []

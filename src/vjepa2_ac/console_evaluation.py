@@ -11,7 +11,9 @@ from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.bootstrap import Estimate
 from vjepa2_ac.evaluation.comparison import Comparison
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
-from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscapes, Sensitivity
+from vjepa2_ac.evaluation.planning_figures import AXES, figures_of, signed_along, ways_of
+from vjepa2_ac.evaluation.planning_protocol import BEST_SCORE, STEPS
+from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscapes, PlanningStudy, Sensitivity
 
 _MOST_HORIZONS = 8  # rows; of longer clips some are left out, and stand in metrics.json
 _TOP = 5
@@ -48,7 +50,12 @@ class Stages:
 def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
     """Return the tables of `evaluate`: errors over persistence, then what the models make of their actions."""
     probed = any(model.sensitivity or model.landscapes for model in evaluation.models.values())
-    return (_errors(evaluation), *((_use_of_actions(evaluation),) if probed else ()))
+    study = evaluation.planning
+    return (
+        _errors(evaluation),
+        *((_use_of_actions(evaluation),) if probed else ()),
+        *((_plans(evaluation, study),) if study is not None else ()),
+    )
 
 
 def comparison_table(comparison: Comparison) -> Table:
@@ -134,6 +141,36 @@ def _landscape_rows(table: Table, models: list[Landscapes]) -> None:
             label = f"its {name} has the true sign ({_clips(first.sign_clips[axis])})"
             signs = [str(one.sign_agreement[axis]) for one in models]
             table.add_row(label, f"{first.sign_chance[axis]:.3f}", *signs)
+
+
+def _plans(evaluation: Evaluation, study: PlanningStudy) -> Table:
+    table = _table(f"Plans beside demonstrations, from {_clips(len(study))} (95 % interval over episodes)", "")
+    found = {"doing nothing": study.zero, "random": study.random, "within limits": study.within_limits}
+    ways = {**found, **ways_of(evaluation)}
+    for name in ways:
+        table.add_column(name, justify="right", no_wrap=True)
+    figures = [figures_of(study, plans) for plans in ways.values()]
+    table.add_row(f"Action Score (best {BEST_SCORE:.0f})", *(_short(one.score) for one in figures))
+    table.add_row(f"end of {STEPS} steps off by, cm", *(_short(one.missed_cm) for one in figures))
+    table.add_section()
+    table.add_row("one step off by, cm", *(_short(one.step_cm) for one in figures))
+    for axis, name in enumerate(AXES):
+        table.add_row(f"  along {name}", *(_short(one.axes_cm[axis]) for one in figures))
+    table.add_row("  angle, degrees", *(_short(one.angle_degrees, 0) for one in figures))
+    for axis, name in enumerate(AXES):
+        count = int(signed_along(study, axis).sum())
+        if count:
+            table.add_row(f"  right sign of {name} ({_clips(count)})", *(_short(o.signs[axis], 2) for o in figures))
+    table.add_row("  gripper off by", *(_short(one.gripper, 2) for one in figures))
+    table.add_section()
+    seconds = [plans.seconds / len(study) if plans.seconds else None for plans in ways.values()]
+    table.add_row("seconds a clip", *("" if one is None else f"{one:.1f}" for one in seconds))
+    return table
+
+
+def _short(one: Estimate, digits: int = 1) -> str:
+    value = f"{one.value:.{digits}f}"
+    return f"{value} [{one.low:.{digits}f}, {one.high:.{digits}f}]" if one.has_interval else value
 
 
 def _clips(number: int) -> str:

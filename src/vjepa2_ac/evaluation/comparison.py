@@ -67,8 +67,14 @@ def _compared(measured: Mapping[str, dict[str, Any]], folders: Mapping[str, Path
     ahead = f"{(about['frames'] - 1) * about['seconds_per_step']:.2f} s"
     return Comparison(
         title=f"L1 error over persistence on {clips['count']} {about['split']} clips of {clips['episodes']} episodes",
-        columns=(f"{ahead} ahead", f"gain over {names[0]}", "gain over its base", "one step", "shuffled", "rank"),
-        rows={name: _row(figures, first, ids) for name, figures in measured.items()},
+        columns=(
+            *(f"{ahead} ahead", f"gain over {names[0]}", "gain over its base", "one step", "shuffled", "rank"),
+            *(("Action Score", "plans end off, cm") if any(map(_plans, measured.values())) else ()),
+        ),
+        rows={
+            name: _row(figures, first, ids) + (_planned(figures) if any(map(_plans, measured.values())) else ())
+            for name, figures in measured.items()
+        },
         seconds=about["seconds_per_step"] * np.arange(1, about["frames"]),
         curves={name: _curve(figures) for name, figures in measured.items()},
         notes=_notes(measured, names),
@@ -109,6 +115,17 @@ def _row(figures: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> 
     )
 
 
+def _plans(figures: dict[str, Any]) -> dict[str, Any] | None:
+    """Return what stands there of plans; nothing where none were asked for, or evaluate did not know them yet."""
+    plans: dict[str, Any] | None = figures["models"][figures["trained"]].get("planning")
+    return plans
+
+
+def _planned(figures: dict[str, Any]) -> tuple[Cell, ...]:
+    plans = _plans(figures)
+    return ("", "") if plans is None else (_estimate(plans["score"]), _estimate(plans["missed_cm"]))
+
+
 def _gain(figures: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> Estimate:
     """Return by which share the error over persistence is smaller than the first run's, at the last horizon, paired."""
     columns = [column for one in (figures, first) for column in _last(one)]
@@ -132,9 +149,19 @@ def _notes(measured: Mapping[str, dict[str, Any]], names: Sequence[str]) -> tupl
         name: np.array(figures["by_clip"]["persistence"], dtype=np.float64).mean() for name, figures in measured.items()
     }
     others = [name for name in names[1:] if abs(nothing[name] / nothing[names[0]] - 1) > _SAME_LATENTS]
-    if not others:
-        return ()
-    return (f"Other latents than those of {names[0]} (another encoder or crop): {', '.join(others)}; ratios compare.",)
+    notes = []
+    if others:
+        notes.append(
+            f"Other latents than those of {names[0]} (another encoder or crop): {', '.join(others)}; ratios compare."
+        )
+    starts = {name: _starts(figures) for name, figures in measured.items() if _plans(figures)}
+    if len(set(starts.values())) > 1:
+        notes.append("Plans began at other frames (another --planning-clips or seed): Action Scores do not compare.")
+    return tuple(notes)
+
+
+def _starts(figures: dict[str, Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    return tuple(figures["planning"]["clips"]), tuple(figures["planning"]["places"])
 
 
 def _estimate(figures: Mapping[str, float | None]) -> Estimate:

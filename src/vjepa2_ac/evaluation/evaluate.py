@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.windows import spread
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.examples import chosen_clips, make_example, predicted_rollout
 from vjepa2_ac.evaluation.landscape import measure_landscapes
 from vjepa2_ac.evaluation.metrics import Predictor, measured, persistence_of, with_other_actions
+from vjepa2_ac.evaluation.planning_score import PlanningStart, measure_plans, planning_start, study_of
 from vjepa2_ac.evaluation.probe import Start, start_of
 from vjepa2_ac.evaluation.result import (
     About,
@@ -36,6 +38,7 @@ from vjepa2_ac.evaluation.strata import clips_of, strata_of
 ClipName = tuple[str, int]  # id of the episode, first control step
 Pictures = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the batch at hand
 _NOT_ASKED = "{} is 0: no {} were asked for."
+_NO_PLANS = "No plans: they are poses' displacements, and the states here are plain numbers."
 _NO_LANDSCAPES = "No energy landscapes: an action has {} numbers, and a landscape is over three."
 
 
@@ -60,6 +63,8 @@ class Probes:
     reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
     examples: int = 4
     at_once: int = 64  # samples that are computed together
+    planning_clips: int = 0  # of these, plans are held against the demonstration; of poses only
+    planning: PlanningConfig = field(default_factory=PlanningConfig)  # how one step is planned
 
 
 @dataclass(frozen=True)
@@ -88,7 +93,7 @@ def evaluate(
         stage: Gives a bar for a part of the work, by its title.
 
     Raises:
-        ValueError: No clips.
+        ValueError: No clips; or to plan they have too few frames.
     """
     probes = probes or Probes()
     seen = _see_all(contenders, clips, probes, about, _bar(stage, "measuring"))
@@ -109,6 +114,11 @@ def evaluate(
                 result,
                 sensitivity=_sensitivity(contender, seen.starts, pool, probes, about, stage),
                 landscapes=_landscapes(contender, seen.starts, known, pool, probes, about, stage),
+                plans=measure_plans(
+                    contender.model, seen.planned, probes.planning, _bar(stage, f"planning, {contender.name}")
+                )
+                if seen.planned
+                else None,
             )
     nothing = _joined(seen.persistence)
     evaluation = Evaluation(
@@ -119,13 +129,14 @@ def evaluate(
         strata=strata_of(known, is_pose=about.is_pose),
         episodes=(),
         examples=(),
+        planning=study_of(seen.planned, probes.planning) if seen.planned else None,
     )
     examples = _examples(contenders, clips, evaluation, probes)
-    notes = _left_out(probes, action_dim=seen.actions.shape[-1])
+    notes = _left_out(probes, about, action_dim=seen.actions.shape[-1])
     return replace(evaluation, episodes=_episodes(evaluation), examples=examples, notes=notes)
 
 
-def _left_out(probes: Probes, *, action_dim: int) -> tuple[str, ...]:
+def _left_out(probes: Probes, about: About, *, action_dim: int) -> tuple[str, ...]:
     """Return what a reader must know of what was not measured: by an option, or as there is no such thing."""
     notes = []
     if not probes.sensitivity_clips:
@@ -134,6 +145,8 @@ def _left_out(probes: Probes, *, action_dim: int) -> tuple[str, ...]:
         notes.append(_NOT_ASKED.format("--landscapes", "energy landscapes"))
     elif action_dim < 3:
         notes.append(_NO_LANDSCAPES.format(action_dim))
+    if probes.planning_clips and not about.is_pose:
+        notes.append(_NO_PLANS)
     if not probes.examples:
         notes.append(_NOT_ASKED.format("--examples", "example clips"))
     return tuple(notes)
@@ -149,6 +162,7 @@ class _Seen:
     errors: dict[tuple[str, str], list[Predicted]]  # by model and actions
     persistence: list[Predicted]
     starts: list[Start]
+    planned: list[PlanningStart] = field(default_factory=list)
 
 
 def _see_all(
@@ -157,6 +171,7 @@ def _see_all(
     seen = _Seen([], [], np.zeros((0, 0, 0)), {}, [], [])
     actions = []
     probed = set(spread(clips.count, probes.sensitivity_clips)) if probes.sensitivity_clips else set()
+    planned = set(spread(clips.count, probes.planning_clips)) if probes.planning_clips and about.is_pose else set()
     for batch, others in with_other_actions(batch for batch, _ in clips.read(None)):
         kinds = {"true": batch.actions, "zero": torch.zeros_like(batch.actions), "shuffled": others}
         for contender in contenders:
@@ -168,6 +183,8 @@ def _see_all(
         for row in range(len(batch.starts)):
             if first + row in probed:
                 seen.starts.append(start_of(batch, row, _largest_step(batch.actions[row], about), first + row))
+            if first + row in planned:
+                seen.planned.append(planning_start(batch, row, first + row, about.seed))
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
         seen.ids += batch.episode_ids
         seen.firsts += batch.starts

@@ -28,6 +28,7 @@ from vjepa2_ac.evaluation.estimates import (
     stratum_gain,
     stratum_over_persistence,
 )
+from vjepa2_ac.evaluation.planning_metrics import plans_as_dict, study_as_dict
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
     METRICS,
@@ -102,6 +103,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "episodes": [_episode(score) for score in evaluation.episodes],
         "by_clip": _by_clip(evaluation),
         "calibration": evaluation.calibration,
+        "planning": None if evaluation.planning is None else study_as_dict(evaluation.planning),
         "notes": list(evaluation.notes),
     }
 
@@ -127,6 +129,7 @@ def _model(evaluation: Evaluation, model: ModelResult) -> dict[str, Any]:
         "gap_of_shuffled_actions": gap_of_actions(evaluation, model.name, "shuffled").as_dict(),
         "sensitivity": None if model.sensitivity is None else _sensitivity(model.sensitivity),
         "landscapes": None if model.landscapes is None else _landscapes(model.landscapes),
+        "planning": plans_as_dict(evaluation, model.name),
     }
 
 

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from vjepa2_ac.evaluation.bootstrap import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
 
-BEST_SCORE = 80.0
 AXES = ("x", "y", "z")
 LEAST_CM = 0.5  # a demonstrated step that is shorter has no direction, and along an axis no sign
 _GRIPPER = 6

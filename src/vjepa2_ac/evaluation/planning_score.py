@@ -1,12 +1,7 @@
 """Would it plan what people did? Plans from frames of held-out clips, to be held against the demonstrated actions.
 
 Two plans from each start: one step towards the next frame, by the settings of the config's `planning`; and three steps
-towards the frame that came three steps later, by a fixed protocol, of which JEPA-WMs' Action Score is made.
-
-Source of the protocol: facebookresearch/jepa-wms @ 6eafb14, configs/evals/simu_env_planning/droid/vj2ac,
-evals/simu_env_planning/planning (planner.py: CEMPlanner; objectives.py: ReprTargetDistMPCObjective; plan_evaluator.py:
-sample_traj_segment_from_dset), app/vjepa_wm/modelcustom/simu_env_planning/vit_enc_preds.py: EncPredWM.unroll.
-Where it differs: docs/evaluation.md.
+towards the frame that came three steps later, by the Action Score's protocol (`planning_protocol`).
 """
 
 from __future__ import annotations
@@ -20,9 +15,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.metrics import Predictor
+from vjepa2_ac.evaluation.planning_protocol import FRAMES, FRAMES_SEEN, SCORED, STEPS
 from vjepa2_ac.evaluation.probe import clip_generator
 from vjepa2_ac.evaluation.result import PlanningStudy, Plans
 from vjepa2_ac.planning.action_space import ActionSpace, pose_space
@@ -31,26 +27,6 @@ from vjepa2_ac.planning.plan import Plan
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.poses import states_along
 
-STEPS = 3  # of a scored plan
-FRAMES = STEPS + 1  # that a clip needs
-SCORED = PlanningConfig(
-    planner="cem",
-    horizon=STEPS,
-    samples=300,
-    iterations=15,
-    gripper_start_std=0.1,
-    limits=LimitsConfig(xyz=(0.1, 0.1, 0.1), rotation=0.1, gripper=0.75, gripper_mode="free"),
-    energy=EnergyConfig(distance="l2", steps="last"),
-    cem=CemConfig(
-        elites=10,
-        momentum_mean=0.0,
-        momentum_std=0.0,
-        momentum_mean_gripper=0.0,
-        momentum_std_gripper=0.0,
-        try_mean=True,
-    ),
-)
-_SEEN = 2  # frames that the model sees at most, predicted ones included
 _RANDOM_PLANS = 64  # of each start: their mean error is the random plan's
 _SAME_M = 1e-6
 
@@ -99,9 +75,9 @@ class WindowCost:
             return actions[:, window], states[:, window], None if cameras is None else cameras[:, window]
 
         frame = start.frame.expand(samples, 1, *start.frame.shape)
-        frames = self._model.rollout(frame, *during(0, _SEEN))
-        for end in range(_SEEN + 1, steps + 1):
-            following = self._model.predict(frames, *during(end - _SEEN, end))[:, -1:]
+        frames = self._model.rollout(frame, *during(0, FRAMES_SEEN))
+        for end in range(FRAMES_SEEN + 1, steps + 1):
+            following = self._model.predict(frames, *during(end - FRAMES_SEEN, end))[:, -1:]
             frames = torch.cat([frames[:, 1:], following], dim=1)
         return distance(frames[:, -1].float(), self._goal, self._config.distance)
 

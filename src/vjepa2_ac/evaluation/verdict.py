@@ -8,9 +8,12 @@ import numpy as np
 
 from vjepa2_ac.evaluation.bootstrap import Estimate
 from vjepa2_ac.evaluation.estimates import gain_over, gap_of_actions, one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.planning_figures import differences_of, figures_of
+from vjepa2_ac.evaluation.planning_protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.result import METRICS, Evaluation, Metric, Ranking
 
 _SIDES = {-1: "better", 0: "no clear difference", 1: "NOT better"}  # of an error over persistence
+_NEARER = {-1: "nearer than", 0: "no clear difference to", 1: "FARTHER than"}  # of a difference
 _WORDS: dict[Metric, str] = {"l1": "L1", "l2": "L2", "cosine": "cosine"}
 
 
@@ -20,7 +23,7 @@ def verdict(evaluation: Evaluation) -> str:
     ahead = f"{evaluation.seconds_ahead:.1f} s ahead"
     absolute = f"Its error {ahead} is {_over_nothing(error)}."
     parts = [f"{_compared(evaluation, ahead)}.", absolute, *_denied(evaluation), _actions(evaluation)]
-    return " ".join(part for part in (*parts, *evaluation.notes) if part)
+    return " ".join(part for part in (*parts, _planned(evaluation), *evaluation.notes) if part)
 
 
 def improvement(evaluation: Evaluation, horizon: int) -> Estimate | None:
@@ -110,6 +113,21 @@ def _actions(evaluation: Evaluation) -> str:
 def _ranked(ranking: Ranking) -> str:
     rank = ranking.mean_rank
     return f"{rank.value:.0%} of other actions fit better than the true one ({interval(rank, '.0%')}; chance 50%)"
+
+
+def _planned(evaluation: Evaluation) -> str:
+    study, plans = evaluation.planning, evaluation.models[evaluation.trained].plans
+    if study is None or plans is None:
+        return ""
+    found, nothing = figures_of(study, plans), figures_of(study, study.zero).missed_cm.value
+    side = _NEARER[found.missed_over_zero.side(of=1.0)]
+    words = f"Its plans of {STEPS} steps end {found.missed_cm.value:.1f} cm from where the demonstrations do"
+    words += f" ({interval(found.missed_cm, '.1f')}): {side} doing nothing ({nothing:.1f} cm)"
+    base = None if evaluation.base is None else evaluation.models[evaluation.base].plans
+    if base is not None:
+        beside = differences_of(study, plans, base).missed_cm
+        words += f", {_NEARER[beside.side(of=0.0)]} the base ({figures_of(study, base).missed_cm.value:.1f} cm)"
+    return f"{words}; the Action Score is {found.score.value:.0f} of {BEST_SCORE:.0f}."
 
 
 def _mean_and_range(values: list[float], form: str) -> str:

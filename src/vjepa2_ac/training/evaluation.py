@@ -25,6 +25,7 @@ from vjepa2_ac.evaluation.evaluate import ClipName, ClipsAgain, Contender, Pictu
 from vjepa2_ac.evaluation.examples import seen_by_the_encoder
 from vjepa2_ac.evaluation.html_report.page import write_report
 from vjepa2_ac.evaluation.metrics_file import METRICS_FILE, write_metrics
+from vjepa2_ac.evaluation.planning_protocol import FRAMES
 from vjepa2_ac.evaluation.plots import plot_evaluation
 from vjepa2_ac.evaluation.result import About, Evaluation, TrainingCurve
 from vjepa2_ac.evaluation.verdict import verdict
@@ -84,6 +85,7 @@ def evaluate_subject(
     """
     asked = asked or Asked()
     config, folder = _config_of(subject, asked)
+    _check_long_enough(config, asked.probes)
     _check_writable(folder)
     dataset = open_dataset(config.data, progress=stage("looking through the data") if stage else None)
     windows = dataset.windows(asked.split)
@@ -115,7 +117,11 @@ def evaluate_subject(
     clips = _clips(through_cache, chosen, config.validation.batch_size, encode, world_model.image_size)
     with accelerator.autocast():
         evaluation = evaluate(
-            contenders, clips, _about(subject, run, config, dataset, asked), probes=asked.probes, stage=stage
+            contenders,
+            clips,
+            _about(subject, run, config, dataset, asked),
+            probes=replace(asked.probes, planning=config.planning),
+            stage=stage,
         )
     evaluation = replace(
         evaluation,
@@ -177,6 +183,16 @@ def _nothing_to_measure(subject: str) -> InputError:
         needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
         fix="To measure a model, name the data with --data CONFIG and a folder with --out",
     )
+
+
+def _check_long_enough(config: Config, probes: Probes) -> None:
+    if probes.planning_clips and config.data.states == "pose" and config.data.frames < FRAMES:
+        raise InputError(
+            where="--planning",
+            found=f"clips of {config.data.frames} frames (data.frames)",
+            needed=f"{FRAMES} or more: plans are held against {FRAMES - 1} steps that were demonstrated",
+            fix=f"Give --data a config with data.frames of {FRAMES} or more, and --out",
+        )
 
 
 def _check_writable(folder: Path) -> None:
