@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
 import torch
+from einops import reduce
 from jaxtyping import Float
 from torch import Tensor
 
@@ -84,4 +85,5 @@ def _later(
 ) -> Float[Tensor, "samples decisions dim"]:
     steps = decisions.shape[1] * repeat
     places = (torch.arange(steps) + by).clamp(max=steps - 1) // repeat
-    return decisions[:, places].unflatten(1, (-1, repeat)).mean(dim=2)
+    at_steps = decisions[:, places]
+    return reduce(at_steps, "samples (decisions repeat) dim -> samples decisions dim", "mean", repeat=repeat)
