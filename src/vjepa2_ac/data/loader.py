@@ -68,9 +68,17 @@ def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size
     Raises:
         InputError: The split is empty, or a clip cannot be read.
     """
+    return batches_of(dataset, validation_windows(dataset, split, clips=clips), batch_size=batch_size)
+
+
+def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tuple[int, int]]:
+    """Return where those clips start: (episode, first control step), in their order.
+
+    Raises:
+        InputError: The split is empty.
+    """
     windows = dataset.windows(split)
-    chosen = [windows[index] for index in far_neighbours(spread(len(windows), clips))]
-    return batches_of(dataset, chosen, batch_size=batch_size)
+    return [windows[index] for index in far_neighbours(spread(len(windows), clips))]
 
 
 def batches_of(dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int) -> Iterator[Batch]:

@@ -22,6 +22,7 @@ from vjepa2_ac.latents import encode_batch, extrinsics_for
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import add_adapter, save_trained, trainable_report
 from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.best import best_so_far, measured_on
 from vjepa2_ac.training.cached import with_latents
 from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, write_checkpoint
 from vjepa2_ac.training.device import is_on_cpu
@@ -119,6 +120,7 @@ def assemble(
     take_up_loss_scale(scaler, state)
     dataset.broken.recall(state.broken)
     say_what_is_new(dataset, state, note)
+    state = best_so_far(state, measured_on(config, dataset), note)
     micro_batches = micro_batches_of(config, state, accelerator.num_processes, note)
     objective = Objective(world_model, config.training)
     return Run(

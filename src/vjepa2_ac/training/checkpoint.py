@@ -44,6 +44,7 @@ class RunState:
     windows: int | None = None  # clips of an epoch: with another number, their order is another
     best_step: int | None = None  # the validation that went best, where checkpoint.keep_best is set
     best_error: float | None = None
+    measured_on: Mapping[str, str] | None = None  # what validation errors are of, see `training.best`
     loss_scale: Mapping[str, float] | None = None  # of fp16: state of the gradient scaler
 
     def measured(self, error: float) -> RunState:

@@ -60,7 +60,10 @@ def _best_step(newest: Path) -> int:
     except (OSError, ValueError, TypeError) as error:
         raise InputError(where=str(newest), found=f"not the state of a run ({error})") from None
     if step is None:
-        found = "no best checkpoint: checkpoint.keep_best was off, there was no validation yet, or it was deleted"
+        found = (
+            "no best checkpoint: checkpoint.keep_best was off, there was no validation yet, what it measures was"
+            " changed since, or it was deleted"
+        )
         raise _not_there(newest.parent, found)
     return step
 
