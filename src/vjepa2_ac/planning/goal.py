@@ -46,7 +46,8 @@ class Goal:
 
         The frame that a goal's last step leads to is still to be that goal.
         """
-        return self.latents[[self.place(done + step) for step in range(steps)]]
+        places = [self.place(done + step) for step in range(steps)]
+        return torch.stack([self.latents[place] for place in places])  # a list as an index would wait for the device
 
 
 def patch_weights(

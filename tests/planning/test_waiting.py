@@ -1,0 +1,52 @@
+"""A device that computes energies is not asked anything before they are done: asking would make the program wait."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from planning.tiny import actions, cost, tiny_model
+
+ASKING = {
+    "_local_scalar_dense", "_to_copy", "copy_", "equal", "index", "index_put_", "is_nonzero", "lift_fresh",
+    "masked_select", "nonzero", "unique_dim", "_unique2",
+}  # fmt: skip
+"""What fetches numbers, has a result whose size depends on them, or brings a list of them to the device."""
+
+
+class Recorder(TorchDispatchMode):
+    """Knows the names of all operations that ran."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[str] = set()
+
+    def __torch_dispatch__(self, operation: Any, types: Any, given: Any = (), named: Any = None) -> Any:
+        self.seen.add(operation._overloadpacket.__name__)
+        return operation(*given, **(named or {}))
+
+
+def operations_of(work: Callable[[], object]) -> set[str]:
+    """Return what runs in something that was done once before."""
+    work()
+    with Recorder() as recorder:
+        work()
+    return recorder.seen
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(("context", "steps", "kind"), [(1, "last", "l1"), (2, "sum", "cosine")])
+def test_energies_are_computed_without_asking_the_device(context: int, steps: str, kind: str) -> None:
+    measure, tried = cost(tiny_model(), context, samples_at_once=4, steps=steps, distance=kind), actions(10, 3)
+    seen = operations_of(lambda: measure(tried))
+    assert "addmm" in seen
+    assert not seen & ASKING
+
+
+@pytest.mark.parametrize(
+    "work", [lambda x: x[[0, 1]], lambda x: float(x[0]), lambda x: x[x > 0], lambda x: x.bfloat16()]
+)
+def test_asking_would_be_noticed(work: Callable[[torch.Tensor], object]) -> None:
+    assert operations_of(lambda: work(torch.ones(3))) & ASKING
