@@ -15,7 +15,8 @@ from vjepa2_ac.cli_data import add_data
 from vjepa2_ac.cli_doctor import add_doctor
 from vjepa2_ac.cli_encode import add_encode
 from vjepa2_ac.cli_evaluate import add_checkpoint, add_evaluate
-from vjepa2_ac.cli_parts import Commands, Handler, command, count, whole_number
+from vjepa2_ac.cli_parts import Commands, Handler, command
+from vjepa2_ac.cli_simulate import add_simulate
 from vjepa2_ac.errors import InputError
 
 
@@ -70,7 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_export(commands)
     _add_config(commands)
     _add_download(commands)
-    _add_simulate(commands)
+    add_simulate(commands)
     return parser
 
 
@@ -187,49 +188,6 @@ def _download(options: argparse.Namespace) -> None:
     progress = DownloadProgress(options.path.name)
     download(options.url or OFFICIAL_URL, options.path, progress=progress)
     console.print(f"The checkpoint is in {options.path}")
-
-
-def _add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = command(commands, "simulate", _simulate, "Record demonstrations of a simulated arm as a DROID data set.")
-    parser.add_argument("what", choices=["record"])
-    parser.add_argument("folder", metavar="FOLDER", type=Path, help="where the data set goes")
-    parser.add_argument(
-        "--domain", default="A", help="A, B, or random: another camera, light and look in every episode"
-    )
-    parser.add_argument("--episodes", type=count, default=40)
-    parser.add_argument("--steps", type=count, default=41, help="control steps of an episode, 15 per second")
-    parser.add_argument("--seed", type=whole_number(0, 2**31 - 1), default=0)
-    parser.add_argument(
-        "--cameras", type=whole_number(1, 3), choices=[1, 3], default=1, help="1: all three pictures are the same one"
-    )
-    parser.add_argument(
-        "--renderer", choices=["rays", "opengl"], default="rays", help="opengl needs a working MUJOCO_GL"
-    )
-    parser.add_argument(
-        "--workers", type=count, default=1, help="processes; the data are the same whatever their number"
-    )
-
-
-def _simulate(options: argparse.Namespace) -> None:
-    from vjepa2_ac.console import ProgressBar, console
-    from vjepa2_ac.simulation.record import record_dataset
-
-    bar = ProgressBar("recording", options.episodes)
-    try:
-        folder = record_dataset(
-            options.folder,
-            domain=options.domain,
-            episodes=options.episodes,
-            steps=options.steps,
-            seed=options.seed,
-            workers=options.workers,
-            cameras=options.cameras,
-            renderer=options.renderer,
-            progress=lambda done, _: bar.advance_to(done),
-        )
-    finally:
-        bar.close()
-    console.print(f"{options.episodes} episodes are in {folder}")
 
 
 if __name__ == "__main__":

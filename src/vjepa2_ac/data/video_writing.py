@@ -1,0 +1,67 @@
+"""How do pictures become a video that every player shows? H.264 in an MP4, written whole or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import atomic_writer
+
+_QUALITY = "20"  # x264's constant rate factor: text stays sharp
+
+
+def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height width 3"]], *, rate_hz: float) -> Path:
+    """Write RGB pictures as a video and return its path; an odd last row or column of pixels is left out.
+
+    Args:
+        path: A local file; missing folders are made.
+        pictures: Of one size, at least one.
+        rate_hz: How many are shown in a second.
+
+    Raises:
+        InputError: PyAV is not installed.
+        ValueError: No pictures, or of different sizes.
+    """
+    av = video_library()
+    size: tuple[int, int] | None = None
+    with atomic_writer(path) as file, av.open(file, "w", format="mp4", options={"movflags": "faststart"}) as container:
+        stream = container.add_stream(
+            "libx264", rate=Fraction(rate_hz).limit_denominator(1000), options={"crf": _QUALITY, "preset": "medium"}
+        )
+        stream.pix_fmt = "yuv420p"  # what browsers can show
+        for picture in pictures:
+            even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+            if size is None:
+                size = even.shape[:2]
+                stream.height, stream.width = size
+            elif even.shape[:2] != size:
+                raise ValueError(f"pictures of {size} and {even.shape[:2]} pixels in one video")
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+            container.mux(stream.encode(frame))
+        if size is None:
+            raise ValueError("a video without pictures")
+        container.mux(stream.encode(None))
+    return Path(path)
+
+
+def video_library() -> Any:
+    """Return PyAV.
+
+    Raises:
+        InputError: It is not installed.
+    """
+    try:
+        import av
+    except ImportError:
+        raise InputError(
+            where="video",
+            found="PyAV, which writes videos, is not installed",
+            fix='Run `pip install -c constraints.txt -e ".[video]"`, or ask for no video',
+        ) from None
+    return av

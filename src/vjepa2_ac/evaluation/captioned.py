@@ -1,0 +1,49 @@
+"""How do pictures side by side look with a few words above them? One frame of a video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+_DOTS = 100  # per inch, of text
+_LINE = 30  # pixels
+_GAP = 6
+
+
+def side_by_side(
+    pictures: Sequence[UInt8[np.ndarray, "height width 3"]], captions: Sequence[str], title: str, *, enlarged: int = 2
+) -> UInt8[np.ndarray, "_ _ 3"]:
+    """Return pictures of one size in a row, a caption above each, a title above all.
+
+    Args:
+        pictures: What is shown.
+        captions: One for each.
+        title: A line that may be as long as all are wide.
+        enlarged: How many pixels each pixel becomes, along both axes.
+
+    Raises:
+        ValueError: Not one caption for each picture.
+    """
+    if len(captions) != len(pictures):
+        raise ValueError(f"{len(captions)} captions for {len(pictures)} pictures")
+    large = [picture.repeat(enlarged, axis=0).repeat(enlarged, axis=1) for picture in pictures]
+    columns = [
+        np.concatenate([_words(text, one.shape[1], 9.0), one]) for text, one in zip(captions, large, strict=True)
+    ]
+    gap = np.full((columns[0].shape[0], _GAP, 3), 255, dtype=np.uint8)
+    row = np.concatenate([part for column in columns for part in (column, gap)][:-1], axis=1)
+    return np.concatenate([_words(title, row.shape[1], 11.0), row])
+
+
+@lru_cache(maxsize=64)
+def _words(text: str, width: int, points: float) -> UInt8[np.ndarray, "_ width 3"]:
+    figure = Figure(figsize=(width / _DOTS, _LINE / _DOTS), dpi=_DOTS, facecolor="white")
+    canvas = FigureCanvasAgg(figure)
+    figure.text(8 / width, 0.5, text, fontsize=points, va="center", ha="left", parse_math=False)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
