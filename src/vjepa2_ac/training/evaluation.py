@@ -40,6 +40,7 @@ from vjepa2_ac.training.chosen import NEWEST, choose_checkpoint
 from vjepa2_ac.training.journal import read_journal
 from vjepa2_ac.training.run_folder import read_run_config
 from vjepa2_ac.training.runs import TrainedRun, is_run, load_run
+from vjepa2_ac.training.start_folder import DATA, with_paths_from_start
 from vjepa2_ac.training.stride import calibrate_model
 
 PLOT, REPORT = "evaluation.png", "report.html"
@@ -148,7 +149,8 @@ def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
 def _config_of(subject: str, asked: Asked) -> tuple[Config, Path]:
     """Return the config to measure with, and the folder for what is found."""
     if is_run(subject):
-        config = read_run_config(Path(subject))
+        config, needed = read_run_config(Path(subject)), [DATA] if asked.data is None else []
+        config = with_paths_from_start(config, Path(subject), needed=needed)
         choose_checkpoint(Path(subject), asked.checkpoint)
         if asked.data is None:
             return config, asked.out or Path(subject)

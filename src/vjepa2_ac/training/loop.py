@@ -37,6 +37,7 @@ from vjepa2_ac.training.quiet import QuietJournal, QuietReporter
 from vjepa2_ac.training.resume import refuse_if_overtaken
 from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open_run_folder
 from vjepa2_ac.training.run_lock import RunLock
+from vjepa2_ac.training.start_folder import require_start_folder
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.stride import CALIBRATION, with_settled_stride
 from vjepa2_ac.training.trackers import open_trackers
@@ -97,6 +98,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
         if accelerator.is_main_process:  # the only one that needs to see the run's folder
             config = with_settled_stride(config)
             check_run_folder(config, allow_config_change=allow_config_change)
+            require_start_folder(config, Path(config.run_dir))
             if not check_only and Path(config.run_dir).is_dir():  # a new one is made, and locked, when all else is well
                 lock.take()
             # What is checked only is fetched to where it does not last.

@@ -1,7 +1,7 @@
 """What does a run's folder hold, and whose is it?
 
 RUN/config.yaml         the resolved config, defaults and a chosen stride included
-RUN/environment.json    versions, machine and command of every start
+RUN/environment.json    versions, machine, command and folder of every start
 RUN/calibration.json    figures of each stride, where data.stride was auto
 RUN/run_id              a name that no other run has
 RUN/metrics.jsonl       figures, a row per line
@@ -96,7 +96,7 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     """
     check_run_folder(config, allow_config_change=allow_config_change)
     folder = Path(config.run_dir)
-    start = {"seed": config.seed, **environment()}
+    start = {"seed": config.seed, "folder": str(Path.cwd()), **environment()}
     if (changes := config_changes(config)) and allow_config_change:
         start["config_changes"] = changes
     if allow_config_change or not (folder / CONFIG).exists():  # first of all files: it makes the folder a run's
@@ -138,6 +138,12 @@ def read_run_config(folder: Path) -> Config:
             needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
         )
     return load_config(folder / CONFIG, [f"run_dir={json.dumps(str(folder))}"])
+
+
+def start_folders(folder: Path) -> list[Path]:
+    """Return the folders in which a run was started, the last one first."""
+    starts = [start for start in _earlier_starts(folder / ENVIRONMENT) if isinstance(start, dict)]
+    return [Path(start["folder"]) for start in reversed(starts) if isinstance(start.get("folder"), str)]
 
 
 def environment() -> dict[str, object]:

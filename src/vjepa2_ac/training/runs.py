@@ -12,6 +12,7 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.checkpoint import ADAPTER
 from vjepa2_ac.training.chosen import NEWEST, choose_checkpoint
 from vjepa2_ac.training.run_folder import CONFIG, read_run_config
+from vjepa2_ac.training.start_folder import BASE, with_paths_from_start
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ def load_run(folder: Path, checkpoint: str = NEWEST, config: Config | None = Non
     Raises:
         InputError: Not the folder of a run, no such checkpoint, or its base cannot be loaded.
     """
-    config = config or read_run_config(folder)
+    config = with_paths_from_start(config or read_run_config(folder), folder, needed=[BASE])
     chosen = choose_checkpoint(folder, checkpoint)
     world_model = load_base(config.model, seed=config.seed)
     load_trained(world_model, chosen.path / ADAPTER, trainable=False)
