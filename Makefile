@@ -45,6 +45,7 @@ bench: $(INSTALLED)  ## figures of this machine; each prints a ratio against a n
 	$(BIN)/python benchmarks/loader.py
 	$(BIN)/python benchmarks/index.py
 	$(BIN)/python benchmarks/train_step.py
+	$(BIN)/python benchmarks/planning.py
 
 clean:
 	rm -rf .venv demo

@@ -55,9 +55,9 @@ class Official:
         self, checkout: Path, weights: Mapping[str, Any], sizes: ModelSizes, adapter: AdapterConfig,
         training: TrainingConfig, *, frames: int, encoder: bool, device: torch.device,
     ) -> None:  # fmt: skip
-        self._module = _imported(checkout, "src.models.ac_predictor")
-        predictor = _predictor(self._module, sizes, frames)
-        predictor.load_state_dict(_plain(weights["predictor"]))
+        self._module = imported(checkout, "src.models.ac_predictor")
+        predictor = build_predictor(self._module, sizes, frames)
+        predictor.load_state_dict(plain_names(weights["predictor"]))
         self._inner, self._device, self._rollout_steps = predictor, device, training.rollout_steps
         lora = LoraConfig(
             r=adapter.rank, lora_alpha=adapter.alpha, use_rslora=adapter.rslora, lora_dropout=adapter.dropout,
@@ -118,8 +118,8 @@ class Official:
         return layer_norm(following, following.shape[-1:]).unflatten(1, latents.shape[1:3])
 
     def _frozen_encoder(self, checkout: Path, weights: Mapping[str, Tensor], sizes: ModelSizes) -> nn.Module:
-        network = _encoder(_imported(checkout, "src.models.vision_transformer"), sizes)
-        network.load_state_dict(_plain(weights))
+        network = _encoder(imported(checkout, "src.models.vision_transformer"), sizes)
+        network.load_state_dict(plain_names(weights))
         return network.requires_grad_(False).to(self._device)
 
 
@@ -175,11 +175,13 @@ def _gradient(matrix: Tensor, third: int | None) -> Tensor:
     return matrix.grad if third is None else matrix.grad.chunk(3)[third]
 
 
-def _plain(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def plain_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return float32 weights by the names that the official modules give them."""
     return {name.removeprefix("module."): value.float() for name, value in weights.items()}
 
 
-def _predictor(module: Any, sizes: ModelSizes, frames: int) -> nn.Module:
+def build_predictor(module: Any, sizes: ModelSizes, frames: int) -> nn.Module:
+    """Return the official predictor with random weights, for clips of so many frames."""
     predictor = sizes.predictor
     return module.VisionTransformerPredictorAC(  # type: ignore[no-any-return]
         img_size=sizes.image_size, patch_size=sizes.patch_size, tubelet_size=2, num_frames=2 * frames,
@@ -197,7 +199,7 @@ def _encoder(module: Any, sizes: ModelSizes) -> nn.Module:
     )  # fmt: skip
 
 
-def _imported(checkout: Path, name: str) -> Any:
+def imported(checkout: Path, name: str) -> Any:
     """Import a module of a checkout. It wants one function of timm, for stochastic depth, which the recipe has not."""
     warnings.filterwarnings("ignore", message=".*sdp_kernel.*")  # deprecated in PyTorch, called by every layer
     if str(checkout) not in sys.path:

@@ -22,16 +22,14 @@ import itertools
 import json
 import math
 import statistics
-import subprocess
 import sys
-import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from official import PREDICTOR
 from timed_steps import OFFICIAL, PRECISIONS, Bench, Setting, has_checkout
+from timing import device_name, in_own_process, peak_memory_gb, take_turns
 
 from vjepa2_ac.model.lora import trainable_report
 from vjepa2_ac.training.health import matmul_speed
@@ -48,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = parse(given)
     if options.memory_of:
-        print(json.dumps(peak_memory_gb(Bench(options, options.dtype[0]), options)))
+        print(json.dumps(memory_of_way(Bench(options, options.dtype[0]), options)))
         return
     _introduce(options)
     for dtype in options.dtype:
@@ -66,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for way in ways:
                 median = statistics.median(seconds[way])
                 ratio = statistics.median(b / o for b, o in zip(seconds[ways[0]], seconds[way], strict=True))
-                peak = in_own_process(given, setting, way, dtype) if options.memory else math.nan
+                peak = memory_in_own_process(given, setting, way, dtype) if options.memory else math.nan
                 print(
                     f"{setting.frames:6} {setting.batch:5} {'yes' if setting.checkpointing else 'no':>13}  {way:9}"
                     f"{median * 1e3:12.0f}{setting.batch / median:12.3f}{flops / median / ceiling:12.1%}"
@@ -131,49 +129,25 @@ def choose_ways(bench: Bench, options: argparse.Namespace) -> list[str]:
     return ["dense", *(way for way in options.attention if way != "dense")]
 
 
-def take_turns(steps: dict[str, Callable[[], object]], options: argparse.Namespace) -> dict[str, list[float]]:
-    """Return the seconds of each repeat of each way."""
-    times: dict[str, list[float]] = {way: [] for way in steps}
-    for repeat in range(options.warm_up + options.repeats):
-        for way, step in steps.items():
-            start = _clock_s(options.device)
-            step()
-            if repeat >= options.warm_up:
-                times[way].append(_clock_s(options.device) - start)
-    return times
-
-
-def peak_memory_gb(bench: Bench, options: argparse.Namespace) -> float:
-    """Return the peak in 10^9 bytes of two steps of one way: on CUDA of PyTorch's allocator, else resident."""
+def memory_of_way(bench: Bench, options: argparse.Namespace) -> float:
+    """Return the peak in 10^9 bytes of two steps of one way, with nothing of the other in memory."""
     step = bench.step(settings(options)[0], options.memory_of)
     if options.memory_of == OFFICIAL:
         del bench.model
     elif "official" in vars(bench):
         del bench.official
     bench._weights = None
-    if options.device != "cpu":
-        torch.cuda.reset_peak_memory_stats()
-    else:
-        with suppress(OSError):  # where the system has it: what building the model took is forgotten
-            Path("/proc/self/clear_refs").write_text("5")
-    step()
-    step()  # with the optimizer's moments
-    if options.device != "cpu":
-        return torch.cuda.max_memory_allocated() / 1e9
-    status = Path("/proc/self/status").read_text()
-    return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) * 1024 / 1e9
+    return peak_memory_gb(step, options.device)
 
 
-def in_own_process(given: list[str], setting: Setting, way: str, dtype: str) -> float:
+def memory_in_own_process(given: list[str], setting: Setting, way: str, dtype: str) -> float:
     """Return the peak memory of one way in a fresh process."""
     again = "on" if setting.checkpointing else "off"
     own = [
         "--frames", str(setting.frames), "--batch", str(setting.batch), "--checkpointing", again, "--dtype", dtype,
         "--memory-of", way,
     ]  # fmt: skip
-    command = [sys.executable, __file__, *given, *own]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)  # noqa: S603
-    return float(json.loads(done.stdout.splitlines()[-1]))
+    return in_own_process(__file__, [*given, *own])
 
 
 def _introduce(options: argparse.Namespace) -> None:
@@ -183,21 +157,6 @@ def _introduce(options: argparse.Namespace) -> None:
         f"{options.layers} layers of width {options.width}, {options.image_size} px, {latents},"
         f" rollout of {options.rollout_steps}, {options.repeats} repeats"
     )
-
-
-def _clock_s(device: str) -> float:
-    if device == "cpu":
-        return time.process_time() / torch.get_num_threads()
-    torch.cuda.synchronize()
-    return time.perf_counter()
-
-
-def device_name(device: str) -> str:
-    """Return what computes."""
-    if device != "cpu":
-        return torch.cuda.get_device_name()
-    lines = Path("/proc/cpuinfo").read_text().splitlines()
-    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "CPU")
 
 
 if __name__ == "__main__":

@@ -62,13 +62,25 @@ class VisionTransformerPredictorAC(nn.Module):
 @pytest.fixture
 def train_step(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The benchmark, imported as where it lies; nothing of it stays."""
+    yield from imported_from_where_it_lies("train_step", monkeypatch)
+
+
+@pytest.fixture
+def planning(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The benchmark of decisions, as well; its name is that of a folder of tests, too."""
+    monkeypatch.delitem(sys.modules, "planning", raising=False)
+    yield from imported_from_where_it_lies("planning", monkeypatch)
+
+
+def imported_from_where_it_lies(name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     threads, before = torch.get_num_threads(), set(sys.modules)
     monkeypatch.setattr(sys, "path", [str(ROOT / "benchmarks"), *sys.path])
-    yield import_module("train_step")
+    yield import_module(name)
     torch.set_num_threads(threads)
-    for name in set(sys.modules) - before:
-        if name.split(".")[0] in {"train_step", "timed_steps", "official", "src"}:
-            del sys.modules[name]
+    own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")} | {"src", "notebooks"}
+    for module in set(sys.modules) - before:
+        if module.split(".")[0] in own:
+            del sys.modules[module]
 
 
 def rows(printed: str) -> list[tuple[str, float, float]]:
@@ -105,6 +117,87 @@ def test_no_ratio_is_printed_to_a_predictor_that_computes_something_else(
     printed = capsys.readouterr().out
     assert "official: NO RATIO" in printed
     assert [way for way, _, _ in rows(printed)] == ["dense", "auto"]
+
+
+DECISION = re.compile(r"^ +(\d+) +(\S+) +(\S+) +\S+ +(\S+)% +(\S+) +(\S+) +(\S+)$", re.MULTILINE)
+"""Horizon, way, seconds, MFU, peak memory, ratio to plain, ratio to official."""
+
+
+def test_quick_benchmark_of_a_decision_completes_without_the_official_code(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--profile"])
+    printed = capsys.readouterr().out
+    assert f"official: skipped, for there is no {tmp_path}" in printed
+    assert "aten::addmm" in printed
+    lines = DECISION.findall(printed)
+    assert [(horizon, way) for horizon, way, *_ in lines] == [("2", "plain"), ("2", "ours/4"), ("2", "ours/1")]
+    for _, _, seconds, mfu, _, of_plain, of_official in lines:
+        assert 0 < float(seconds) < 60
+        assert 0 < float(mfu) < 150
+        assert 0 < float(of_plain) < 100
+        assert of_official == "nan"
+    assert lines[0][5] == "1.00"
+
+
+def test_peak_memory_of_a_decision_is_told_as_a_number_alone(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planning.main(["--quick", "--official", str(tmp_path), "--memory-of", "ours/4", "4"])
+    assert 0.01 < float(capsys.readouterr().out) < 100
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_no_ratio_is_printed_to_a_decision_that_comes_out_otherwise(
+    planning: Any, dtype: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses = sys.modules["timed_decisions"]._poses_one_by_one
+    monkeypatch.setattr("timed_decisions._poses_one_by_one", lambda states, actions: poses(states, -3 * actions))
+    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--dtype", dtype])
+    printed = capsys.readouterr().out
+    assert re.search(r"plain: actions differ by .*: NO RATIO", printed)
+    assert [(way, of_plain) for _, way, _, _, _, of_plain, _ in DECISION.findall(printed)] == [
+        ("ours/4", "nan"), ("ours/1", "nan"),
+    ]  # fmt: skip
+
+
+NOTEBOOK = """
+import torch
+
+class WorldModel:
+    def __init__(self, mpc_args, device, **_):
+        self.asked = mpc_args
+
+    def infer_next_action(self, rep, pose, goal_rep):
+        assert rep.shape == goal_rep.shape == (1, 4, 128)
+        assert pose.shape == (1, 1, 7)
+        assert not torch.is_grad_enabled()
+        assert sorted(self.asked) == [
+            "cem_steps", "maxnorm", "momentum_mean", "momentum_mean_gripper", "momentum_std", "momentum_std_gripper",
+            "rollout", "samples", "topk",
+        ]
+        return torch.zeros(self.asked["rollout"], 7) if torch.randn(3, device="cpu").any() else None
+"""
+
+
+def test_no_ratio_is_printed_to_a_notebook_that_plans_otherwise(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "src" / "models").mkdir(parents=True)
+    (tmp_path / "src" / "models" / "ac_predictor.py").write_text(ELSEWHERE)
+    (tmp_path / "notebooks" / "utils").mkdir(parents=True)
+    (tmp_path / "notebooks" / "utils" / "world_model_wrapper.py").write_text(NOTEBOOK)
+    planning.main(["--quick", "--no-memory", "--official", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert re.search(r"official: actions differ by .*: NO RATIO", printed)
+    assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/1"]
+
+
+def test_on_cuda_the_papers_setting_is_measured(planning: Any) -> None:
+    options = planning.parse(["--device", "cuda"])
+    assert (options.samples, options.iterations, options.horizon, options.layers) == (800, 10, [1, 2], 24)
+    assert (options.width, options.latent_dim, options.image_size, options.dtype) == (1024, 1408, 256, ["bfloat16"])
+    assert planning.parse(["--device", "cuda", "--samples", "9"]).samples == 9
 
 
 def test_quick_benchmark_of_latents_tells_speed_size_and_added_error(
