@@ -87,6 +87,33 @@ def line_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis, *, 
     )
 
 
+def dot_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis) -> Markup:
+    """Return points that no curve joins, with the diagonal on which both of their values are the same, and zero.
+
+    Args:
+        says: What the chart shows, for those who do not see it.
+        lines: The points; the later ones lie above.
+        x_axis: From where to where.
+        y_axis: Likewise, zero included.
+    """
+    place = _Place(x_axis, y_axis)
+    low, high = max(x_axis.low, y_axis.low), min(x_axis.high, y_axis.high)
+    ends = {"x1": place.across(low), "x2": place.across(high), "y1": place.down(low), "y2": place.down(high)}
+    zero = {"x1": _LEFT, "x2": _WIDTH - _RIGHT, "y1": place.down(0.0), "y2": place.down(0.0)}
+    return element(
+        "svg",
+        element("title", says),
+        _grid(place),
+        element("line", class_="axis", **zero),
+        element("line", class_="level", **ends),
+        *(_mark(line, x, y, place) for line in lines for x, y in zip(line.x, line.y, strict=True)),
+        class_="chart",
+        viewBox=f"0 0 {_WIDTH:g} {_HEIGHT:g}",
+        role="img",
+        aria_label=says,
+    )
+
+
 def legend(lines: Sequence[Line]) -> Markup:
     """Return the names of curves, each beside a piece of it."""
     entries = [element("li", swatch(line.style), line.name) for line in lines]

@@ -12,6 +12,7 @@ from vjepa2_ac.evaluation.html_report.examples import animation_style, examples_
 from vjepa2_ac.evaluation.html_report.layout import Section, share, value
 from vjepa2_ac.evaluation.html_report.markup import Markup, element, joined
 from vjepa2_ac.evaluation.html_report.numbers import seconds
+from vjepa2_ac.evaluation.html_report.planning import planning_section
 from vjepa2_ac.evaluation.html_report.runs import calibration_section, episode_section, training_section
 from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.storage import write_atomically
@@ -59,6 +60,7 @@ def report_page(evaluation: Evaluation, verdict: str) -> str:
         strata_section(evaluation),
         actions_section(evaluation),
         landscape_section(evaluation),
+        planning_section(evaluation),
         episode_section(evaluation),
         examples_section(evaluation),
         training_section(evaluation),
