@@ -41,7 +41,7 @@ from vjepa2_ac.training.health import matmul_speed
 BESIDE = Path(__file__).resolve().parents[2] / "vjepa2"
 QUICK = {
     "layers": 1, "width": 128, "latent_dim": 128, "image_size": 32, "samples": 6, "iterations": 2, "at_once": [4, 1],
-    "horizon": [2], "repeats": 1, "threads": 1,
+    "horizon": [3], "repeats": 1, "threads": 1,
 }  # fmt: skip
 _ON_CPU = {"layers": 2, "samples": 8, "iterations": 2, "horizon": [2, 4], "at_once": [8], "dtype": ["float32"]}
 _ON_CUDA = {"layers": 24, "samples": 800, "iterations": 10, "horizon": [1, 2], "at_once": [64], "dtype": ["bfloat16"]}

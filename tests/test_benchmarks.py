@@ -131,7 +131,7 @@ def test_quick_benchmark_of_a_decision_completes_without_the_official_code(
     assert f"official: skipped, for there is no {tmp_path}" in printed
     assert "aten::addmm" in printed
     lines = DECISION.findall(printed)
-    assert [(horizon, way) for horizon, way, *_ in lines] == [("2", "plain"), ("2", "ours/4"), ("2", "ours/1")]
+    assert [(horizon, way) for horizon, way, *_ in lines] == [("3", "plain"), ("3", "ours/4"), ("3", "ours/1")]
     for _, _, seconds, mfu, _, of_plain, of_official in lines:
         assert 0 < float(seconds) < 60
         assert 0 < float(mfu) < 150
@@ -172,6 +172,7 @@ class WorldModel:
         assert rep.shape == goal_rep.shape == (1, 4, 128)
         assert pose.shape == (1, 1, 7)
         assert not torch.is_grad_enabled()
+        assert torch.initial_seed() == 0
         assert sorted(self.asked) == [
             "cem_steps", "maxnorm", "momentum_mean", "momentum_mean_gripper", "momentum_std", "momentum_std_gripper",
             "rollout", "samples", "topk",
@@ -191,6 +192,35 @@ def test_no_ratio_is_printed_to_a_notebook_that_plans_otherwise(
     printed = capsys.readouterr().out
     assert re.search(r"official: actions differ by .*: NO RATIO", printed)
     assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/1"]
+
+
+def test_a_decision_is_counted_and_timed_in_the_type_and_towards_the_goal_that_were_asked_for(
+    planning: Any, tmp_path: Path
+) -> None:
+    decisions = sys.modules["timed_decisions"]
+    options = planning.parse(["--quick", "--official", str(tmp_path)])
+    bench = decisions.Bench(options, "bfloat16")
+    for horizon in (1, 3):
+        cost = decisions.WorldModelCost(bench.model, bench._scene, bench._goal(horizon), decisions.EnergyConfig())
+        with torch.no_grad():
+            assert float(cost(torch.tensor(decisions.WANTED).expand(1, horizon, -1))) < 1e-5
+            assert float(cost(torch.zeros(1, horizon, 7))) > 1e-3
+    assert bench.model.predictor.dtype == torch.float32  # until all were compared
+    plan = bench.decision(decisions.Way.ours(2), 3)()
+    assert bench.model.predictor.dtype == torch.bfloat16
+    assert len(plan.actions) == 3
+    assert plan.evaluations == bench.sequences
+    assert bench.flops(3) == bench.sequences * decisions.plan_flops(bench.sizes, 3)
+
+
+def test_ways_take_turns_and_a_ratio_is_of_neighbours(planning: Any) -> None:
+    calls: list[str] = []
+    ways = {"plain": lambda: calls.append("p"), "ours/1": lambda: calls.append("o")}
+    times = sys.modules["timing"].take_turns(ways, planning.parse(["--repeats", "2"]))
+    assert "".join(calls) == "popopo"  # the first round warms up
+    assert [len(one) for one in times.values()] == [2, 2]
+    seconds = {"plain": [2.0, 30.0, 8.0], "ours/1": [1.0, 10.0, 2.0]}
+    assert planning.ratio(seconds, "plain", "ours/1") == 3.0
 
 
 def test_on_cuda_the_papers_setting_is_measured(planning: Any) -> None:
