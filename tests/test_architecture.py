@@ -17,7 +17,7 @@ RANK = {
     "geometry": 1, "storage": 1, "data": 2, "model": 2, "latents": 3, "encoding": 3.5, "planning": 4, "evaluation": 5,
     "training": 6, "simulation": 7,
     "console": 8, "console_data": 8.2, "console_doctor": 8.2, "cli_parts": 8.4, "cli_data": 8.5, "cli_doctor": 8.5,
-    "cli_encode": 8.5, "console_evaluation": 8.2, "cli_evaluate": 8.7,
+    "cli_encode": 8.5, "console_evaluation": 8.2, "cli_evaluate": 8.7, "console_planning": 8.2, "cli_plan": 8.8,
     "console_simulation": 8.2, "cli_simulate": 8.8, "cli": 9,
 }  # fmt: skip
 
@@ -30,8 +30,13 @@ HOMES = {
     "simplejpeg": {"data/"},
     "PIL": {"data/picture_file.py"},
     "mujoco": {"simulation/"},
-    "matplotlib": {"evaluation/plots.py", "evaluation/contact_sheet.py", "evaluation/clip_picture.py",
-        "evaluation/captioned.py"},
+    "matplotlib": {
+        "evaluation/plots.py",
+        "evaluation/contact_sheet.py",
+        "evaluation/clip_picture.py",
+        "evaluation/plan_picture.py",
+        "evaluation/captioned.py",
+    },
     "fsspec": {"remote/"},
     "av": {"data/video.py", "data/video_writing.py"},
     "h5py": {"data/sources/droid_raw/trajectory.py"},

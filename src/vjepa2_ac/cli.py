@@ -16,6 +16,7 @@ from vjepa2_ac.cli_doctor import add_doctor
 from vjepa2_ac.cli_encode import add_encode
 from vjepa2_ac.cli_evaluate import add_checkpoint, add_evaluate
 from vjepa2_ac.cli_parts import Commands, Handler, command
+from vjepa2_ac.cli_plan import add_plan
 from vjepa2_ac.cli_simulate import add_simulate
 from vjepa2_ac.errors import InputError
 
@@ -68,6 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     add_data(commands)
     add_encode(commands)
     add_doctor(commands)
+    add_plan(commands)
     _add_export(commands)
     _add_config(commands)
     _add_download(commands)

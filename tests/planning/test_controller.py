@@ -218,3 +218,9 @@ def test_a_goal_that_is_reached_on_the_way_to_another_is_left() -> None:
         run = controller(energy=EnergyConfig(steps=steps))
         run.reset(picture(100), picture(101), durations=(1,))
         assert run.act(picture(100), STATE).any()
+
+
+def test_goals_that_are_all_reached_are_reached() -> None:
+    run = controller()
+    run.reset(picture(100), picture(100), durations=(1,))
+    assert not run.act(picture(100), STATE).any()

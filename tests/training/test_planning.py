@@ -44,8 +44,8 @@ def test_a_run_is_planned_with_as_its_own_config_says(run: Path) -> None:
     assert controller.decision.plan is not None
     assert controller.decision.plan.seed == 7
     assert len(controller.decision.plan.actions) == 2
-    assert controller._crop == "square"
-    assert steering.controller(seed=3)._seed == 3
+    assert controller.crop == "square"
+    assert steering.controller(seed=3).seed == 3
 
 
 def test_the_checkpoint_that_is_named_is_the_one_that_plans(run: Path, base_folder: Path) -> None:

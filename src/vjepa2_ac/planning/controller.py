@@ -19,9 +19,10 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.planning.energy import Scene, WorldModelCost, energies_of
+from vjepa2_ac.planning.action_space import ActionSpace
+from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goal import Goal, patch_weights
-from vjepa2_ac.planning.observation import require_picture, require_pose
+from vjepa2_ac.planning.observation import require_extrinsics, require_mask, require_picture, require_pose
 from vjepa2_ac.planning.plan import Plan
 from vjepa2_ac.planning.planner import Clock, Planner
 from vjepa2_ac.planning.poses import states_along
@@ -38,7 +39,8 @@ class Decision:
     action: Float[np.ndarray, " 7"]  # for the next model step; zero where `why` says so
     why: Why  # out of time: the best plan so far. at the goal, no finite energy: do nothing
     energy_now: float  # of the present picture, if it stayed: to compare with the plan's
-    goal: int  # which of several goals counted
+    goal: int  # which of several goals counts now
+    goals: tuple[int, ...]  # and after each model step of a plan
     plan: Plan | None  # None at the goal
     states: Float[np.ndarray, "time 7"] | None  # where the plan leads, the present state first
     cost: WorldModelCost | None  # to look at other actions
@@ -72,19 +74,22 @@ class Controller:
             clock: What the time budget is measured by.
 
         Raises:
-            InputError: The model's states and actions are no poses, or it needs a camera pose and there is none.
+            InputError: The model's states and actions are no poses, or it needs a camera pose and there is none, or
+                none that can be.
         """
         if widths_of_model(world_model.sizes) != POSE_WIDTHS:
             raise InputError(
                 where="model", found="states and actions that are no poses", needed="a model of 7 and 7 numbers"
             )
+        if extrinsics is not None:
+            require_extrinsics(extrinsics, where="extrinsics")
         if world_model.sizes.predictor.use_extrinsics != (extrinsics is not None):
             raise InputError(
                 where="model: predictor.use_extrinsics",
                 found=f"{world_model.sizes.predictor.use_extrinsics}, camera pose given: {extrinsics is not None}",
                 needed="a camera pose exactly where the model uses it",
             )
-        self._model, self.config, self._seed, self._crop = world_model.eval(), config, seed, crop
+        self._model, self.config, self.seed, self.crop = world_model.eval(), config, seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
         self._planner = Planner(config, clock=clock)
         self._goal: Goal | None = None
@@ -92,6 +97,11 @@ class Controller:
         self._seen: deque[tuple[Tensor, np.ndarray]] = deque(maxlen=config.context)
         self._done = 0
         self.decision: Decision | None = None  # the last one
+
+    @property
+    def space(self) -> ActionSpace:
+        """What is allowed."""
+        return self._planner.space
 
     def reset(self, *goals: np.ndarray, durations: tuple[int, ...] = (), mask: np.ndarray | None = None) -> None:
         """Set a goal, or several in order, and forget what was seen.
@@ -140,18 +150,19 @@ class Controller:
 
     def _decided(self, goal: Goal, before: Plan | None) -> Decision:
         latents, state = self._seen[-1]
-        place = goal.place(self._done)
-        still = latents.expand(1, self.config.horizon, -1, -1)
-        energy = float(energies_of(still, goal, self.config.energy, done=self._done)[0])
-        if energy <= _REACHED and goal.place(self._done + self.config.horizon - 1) == place:
-            return Decision(np.zeros(ACTION_DIM), "at the goal", energy, place, None, None, None)
+        places = tuple(goal.place(self._done + step) for step in range(self.config.horizon))
+        wanted = goal.ahead(self._done, self.config.horizon)
+        still = distance(latents.expand_as(wanted), wanted, self.config.energy.distance, goal.weights)
+        energy = float(still[-1] if self.config.energy.steps == "last" else still.sum())
+        if float(still.max()) <= _REACHED:
+            return Decision(np.zeros(ACTION_DIM), "at the goal", energy, places[0], places, None, None, None)
         cost = WorldModelCost(self._model, self._scene(), goal, self.config.energy, done=self._done)
-        generator = torch.Generator().manual_seed(self._seed + self._done)
+        generator = torch.Generator().manual_seed(self.seed + self._done)
         start = before.start_after(1) if before is not None and self.config.warm_start else None
         plan = self._planner.plan(cost, generator, start)
         why: Why = "planned" if plan.stopped == "finished" else plan.stopped
         states = states_along(torch.from_numpy(state), plan.actions.double()[None])[0]
-        return Decision(plan.actions[0].double().numpy(), why, energy, place, plan, states.numpy(), cost)
+        return Decision(plan.actions[0].double().numpy(), why, energy, places[0], places, plan, states.numpy(), cost)
 
     def _scene(self) -> Scene:
         states = np.stack([state for _, state in self._seen])
@@ -164,18 +175,17 @@ class Controller:
         )
 
     def _encoded(self, picture: np.ndarray) -> Float[Tensor, "tokens dim"]:
-        frames = torch.from_numpy(np.ascontiguousarray(view(picture[None], self._crop)))[None]
+        frames = torch.from_numpy(np.ascontiguousarray(view(picture[None], self.crop)))[None]
         frames = frames.to(self._model.device)
         return self._model.encode(pixels_to_input(frames, self._model.image_size))[0, 0]
 
     def _weights(self, mask: np.ndarray | None, like: np.ndarray) -> Float[Tensor, " tokens"] | None:
         if mask is None:
             return None
-        if mask.shape != like.shape[:2]:
-            raise InputError(where="mask", found=f"shape {mask.shape}", needed=f"{like.shape[:2]}, as the goal")
+        require_mask(mask, where="mask", like=like)
         grid = self._model.image_size // self._model.sizes.patch_size
         picture = np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1)
-        seen = torch.from_numpy(np.ascontiguousarray(view(picture, self._crop)[0, ..., 0]))
+        seen = torch.from_numpy(np.ascontiguousarray(view(picture, self.crop)[0, ..., 0]))
         try:
             return patch_weights(seen > 0, grid).to(self._model.device)
         except ValueError:

@@ -99,7 +99,11 @@ class WorldModelCost:
 
     def _energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
         predicted, _ = self.imagine(actions)
-        return energies_of(predicted, self._goal, self._config, done=self._done)
+        wanted = self._goal.ahead(self._done, actions.shape[1])
+        if self._config.steps == "last":
+            predicted, wanted = predicted[:, -1:], wanted[-1:]
+        far = distance(predicted, wanted, self._config.distance, self._goal.weights)
+        return far.sum(dim=1)
 
     @torch.no_grad()
     def _past(self, scene: Scene) -> KeyValueCache | None:
@@ -114,16 +118,6 @@ class WorldModelCost:
         camera = None if self._camera is None else self._camera.expand(1, before, -1)
         self._model.predict(latents, actions, states, camera, cache=cache)
         return cache
-
-
-def energies_of(
-    latents: Float[Tensor, "samples steps tokens dim"], goal: Goal, config: EnergyConfig, *, done: int
-) -> Float[Tensor, " samples"]:
-    """Return the energies of what is seen after each step from the present on, when `done` steps were done before."""
-    wanted = goal.ahead(done, latents.shape[1])
-    if config.steps == "last":
-        latents, wanted = latents[:, -1:], wanted[-1:]
-    return distance(latents, wanted, config.distance, goal.weights).sum(dim=1)
 
 
 def distance(

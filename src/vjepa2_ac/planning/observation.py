@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from vjepa2_ac.episode import STATE_DIM
+from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.errors import InputError
 
 _LEAST_SIDE = 16  # pixels
@@ -40,6 +40,20 @@ def require_picture(picture: np.ndarray, *, where: str, like: np.ndarray | None 
         )
 
 
+def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
+    """Refuse a mask that is not of a picture's size.
+
+    Raises:
+        InputError: Says what was found.
+    """
+    if mask.shape != like.shape[:2]:
+        raise InputError(
+            where=where,
+            found=f"shape {mask.shape} (height, width)",
+            needed=f"{like.shape[:2]}, as the goal's picture",
+        )
+
+
 def require_pose(state: np.ndarray, *, where: str) -> None:
     """Refuse a state that is not a pose in metres and radians with a gripper's closedness.
 
@@ -49,15 +63,31 @@ def require_pose(state: np.ndarray, *, where: str) -> None:
     needed = f"{STATE_DIM} finite numbers: x, y, z in metres, roll, pitch, yaw in radians, closedness 0 .. 1"
     if state.shape != (STATE_DIM,):
         raise InputError(where=where, found=f"{state.size} numbers in the shape {state.shape}", needed=needed)
-    shown = ", ".join(f"{number:g}" for number in state)
-    if not np.isfinite(state).all():
-        raise InputError(where=where, found=shown, needed=needed)
-    if np.abs(state[3:6]).max() > _ANGLE:
-        raise InputError(where=where, found=f"{shown}: angles beyond a whole turn", needed=needed, fix=_FROM_DEGREES)
-    if np.abs(state[:3]).max() > _REACH_M:
-        raise InputError(where=where, found=f"{shown}: beyond {_REACH_M:g} m", needed=needed, fix=_FROM_MILLIMETRES)
+    _require_place(state, where, needed)
     if not -_GRIPPER_SLACK <= state[6] <= 1 + _GRIPPER_SLACK:
-        raise InputError(where=where, found=f"{shown}: a closedness of {state[6]:g}", needed=needed, fix=_FROM_WIDTH)
+        raise InputError(where=where, found=f"a closedness of {state[6]:g}", needed=needed, fix=_FROM_WIDTH)
+
+
+def require_extrinsics(extrinsics: np.ndarray, *, where: str) -> None:
+    """Refuse what is not a camera's pose in the robot base frame.
+
+    Raises:
+        InputError: Says what was found.
+    """
+    needed = f"{EXTRINSICS_DIM} finite numbers: the camera's x, y, z in metres and roll, pitch, yaw in radians"
+    if extrinsics.shape != (EXTRINSICS_DIM,):
+        raise InputError(where=where, found=f"{extrinsics.size} numbers in the shape {extrinsics.shape}", needed=needed)
+    _require_place(extrinsics, where, needed)
+
+
+def _require_place(pose: np.ndarray, where: str, needed: str) -> None:
+    shown = ", ".join(f"{number:g}" for number in pose)
+    if not np.isfinite(pose).all():
+        raise InputError(where=where, found=shown, needed=needed)
+    if np.abs(pose[3:6]).max() > _ANGLE:
+        raise InputError(where=where, found=f"{shown}: angles beyond a whole turn", needed=needed, fix=_FROM_DEGREES)
+    if np.abs(pose[:3]).max() > _REACH_M:
+        raise InputError(where=where, found=f"{shown}: beyond {_REACH_M:g} m", needed=needed, fix=_FROM_MILLIMETRES)
 
 
 _FROM_DEGREES = "These look like degrees: multiply the angles by pi / 180"

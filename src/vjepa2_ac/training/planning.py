@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
+from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_from, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.load import load_base
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.world_model import WorldModel, fingerprint
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.training.chosen import NEWEST
 from vjepa2_ac.training.device import is_on_cpu
@@ -52,6 +55,27 @@ class Steering:
             crop=self.config.data.crop,
             extrinsics=extrinsics,
         )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return which model this is, as plain values: what was named, and hashes of the weights."""
+        model = self.world_model
+        dtype = next(model.parameters()).dtype  # of the frozen weights
+        return {
+            "version": __version__,
+            "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "model": {
+                "subject": self.subject,
+                "checkpoint": self.checkpoint or None,
+                "encoder": model.encoder_fingerprint(),
+                "base": model.predictor_fingerprint() if model.adaptation is None else model.adaptation.base,
+                "predictor": fingerprint(model.predictor.state_dict()),
+                "dtype": str(dtype).removeprefix("torch."),
+                "device": model.device.type,
+                "image_size": model.image_size,
+            },
+            "control_steps_of_a_model_step": self.config.data.stride,
+            "frame_of_states": self.config.data.pose_frame,
+        }
 
 
 def load_to_plan(
