@@ -1,6 +1,7 @@
 """Encoding is done once, whoever interrupts it; a run on cached latents is the run on pictures."""
 
 import errno
+import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -368,16 +369,39 @@ def test_what_a_damaged_file_is_said_to_need_makes_the_cache_sound_again(
     out = tmp_path / "out"
     encode(make_config(), out)
     sound, damaged = contents(out), sorted(out.rglob("*.safetensors"))[0]
+    alone = make_config(data__source="latents", data__path=str(out)).data
     with damaged.open("r+b") as file:
         file.truncate(100)
-    with pytest.raises(InputError, match=r"Delete the file and the cache's cache\.json, and run `vjepa2-ac encode`"):
-        open_dataset(make_config(data__source="latents", data__path=str(out)).data)
-    damaged.unlink()
-    (out / "cache.json").unlink()
+    with pytest.raises(InputError, match=r"Run `vjepa2-ac encode` again, as the cache was made"):
+        open_dataset(alone)
     encoded_frames.clear()
-    encode(make_config(), out)
+    said = encode(make_config(), out)
+    assert re.search(rf"episode.*{damaged.name}: 100 bytes instead of [\d,]+\)\. It is encoded again", said[0])
     assert contents(out) == sound
     assert 0 < len(encoded_frames) < chunks(needed(make_config()), make_config())
+    damaged.write_bytes(bytes(damaged.stat().st_size))
+    with pytest.raises(InputError, match=r"000000.*Delete this file, and then run `vjepa2-ac encode` again"):
+        open_dataset(alone).source.read(0)
+    damaged.unlink()
+    encode(make_config(), out)
+    assert contents(out) == sound
+    open_dataset(alone)
+
+
+def test_episodes_that_take_part_from_now_on_are_added_to_a_cache(
+    make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
+) -> None:
+    out = tmp_path / "out"
+    few = make_config(data__exclude=[open_dataset(make_config().data).table.identity(0)])
+    encode(few, out)
+    assert read_manifest(out).encoded == 7
+    encoded_frames.clear()
+    assert "not encoded yet" in encode(make_config(), out)[0]
+    assert read_manifest(out).encoded == 8
+    assert 0 < sum(encoded_frames) < needed(make_config()) / 4
+    sorted(out.rglob("*.safetensors"))[0].unlink()
+    encode(few, out)
+    assert read_manifest(out).encoded == 7, "one that takes no part is not encoded again"
 
 
 @pytest.mark.usefixtures("mend")
@@ -421,6 +445,57 @@ def test_a_run_that_encodes_first_is_the_run_on_pictures_bit_for_bit(
     assert_same_run(pictures, train(make_config(run_dir=str(tmp_path / "again"), **cached), reporter))
     assert not encoded_frames
     assert any("Latents come from" in note for note in reporter.notes)
+
+
+def test_a_run_mends_the_cache_that_it_finds_damaged(
+    make_config: MakeConfig, tmp_path: Path, cache: Path, reporter: SilentReporter, encoded_frames: list[int]
+) -> None:
+    knobs = {"data__cache": "auto", "data__cache_dir": str(cache), "training__steps": 1}
+    first = train(make_config(run_dir=str(tmp_path / "first"), **knobs), reporter)
+    (folder,) = cache.iterdir()
+    sound, (cut, gone, *_) = contents(folder), sorted(folder.rglob("*.safetensors"))
+    cut.write_bytes(cut.read_bytes()[:-10])
+    gone.unlink()
+    with pytest.raises(InputError, match=r"000000.*bytes.*Run `vjepa2-ac encode`"):
+        train(make_config(run_dir=str(tmp_path / "x"), **knobs | {"data__cache": "require"}), reporter)
+    reporter.notes.clear()
+    encoded_frames.clear()
+    again = make_config(run_dir=str(tmp_path / "again"), **knobs)
+    train(again, reporter, check_only=True)
+    (said,) = [note for note in reporter.notes if "Missing in the latent cache" in note]
+    assert re.search(rf"damaged: .*{cut.name}: .* bytes instead of .* and 1 more\. A run would encode it again", said)
+    assert not gone.exists(), "a check writes nothing"
+    assert is_whole(folder)
+    assert_same_run(first, train(again, reporter))
+    assert "It is encoded again." in "".join(reporter.notes)
+    assert contents(folder) == sound
+    encoded_frames.clear()
+    train(make_config(run_dir=str(tmp_path / "third"), **knobs), reporter)
+    assert not encoded_frames
+
+
+def test_a_kill_while_a_cache_is_mended_leaves_what_is_found_again(
+    make_config: MakeConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out"
+    encode(make_config(), out)
+    sound, (cut, *_) = contents(out), sorted(out.rglob("*.safetensors"))
+    cut.write_bytes(cut.read_bytes()[:-10])
+    unlink, unlinked = Path.unlink, []
+
+    def killed(path: Path, missing_ok: bool = False) -> None:
+        if unlinked:
+            raise KeyboardInterrupt
+        unlinked.append(path.name)
+        unlink(path, missing_ok)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", killed)
+        with pytest.raises(KeyboardInterrupt):
+            encode(make_config(), out)
+    assert unlinked == [cut.name], "what makes it whole goes last"
+    encode(make_config(), out)
+    assert contents(out) == sound
 
 
 def test_a_run_on_latents_has_no_encoder_on_its_device_and_does_not_count_its_work(

@@ -12,6 +12,7 @@ from vjepa2_ac.data.latent_cache import through_cache
 from vjepa2_ac.data.sources.latents.folder import is_whole
 from vjepa2_ac.data.sources.latents.writer import CacheWriter
 from vjepa2_ac.encoding.build import frames_per_second
+from vjepa2_ac.encoding.mending import Lacking, begin_again, in_words, lacking_files
 from vjepa2_ac.encoding.room import require_room
 from vjepa2_ac.encoding.work import Share, Work
 from vjepa2_ac.episode import Progress
@@ -50,6 +51,12 @@ def with_latents(
         require_same_encoder(model, dataset, config)
         return dataset
     writer = writer_for(config, dataset, model)
+    if lacking := _lacking(config, dataset, accelerator, writer):
+        note(f"{in_words(lacking)}. " + ("A run would encode it again." if check_only else "It is encoded again."))
+        if check_only:
+            return dataset
+        if accelerator.is_main_process:
+            begin_again(writer, lacking)
     if not from_first(accelerator, is_whole(writer.folder)):
         if config.data.cache == "require":
             return through_cache(dataset, writer.encoding)  # which says what is there instead
@@ -72,6 +79,12 @@ def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -
         return dataset
     writer = writer_for(config, dataset, model)
     return through_cache(dataset, writer.encoding) if is_whole(writer.folder) else dataset
+
+
+def _lacking(config: Config, dataset: Dataset, accelerator: Accelerator, writer: CacheWriter) -> list[Lacking]:
+    """Return what a cache lacks that is whole by its own account: the first process looks, for all of them."""
+    looks = accelerator.is_main_process and config.data.cache == "auto" and is_whole(writer.folder)
+    return from_first(accelerator, lacking_files(dataset, writer) if looks else [])
 
 
 def _encode(

@@ -20,6 +20,7 @@ from vjepa2_ac.data.latent_cache import folder_of, key_for
 from vjepa2_ac.data.sources.latents.folder import Manifest, is_whole, read_manifest
 from vjepa2_ac.data.sources.latents.writer import CacheWriter
 from vjepa2_ac.encoding.build import EncoderAtWork, build
+from vjepa2_ac.encoding.mending import begin_again, in_words, lacking_files
 from vjepa2_ac.encoding.room import GIGABYTE, free_bytes, require_room
 from vjepa2_ac.encoding.work import Share, Work, take_folder
 from vjepa2_ac.episode import Progress
@@ -67,8 +68,11 @@ def encode_config(
     writer = writer_for(config, dataset, model, out)
     if is_whole(writer.folder):
         take_folder(writer)
-        note(f"Everything is encoded already, in {writer.folder}")
-        return EncodedSet(writer.folder, read_manifest(writer.folder))
+        if not (lacking := lacking_files(dataset, writer)):
+            note(f"Everything is encoded already, in {writer.folder}")
+            return EncodedSet(writer.folder, read_manifest(writer.folder))
+        note(f"{in_words(lacking)}. It is encoded again.")
+        begin_again(writer, lacking)
     share = Share(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
     device = _device(config)
     at_work = encoder_at_work(config, model, device)

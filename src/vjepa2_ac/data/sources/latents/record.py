@@ -40,7 +40,7 @@ FORMAT = "vjepa2-ac latents 1"
 _OPTIONAL = ("commands", "extrinsics", "joint_velocities")
 _BY_FRAME = frozenset({"latents", "scales", "pictures"})  # read and checked by frame, when asked for
 _JPEG_QUALITY = 85
-_FIX = "Delete the file and the cache's cache.json, and run `vjepa2-ac encode` again; or copy it again"
+_FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,14 +13,22 @@ from jaxtyping import Int, UInt8
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.idle_search import FoundRanges
-from vjepa2_ac.data.sources.latents.folder import Manifest, path_of, read_episodes, read_manifest, size_column
+from vjepa2_ac.data.sources.latents.folder import (
+    Manifest,
+    path_of,
+    read_episodes,
+    read_manifest,
+    size_column,
+    size_of,
+)
 from vjepa2_ac.data.sources.latents.key import OF_CLIPS, clip_parts
 from vjepa2_ac.data.sources.latents.record import Record
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges, StoredLatents
 from vjepa2_ac.errors import InputError
 
-_ENCODE = "Delete the file and the cache's cache.json, and run `vjepa2-ac encode` again"
+_ENCODE = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is lacking; or copy the file again"
+_DELETE = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
 
 
 @dataclass(frozen=True)
@@ -121,7 +128,7 @@ class LatentSource:
             sizes = opened.table.locators[size_column(place)]
             for number in np.flatnonzero(sizes).tolist():
                 path = path_of(self._folder, number, camera)
-                found = _size_of(path)
+                found = size_of(path)
                 if found != sizes[number]:
                     said = "no such file" if found is None else f"{found:,} bytes"
                     name = opened.table.identity(number)
@@ -220,12 +227,5 @@ def _require_as_indexed(record: Record, info: EpisodeInfo, camera: str) -> None:
             where=record.path,
             found=f"episode {found[0]} of {found[2]} steps, camera {found[1]}",
             needed=f"{info.id} of {info.num_steps} steps, camera {camera}",
-            fix=_ENCODE,
+            fix=_DELETE,
         )
-
-
-def _size_of(path: Path) -> int | None:
-    try:
-        return os.stat(path).st_size  # noqa: PTH116 - a third of the time, for as many files as there are episodes
-    except OSError:
-        return None
