@@ -8,6 +8,7 @@ from torch import Tensor
 from planning.tiny import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_model
 from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.geometry import apply_action
+from vjepa2_ac.model.key_value_cache import KeyValueCache
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goal import Goal, patch_weights
@@ -198,3 +199,21 @@ def test_a_model_that_says_nothing_leads_to_no_motion() -> None:
 def test_a_model_in_training_mode_is_refused() -> None:
     with pytest.raises(ValueError, match="eval"):
         cost(tiny_model(adapted=True).train())
+
+
+@torch.no_grad()
+def test_what_a_patch_knows_depends_on_the_action_beside_it_from_the_second_layer_on() -> None:
+    """So keys and values of the present frame cannot be shared over samples, but those of earlier frames can."""
+    model, start, tried = tiny_model(), scene(2), actions(2, 1)
+    found, layers = [], model.base_predictor.config.num_hidden_layers
+    for action in tried:
+        cache = KeyValueCache()
+        given = torch.cat([start.actions, action])[None]
+        model.predict(start.latents[None], given, start.states[None], cache=cache)
+        found.append([cache.layer(layer)[0][:, 0] for layer in range(layers)])
+    (first, second), (other_first, other_second) = found
+    for one, other in ((first, other_first), (second, other_second)):
+        past, present = one.tensor_split([TOKENS + 2], dim=2)
+        other_past, other_present = other.tensor_split([TOKENS + 2], dim=2)
+        assert torch.equal(past, other_past)
+        assert torch.equal(present[:, :, 2:], other_present[:, :, 2:]) == (one is first)
