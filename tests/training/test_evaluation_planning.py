@@ -1,0 +1,90 @@
+"""Plans are measured with the planning section of a config, and clips too short for them are refused at once."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from vjepa2_ac.cli import main
+from vjepa2_ac.config_file import parse_config
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation import planning_score
+from vjepa2_ac.evaluation.evaluate import Probes
+from vjepa2_ac.evaluation.planning_protocol import SCORED
+from vjepa2_ac.training.evaluation import Asked, evaluate_subject
+
+QUICK = {"sensitivity_clips": 0, "examples": 0}
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plan three steps with few samples."""
+    monkeypatch.setattr(planning_score, "SCORED", SCORED.model_copy(update={"samples": 20, "iterations": 2}))
+
+
+def written(folder: Path, data: Path | str, base: Path | str, **changes: object) -> Path:
+    """Write a config of data and planning, and return its path."""
+    values: dict[str, Any] = {
+        "run_dir": str(folder / "run"),
+        "data": {
+            "path": str(data), "frames": 5, "stride": 2, "validation_share": 0.3, "test_share": 0.4, "workers": 0,
+            "cache_dir": str(folder / "caches"), **changes,
+        },
+        "model": {"base": str(base), "dtype": "float32"},
+        "training": {"precision": "fp32", "device": "cpu"},
+        "validation": {"batch_size": 3},
+        "planning": {"samples": 12, "iterations": 2, "limits": {"xyz": [0.0, 0.03, 0.03]}},
+    }  # fmt: skip
+    path = folder / "config.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return path
+
+
+def asked(path: Path, out: Path) -> Asked:
+    config = parse_config(yaml.safe_load(path.read_text()), where="test")
+    return Asked(clips=5, data=config, against=("base",), out=out, probes=Probes(**QUICK, planning_clips=3))
+
+
+@pytest.mark.usefixtures("quick")
+def test_plans_are_measured_on_held_out_clips_with_the_configs_settings(
+    tmp_path: Path, data_folder: Path, base_folder: Path
+) -> None:
+    path = written(tmp_path, data_folder, base_folder)
+    stages: list[str] = []
+
+    def stage(title: str) -> Progress:
+        stages.append(title)
+        return lambda *_: None
+
+    evaluation = evaluate_subject(str(base_folder), asked(path, tmp_path / "out"), stage=stage).evaluation
+    assert {"planning, base", "planning, model"} <= set(stages)
+    figures = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert figures["planning"]["starts"] == 3
+    assert figures["planning"]["one_step_settings"]["samples"] == 12
+    assert set(figures["planning"]["places"]) <= {0, 1}
+    assert "Its plans of 3 steps end" in figures["verdict"]
+    one, other = (evaluation.models[name].plans for name in ("base", "model"))
+    assert one is not None
+    assert other is not None
+    assert not one.one_step[..., 0].any(), "planning.limits.xyz holds x"
+    assert one.one_step[..., 1].any()
+    assert (one.three_steps == other.three_steps).all(), "the same weights plan the same"
+    difference = figures["models"]["model"]["planning"]["difference_to_base"]
+    assert difference["missed_cm"] == {"value": 0.0, "low": 0.0, "high": 0.0}
+
+
+def test_clips_too_short_to_plan_on_are_refused_before_any_data_are_read(tmp_path: Path) -> None:
+    path = written(tmp_path, "no such data", "no such model", frames=3)
+    with pytest.raises(InputError, match=r"--planning: clips of 3 frames \(data\.frames\).*4 or more"):
+        evaluate_subject("model", asked(path, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("number", ["0", "-1", "many"])
+def test_a_number_of_clips_to_plan_from_is_one_or_more(number: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["evaluate", "run", "--planning", "--planning-clips", number])
+    assert "--planning-clips" in capsys.readouterr().err
