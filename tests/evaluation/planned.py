@@ -16,7 +16,9 @@ from worlds import about, actions_of, again, clips_batch
 ONE_STEP = PlanningConfig(
     samples=200, iterations=12, limits=LimitsConfig(rotation=0.1), energy=EnergyConfig(samples_at_once=400)
 )
+FEW = ONE_STEP.model_copy(update={"samples": 40, "iterations": 3})
 PROBES = Probes(sensitivity_clips=0, examples=0, planning_clips=4, planning=ONE_STEP)
+QUICK = replace(PROBES, planning=FEW)  # where it does not matter how good a plan is
 
 
 def small_actions(clips: int = 4) -> Tensor:
