@@ -78,7 +78,8 @@ def _share(cell: Estimate | str) -> str:
 
 
 def _errors(evaluation: Evaluation) -> Table:
-    table = _table("Latent error / persistence on held-out episodes (95 % interval over episodes)", "open loop, L1")
+    sure = "95 % interval over episodes" if evaluation.clips.episodes > 1 else "one episode: no interval"
+    table = _table(f"Latent error / persistence on held-out episodes ({sure})", "open loop, L1")
     table.add_column("persistence", justify="right", no_wrap=True)
     for name in evaluation.models:
         table.add_column(name, justify="right", no_wrap=True)

@@ -35,6 +35,7 @@ def test_runs_are_compared_with_the_first_one_pair_by_pair(tmp_path: Path) -> No
     assert isinstance(gain, Estimate)
     assert (gain.low, gain.value, gain.high) == pytest.approx((-1.0, -1.0, -1.0), rel=1e-4)
     assert found.notes == ()
+    assert found.title.endswith(" episodes")
     assert plot_comparison(found, tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vjepa2_ac.console_evaluation import evaluation_tables
 from vjepa2_ac.evaluation.plots import plot_evaluation
 from vjepa2_ac.evaluation.result import Errors, Evaluation, Example, ModelResult, Predicted
 from vjepa2_ac.evaluation.strata import clips_of
@@ -62,6 +63,13 @@ def test_a_worse_adapter_is_called_worse() -> None:
     words = verdict(evaluation(model("base", 0.8, noise=0.0), model("adapter", 1.2, noise=0.0)))
     assert "50% WORSE than the base" in words
     assert ": NOT better." in words
+
+
+def test_a_difference_that_is_small_and_sure_is_not_called_0_percent() -> None:
+    level = Predicted(*[Errors(*[np.full((CLIPS, HORIZON), 0.499)] * 3)] * 2)
+    found = with_errors(evaluation(model("base", 1.0, noise=0.0), model("adapter", 1.0, noise=0.0)), "adapter", level)
+    words = verdict(found)
+    assert "0.20% better than the base (gain 95 % interval 0.20% to 0.20%)" in words
 
 
 def test_a_difference_within_the_noise_is_not_called_one() -> None:
@@ -138,6 +146,11 @@ def test_one_episode_gives_no_interval_and_no_certainty(tmp_path) -> None:
     words = verdict(one)
     assert "one episode: no interval" in words
     assert "did not clearly help" in words
+    titles = [evaluation_tables(found)[0].title for found in (one, evaluation(model("model", 0.5)))]
+    assert [str(title).partition("(")[2] for title in titles] == [
+        "one episode: no interval)",
+        "95 % interval over episodes)",
+    ]
     assert plot_evaluation(one, tmp_path / "picture.png").stat().st_size > 1000
 
 

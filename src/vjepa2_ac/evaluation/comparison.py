@@ -66,7 +66,8 @@ def _compared(measured: Mapping[str, dict[str, Any]], folders: Mapping[str, Path
     ids = [clip["episode"] for clip in clips["named"]]
     ahead = f"{(about['frames'] - 1) * about['seconds_per_step']:.2f} s"
     return Comparison(
-        title=f"L1 error over persistence on {clips['count']} {about['split']} clips of {clips['episodes']} episodes",
+        title=f"L1 error over persistence on {clips['count']} {about['split']} clips of {clips['episodes']}"
+        f" episode{'s' * (clips['episodes'] != 1)}",
         columns=(
             *(f"{ahead} ahead", f"gain over {names[0]}", "gain over its base", "one step", "shuffled", "rank"),
             *(("Action Score", "plans end off, cm") if any(map(_plans, measured.values())) else ()),

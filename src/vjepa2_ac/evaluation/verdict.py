@@ -62,11 +62,16 @@ def _compared(evaluation: Evaluation, ahead: str) -> str:
     gain = improvement(evaluation, evaluation.horizon)
     if gain is None:
         return f"The {evaluation.trained} was measured {where}"
-    direction = "better" if gain.value > 0 else "WORSE"
-    compared = f"{abs(gain.value):.0%} {direction} than the base (gain {interval(gain, '.0%')}), {where}"
+    direction, form = "better" if gain.value > 0 else "WORSE", _digits(gain)
+    compared = f"{abs(gain.value):{form}} {direction} than the base (gain {interval(gain, form)}), {where}"
     if gain.side(of=0.0) == 0:
         return f"The {evaluation.trained} did not clearly help: it predicts {ahead} {compared}"
     return f"The {evaluation.trained} predicts {ahead} {compared}"
+
+
+def _digits(gain: Estimate) -> str:
+    """Return how a gain is written: 0 % better or worse would say nothing."""
+    return ".0%" if abs(gain.value) >= 0.01 else ".2%"
 
 
 def _denied(evaluation: Evaluation) -> tuple[str, ...]:
@@ -85,9 +90,10 @@ def _otherwise(evaluation: Evaluation, metric: Metric) -> list[str]:
             gain_over(evaluation, evaluation.trained, evaluation.base, metric=each)[-1] for each in ("l1", metric)
         )
         if by_other.side(of=0.0) != by_l1.side(of=0.0):
-            share = f"{abs(by_other.value):.0%}"
+            form = _digits(by_other)
+            share = f"{abs(by_other.value):{form}}"
             how = {-1: f"{share} WORSE than", 0: "no clear difference to", 1: f"{share} better than"}
-            words.append(f"{how[by_other.side(of=0.0)]} the base (gain {interval(by_other, '.0%')})")
+            words.append(f"{how[by_other.side(of=0.0)]} the base (gain {interval(by_other, form)})")
     by_l1, by_other = (over_persistence(evaluation, evaluation.trained, "rollout", each)[-1] for each in ("l1", metric))
     if by_other.side(of=1.0) != by_l1.side(of=1.0):
         words.append(_over_nothing(by_other))
