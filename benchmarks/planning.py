@@ -142,7 +142,7 @@ def profiled(decide: Callable[[], object], options: argparse.Namespace) -> str:
         decide()
     table = found.key_averages()
     waits = {one.key: one.count for one in table if one.key in _WAITS}
-    order = "self_cuda_time_total" if on_cuda else "self_cpu_time_total"
+    order = "self_device_time_total" if on_cuda else "self_cpu_time_total"
     rows = table.table(sort_by=order, row_limit=_PROFILED_ROWS, max_name_column_width=40)
     return f"{rows}the host waited, in {options.iterations} iterations: {waits}" if on_cuda else rows
 
