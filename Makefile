@@ -1,9 +1,9 @@
-# make demo · make test · make lint · make soak · make bench · make base: each creates the environment it needs.
+# make demo · make evidence · make test · make lint · make soak · make bench · make base: each creates the environment it needs.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 
-.PHONY: demo demo-seeds base test soak lint format bench clean
+.PHONY: demo demo-seeds base evidence test soak lint format bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
@@ -25,6 +25,9 @@ base:  $(INSTALLED)  ## make the demo's base model again (about an hour); replac
 	$(BIN)/vjepa2-ac train configs/demo_base.yaml
 	rm -rf base/model && $(BIN)/vjepa2-ac export base/run base/model
 	rm -rf src/vjepa2_ac/assets/sim-tiny && cp -r base/model src/vjepa2_ac/assets/sim-tiny
+
+evidence: $(INSTALLED)  ## does LoRA help? every method side by side; goes on where it stopped; replaces table and plot
+	$(BIN)/python benchmarks/evidence --readme README.md
 
 test: $(INSTALLED)  ## the whole test suite
 	$(BIN)/pytest -q

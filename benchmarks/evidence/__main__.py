@@ -1,0 +1,105 @@
+"""Does LoRA fine-tuning help? A base meets a shifted world: every method, side by side, on goals it was not chosen by.
+
+    python benchmarks/evidence                          # all cells (make evidence); goes on where it stopped
+    python benchmarks/evidence --only look --seeds 1    # a part of it
+    python benchmarks/evidence --choose                 # the settings, on validation episodes and goals
+
+Cells that are done stand in FOLDER/results as JSON; table and plot are made of whatever is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+import traceback
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from cells import Cell, all_cells, candidate_cells, method_of
+
+
+def main() -> int:
+    """Run what is not there yet, then write the table and the plot; return 1 where a cell failed."""
+    options = _parse()
+    from prepare import prepare
+    from table import write_tables
+
+    folder, results = options.folder, options.folder / ("choosing" if options.choose else "results")
+    results.mkdir(parents=True, exist_ok=True)
+    if options.table:
+        write_tables(folder, options.out, options.readme)
+        return 0
+    prepare(folder, options.seeds)
+    cells = list(candidate_cells() if options.choose else all_cells(options.seeds))
+    cells = [cell for cell in cells if options.only is None or options.only in cell.name]
+    missing = [cell for cell in cells if not _result(results, cell).exists()]
+    print(f"{len(cells)} cells, {len(cells) - len(missing)} of them done", flush=True)
+    failed = _run(missing, results, options)
+    if not options.choose:
+        write_tables(folder, options.out, options.readme)
+    return 1 if failed else 0
+
+
+def _parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, default=Path("evidence"), help="data, bases, runs, results")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="where table and plot go")
+    parser.add_argument("--readme", type=Path, help="a README whose short table is to be made anew")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--goals", type=int, default=20, help="of each run; a row pools its seeds")
+    parser.add_argument("--workers", type=int, default=2, help="cells at once, one thread each")
+    parser.add_argument("--only", help="cells whose name has this in it")
+    parser.add_argument("--choose", action="store_true", help="run what the learning rates were chosen from")
+    parser.add_argument("--table", action="store_true", help="make table and plot again, run nothing")
+    return parser.parse_args()
+
+
+def _run(cells: list[Cell], results: Path, options: argparse.Namespace) -> int:
+    """Run cells, each in a process of its own; return how many failed."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    context = multiprocessing.get_context("spawn")
+    failed = 0
+    with ProcessPoolExecutor(options.workers, mp_context=context, max_tasks_per_child=1) as pool:
+        waiting = {pool.submit(_measured, cell, options.folder, options.goals, options.choose): cell for cell in cells}
+        for number, done in enumerate(as_completed(waiting), start=1):
+            cell = waiting[done]
+            try:
+                figures = done.result()
+            except Exception:  # one cell must not cost the others
+                traceback.print_exc()
+                failed += 1
+                continue
+            path = _result(results, cell)
+            path.with_suffix(".part").write_text(json.dumps(figures, indent=1))
+            path.with_suffix(".part").rename(path)
+            reached = [row[-1] < 5.0 for row in figures["reach"]["l1"]["distance_cm"]]
+            error = figures["shifted"]["rollout_over_persistence"][-1]
+            print(
+                f"{number}/{len(cells)} {cell.name}: error {error:.3f}, reach {sum(reached)}/{len(reached)},"
+                f" {figures['minutes']:.1f} min",
+                flush=True,
+            )
+    return failed
+
+
+def _measured(cell: Cell, folder: Path, goals: int, choosing: bool) -> dict[str, Any]:
+    import torch
+    from measure import baselines, measure
+
+    torch.set_num_threads(1)
+    figures = measure(cell, folder, goals=goals, choosing=choosing)
+    if method_of(cell.method).kind == "zero-shot":
+        figures["baselines"] = baselines(cell, goals=goals)
+    return figures
+
+
+def _result(results: Path, cell: Cell) -> Path:
+    return results / f"{cell.name}.json"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

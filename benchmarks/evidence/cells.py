@@ -1,0 +1,155 @@
+"""What is compared with what? Every cell of the evidence, and the settings that were chosen for it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from vjepa2_ac.config import AdapterConfig, TrainingConfig
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
+
+Shift = Literal["look", "motion"]
+Base = Literal["one camera", "many cameras", "none"]
+
+SHIFTS: dict[Shift, Domain] = {
+    "look": replace(DOMAIN_B, name="look", base_yaw_deg=DOMAIN_A.base_yaw_deg, lag_s=DOMAIN_A.lag_s),
+    "motion": replace(DOMAIN_A, name="motion", base_yaw_deg=60.0, lag_s=DOMAIN_B.lag_s),
+}
+"""look: camera turned by 43 degrees, other colours, light, table and things on it; the arm moves as in A. motion: looks
+like A, but the robot is mounted turned by 60 degrees, so that an action moves the arm elsewhere in the picture."""
+
+BASES: tuple[Base, ...] = ("one camera", "many cameras")
+"""one camera: trained on domain A alone. many cameras: on 800 worlds, each seen by another camera (the demo's base)."""
+
+INPUT_OUTPUT = ("predictor_embed", "predictor_proj", "action_encoder", "state_encoder")
+BLOCKS = ("q", "k", "v", "o", "fc1", "fc2")
+BEST = "LoRA r16 + in/out"
+"""The LoRA that takes part in every comparison; chosen on validation goals (`--choose`)."""
+
+STEPS = 400
+TRAINING = TrainingConfig(
+    steps=STEPS,
+    batch_size=6,
+    accumulation=1,
+    rollout_steps=2,
+    warmup_steps=20,
+    precision="bf16",
+    device="cpu",
+    log_every=50,
+)
+PLANNING = PlanningConfig(
+    samples=64,
+    iterations=4,
+    start_std=0.67,
+    limits=LimitsConfig(xyz=(0.075, 0.075, 0.075), gripper_mode="held"),
+    energy=EnergyConfig(distance="l1"),
+)
+"""As the reach tasks of FACTS' prototype: 64 samples, 4 iterations, horizon 1, 7.5 cm an axis and model step."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """How the weights change."""
+
+    name: str
+    kind: Literal["zero-shot", "LoRA", "full", "scratch"]
+    rank: int = 0
+    input_output: bool = False  # whether the adapter covers the input and output projections, too
+    times: int = 1  # so many times the steps
+    learning_rate: float = 1e-3
+
+    @property
+    def adapter(self) -> AdapterConfig:
+        """The adapter section of its config."""
+        if self.kind != "LoRA":
+            return AdapterConfig(kind="none")
+        targets = BLOCKS + INPUT_OUTPUT if self.input_output else BLOCKS
+        return AdapterConfig(rank=self.rank, alpha=2.0 * self.rank, dropout=0.0, targets=targets)
+
+    @property
+    def training(self) -> TrainingConfig:
+        """The training section of its config."""
+        return TRAINING.model_copy(
+            update={
+                "steps": STEPS * self.times,
+                "learning_rate": self.learning_rate,
+                "allow_weak_base": True,
+            }
+        )
+
+
+METHODS = {
+    method.name: method
+    for method in (
+        Method("zero-shot", "zero-shot"),
+        *(
+            Method(f"LoRA r{rank}{' + in/out' * both}", "LoRA", rank, both, learning_rate=3e-3)
+            for both in (False, True)
+            for rank in (4, 8, 16)
+        ),
+        Method("full", "full", learning_rate=1e-3),
+        Method("scratch", "scratch", learning_rate=1.5e-3),
+        Method("scratch, 3x steps", "scratch", times=3, learning_rate=1.5e-3),
+    )
+}
+
+CANDIDATES = {
+    f"{name}, lr {rate:g}": replace(METHODS[name], name=f"{name}, lr {rate:g}", learning_rate=rate)
+    for name, rates in ((BEST, (1e-3, 3e-3, 5e-3)), ("full", (5e-4, 1e-3, 2e-3)), ("scratch", (1.5e-3, 3e-3, 6e-3)))
+    for rate in rates
+}
+"""What the learning rates were chosen from, on validation episodes and goals."""
+
+
+def method_of(name: str) -> Method:
+    """Return a method, or a candidate for one, by its name."""
+    return METHODS[name] if name in METHODS else CANDIDATES[name]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run: trained once, measured once."""
+
+    shift: Shift
+    base: Base
+    method: str
+    episodes: int  # demonstrations of the shifted domain
+    seed: int  # decides which demonstrations, fresh weights, order, and the goals
+
+    @property
+    def name(self) -> str:
+        """What its files are called."""
+        words = f"{self.shift}-{self.base}-{self.method}-k{self.episodes}-s{self.seed}"
+        return words.replace(" + in/out", "-io").replace(", 3x steps", "-3x").replace(",", "").replace(" ", "-")
+
+
+def all_cells(seeds: int = 3) -> Iterator[Cell]:
+    """Yield every cell, those of the main table first."""
+    for seed in range(seeds):
+        yield from _of("look", tuple(METHODS), 20, seed)
+    for seed in range(seeds):
+        yield from _of("motion", ("zero-shot", BEST, "full", "scratch"), 20, seed)
+    for seed in range(seeds):
+        for episodes in (10, 40):
+            yield from _of("look", (BEST, "full", "scratch"), episodes, seed)
+
+
+def candidate_cells() -> Iterator[Cell]:
+    """Yield what the learning rates are chosen by: one base, one seed."""
+    for name, method in CANDIDATES.items():
+        yield Cell("look", "none" if method.kind == "scratch" else "many cameras", name, 20, 0)
+
+
+def _of(shift: Shift, methods: tuple[str, ...], episodes: int, seed: int) -> Iterator[Cell]:
+    for name in methods:
+        bases: tuple[Base, ...] = ("none",) if METHODS[name].kind == "scratch" else BASES
+        for base in bases:
+            yield Cell(shift, base, name, 0 if name == "zero-shot" else episodes, seed)
+
+
+def energies_of(cell: Cell) -> tuple[Literal["l1", "l2"], ...]:
+    """Return by which energies a cell plans: upstream's, and for the methods that matter most the squared one, too."""
+    both = cell.shift == "look" and cell.episodes in (0, 20) and cell.method in ("zero-shot", BEST, "full")
+    return ("l1", "l2") if both else ("l1",)

@@ -1,0 +1,174 @@
+"""How good does one cell become? Train it as anybody would, then measure it on held-out episodes and in closed loop."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from cells import PLANNING, SHIFTS, Cell, energies_of, method_of
+from prepare import base_model, data_a, data_shifted, training_episodes
+
+from vjepa2_ac.config import Config, DataConfig, ModelConfig, PlanningConfig, ValidationConfig
+from vjepa2_ac.config.training import CheckpointConfig
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.loader import batches_of
+from vjepa2_ac.data.windows import Split, far_neighbours, spread
+from vjepa2_ac.evaluation.metrics import PredictionErrors, prediction_errors
+from vjepa2_ac.latents import encode_batch
+from vjepa2_ac.model.adapter_end import base_only, merge_adapter
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.simulation.closed_loop import run_task
+from vjepa2_ac.simulation.policies import DoNothing, Oracle, Planning, Policy, RandomActions
+from vjepa2_ac.training.cached import with_latents_if_there
+from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.quiet import QuietReporter
+from vjepa2_ac.training.runs import load_run
+
+TEST_GOALS, VALIDATION_GOALS = 9_000, 4_000  # seeds of problems, to which a cell adds its own
+GOALS, CLIPS = 20, 128  # of one run; a row of the table pools its seeds, each with other goals
+
+
+def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = False) -> dict[str, Any]:
+    """Return the figures of a cell.
+
+    Args:
+        cell: What to train.
+        folder: Where `prepare` put things.
+        goals: Problems of the closed loop.
+        choosing: Measure on validation episodes and goals, to choose settings by.
+    """
+    config = config_of(cell, folder)
+    started = time.process_time(), time.perf_counter()
+    if method_of(cell.method).kind == "zero-shot":
+        model = load_base(config.model, seed=cell.seed)
+        trained: dict[str, Any] = {"trained_share": 0.0, "trained_parameters": 0, "adapter_mb": 0.0}
+    else:
+        run = train(config, QuietReporter())
+        model, trained = _trained(run)
+    seconds = time.process_time() - started[0], time.perf_counter() - started[1]
+    split: Split = "validation" if choosing else "test"
+    figures = {
+        "cell": asdict(cell) | {"name": cell.name},
+        "cpu_minutes": seconds[0] / 60,
+        "minutes": seconds[1] / 60,
+        **trained,
+        "shifted": _as_dict(held_out(model, config, split)),
+    }
+    if cell.base != "none":
+        figures["forgetting"] = _forgetting(model, folder, config)
+    if model.adaptation is not None:
+        merge_adapter(model)
+    goals_seed = (VALIDATION_GOALS if choosing else TEST_GOALS) + cell.seed
+    figures["reach"] = {
+        distance: reach(cell, planner(model, distance), seed=goals_seed, goals=goals) for distance in energies_of(cell)
+    }
+    return figures
+
+
+def config_of(cell: Cell, folder: Path) -> Config:
+    """Return the run of a cell: the config that anybody would write."""
+    method = method_of(cell.method)
+    data = data_shifted(folder, cell.shift)
+    left_out = training_episodes(data, cell.episodes, cell.seed) if cell.episodes else ()
+    return Config(
+        run_dir=str(folder / "runs" / cell.name),
+        seed=cell.seed,
+        data=data.model_copy(update={"exclude": left_out}),
+        model=ModelConfig(base=base_model(folder, cell.base, cell.seed), dtype="float32"),
+        adapter=method.adapter,
+        training=method.training,
+        validation=ValidationConfig(every=method.training.steps, clips=40, batch_size=20),
+        checkpoint=CheckpointConfig(every=method.training.steps),
+    )
+
+
+def baselines(cell: Cell, *, goals: int = GOALS) -> dict[str, Any]:
+    """Return how far those get who need no model, on the same goals."""
+    limits = PLANNING.limits
+    policies: tuple[Policy, ...] = (DoNothing(), RandomActions(limits, cell.seed), Oracle(limits))
+    return {policy.name: reach(cell, policy, seed=TEST_GOALS + cell.seed, goals=goals) for policy in policies}
+
+
+def planner(model: WorldModel, distance: str, config: PlanningConfig = PLANNING) -> Policy:
+    """Return a policy that plans with a model."""
+    energy = config.energy.model_copy(update={"distance": distance})
+    return Planning(Controller(model, config.model_copy(update={"energy": energy})))
+
+
+def reach(cell: Cell, policy: Policy, *, seed: int, goals: int) -> dict[str, Any]:
+    """Return distances to the goal (cm) before the first step and after each, and seconds of a decision."""
+    with _bf16():
+        result = run_task("reach", SHIFTS[cell.shift], policy, episodes=goals, seed=seed)
+    return {
+        "goals_seed": seed,
+        "distance_cm": np.round(result.distance_cm, 3).tolist(),
+        "seconds_per_decision": float(result.seconds.mean()),
+        "unreachable": int(result.unreachable.sum()),
+        "whys": result.why_counts,
+    }
+
+
+def held_out(model: WorldModel, config: Config, split: Split = "test", clips: int = CLIPS) -> PredictionErrors:
+    """Return errors on clips of held-out episodes, from the latents that training used."""
+    dataset = with_latents_if_there(config, open_dataset(config.data), model)
+    windows = dataset.windows(split)
+    chosen = [windows[place] for place in far_neighbours(spread(len(windows), clips))]
+    batches = batches_of(dataset, chosen, batch_size=32)
+    model.eval()
+    with _bf16():
+        return prediction_errors(
+            model, (encode_batch(model, batch, device=torch.device("cpu"), chunk=64) for batch in batches)
+        )
+
+
+def _forgetting(model: WorldModel, folder: Path, config: Config) -> dict[str, Any]:
+    """Return errors on A with the adapter on and off, and whether off is the base's to the last bit."""
+    on_a: DataConfig = data_a(folder)
+    config = config.model_copy(update={"data": on_a})
+    on = held_out(model, config)
+    if model.adaptation is None:
+        return {"on": _as_dict(on)}
+    with base_only(model):
+        off = held_out(model, config)
+    base = held_out(load_base(config.model, seed=0), config)
+    same = all(
+        np.array_equal(getattr(off, name), getattr(base, name))
+        for name in ("rollout", "one_step", "one_step_zero_actions")
+    )
+    return {"on": _as_dict(on), "off": _as_dict(off), "off_is_base_bit_for_bit": same}
+
+
+def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
+    loaded = load_run(run)
+    own = sum(value.numel() for value in load_base(loaded.config.model, seed=0).predictor.parameters())
+    files = list((loaded.checkpoint / "adapter").rglob("*.safetensors"))
+    lora = [value.numel() for name, value in loaded.world_model.predictor.named_parameters() if "lora_" in name]
+    count = sum(lora) or own
+    return loaded.world_model, {
+        "trained_share": count / own,
+        "trained_parameters": count,
+        "adapter_mb": sum(path.stat().st_size for path in files) / 1e6,
+    }
+
+
+def _as_dict(errors: PredictionErrors) -> dict[str, Any]:
+    """Return ratios to persistence, and the sums by episode that intervals are made of."""
+    nothing = errors.one_step_persistence.sum()
+    return {
+        "rollout_over_persistence": (errors.rollout.sum(axis=0) / errors.persistence.sum(axis=0)).tolist(),
+        "one_step": float(errors.one_step.sum() / nothing),
+        "one_step_zero_actions": float(errors.one_step_zero_actions.sum() / nothing),
+        "one_step_shuffled_actions": float(errors.one_step_shuffled_actions.sum() / nothing),
+        "clips": len(errors.episode_ids),
+        "episodes": len(set(errors.episode_ids)),
+    }
+
+
+def _bf16() -> Any:
+    return torch.autocast("cpu", dtype=torch.bfloat16)

@@ -1,0 +1,108 @@
+"""What must be there before a cell can run? Data sets of the simulated arm, base models, predictors without a past."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from cells import SHIFTS, TRAINING, Base, Shift
+
+from vjepa2_ac.config import Config, DataConfig, ModelConfig
+from vjepa2_ac.config_file import load_config
+from vjepa2_ac.data.dataset import open_dataset
+from vjepa2_ac.data.windows import split_of
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.simulation.record import record_dataset
+from vjepa2_ac.training.encode import encode_config
+from vjepa2_ac.training.export import export_run
+from vjepa2_ac.training.loop import Reporter, train
+from vjepa2_ac.training.quiet import QuietReporter
+
+BUILTIN = "builtin:sim-tiny"
+EPISODES_A, EPISODES_SHIFTED = 400, 100
+SEED_A, SEED_SHIFTED = 11, 21  # of recordings; another than those of the demo and its base
+BASE_CONFIG = Path(__file__).with_name("base_one_camera.yaml")
+
+
+def data_a(folder: Path) -> DataConfig:
+    """Return the data of domain A, on which the base of one camera is trained; its test split measures forgetting."""
+    return DataConfig(
+        path=str(folder / "data-A"),
+        frames=4,
+        stride=4,
+        validation_share=0.05,
+        test_share=0.05,
+        workers=0,
+        cache="auto",
+        cache_dir=str(folder / "latents"),
+    )
+
+
+def data_shifted(folder: Path, shift: Shift) -> DataConfig:
+    """Return the data of a shifted domain: half of its episodes may be trained on, the others are held out."""
+    update = {"path": str(folder / f"data-{shift}"), "validation_share": 0.12, "test_share": 0.35}
+    return data_a(folder).model_copy(update=update)
+
+
+def base_model(folder: Path, base: Base, seed: int) -> str:
+    """Return what `model.base` takes for a base, or for a predictor without a past."""
+    if base == "many cameras":
+        return BUILTIN
+    return str(folder / (f"scratch-{seed}" if base == "none" else "base-one-camera"))
+
+
+def prepare(folder: Path, seeds: int, reporter: Reporter | None = None) -> None:
+    """Make everything that is not there yet: some 25 minutes on one core, nearly all of it the base of one camera."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _record(data_a(folder), "A", EPISODES_A, SEED_A)
+    for shift in SHIFTS:
+        _record(data_shifted(folder, shift), shift, EPISODES_SHIFTED, SEED_SHIFTED)
+    if not Path(base_model(folder, "one camera", 0)).exists():
+        run = train(_base_config(folder), reporter or QuietReporter())
+        export_run(run, Path(base_model(folder, "one camera", 0)))
+    for seed in range(seeds):
+        _without_a_past(Path(base_model(folder, "none", seed)), seed)
+    for data in (data_a(folder), *(data_shifted(folder, shift) for shift in SHIFTS)):
+        for base in ("one camera", "many cameras"):
+            encode(data, base_model(folder, base, 0))
+
+
+def encode(data: DataConfig, base: str) -> None:
+    """Keep the latents of every episode: cells leave out different ones. Nothing to do where they are there."""
+    model = ModelConfig(base=base, dtype="float32")
+    encode_config(Config(run_dir="none", data=data, model=model, training=TRAINING), lambda _: None)
+
+
+def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...]:
+    """Return which training episodes are *left out* so that `count` remain, drawn by the seed.
+
+    Raises:
+        ValueError: There are not as many.
+    """
+    table = open_dataset(data).table
+    names = [name for name in map(table.identity, range(len(table))) if split_of(name, data) == "train"]
+    if len(names) < count:
+        raise ValueError(f"{data.path} has {len(names)} training episodes, not {count}")
+    order = np.random.default_rng([seed, 77]).permutation(len(names))
+    return tuple(sorted(names[place] for place in order[count:]))
+
+
+def _record(data: DataConfig, domain: str, episodes: int, seed: int) -> None:
+    if not Path(data.path).exists():
+        world = SHIFTS.get(domain, domain)  # type: ignore[call-overload]
+        record_dataset(data.path, domain=world, episodes=episodes, seed=seed)
+
+
+def _base_config(folder: Path) -> Config:
+    config = load_config(BASE_CONFIG, [f"run_dir={folder / 'run-base'}"])
+    return config.model_copy(update={"data": data_a(folder)})
+
+
+def _without_a_past(folder: Path, seed: int) -> None:
+    """Write the frozen encoder that all share with a predictor of fresh weights, which begins close to copying."""
+    if folder.exists():
+        return
+    model = load_base(ModelConfig(base=BUILTIN, dtype="float32"), seed=0)
+    model.predictor = WorldModel.random(model.sizes, seed=1000 + seed, at_persistence=True).predictor
+    model.save_pretrained(folder)
