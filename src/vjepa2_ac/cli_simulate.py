@@ -10,10 +10,10 @@ from vjepa2_ac.cli_parts import Commands, command, count, whole_number
 from vjepa2_ac.errors import InputError
 
 _RECORD = "record"
-_RECORDING = {"episodes": 40, "steps": 41, "cameras": 1, "workers": 1}
+_RECORDING = {"episodes": 40, "steps": 41, "cameras": 1, "workers": 1, "task": None}
 _STEERING = {
     "episodes": 50,
-    "steps": 8,
+    "steps": None,
     "task": "reach",
     "films": 6,
     "checkpoint": "newest",
@@ -49,6 +49,11 @@ def add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--renderer", choices=["rays", "opengl"], default="rays", help="opengl needs a working MUJOCO_GL"
     )
+    parser.add_argument(
+        "--task",
+        choices=["reach", "push", "pick"],
+        help="what is to be done (reach); record: push or pick, with a block on the table (none: reaching around)",
+    )
     _add_steering(parser.add_argument_group("of a model that steers"))
     recording = parser.add_argument_group("of record")
     recording.add_argument(
@@ -59,7 +64,6 @@ def add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _add_steering(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--task", choices=["reach"], help="what it is to do (reach)")
     add_checkpoint(group)
     group.add_argument("--config", metavar="CONFIG", help="of a model: a config whose `planning` is heeded")
     group.add_argument("--films", metavar="N", type=whole_number(0), help="episodes in the video; 0: none (6)")
@@ -102,6 +106,7 @@ def _record(options: argparse.Namespace) -> None:
             workers=options.workers,
             cameras=options.cameras,
             renderer=options.renderer,
+            task=None if options.task == "reach" else options.task,
             progress=lambda done, _: bar.advance_to(done),
         )
     finally:

@@ -148,6 +148,7 @@ def fake(*distances_m: float, unreachable: int = 0) -> EpisodeResult:
         problem=make_problem("reach", DOMAIN_A, 0, 0),
         states=np.zeros((count, 7)),
         actions=np.zeros((count - 1, 7)),
+        blocks=None,
         distances_m=np.array(distances_m),
         seconds=np.arange(1.0, count),
         whys=("planned",) * (count - 2) + ("out of time",),

@@ -40,7 +40,7 @@ class SimulatedArm:
     ) -> None:
         self.domain = domain
         self._mujoco = load_mujoco()
-        self._model = compile_scene(domain)
+        self._model = self._compiled(domain)
         self._data = self._mujoco.MjData(self._model)
         self._size = {"height": height, "width": width}
         self._renderer = renderer
@@ -57,7 +57,25 @@ class SimulatedArm:
     @property
     def state(self) -> Float[np.ndarray, " 7"]:
         """Measured pose of the flange, and closedness of the gripper."""
-        return np.append(forward_kinematics(self.joints), self._closedness)
+        return np.append(forward_kinematics(self.joints), self.closedness)
+
+    @property
+    def closedness(self) -> float:
+        """Measured closedness of the gripper: 0 open .. 1 closed."""
+        return self._closedness
+
+    @property
+    def block(self) -> Float[np.ndarray, " 4"] | None:
+        """Where the block is, as `tasks.Problem` tells it; None: there is none."""
+        return None
+
+    def place_block(self, block: Float[np.ndarray, " 4"]) -> None:
+        """Put the block there at once, at rest.
+
+        Raises:
+            ValueError: There is none.
+        """
+        raise ValueError(f"no block to be put at {block.tolist()}: this arm touches nothing")
 
     def set_joints(self, joints: Float[np.ndarray, " 7"], closedness: float) -> None:
         """Put the arm there at once."""
@@ -90,10 +108,16 @@ class SimulatedArm:
             UnreachableError: No joint angles lead there.
         """
         goal = inverse_kinematics(target[:6], self.joints, rest=rest_joints(self.domain))
+        return self.command_joints(goal, float(target[6]), control_steps)
+
+    def command_joints(
+        self, goal: Float[np.ndarray, " 7"], closedness: float, control_steps: int = 1
+    ) -> Float[np.ndarray, " 7"]:
+        """Send the joints (radians) and the gripper there for some control steps; return the state measured then."""
         left = (1.0 - tracking_share(self.domain.lag_s)) ** control_steps
         grip_left = (1.0 - tracking_share(GRIPPER_LAG_S)) ** control_steps
-        grip = float(target[6])
-        self.set_joints(goal + left * (self.joints - goal), grip + grip_left * (self._closedness - grip))
+        joints = goal + left * (self.joints - goal)
+        self.set_joints(joints, closedness + grip_left * (self._closedness - closedness))
         return self.state
 
     def picture(self, camera: str = "exterior_1") -> UInt8[np.ndarray, "height width 3"]:
@@ -107,6 +131,9 @@ class SimulatedArm:
         """Return the pose of a camera in the robot base frame: x right, y down, z into the picture."""
         pose = np.linalg.inv(self.domain.base_pose()) @ self._camera_pose(camera)
         return np.concatenate([pose[:3, 3], euler_from_matrices(pose[:3, :3])])
+
+    def _compiled(self, domain: Domain) -> Any:
+        return compile_scene(domain)
 
     def _camera(self, name: str) -> Any:
         if name not in self._cameras:

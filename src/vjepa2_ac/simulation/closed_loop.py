@@ -19,11 +19,12 @@ from vjepa2_ac.evaluation.bootstrap import Estimate, mean_of
 from vjepa2_ac.evaluation.proportion import share_of
 from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.simulation.arm import SimulatedArm
+from vjepa2_ac.simulation.contact_arm import arm_for
 from vjepa2_ac.simulation.domains import Domain, named_domain
 from vjepa2_ac.simulation.kinematics import UnreachableError
 from vjepa2_ac.simulation.motion import rest_joints
 from vjepa2_ac.simulation.policies import Policy
-from vjepa2_ac.simulation.tasks import SUCCESS_M, Problem, TaskName, make_problem
+from vjepa2_ac.simulation.tasks import STEPS, SUCCESS_M, Problem, TaskName, make_problem
 
 _PARTS = 8  # of a way that cannot be gone to its end
 
@@ -35,6 +36,7 @@ class EpisodeResult:
     problem: Problem
     states: Float[np.ndarray, "time 7"]  # measured, in the robot base frame
     actions: Float[np.ndarray, "steps 7"]  # as the policy named them
+    blocks: Float[np.ndarray, "time 4"] | None  # where the block was, as `Problem` tells it; None: there is none
     distances_m: Float[np.ndarray, " time"]  # of what the task moves, to its goal
     seconds: Float[np.ndarray, " steps"]  # that the policy took
     whys: tuple[str, ...]  # of each action
@@ -126,7 +128,7 @@ def run_task(
     *,
     episodes: int = 50,
     seed: int = 0,
-    steps: int = 8,
+    steps: int | None = None,
     stride: int = 4,
     keep_pictures: int = 0,
     arm: SimulatedArm | None = None,
@@ -140,10 +142,10 @@ def run_task(
         policy: Who does it.
         episodes: How many problems, from number 0 on.
         seed: Which problems. Settings that were chosen on one seed are to be reported on another.
-        steps: Model steps of an episode.
+        steps: Model steps of an episode; None: as many as the task has by default.
         stride: Control steps of a model step (15 per second).
         keep_pictures: Of so many episodes, the first ones, for a video.
-        arm: In this domain, to be used again; None: a new one.
+        arm: In this domain, from `arm_for` of this task, to be used again; None: a new one.
         progress: Told how many episodes are done.
 
     Raises:
@@ -154,7 +156,7 @@ def run_task(
         domain = named_domain(domain)
     if episodes < 1:
         raise ValueError(f"{episodes} episodes")
-    arm = arm or SimulatedArm(domain)
+    arm, steps = arm or arm_for(task, domain), steps or STEPS[task]
     done: list[EpisodeResult] = []
     for index in range(episodes):
         problem = make_problem(task, domain, seed, index)
@@ -182,14 +184,14 @@ def run_episode(
 
     Raises:
         UnreachableError: The problem's own start or goal cannot be reached.
-        ValueError: No steps, or an action that is not 7 finite numbers.
+        ValueError: No steps, an action that is not 7 finite numbers, or a block to be moved that the arm has not.
     """
     if min(steps, stride) < 1:
         raise ValueError(f"{steps} model steps of {stride} control steps")
-    goal_picture = _put(arm, problem.goal).picture()
-    _put(arm, problem.start)
+    goal_picture = put(arm, problem.goal, problem.block_goal).picture()
+    put(arm, problem.start, problem.block_start)
     policy.reset(problem, goal_picture)
-    states, pictures = [arm.state], [arm.picture()]
+    states, blocks, pictures = [arm.state], [arm.block], [arm.picture()]
     actions, seconds, whys, unreachable = [], [], [], 0
     for _ in range(steps):
         began = time.perf_counter()
@@ -199,12 +201,14 @@ def run_episode(
         whys.append(policy.why)
         unreachable += not _send(arm, action, stride)
         states.append(arm.state)
+        blocks.append(arm.block)
         pictures.append(arm.picture())
     return EpisodeResult(
         problem=problem,
         states=np.stack(states),
         actions=np.stack(actions),
-        distances_m=np.array([problem.distance_m(state) for state in states]),
+        blocks=None if problem.block_goal is None else np.stack([block for block in blocks if block is not None]),
+        distances_m=np.array([problem.distance_m(*seen) for seen in zip(states, blocks, strict=True)]),
         seconds=np.array(seconds),
         whys=tuple(whys),
         unreachable=unreachable,
@@ -213,19 +217,21 @@ def run_episode(
     )
 
 
+def put(arm: SimulatedArm, state: Float[np.ndarray, " 7"], block: Float[np.ndarray, " 4"] | None) -> SimulatedArm:
+    """Put arm and block somewhere, by way of the arm's rest: its spare joint must not depend on what was before."""
+    arm.set_joints(rest_joints(arm.domain), 0.0)
+    arm.set_state(state)
+    if block is not None:
+        arm.place_block(block)
+    return arm
+
+
 def ways_along(
     state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], parts: int = _PARTS
 ) -> Sequence[Float[np.ndarray, " 7"]]:
     """Return states at even distances on the straight way of an action, the nearest first."""
     shares = np.arange(1, parts + 1)[:, None] / parts
     return list(apply_action(np.tile(state, (parts, 1)), shares * action))
-
-
-def _put(arm: SimulatedArm, state: Float[np.ndarray, " 7"]) -> SimulatedArm:
-    """Put the arm in a state by way of its rest, so that its spare joint does not depend on what was before."""
-    arm.set_joints(rest_joints(arm.domain), 0.0)
-    arm.set_state(state)
-    return arm
 
 
 def _checked(action: Float[np.ndarray, " dim"], policy: Policy) -> Float[np.ndarray, " 7"]:
@@ -243,12 +249,15 @@ def _send(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int) -> bo
         pass
     else:
         return True
-    reachable = arm.state
+    reachable = None
     for way in ways_along(arm.state, action):
         if not arm.can_reach(way):
             break
         reachable = way
-    arm.command(_with_real_gripper(reachable), stride)
+    if reachable is None:
+        arm.command_joints(arm.joints, target[6], stride)
+    else:
+        arm.command(np.append(reachable[:6], target[6]), stride)
     return False
 
 

@@ -17,9 +17,11 @@ from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.simulation.arm import Renderer, SimulatedArm
 from vjepa2_ac.simulation.closed_loop import ClosedLoopResult, run_task
+from vjepa2_ac.simulation.contact_arm import arm_for
 from vjepa2_ac.simulation.domains import named_domain
 from vjepa2_ac.simulation.film import write_film
 from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ
+from vjepa2_ac.simulation.oracles import oracle_for
 from vjepa2_ac.simulation.policies import DoNothing, Oracle, Planning, Policy, RandomActions
 from vjepa2_ac.simulation.tasks import SUCCESS_M, TaskName
 from vjepa2_ac.storage import user_can_write, write_atomically
@@ -36,7 +38,7 @@ class Asked:
     task: TaskName = "reach"
     domain: str = "A"
     episodes: int = 50
-    steps: int = 8  # model steps of an episode
+    steps: int | None = None  # model steps of an episode; None: as many as the task has by default
     seed: int = 0  # which problems
     films: int = 6  # episodes in the video; 0: no video
     renderer: Renderer = "rays"
@@ -85,7 +87,7 @@ def hold_contest(
         video_library()
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    arm = SimulatedArm(named_domain(asked.domain), renderer=asked.renderer)
+    arm = arm_for(asked.task, named_domain(asked.domain), renderer=asked.renderer)
     results = []
     for policy in _policies(steering, asked, arm):
         result = run_task(
@@ -120,6 +122,7 @@ def contest_as_dict(contest: Contest) -> dict[str, Any]:
             "subject": contest.subject,
             "checkpoint": contest.checkpoint,
             **{key: value for key, value in dataclasses.asdict(contest.asked).items() if key != "films"},
+            "steps": contest.results[0].steps,
             "stride": contest.results[0].stride,
             "seconds_per_step": contest.seconds_per_step,
             "success_below_cm": 100 * SUCCESS_M[contest.asked.task],
@@ -139,7 +142,7 @@ def _policies(steering: Steering, asked: Asked, arm: SimulatedArm) -> Sequence[P
     name = Path(steering.subject).name or steering.subject
     taken = {DoNothing.name, RandomActions.name, Oracle.name}
     model = Planning(controller, name if name not in taken else f"model {name}")
-    return model, DoNothing(), RandomActions(limits, seed=asked.seed), Oracle(limits)
+    return model, DoNothing(), RandomActions(limits, seed=asked.seed), oracle_for(asked.task, limits, arm)
 
 
 def _figures(result: ClosedLoopResult) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from vjepa2_ac.simulation.scene import load_mujoco
 
 SUCCESS_SHARE = 0.9
 JPEG_QUALITY = 85  # some 11 KB a picture, as in DROID
-INSTRUCTION = "reach around over the table"
+_INSTRUCTIONS = {None: "reach around over the table", "push": "push the block", "pick": "pick up the block"}
 _SIMULATED_CAMERAS = dict(zip(CAMERAS, ("exterior_1", "exterior_2", "wrist"), strict=True))
 
 
@@ -45,6 +45,7 @@ def record_dataset(
     workers: int = 1,
     renderer: Renderer = "rays",
     recipe: MotionRecipe | None = None,
+    task: Literal["push", "pick"] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Record episodes and write them as a data set; the same arguments give the same bytes, whatever `workers`.
@@ -62,7 +63,8 @@ def record_dataset(
         cameras: 1: the three pictures of a step are the same one. 3: each camera sees its own.
         workers: Processes. More than one needs `if __name__ == "__main__":` in a script that calls this.
         renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
-        recipe: How the arm moves.
+        recipe: How the arm moves, without a task.
+        task: With a block on the table: half of the episodes push or pick it by script, half play around it at random.
         progress: Called with (episodes done, episodes in all).
 
     Raises:
@@ -86,6 +88,7 @@ def record_dataset(
         cameras=cameras,
         renderer=renderer,
         recipe=recipe,
+        task=task,
     )
     stream = _watched(_recorded(record, episodes, workers), episodes, progress)
     return write_droid_rlds(folder, stream, shards=shards or -(-episodes // 32))
@@ -100,6 +103,7 @@ def record_episode(
     cameras: Literal[1, 3] = 1,
     renderer: Renderer = "rays",
     recipe: MotionRecipe | None = None,
+    task: Literal["push", "pick"] | None = None,
 ) -> DroidEpisode:
     """Return one episode, in a domain or in a world drawn from ranges: a pure function of its arguments.
 
@@ -108,7 +112,22 @@ def record_episode(
     """
     motion_rng, world_rng = (np.random.default_rng([seed, index, purpose]) for purpose in range(2))
     world = domain if isinstance(domain, Domain) else sample_domain(world_rng, domain)
-    motion = random_reaching(world, steps, motion_rng, recipe)
+    if task is None:
+        motion = random_reaching(world, steps, motion_rng, recipe)
+        images = _film(world, motion, cameras, renderer)
+    else:
+        from vjepa2_ac.simulation.play import play  # torch comes with it, which reaching around does without
+
+        images = {}
+        motion = play(
+            task,
+            world,
+            steps,
+            motion_rng,
+            script=index % 2 == 0,
+            renderer=renderer,
+            look=lambda arm: _take(arm, images, cameras),
+        )
     folder = episode_folder(index, seed, world.name)
     return DroidEpisode(
         file_path=f"{folder}/trajectory.h5",
@@ -118,8 +137,8 @@ def record_episode(
         observation=DroidMeasurements(
             cartesian_position=motion.poses, gripper_position=motion.gripper[:, None], joint_position=motion.joints
         ),
-        images=_film(world, motion, cameras, renderer),
-        language_instruction=INSTRUCTION,
+        images={feature: images.get(feature, images[CAMERAS[0]]) for feature in CAMERAS},
+        language_instruction=_INSTRUCTIONS[task],
     )
 
 
@@ -133,12 +152,18 @@ def episode_folder(index: int, seed: int, domain_name: str) -> str:
 
 def _film(world: Domain, motion: Motion, cameras: int, renderer: Renderer) -> dict[str, list[bytes]]:
     arm = SimulatedArm(world, renderer=renderer)
-    films: dict[str, list[bytes]] = {feature: [] for feature in CAMERAS[:cameras]}
+    films: dict[str, list[bytes]] = {}
     for joints, closedness in zip(motion.joints, motion.gripper, strict=True):
         arm.set_joints(joints, float(closedness))
-        for feature, film in films.items():
-            film.append(encode_jpeg(arm.picture(_SIMULATED_CAMERAS[feature]), quality=JPEG_QUALITY))
-    return {feature: films.get(feature, films[CAMERAS[0]]) for feature in CAMERAS}
+        _take(arm, films, cameras)
+    return films
+
+
+def _take(arm: SimulatedArm, films: dict[str, list[bytes]], cameras: int) -> None:
+    """Add what the cameras see now to their films."""
+    for feature in CAMERAS[:cameras]:
+        picture = arm.picture(_SIMULATED_CAMERAS[feature])
+        films.setdefault(feature, []).append(encode_jpeg(picture, quality=JPEG_QUALITY))
 
 
 def _commands(motion: Motion) -> DroidCommands:

@@ -16,6 +16,12 @@ from vjepa2_ac.simulation.kinematics import FLANGE_OFFSET_M, JOINTS
 STATIC_GROUP, ARM_GROUP = 0, 1
 """Geom groups: what never moves, and what does."""
 FINGER_TRAVEL_M = 0.04
+FINGER_INSIDE_M, FINGER_OUTSIDE_M, FINGER_HALF_M = 0.004, 0.028, 0.014
+"""Of a closed finger: from the middle of the hand to its inner and outer side, and half its width across."""
+FINGERTIP_M = 0.15
+"""How far the fingers reach beyond the flange."""
+BLOCK_M = 0.06
+"""Edge of the block, a cube, in scenes that have one."""
 
 Coordinate = float | int
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -111,21 +117,31 @@ def compile_scene(domain: Domain) -> Any:
 
 def scene_xml(domain: Domain) -> str:
     """Return the scene as MJCF: seven hinges `joint1`..`joint7`, two slides `finger1`, `finger2`, the site `flange`."""
+    return ET.tostring(scene_tree(domain), encoding="unicode")
+
+
+def scene_tree(domain: Domain) -> ET.Element:
+    """Return the scene as the tree of its MJCF, for others to add to."""
     root = ET.Element("mujoco", model="arm")
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     visual = ET.SubElement(root, "visual")
     ET.SubElement(visual, "global", fovy=str(domain.camera.vertical_fov_deg), offwidth="1280", offheight="720")
     look = domain.look
-    ET.SubElement(visual, "headlight", ambient=_text([look.ambient] * 3), diffuse="0 0 0", specular="0 0 0")
+    ET.SubElement(visual, "headlight", ambient=as_text([look.ambient] * 3), diffuse="0 0 0", specular="0 0 0")
     world = ET.SubElement(root, "worldbody")
     light = light_position(look)
     ET.SubElement(
-        world, "light", pos=_text(light), dir=_text(-light), diffuse=_text([1 - look.ambient] * 3), castshadow="true"
+        world,
+        "light",
+        pos=as_text(light),
+        dir=as_text(-light),
+        diffuse=as_text([1 - look.ambient] * 3),
+        castshadow="true",
     )
     _add_room(world, look)
     _add_clutter(world, np.random.default_rng(domain.clutter_seed))
     _add_arm(world, domain)
-    return ET.tostring(root, encoding="unicode")
+    return root
 
 
 def light_position(look: Look) -> np.ndarray:
@@ -161,32 +177,34 @@ def _add_clutter(world: ET.Element, rng: np.random.Generator) -> None:
             "geom",
             name=f"thing{index}",
             type="box" if index % 2 else "cylinder",
-            pos=_text([x, y, height]),
-            size=_text([size, size, height] if index % 2 else [size, height]),
-            euler=_text([0.0, 0.0, rng.uniform(0, np.pi)]),
-            rgba=_text([*colour, 1.0]),
+            pos=as_text([x, y, height]),
+            size=as_text([size, size, height] if index % 2 else [size, height]),
+            euler=as_text([0.0, 0.0, rng.uniform(0, np.pi)]),
+            rgba=as_text([*colour, 1.0]),
             group=str(STATIC_GROUP),
         )
 
 
 def _add_arm(world: ET.Element, domain: Domain) -> None:
-    body = ET.SubElement(world, "body", name="link0", euler=_text([0, 0, np.deg2rad(domain.base_yaw_deg)]))
+    body = ET.SubElement(world, "body", name="link0", euler=as_text([0, 0, np.deg2rad(domain.base_yaw_deg)]))
     _add_shapes(body, LINK_SHAPES[0], domain.look)
     for index, joint in enumerate(JOINTS, start=1):
         twist = np.deg2rad(joint.twist_deg)
         offset = [joint.length_m, -np.sin(twist) * joint.offset_m, np.cos(twist) * joint.offset_m]
-        body = ET.SubElement(body, "body", name=f"link{index}", pos=_text(offset), euler=_text([twist, 0, 0]))
+        body = ET.SubElement(body, "body", name=f"link{index}", pos=as_text(offset), euler=as_text([twist, 0, 0]))
         ET.SubElement(
             body,
             "joint",
             name=f"joint{index}",
             type="hinge",
             axis="0 0 1",
-            range=_text([joint.low_rad, joint.high_rad]),
+            range=as_text([joint.low_rad, joint.high_rad]),
         )
         _add_shapes(body, LINK_SHAPES[index], domain.look)
-    ET.SubElement(body, "site", name="flange", pos=_text([0, 0, FLANGE_OFFSET_M]))
-    hand = ET.SubElement(body, "body", name="hand", pos=_text([0, 0, FLANGE_OFFSET_M]), euler=_text([0, 0, -np.pi / 4]))
+    ET.SubElement(body, "site", name="flange", pos=as_text([0, 0, FLANGE_OFFSET_M]))
+    hand = ET.SubElement(
+        body, "body", name="hand", pos=as_text([0, 0, FLANGE_OFFSET_M]), euler=as_text([0, 0, -np.pi / 4])
+    )
     _add_shapes(hand, HAND_SHAPES, domain.look)
     for index, side in enumerate((1, -1), start=1):
         _add_finger(hand, f"finger{index}", side, domain.look)
@@ -194,19 +212,22 @@ def _add_arm(world: ET.Element, domain: Domain) -> None:
 
 def _add_finger(hand: ET.Element, name: str, side: int, look: Look) -> None:
     finger = ET.SubElement(hand, "body", name=name)
-    ET.SubElement(finger, "joint", name=name, type="slide", axis=_text([0, side, 0]), range=_text([0, FINGER_TRAVEL_M]))
-    low, high = sorted((side * 0.004, side * 0.028))
-    _add_shapes(finger, (Shape("box", (-0.014, low, 0.07), (0.014, high, 0.15), 0.0, "hand"),), look)
+    ET.SubElement(
+        finger, "joint", name=name, type="slide", axis=as_text([0, side, 0]), range=as_text([0, FINGER_TRAVEL_M])
+    )
+    low, high = sorted((side * FINGER_INSIDE_M, side * FINGER_OUTSIDE_M))
+    ends = (-FINGER_HALF_M, low, 0.07), (FINGER_HALF_M, high, FINGERTIP_M)
+    _add_shapes(finger, (Shape("box", *ends, 0.0, "hand"),), look)
 
 
 def _add_shapes(body: ET.Element, shapes: tuple[Shape, ...], look: Look) -> None:
     for shape in shapes:
         start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
         if shape.kind == "box":
-            place: dict[str, Any] = {"pos": _text((start + end) / 2), "size": _text((end - start) / 2)}
+            place: dict[str, Any] = {"pos": as_text((start + end) / 2), "size": as_text((end - start) / 2)}
         else:
-            place = {"fromto": _text([*start, *end]), "size": _text([shape.radius_m])}
-        rgba = _text([*getattr(look, shape.colour), 1.0])
+            place = {"fromto": as_text([*start, *end]), "size": as_text([shape.radius_m])}
+        rgba = as_text([*getattr(look, shape.colour), 1.0])
         ET.SubElement(body, "geom", type=shape.kind, rgba=rgba, group=str(ARM_GROUP), **place)
 
 
@@ -216,12 +237,13 @@ def _add_box(world: ET.Element, name: str, centre: Point, half: Point, colour: t
         "geom",
         name=name,
         type="box",
-        pos=_text(centre),
-        size=_text(half),
-        rgba=_text([*colour, 1.0]),
+        pos=as_text(centre),
+        size=as_text(half),
+        rgba=as_text([*colour, 1.0]),
         group=str(STATIC_GROUP),
     )
 
 
-def _text(numbers: Any) -> str:
+def as_text(numbers: Any) -> str:
+    """Return numbers as an attribute of MJCF, to the last digit."""
     return " ".join(repr(float(number)) for number in numbers)
