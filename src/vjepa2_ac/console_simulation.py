@@ -16,8 +16,8 @@ def contest_table(contest: Contest) -> Table:
     """Return a row for each who did the task; the intervals are 95 %, over episodes."""
     asked, threshold = contest.asked, f"{100 * SUCCESS_M[contest.asked.task]:g} cm"
     table = Table(
-        title=f"{asked.task} in domain {asked.domain}: {asked.episodes} problems of seed {asked.seed}, {contest.results[0].steps}"
-        f" steps of {contest.seconds_per_step:.2f} s (95 % interval over episodes)",
+        title=f"{asked.task} in domain {asked.domain}: {asked.episodes} problems of seed {asked.seed},"
+        f" {contest.results[0].steps} steps of {contest.seconds_per_step:.2f} s (95 % interval over episodes)",
         title_justify="left",
     )
     table.add_column("", no_wrap=True)
