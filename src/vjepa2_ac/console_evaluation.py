@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from types import TracebackType
+from typing import Literal
 
 from rich.table import Table
 
@@ -11,7 +14,7 @@ from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.bootstrap import Estimate
 from vjepa2_ac.evaluation.comparison import Comparison
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
-from vjepa2_ac.evaluation.planning_figures import AXES, figures_of, signed_along, ways_of
+from vjepa2_ac.evaluation.planning_figures import AXES, PlanFigures, figures_of, signed_along, ways_of
 from vjepa2_ac.evaluation.planning_protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscapes, PlanningStudy, Sensitivity
 
@@ -151,27 +154,37 @@ def _plans(evaluation: Evaluation, study: PlanningStudy) -> Table:
     for name in ways:
         table.add_column(name, justify="right", no_wrap=True)
     figures = [figures_of(study, plans) for plans in ways.values()]
-    table.add_row(f"Action Score (best {BEST_SCORE:.0f})", *(_short(one.score) for one in figures))
-    table.add_row(f"end of {STEPS} steps off by, cm", *(_short(one.missed_cm) for one in figures))
+
+    def row(label: str, of: Callable[[PlanFigures], Estimate], digits: int = 1) -> None:
+        cells = [_short(of(one), digits, interval=name not in found) for name, one in zip(ways, figures, strict=True)]
+        table.add_row(label, *cells)
+
+    row(f"Action Score (best {BEST_SCORE:.0f})", lambda one: one.score)
+    row(f"end of {STEPS} steps off by, cm", lambda one: one.missed_cm)
     table.add_section()
-    table.add_row("one step off by, cm", *(_short(one.step_cm) for one in figures))
+    row("one step off by, cm", lambda one: one.step_cm)
     for axis, name in enumerate(AXES):
-        table.add_row(f"  along {name}", *(_short(one.axes_cm[axis]) for one in figures))
-    table.add_row("  angle, degrees", *(_short(one.angle_degrees, 0) for one in figures))
+        row(f"  along {name}", partial(_on, "axes_cm", axis))
+    row("  angle, degrees", lambda one: one.angle_degrees, 0)
     for axis, name in enumerate(AXES):
         count = int(signed_along(study, axis).sum())
         if count:
-            table.add_row(f"  right sign of {name} ({_clips(count)})", *(_short(o.signs[axis], 2) for o in figures))
-    table.add_row("  gripper off by", *(_short(one.gripper, 2) for one in figures))
+            row(f"  right sign of {name} ({_clips(count)})", partial(_on, "signs", axis), 2)
+    row("  gripper off by", lambda one: one.gripper, 2)
     table.add_section()
     seconds = [plans.seconds / len(study) if plans.seconds else None for plans in ways.values()]
     table.add_row("seconds a clip", *("" if one is None else f"{one:.1f}" for one in seconds))
     return table
 
 
-def _short(one: Estimate, digits: int = 1) -> str:
+def _on(name: Literal["axes_cm", "signs"], axis: int, figures: PlanFigures) -> Estimate:
+    estimates = {"axes_cm": figures.axes_cm, "signs": figures.signs}
+    return estimates[name][axis]
+
+
+def _short(one: Estimate, digits: int, *, interval: bool) -> str:
     value = f"{one.value:.{digits}f}"
-    return f"{value} [{one.low:.{digits}f}, {one.high:.{digits}f}]" if one.has_interval else value
+    return f"{value} [{one.low:.{digits}f}, {one.high:.{digits}f}]" if interval and one.has_interval else value
 
 
 def _clips(number: int) -> str:
