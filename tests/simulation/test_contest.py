@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,21 @@ def test_a_missing_library_is_told_before_anything_is_done(
     with pytest.raises(InputError, match="PyAV"):
         hold_contest(load_to_plan(model), Asked(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_model_of_states_in_the_cameras_frame_is_refused(model: str, tmp_path: Path) -> None:
+    steering = load_to_plan(model)
+    data = steering.config.data.model_copy(update={"pose_frame": "camera"})
+    steering = replace(steering, config=steering.config.model_copy(update={"data": data}))
+    with pytest.raises(InputError, match=r"data\.pose_frame: camera"):
+        hold_contest(steering, Asked(), tmp_path)
+
+
+def test_a_task_with_a_block_has_its_own_number_of_steps(model: str, tmp_path: Path) -> None:
+    asked = Asked(task="pick", episodes=1, films=0)
+    contest, _ = hold_contest(load_to_plan(model, overrides=SMALL), asked, tmp_path)
+    assert figures(tmp_path)["about"]["steps"] == contest.results[0].steps == 12
+    assert figures(tmp_path)["policies"]["oracle"]["success"]["value"] == 1.0
 
 
 def test_a_stride_that_is_to_be_found_out_is_no_stride(model: str, tmp_path: Path) -> None:

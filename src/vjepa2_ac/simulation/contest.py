@@ -73,7 +73,7 @@ def hold_contest(
         stage: Gives a bar for a part of the work, by its title.
 
     Raises:
-        InputError: MuJoCo or PyAV is missing, no such domain, no stride, or the folder cannot be written.
+        InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, or a folder nobody can write.
     """
     stride = steering.config.data.stride
     if stride == "auto":
@@ -82,6 +82,12 @@ def hold_contest(
             found="auto",
             needed="a number of control steps, to steer",
             fix="Say which, as data.stride=4",
+        )
+    if steering.config.data.pose_frame != "base":
+        raise InputError(
+            where=f"data.pose_frame: {steering.config.data.pose_frame}",
+            found="a model of states in another frame",
+            needed="base: the simulated arm is steered in the frame of its base",
         )
     if asked.films:
         video_library()
