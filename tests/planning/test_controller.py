@@ -224,3 +224,16 @@ def test_goals_that_are_all_reached_are_reached() -> None:
     run = controller()
     run.reset(picture(100), picture(100), durations=(1,))
     assert not run.act(picture(100), STATE).any()
+
+
+def test_a_new_goal_forgets_what_was_seen() -> None:
+    run = controller(context=3)
+    actions(run)
+    assert len(run._scene().latents) == 3
+    actions(run, 1)
+    assert len(run._scene().latents) == 1
+
+
+def test_a_model_that_was_in_training_is_put_into_eval_mode() -> None:
+    model = tiny_model(adapted=True).train()
+    np.testing.assert_array_equal(actions(controller(model), 1), actions(controller(tiny_model(adapted=True)), 1))

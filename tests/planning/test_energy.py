@@ -60,6 +60,18 @@ def test_energies_do_not_depend_on_how_many_are_computed_at_once(context: int) -
     assert expected.unique().numel() == 7
 
 
+def test_no_more_samples_go_through_the_predictor_at_once_than_were_asked_for() -> None:
+    model, seen = tiny_model(), []
+    model.base_predictor.register_forward_pre_hook(lambda _, given: seen.append(len(given[0])))
+    with torch.no_grad():
+        cost(model, samples_at_once=3)(actions(7, 1))
+    assert seen == [3, 3, 1]
+    seen.clear()
+    tried = actions(7, 1).requires_grad_()
+    cost(model, samples_at_once=7)(tried).sum().backward()  # one part is not computed again
+    assert seen == [7]
+
+
 @torch.no_grad()
 def test_an_energy_is_upstreams_mean_absolute_difference_of_the_last_step() -> None:
     model, tried = tiny_model(), actions(4, 2)
@@ -134,8 +146,14 @@ def test_the_goal_that_counts_depends_on_what_was_done() -> None:
     "wrong",
     [
         {"durations": (1,)},
+        {"goals": 2, "durations": (0,)},
+        {"goals": 2},
+        {"goals": 0},
         {"weights": torch.zeros(TOKENS)},
         {"weights": -torch.ones(TOKENS)},
+        {"weights": torch.full((TOKENS,), torch.inf)},
+        {"weights": torch.full((TOKENS,), torch.nan)},
+        {"weights": torch.arange(TOKENS) - 1.0},
     ],
 )
 def test_a_goal_that_cannot_be_is_refused(wrong) -> None:
@@ -194,6 +212,14 @@ def test_a_model_that_says_nothing_leads_to_no_motion() -> None:
     plan = Planner(PlanningConfig(samples=8, cem={"elites": 2}, iterations=2)).plan(cost(model), torch.Generator())
     assert plan.stopped == "no finite energy"
     assert not plan.actions.any()
+
+
+def test_what_all_samples_share_keeps_no_graph_of_an_adapters_weights() -> None:
+    model = tiny_model(adapted=True)
+    assert any(value.requires_grad for value in model.parameters())
+    shared = cost(model, context=3)._cache
+    assert shared is not None
+    assert not any(piece.requires_grad for piece in shared.layer(0) + shared.layer(1))
 
 
 def test_a_model_in_training_mode_is_refused() -> None:
