@@ -145,8 +145,9 @@ def test_what_does_not_count_may_differ_at_the_goal() -> None:
     mask = np.zeros((60, 48), bool)
     with pytest.raises(InputError, match="nothing of what the model sees"):
         run.reset(picture(100), mask=mask)
-    with pytest.raises(InputError, match="mask"):
-        run.reset(picture(100), mask=mask.T)
+    for other in (mask.T, mask[:, :40], mask[:40]):
+        with pytest.raises(InputError, match="mask"):
+            run.reset(picture(100), mask=other)
 
 
 @torch.no_grad()
@@ -159,7 +160,8 @@ def test_a_model_in_bfloat16_plans_as_well(planner: str) -> None:
 @pytest.mark.parametrize(
     ("frame", "complaint"),
     [
-        (picture(0, 48, 60), "as the goal's picture"), (picture(0)[..., 0], "RGB picture"),
+        (picture(0, 48, 60), "as the goal's picture"), (picture(0, 60, 60), "as the goal's picture"),
+        (picture(0, 50, 48), "as the goal's picture"), (picture(0)[..., 0], "RGB picture"),
         (picture(0).astype(np.float32), "RGB picture"), (picture(0)[:4, :4], "RGB picture"),
     ],
 )  # fmt: skip
@@ -237,3 +239,41 @@ def test_a_new_goal_forgets_what_was_seen() -> None:
 def test_a_model_that_was_in_training_is_put_into_eval_mode() -> None:
     model = tiny_model(adapted=True).train()
     np.testing.assert_array_equal(actions(controller(model), 1), actions(controller(tiny_model(adapted=True)), 1))
+
+
+@torch.no_grad()
+def test_energies_are_of_the_goal_that_counts_now() -> None:
+    run = controller(horizon=1)
+    run.reset(picture(100), picture(101), durations=(1,))
+    for seed, wanted in enumerate((0, 1)):
+        run.act(picture(seed), STATE)
+        assert run._goal is not None
+        assert run.decision is not None
+        assert run.decision.cost is not None
+        tried = torch.full((1, 1, 7), 0.02)
+        predicted, _ = run.decision.cost.imagine(tried)
+        expected = (predicted[:, 0] - run._goal.latents[wanted]).abs().mean(dim=(1, 2))
+        torch.testing.assert_close(run.decision.cost(tried), expected)
+
+
+def test_one_model_step_of_the_last_plan_is_gone_when_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    run = controller(horizon=3)
+    actions(run, 1)
+    assert run.decision is not None
+    before, starts, plan = run.decision.plan, [], run._planner.plan
+    monkeypatch.setattr(run._planner, "plan", lambda *given: (starts.append(given[2]), plan(*given))[1])
+    run.act(picture(1), STATE)
+    assert before is not None
+    assert torch.equal(starts[0].mean, before.mean[[1, 2, 2]])
+    assert not torch.equal(before.mean[0], before.mean[1])
+
+
+def test_a_mask_is_cropped_as_the_picture_is() -> None:
+    run = controller()
+    mask = np.zeros((48, 120), bool)
+    mask[:16, :20] = True  # outside what the model sees: columns 27 to 91
+    mask[:16, 72:] = True
+    run.reset(picture(100, 48, 120), mask=mask)
+    assert run._goal is not None
+    assert run._goal.weights is not None
+    assert run._goal.weights.nonzero().flatten().tolist() == [2]
