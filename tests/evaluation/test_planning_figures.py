@@ -12,7 +12,7 @@ from evaluation.planned import study, with_plans
 from evaluation.results import evaluation
 from vjepa2_ac.console_evaluation import evaluation_tables
 from vjepa2_ac.evaluation.comparison import compare
-from vjepa2_ac.evaluation.metrics_file import write_metrics
+from vjepa2_ac.evaluation.metrics_file import metrics_as_dict, write_metrics
 from vjepa2_ac.evaluation.planning_figures import differences_of, figures_of, missed_cm
 from vjepa2_ac.evaluation.result import Evaluation, Plans
 from vjepa2_ac.evaluation.verdict import verdict
@@ -108,6 +108,17 @@ def test_intervals_are_over_episodes() -> None:
 @pytest.fixture
 def found() -> Evaluation:
     return with_plans(evaluation())
+
+
+def test_what_was_trained_is_compared_with_the_base_and_the_base_not_with_itself(found: Evaluation) -> None:
+    models = metrics_as_dict(found)["models"]
+    assert "difference_to_base" not in models["base"]["planning"]
+    difference, ours, theirs = (
+        models["adapter"]["planning"]["difference_to_base"],
+        *(models[name]["planning"] for name in ("adapter", "base")),
+    )
+    for name in ("missed_cm", "step_cm"):
+        assert difference[name]["value"] == pytest.approx(ours[name]["value"] - theirs[name]["value"])
 
 
 def test_the_verdict_says_how_plans_end(found: Evaluation) -> None:
