@@ -163,6 +163,7 @@ def test_success_counts_at_the_end_and_in_passing_is_told_apart() -> None:
     result = ClosedLoopResult("reach", "A", "x", 0, 2, 4, episodes)
     assert result.successes.tolist() == [False, True, False]
     assert result.success_rate.value == pytest.approx(1 / 3)
+    assert [episode.success_ever for episode in episodes] == [True, True, False]
     assert result.success_ever_rate.value == pytest.approx(2 / 3)
     assert 0 < result.success_rate.low < 1 / 3 < result.success_rate.high < 1
     assert result.final_distance_cm.value == pytest.approx(10.0)
