@@ -145,7 +145,7 @@ def test_what_does_not_count_may_differ_at_the_goal() -> None:
     mask = np.zeros((60, 48), bool)
     with pytest.raises(InputError, match="nothing of what the model sees"):
         run.reset(picture(100), mask=mask)
-    for other in (mask.T, mask[:, :40], mask[:40]):
+    for other in (~mask.T, ~mask[:, :40], ~mask[:40]):
         with pytest.raises(InputError, match="mask"):
             run.reset(picture(100), mask=other)
 
@@ -162,6 +162,7 @@ def test_a_model_in_bfloat16_plans_as_well(planner: str) -> None:
     [
         (picture(0, 48, 60), "as the goal's picture"), (picture(0, 60, 60), "as the goal's picture"),
         (picture(0, 50, 48), "as the goal's picture"), (picture(0)[..., 0], "RGB picture"),
+        (np.dstack([picture(0), picture(0)]), "RGB picture"),
         (picture(0).astype(np.float32), "RGB picture"), (picture(0)[:4, :4], "RGB picture"),
     ],
 )  # fmt: skip
@@ -277,3 +278,32 @@ def test_a_mask_is_cropped_as_the_picture_is() -> None:
     assert run._goal is not None
     assert run._goal.weights is not None
     assert run._goal.weights.nonzero().flatten().tolist() == [2]
+
+
+def test_every_decision_draws_with_a_seed_of_its_own() -> None:
+    run = controller(seed=7)
+    run.reset(picture(100))
+    seeds = []
+    for seed in range(3):
+        run.act(picture(seed), STATE)
+        seeds.append(run.decision.plan.seed)  # type: ignore[union-attr]
+    assert seeds == [7, 8, 9]
+
+
+def test_pictures_are_cropped_as_in_training() -> None:
+    wide = [picture(seed, 48, 120) for seed in (100, 1)]
+    narrow = [np.ascontiguousarray(one[:, 36:84]) for one in wide]  # the central square
+    energies = []
+    for pictures, crop in ((wide, "square"), (narrow, "square"), (wide, "released")):
+        run = Controller(tiny_model(), QUICK, crop=crop)
+        run.reset(pictures[0])
+        run.act(pictures[1], STATE)
+        energies.append(run.decision.energy_now)  # type: ignore[union-attr]
+    assert energies[0] == energies[1] != energies[2]
+
+
+def test_a_model_whose_states_are_no_poses_is_refused() -> None:
+    sizes = tiny_model().sizes
+    vectors = sizes.model_copy(update={"predictor": sizes.predictor.model_copy(update={"state_dim": 8})})
+    with pytest.raises(InputError, match="no poses"):
+        controller(WorldModel.random(vectors, seed=0))

@@ -70,6 +70,9 @@ def test_no_more_samples_go_through_the_predictor_at_once_than_were_asked_for() 
     tried = actions(7, 1).requires_grad_()
     cost(model, samples_at_once=7)(tried).sum().backward()  # one part is not computed again
     assert seen == [7]
+    seen.clear()
+    cost(model, samples_at_once=4)(tried).sum().backward()  # several are, so that one at a time is in memory
+    assert sorted(seen) == [3, 3, 4, 4]
 
 
 @torch.no_grad()

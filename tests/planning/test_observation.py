@@ -24,8 +24,10 @@ def test_a_number_that_cannot_be_is_refused_wherever_it_stands(place: int, sign:
     wrong = {0: 300.0, 1: 90.0, 2: 1.2 if sign > 0 else 0.2}[place // 3]
     with pytest.raises(InputError, match=complaint):
         require_pose(changed(place, sign * wrong), where="state")
-    with pytest.raises(InputError, match="finite"):
-        require_pose(changed(place, sign * math.inf), where="state")
+    for never in (math.nan, sign * math.inf):
+        with pytest.raises(InputError, match=rf"{never}\b.* needed: 7 finite numbers") as caught:
+            require_pose(changed(place, never), where="state")
+        assert "degrees" not in str(caught.value)
     if place < 6:
         with pytest.raises(InputError, match=complaint):
             require_extrinsics(changed(place, sign * wrong)[:6], where="camera")
