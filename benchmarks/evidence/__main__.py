@@ -14,12 +14,11 @@ import json
 import multiprocessing
 import os
 import sys
-import traceback
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any
 
-from cells import Cell, all_cells, candidate_cells, method_of
+from cells import Cell, all_cells, candidate_cells
 
 
 def main() -> int:
@@ -60,17 +59,23 @@ def _parse() -> argparse.Namespace:
 
 def _run(cells: list[Cell], results: Path, options: argparse.Namespace) -> int:
     """Run cells, each in a process of its own; return how many failed."""
+    from measure import measure_alone  # which a process of its own can import
+
     os.environ["OMP_NUM_THREADS"] = "1"
     context = multiprocessing.get_context("spawn")
     failed = 0
     with ProcessPoolExecutor(options.workers, mp_context=context, max_tasks_per_child=1) as pool:
-        waiting = {pool.submit(_measured, cell, options.folder, options.goals, options.choose): cell for cell in cells}
+        waiting = {
+            pool.submit(measure_alone, cell, options.folder, options.goals, options.choose): cell for cell in cells
+        }
         for number, done in enumerate(as_completed(waiting), start=1):
             cell = waiting[done]
             try:
                 figures = done.result()
-            except Exception:  # one cell must not cost the others
-                traceback.print_exc()
+            except BrokenProcessPool:
+                raise
+            except Exception as error:  # one cell must not cost the others
+                print(f"{cell.name} failed: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
                 failed += 1
                 continue
             path = _result(results, cell)
@@ -84,17 +89,6 @@ def _run(cells: list[Cell], results: Path, options: argparse.Namespace) -> int:
                 flush=True,
             )
     return failed
-
-
-def _measured(cell: Cell, folder: Path, goals: int, choosing: bool) -> dict[str, Any]:
-    import torch
-    from measure import baselines, measure
-
-    torch.set_num_threads(1)
-    figures = measure(cell, folder, goals=goals, choosing=choosing)
-    if method_of(cell.method).kind == "zero-shot":
-        figures["baselines"] = baselines(cell, goals=goals)
-    return figures
 
 
 def _result(results: Path, cell: Cell) -> Path:

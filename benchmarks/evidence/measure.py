@@ -71,6 +71,15 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
     return figures
 
 
+def measure_alone(cell: Cell, folder: Path, goals: int, choosing: bool) -> dict[str, Any]:
+    """Measure a cell in a process of its own, on one thread; beside a zero-shot base, those who need no model, too."""
+    torch.set_num_threads(1)
+    figures = measure(cell, folder, goals=goals, choosing=choosing)
+    if method_of(cell.method).kind == "zero-shot":
+        figures["baselines"] = baselines(cell, goals=goals)
+    return figures
+
+
 def config_of(cell: Cell, folder: Path) -> Config:
     """Return the run of a cell: the config that anybody would write."""
     method = method_of(cell.method)

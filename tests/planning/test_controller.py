@@ -258,7 +258,7 @@ def test_energies_are_of_the_goal_that_counts_now() -> None:
 
 
 def test_one_model_step_of_the_last_plan_is_gone_when_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
-    run = controller(horizon=3)
+    run = controller(warm_start=True, horizon=3)
     actions(run, 1)
     assert run.decision is not None
     before, starts, plan = run.decision.plan, [], run._planner.plan

@@ -73,3 +73,10 @@ def test_gradients_are_those_of_finite_differences() -> None:
     state = torch.tensor([0.4, 0.0, 0.3, 3.0, 0.3, 0.2, 0.5], dtype=torch.float64)
     actions = 0.1 * torch.randn(2, 3, 7, generator=torch.Generator().manual_seed(0)).double()
     assert torch.autograd.gradcheck(lambda given: states_along(state, given), (actions.requires_grad_(),))
+
+
+def test_autocast_does_not_coarsen_poses() -> None:
+    states, actions = torch.rand(5, 7), 0.1 * torch.rand(5, 7)
+    plain = apply_actions(states, actions)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(apply_actions(states, actions), plain)

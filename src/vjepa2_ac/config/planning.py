@@ -125,8 +125,9 @@ class PlanningConfig(Section):
     budget_s: Positive | None = None
     """Seconds after which the best plan so far is taken: no iteration begins that would not end by then. The first
     always runs. null: all iterations run."""
-    warm_start: bool = True
-    """Whether a decision begins from the last one's plan, shifted by what was done of it."""
+    warm_start: bool = False
+    """Whether a decision begins from the last one's plan, shifted by what was done of it. Not at horizon 1, where the
+    last action is all there is of it: the arm overshoots (docs/log.md)."""
     context: PositiveInt = 1
     """Frames that the model sees, the present one included (upstream: 1); fewer at the start."""
     limits: LimitsConfig = LimitsConfig()

@@ -66,8 +66,7 @@ class WindowCost:
 
     def _energies(self, actions: Float[Tensor, "samples steps 7"]) -> Float[Tensor, " samples"]:
         start, (samples, steps) = self._start, actions.shape[:2]
-        with torch.autocast(actions.device.type, enabled=False):  # bfloat16 has too few digits for rotations
-            states = states_along(start.state, actions)[:, :-1]
+        states = states_along(start.state, actions)[:, :-1]
         cameras = None if start.extrinsics is None else start.extrinsics.expand(samples, steps, -1)
 
         def during(first: int, last: int) -> tuple[Tensor, Tensor, Tensor | None]:

@@ -15,9 +15,12 @@ _LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw can be to
 def apply_actions(states: Float[Tensor, "*batch 7"], actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
     """Return the states that actions lead to: xyz and gripper add, R' = R_delta @ R, the gripper is cut to 0 .. 1.
 
+    Autocast does not touch it: bfloat16 has too few digits for rotations.
+
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.
     """
-    rotation = matrices_from_euler(actions[..., 3:6]) @ matrices_from_euler(states[..., 3:6])
+    with torch.autocast(states.device.type, enabled=False):
+        rotation = matrices_from_euler(actions[..., 3:6]) @ matrices_from_euler(states[..., 3:6])
     gripper = (states[..., 6:] + actions[..., 6:]).clamp(0.0, 1.0)
     return torch.cat([states[..., :3] + actions[..., :3], euler_from_matrices(rotation), gripper], dim=-1)
 
