@@ -96,6 +96,8 @@ def test_impossible_limits_are_refused(lower: float, upper: float, ball: str | N
         ({"samples": 5}, "more than 5 samples"),
         ({"limits": {"xyz": (0.0, 0.0, 0.0), "gripper_mode": "held"}}, "nothing is left"),
         ({"limits": {"xyz": (-0.1, 0.0, 0.0)}}, "greater than or equal to 0"),
+        ({"limits": {"xyz": (50.0, 50.0, 50.0)}}, "less than or equal to 1"),  # millimetres
+        ({"limits": {"rotation": 10.0}}, "less than or equal to 3.14"),  # degrees
         ({"limits": {"radius": 0.0}}, "greater than 0"),
         ({"budget_s": 0.0}, "greater than 0"),
     ],

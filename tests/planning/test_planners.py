@@ -200,6 +200,21 @@ def test_no_iteration_begins_that_would_end_after_the_time_budget(planner: str, 
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
+def test_when_time_is_up_no_mean_is_returned_that_is_worse_than_what_was_tried(planner: str) -> None:
+    watch = Watch()
+
+    def two_valleys(actions: Tensor) -> Tensor:
+        watch.time += 1.0
+        return (actions[:, 0].abs() - 0.5).square().sum(dim=-1)
+
+    settings = config(planner, iterations=5, budget_s=0.1)
+    plan = Planner(settings, space(), clock=watch).plan(two_valleys, torch.Generator().manual_seed(0))
+    assert plan.stopped == "out of time"
+    assert plan.energy <= plan.iterations[0].lowest
+    assert plan.energy == pytest.approx(float(two_valleys(plan.actions[None])[0]))
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
 def test_a_plan_tells_how_it_was_found(planner: str) -> None:
     cost = parabola(torch.tensor([[0.3, -0.2]]))
     plan = solve(planner, cost, space(), iterations=15)

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from vjepa2_ac.config.section import PositiveInt, Section, Share
 
-NotNegative = Annotated[float, Field(ge=0.0)]
 Positive = Annotated[float, Field(gt=0.0)]
+Metre = Annotated[float, Field(ge=0.0, le=1.0)]  # no arm moves farther in a model step: these would be millimetres
 
 
 class LimitsConfig(Section):
     """What no action goes beyond, whatever the model says. All of one model step; `action_repeat` repeats it."""
 
-    xyz: tuple[NotNegative, NotNegative, NotNegative] = (0.05, 0.05, 0.05)
-    """Largest dx, dy, dz in metres; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075."""
+    xyz: tuple[Metre, Metre, Metre] = (0.05, 0.05, 0.05)
+    """Largest dx, dy, dz in metres, 1 at most; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075."""
     ball: Literal["none", "l1", "l2"] = "none"
     """Whether (dx, dy, dz) stays, besides, in a ball: sum of sizes (l1) or length (l2)."""
     radius: Positive = 0.05
     """Of the ball, in metres."""
-    rotation: NotNegative = 0.0
+    rotation: Annotated[float, Field(ge=0.0, le=math.pi)] = 0.0
     """Largest turn about each axis, in radians; 0: the rotation is held, as upstream does."""
     gripper: Annotated[float, Field(ge=0.0, le=1.0)] = 0.75
     """Largest change of the gripper's closedness."""
@@ -83,7 +84,7 @@ class IcemConfig(Section):
     shrink: Annotated[float, Field(ge=1.0)] = 1.25
     """Each iteration has as many samples as the last divided by this, and at least twice the elites."""
     kept: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
-    """Share of the elites that take part again, in the next iteration and, shifted, in the next decision."""
+    """Share of the elites that take part again, in the next iteration and, with warm_start, in the next decision."""
 
 
 class MppiConfig(Section):
@@ -123,8 +124,8 @@ class PlanningConfig(Section):
     gripper_start_std: Positive = 1.0
     """The same of the gripper, in closedness: beyond its limit as upstream, where samples then gather."""
     budget_s: Positive | None = None
-    """Seconds after which the best plan so far is taken: no iteration begins that would not end by then. The first
-    always runs. null: all iterations run."""
+    """Seconds of search after which the best plan so far is taken: no iteration begins that would not end by then. The
+    first always runs. Encoding the picture is not counted. null: all iterations run."""
     warm_start: bool = False
     """Whether a decision begins from the last one's plan, shifted by what was done of it. Not at horizon 1, where the
     last action is all there is of it: the arm overshoots (docs/log.md)."""

@@ -63,7 +63,7 @@ class Planner:
         while len(record) < self.config.iterations and self._has_time(began, record):
             record.append(self._iterate(search, cost, best))
         stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"
-        actions, energy, tried = self._chosen(search.answer(), best, cost)
+        actions, energy, tried = self._chosen(search.answer(), best, cost, lowest=stopped == "out of time")
         if actions is None:
             actions, stopped = torch.zeros(self.space.steps, self.space.dim), "no finite energy"
         return Plan(
@@ -131,21 +131,23 @@ class Planner:
         return Tried(decisions.detach()[finite], energies.detach().float().cpu()[finite], downhill)
 
     def _chosen(
-        self, answer: Tensor | None, best: _Best, cost: Cost
+        self, answer: Tensor | None, best: _Best, cost: Cost, *, lowest: bool
     ) -> tuple[Float[Tensor, "steps dim"] | None, float, int]:
-        """Return actions, their energy, and how many more were tried: the answer, or else the best that was tried."""
-        tried = 0
+        """Return actions, their energy, and how many more were tried: the answer, or else the best that was tried.
+
+        With `lowest`, whichever of the two costs less: a mean that has hardly been moved may lead nowhere.
+        """
+        chosen, lowest_energy, tried = None, math.nan, 0
         for decisions in (answer, best.decisions):
-            if decisions is None:
+            if decisions is None or (chosen is not None and not lowest):
                 continue
-            done = self.space.finished(decisions)
-            if decisions is best.decisions and torch.equal(done, decisions):
-                return self.space.over_steps(done), best.energy, tried
-            energies = self._try(cost, done[None], gradients=False).energies
-            tried += 1
-            if len(energies):
-                return self.space.over_steps(done), float(energies[0]), tried
-        return None, math.nan, tried
+            done, energies = self.space.finished(decisions), [best.energy]
+            if decisions is not best.decisions or not torch.equal(done, decisions):
+                energies = self._try(cost, done[None], gradients=False).energies.tolist()
+                tried += 1
+            if energies and not energies[0] >= lowest_energy:
+                chosen, lowest_energy = self.space.over_steps(done), energies[0]
+        return chosen, lowest_energy, tried
 
 
 @dataclass
