@@ -62,6 +62,25 @@ def test_the_looks_differ_and_the_motion_does_not_and_the_other_way_round(eviden
     )
 
 
+def test_every_table_has_who_needs_no_model_and_time_that_other_work_does_not_lengthen(evidence: Any) -> None:
+    def figures(shift: str, base: str, method: str, **more: Any) -> dict[str, Any]:
+        reach = {"distance_cm": [[20.0, 3.0], [20.0, 9.0]]}
+        cell = {"shift": shift, "base": base, "method": method, "episodes": 20, "seed": 0}
+        errors = {"rollout_over_persistence": [0.5], "one_step_zero_actions": 1.0, "one_step_shuffled_actions": 1.0}
+        trained = {"trained_share": 0.1, "adapter_mb": 0.3, "minutes": 77.0, "cpu_minutes": 5.0}
+        return {"cell": cell, "shifted": errors, "reach": {"l1": reach}, **trained, **more}
+
+    reach = {"distance_cm": [[20.0, 20.0], [20.0, 20.0]]}
+    alone = {"baselines": dict.fromkeys(("do nothing", "random", "oracle"), reach)}
+    results = [figures("motion", "one camera", "zero-shot", **alone), figures("motion", "one camera", "full")]
+    lines = evidence.table._motion(results).splitlines()
+    assert [line.split(" | ")[0] for line in lines[4:]] == [
+        "| do nothing", "| random", "| oracle", "| zero-shot (one camera)", "| full (one camera)",
+    ]  # fmt: skip
+    assert " 5.0 " in lines[-1]
+    assert "77" not in lines[-1]
+
+
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Everything at its smallest: two steps, one goal; the figures mean nothing."""

@@ -25,9 +25,11 @@ def main() -> int:
     """Run what is not there yet, then write the table and the plot; return 1 where a cell failed."""
     options = _parse()
     from prepare import prepare
-    from table import write_tables
+    from table import place_in, write_tables
 
     folder, results = options.folder, options.folder / ("choosing" if options.choose else "results")
+    if options.readme:
+        place_in(options.readme)  # before the hours, not after them
     results.mkdir(parents=True, exist_ok=True)
     if options.table:
         write_tables(folder, options.out, options.readme)

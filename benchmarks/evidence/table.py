@@ -53,12 +53,21 @@ def write_summary(results: Sequence[Figures], readme: Path) -> None:
     Raises:
         ValueError: The marks are not there.
     """
-    text = readme.read_text()
-    before, begin, rest = text.partition(_BEGIN)
+    before, begin, end, after = place_in(readme)
+    readme.write_text(f"{before}{begin}\n{summary(results)}\n{end}{after}")
+
+
+def place_in(readme: Path) -> tuple[str, str, str, str]:
+    """Return what stands before the short table in a README, the marks around it, and what stands after it.
+
+    Raises:
+        ValueError: The marks are not there.
+    """
+    before, begin, rest = readme.read_text().partition(_BEGIN)
     _, end, after = rest.partition(_END)
     if not (begin and end):
         raise ValueError(f"{readme} has no {_BEGIN} ... {_END}")
-    readme.write_text(f"{before}{begin}\n{summary(results)}\n{end}{after}")
+    return before, begin, end, after
 
 
 def summary(results: Sequence[Figures]) -> str:
@@ -102,7 +111,7 @@ def _main(results: Sequence[Figures]) -> str:
 
 
 def _motion(results: Sequence[Figures]) -> str:
-    rows = []
+    rows = _policies(results, BASES[0], "motion")
     for base in BASES:
         for method in METHODS.values():
             if method.kind != "scratch":
@@ -152,7 +161,7 @@ def _lora(results: Sequence[Figures]) -> str:
 
 _HEAD = (
     "method | error 0.27 / 0.53 / 0.80 s | zero / shuffled actions | reach at the end | distance, cm | L2 energy"
-    " | trained | MB | min | error on A, on"
+    " | trained | MB | CPU min | error on A, on"
 )
 
 
@@ -176,24 +185,24 @@ def _row(name: str, found: Sequence[Figures]) -> str:
         _reach(found, "l2"),
         f"{trained:.1%}" if trained else "",
         f"{found[0]['adapter_mb']:.2f}" if trained else "",
-        f"{np.mean([one['minutes'] for one in found]):.1f}" if trained else "",
+        f"{np.mean([one['cpu_minutes'] for one in found]):.1f}" if trained else "",
         _forgotten(found),
     ]
     return "| " + " | ".join(cells) + " |"
 
 
-def _policies(results: Sequence[Figures], base: str) -> list[str]:
+def _policies(results: Sequence[Figures], base: str, shift: str = "look") -> list[str]:
     rows = []
     for name in ("do nothing", "random", "oracle"):
-        of_it = _of_policy(results, base, name)
+        of_it = _of_policy(results, base, name, shift)
         if of_it:
             rows.append(f"| {name} | | | {_reach(of_it, 'l1')} | {_distance(of_it, 'l1')} | | | | | |")
     return rows
 
 
-def _of_policy(results: Sequence[Figures], base: str, name: str) -> list[Figures]:
+def _of_policy(results: Sequence[Figures], base: str, name: str, shift: str = "look") -> list[Figures]:
     """Return how far those got who need no model, on the goals of a base's cells."""
-    found = pick(results, shift="look", base=base, method="zero-shot")
+    found = pick(results, shift=shift, base=base, method="zero-shot")
     return [{"reach": {"l1": one["baselines"][name]}} for one in found if "baselines" in one]
 
 
