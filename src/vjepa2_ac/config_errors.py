@@ -40,6 +40,7 @@ _ALSO_CALLED = {
     "training.max_grad_norm": ("grad_clip", "clip_grad", "clip_grad_norm", "gradient_clipping"),
     "training.precision": ("amp", "mixed_precision"),
     "training.gradient_checkpointing": ("activation_checkpointing", "grad_checkpointing"),
+    "training.compile": ("torch_compile",),
     "training.log_every": ("logging_steps",),
     "validation.every": ("eval_every", "eval_steps"),
     "checkpoint.every": ("save_every", "save_steps"),

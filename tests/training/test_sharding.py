@@ -76,6 +76,7 @@ def test_two_processes_that_share_a_predictor_make_the_run_of_one(make_config, r
         ({}, {"FSDP_VERSION": "1"}, "FSDP version 1.*Add --fsdp_version 2"),
         ({"adapter__kind": "lora"}, {}, "an adapter needs no shards.*Start without --use_fsdp"),
         ({"training__optimizer": "adamw_8bit"}, {}, "Set training.optimizer=adamw"),
+        ({"training__compile": "blocks"}, {}, "Set training.compile=off"),
         ({"data__broken_episodes": "skip"}, {}, "would leave the others waiting.*data.broken_episodes=error"),
         ({}, {"FSDP_OFFLOAD_PARAMS": "true"}, "--fsdp_offload_params true.*Start without it"),
         ({}, {"FSDP_ACTIVATION_CHECKPOINTING": "true"}, "training.gradient_checkpointing=true"),

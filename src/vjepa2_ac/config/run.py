@@ -48,6 +48,8 @@ class Config(Section):
             raise ValueError("model.random with adapter.kind lora would adapt noise; set adapter.kind: none")
         if self.training.precision == "fp32" and self.model.dtype != "float32":
             raise ValueError("training.precision fp32 needs model.dtype float32: bfloat16 weights compute in bfloat16")
+        if self.training.compile != "off" and self.adapter.kind == "lora" and self.adapter.dora:
+            raise ValueError("training.compile blocks cannot trace adapter.dora; set one of them off")
         sizes = self.model.random or self.model.sizes
         if sizes.predictor.use_extrinsics and self.data.source in {"rlds", "lerobot"}:
             raise ValueError(

@@ -54,6 +54,9 @@ class TrainingConfig(Section):
     """Arithmetic of the networks (autocast). fp16 scales the loss, and needs CUDA."""
     gradient_checkpointing: bool = False
     """Compute each predictor block again in the backward pass instead of keeping its activations."""
+    compile: Literal["off", "blocks"] = "off"
+    """blocks: torch.compile for the predictor's blocks, in training steps only; needs a C compiler, and a minute before
+    the first step. The same losses and gradients to rounding; dropout draws other masks."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: CUDA where there is one."""
     allow_weak_base: bool = False

@@ -59,7 +59,13 @@ def block_causal_attention(
 def best_kind(device: torch.device, head_dim: int, steps: int, *, gradients: bool) -> AttentionKind:
     """Return what `auto` takes: see `block_causal_attention`."""
     fits_flex = device.type == "cuda" and head_dim >= _FLEX_HEAD_DIM and steps >= _FLEX_STEPS and gradients
-    return "flex" if fits_flex and _has_triton() else "per_step"
+    return "flex" if fits_flex and has_triton() else "per_step"
+
+
+@lru_cache(maxsize=1)
+def has_triton() -> bool:
+    """Return whether Triton is installed, without which nothing is compiled for CUDA."""
+    return importlib.util.find_spec("triton") is not None
 
 
 def _dense(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
@@ -123,8 +129,3 @@ def _flex_attention(compiled: bool) -> Callable[..., Any]:
 
     attend: Callable[..., Any] = flex_attention
     return torch.compile(attend, dynamic=False) if compiled else attend
-
-
-@lru_cache(maxsize=1)
-def _has_triton() -> bool:
-    return importlib.util.find_spec("triton") is not None

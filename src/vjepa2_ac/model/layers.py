@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from vjepa2_ac.model.attention import AttentionKind, block_causal_attention
+from vjepa2_ac.model.compilation import compiled
 from vjepa2_ac.model.positions import RotaryTables, rotate
 
 NORM_EPSILON = 1e-6
@@ -24,7 +25,7 @@ class OutputLinear(nn.Linear):
 
 
 class Attention(nn.Module):
-    """Multi-head block-causal attention; queries, keys and values keep one type (SDPA refuses a mixture)."""
+    """Layers around block-causal attention; queries, keys and values keep one type (SDPA refuses a mixture)."""
 
     def __init__(self, width: int, heads: int, layer: int) -> None:
         super().__init__()
@@ -34,24 +35,17 @@ class Attention(nn.Module):
         self.v = nn.Linear(width, width)
         self.o = OutputLinear(width, width, layer)
 
-    def forward(
-        self,
-        tokens: Float[Tensor, "batch sequence width"],
-        tables: RotaryTables,
-        tokens_per_step: int,
-        kind: AttentionKind = "auto",
-        keep: int = 0,
-        *past: Float[Tensor, "2 batch heads _ head_dim"],
-    ) -> tuple[Float[Tensor, "batch sequence width"], Float[Tensor, "2 batch heads keep head_dim"] | None]:
-        """Return what each token gathers from the tokens of its own and earlier steps, and what `Block` says."""
+    def project(
+        self, tokens: Float[Tensor, "batch sequence width"], tables: RotaryTables
+    ) -> tuple[
+        Float[Tensor, "batch heads sequence head_dim"],
+        Float[Tensor, "batch heads sequence head_dim"],
+        Float[Tensor, "batch heads sequence head_dim"],
+    ]:
+        """Return queries and keys, rotated, and values."""
         query, key, value = (project(tokens).unflatten(-1, (self.heads, -1)) for project in (self.q, self.k, self.v))
         query, key = rotate(query, tables), rotate(key, tables)
-        query, key, value = (part.transpose(1, 2) for part in (query, key, value))
-        kept = torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None  # a copy: the rest can be freed
-        if past:
-            key, value = torch.cat((*past, torch.stack((key, value))), dim=3)
-        gathered = block_causal_attention(query, key, value, tokens_per_step, kind)
-        return self.o(gathered.transpose(1, 2).flatten(2)), kept
+        return query.transpose(1, 2), key.transpose(1, 2), value.transpose(1, 2)
 
 
 class Mlp(nn.Module):
@@ -84,6 +78,7 @@ class Block(nn.Module):
         self.attn = Attention(width, heads, layer)
         self.norm2 = nn.LayerNorm(width, eps=NORM_EPSILON)
         self.mlp = Mlp(width, hidden, layer)
+        self.compiled = False  # with gradients, its halves are
 
     def forward(
         self,
@@ -105,9 +100,15 @@ class Block(nn.Module):
             past: What earlier calls returned, in their order: the tokens come after these, and see them. One argument
                 each, for checkpointing knows of tensors among its arguments only.
         """
-        gathered, kept = self.attn(self.norm1(tokens), tables, tokens_per_step, kind, keep, *past)
-        tokens = tokens + gathered
-        return tokens + self.mlp(self.norm2(tokens)), kept
+        before, after = _before_attention, _after_attention
+        if self.compiled and torch.is_grad_enabled():
+            before, after = compiled(before), compiled(after)
+        query, key, value = before(self, tokens, tables)
+        kept = torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None  # a copy: the rest can be freed
+        if past:
+            key, value = torch.cat((*past, torch.stack((key, value))), dim=3)
+        gathered = block_causal_attention(query, key, value, tokens_per_step, kind)
+        return after(self, tokens, gathered), kept
 
 
 def initialise(module: nn.Module, generator: Generator | None = None) -> None:
@@ -128,6 +129,15 @@ def initialise(module: nn.Module, generator: Generator | None = None) -> None:
 def output_std(layer: int) -> float:
     """Return the standard deviation of a fresh output layer of a block, counted from 1."""
     return INIT_STD / math.sqrt(2 * layer)
+
+
+def _before_attention(block: Block, tokens: Tensor, tables: RotaryTables) -> tuple[Tensor, Tensor, Tensor]:
+    return block.attn.project(block.norm1(tokens), tables)
+
+
+def _after_attention(block: Block, tokens: Tensor, gathered: Tensor) -> Tensor:
+    tokens = tokens + block.attn.o(gathered.transpose(1, 2).flatten(2))
+    return tokens + block.mlp(block.norm2(tokens))  # type: ignore[no-any-return]  # nn.Module is untyped
 
 
 def hidden_width(width: int, mlp_ratio: float) -> int:

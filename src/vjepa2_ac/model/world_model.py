@@ -228,6 +228,11 @@ class WorldModel(nn.Module):
         """Choose whether predictor blocks are computed again in the backward pass instead of being kept."""
         self.base_predictor.gradient_checkpointing = enabled
 
+    def set_compiled(self, enabled: bool) -> None:
+        """Choose whether predictor blocks are compiled where gradients are on (see `model.compilation`)."""
+        for block in self.base_predictor.blocks:
+            block.compiled = enabled
+
     def set_attention(self, kind: AttentionKind) -> None:
         """Choose how the predictor computes block-causal attention (see `model.attention`)."""
         self.base_predictor.attention = kind

@@ -6,13 +6,14 @@ import torch
 
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.compilation import missing_for_compilation
 
 
 def is_on_cpu(training: TrainingConfig) -> bool:
     """Return whether a run computes on a CPU; else on CUDA.
 
     Raises:
-        InputError: CUDA was asked for and there is none, or fp16 without CUDA.
+        InputError: CUDA was asked for and there is none, fp16 without CUDA, or nothing to compile with.
     """
     has_cuda = torch.cuda.is_available()
     if training.device == "cuda" and not has_cuda:
@@ -28,6 +29,13 @@ def is_on_cpu(training: TrainingConfig) -> bool:
             found="fp16 on a CPU",
             needed="a CUDA device: only there are losses scaled so that small gradients do not vanish",
             fix="Set training.precision to bf16 or fp32",
+        )
+    missing = missing_for_compilation("cpu" if on_cpu else "cuda") if training.compile == "blocks" else None
+    if missing:
+        raise InputError(
+            where="training.compile",
+            found=f"blocks, but {missing}",
+            fix="Set training.compile=off, or install it" + ("" if on_cpu else " (Triton comes with PyTorch for CUDA)"),
         )
     return on_cpu
 

@@ -53,20 +53,7 @@ def check_launch(config: Config, environment: Mapping[str, str] = os.environ) ->
     version = environment.get("FSDP_VERSION", "1")
     if version != "2":
         raise _refusal(f"FSDP version {version}", "version 2", "Add --fsdp_version 2")
-    if config.adapter.kind == "lora":
-        raise _refusal(
-            "FSDP with adapter.kind lora",
-            "adapter.kind none: an adapter needs no shards",
-            "Start without --use_fsdp",
-        )
-    if config.training.optimizer == "adamw_8bit":
-        raise _refusal("FSDP with training.optimizer adamw_8bit", "adamw", "Set training.optimizer=adamw")
-    if config.data.broken_episodes == "skip":
-        raise _refusal(
-            "FSDP with data.broken_episodes skip",
-            "clips for every process: one without would leave the others waiting",
-            "Set data.broken_episodes=error, or start without --use_fsdp",
-        )
+    _check_run(config)
     for name, (option, way_out) in _OPTIONS.items():
         if _is_set(environment, name):
             raise _refusal(option, "FSDP2 without it", way_out[0].upper() + way_out[1:])
@@ -130,6 +117,28 @@ def whole_moments(optimizer: torch.optim.Optimizer, *, keep: bool) -> dict[str, 
     """
     state: dict[str, Any] = _whole(optimizer.state_dict(), keep)
     return state
+
+
+def _check_run(config: Config) -> None:
+    """Refuse runs whose weights FSDP2 cannot share."""
+    if config.adapter.kind == "lora":
+        raise _refusal(
+            "FSDP with adapter.kind lora",
+            "adapter.kind none: an adapter needs no shards",
+            "Start without --use_fsdp",
+        )
+    if config.training.optimizer == "adamw_8bit":
+        raise _refusal("FSDP with training.optimizer adamw_8bit", "adamw", "Set training.optimizer=adamw")
+    if config.training.compile != "off":
+        raise _refusal(
+            "FSDP with training.compile blocks", "off: together they are untried", "Set training.compile=off"
+        )
+    if config.data.broken_episodes == "skip":
+        raise _refusal(
+            "FSDP with data.broken_episodes skip",
+            "clips for every process: one without would leave the others waiting",
+            "Set data.broken_episodes=error, or start without --use_fsdp",
+        )
 
 
 def _is_set(environment: Mapping[str, str], name: str) -> bool:
