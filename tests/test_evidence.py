@@ -23,7 +23,7 @@ pytest.importorskip("mujoco")
 @pytest.fixture
 def evidence(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The modules of benchmarks/evidence."""
-    names = ("cells", "prepare", "measure", "table")
+    names = ("cells", "prepare", "measure", "results", "plot", "table")
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks/evidence"))
     yield SimpleNamespace(**{name: import_module(name) for name in names})
     for name in names:
@@ -86,7 +86,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Everything at its smallest: two steps, one goal; the figures mean nothing."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(ROOT / "benchmarks/evidence"))
-        names = ("cells", "prepare", "measure", "table")
+        names = ("cells", "prepare", "measure", "results", "plot", "table")
         modules = SimpleNamespace(**{name: import_module(name) for name in names})
         cells, prepare, measure = modules.cells, modules.prepare, modules.measure
         patch.setattr(cells, "STEPS", 2)

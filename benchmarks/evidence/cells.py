@@ -95,9 +95,10 @@ METHODS = {
     )
 }
 
+_RATES = {BEST: (3e-3, 5e-3, 1e-2), "full": (1e-3, 2e-3, 4e-3), "scratch": (1.5e-3, 3e-3, 6e-3, 1.2e-2)}
 CANDIDATES = {
     f"{name}, lr {rate:g}": replace(METHODS[name], name=f"{name}, lr {rate:g}", learning_rate=rate)
-    for name, rates in ((BEST, (3e-3, 5e-3)), ("full", (1e-3, 2e-3)), ("scratch", (1.5e-3, 3e-3, 6e-3)))
+    for name, rates in _RATES.items()
     for rate in rates
 }
 """What the learning rates were chosen from, on validation episodes and goals."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 
 from vjepa2_ac.evaluation.bootstrap import Estimate
-from vjepa2_ac.simulation.closed_loop import ClosedLoopResult
+from vjepa2_ac.simulation.closed_loop_result import ClosedLoopResult
 from vjepa2_ac.simulation.contest import Contest
 from vjepa2_ac.simulation.tasks import SUCCESS_M
 
@@ -21,7 +21,8 @@ def contest_table(contest: Contest) -> Table:
         title_justify="left",
     )
     table.add_column("", no_wrap=True)
-    for column in (f"within {threshold} at the end", "once on the way", "left at the end, cm", "s per decision"):
+    columns = (f"within {threshold} at the end", "once on the way", "left at the end, cm", "steps", "s per decision")
+    for column in columns:
         table.add_column(column, justify="right")
     for result in contest.results:
         table.add_row(result.policy, *_cells(result))
@@ -47,6 +48,7 @@ def _cells(result: ClosedLoopResult) -> tuple[str, ...]:
         _share(result.success_rate),
         _share(result.success_ever_rate),
         f"{distance.value:.1f}" + (f" [{distance.low:.1f}, {distance.high:.1f}]" if distance.has_interval else ""),
+        "" if result.steps_needed is None else f"{result.steps_needed.value:.1f}",
         f"{seconds.value:.2f}",
     )
 

@@ -13,7 +13,8 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 from planning.tiny import tiny_model
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.simulation.arm import SimulatedArm
-from vjepa2_ac.simulation.closed_loop import ClosedLoopResult, EpisodeResult, run_episode, run_task, ways_along
+from vjepa2_ac.simulation.closed_loop import run_episode, run_task, ways_along
+from vjepa2_ac.simulation.closed_loop_result import ClosedLoopResult, EpisodeResult
 from vjepa2_ac.simulation.policies import DoNothing, Oracle, Planning, RandomActions, farthest, shortened
 
 LIMITS = LimitsConfig(xyz=(0.075, 0.075, 0.075))
@@ -171,6 +172,16 @@ def test_success_counts_at_the_end_and_in_passing_is_told_apart() -> None:
     assert result.seconds_per_decision.value == pytest.approx(1.5)
     assert result.why_counts == {"planned": 3, "out of time": 3}
     assert result.unreachable.tolist() == [0, 0, 2]
+
+
+def test_steps_are_counted_until_it_is_done_for_good() -> None:
+    episodes = (fake(0.2, 0.04, 0.1, 0.03, 0.02), fake(0.2, 0.1, 0.04, 0.04, 0.04), fake(0.2, 0.01, 0.2, 0.2, 0.2))
+    assert [episode.steps_needed for episode in episodes] == [3, 2, None]
+    assert fake(0.01, 0.02).steps_needed == 0
+    result = ClosedLoopResult("reach", "A", "x", 0, 4, 4, episodes)
+    assert result.steps_needed is not None
+    assert result.steps_needed.value == 2.5
+    assert ClosedLoopResult("reach", "A", "x", 0, 4, 4, episodes[2:]).steps_needed is None
 
 
 def test_ways_are_shortened_in_their_direction_and_held_axes_left_out() -> None:

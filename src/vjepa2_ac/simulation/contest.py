@@ -16,7 +16,8 @@ from vjepa2_ac.data.video_writing import video_library
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.simulation.arm import Renderer, SimulatedArm
-from vjepa2_ac.simulation.closed_loop import ClosedLoopResult, run_task
+from vjepa2_ac.simulation.closed_loop import run_task
+from vjepa2_ac.simulation.closed_loop_result import ClosedLoopResult
 from vjepa2_ac.simulation.contact_arm import arm_for
 from vjepa2_ac.simulation.domains import named_domain
 from vjepa2_ac.simulation.film import write_film
@@ -156,11 +157,13 @@ def _figures(result: ClosedLoopResult) -> dict[str, Any]:
         "success": result.success_rate.as_dict(),
         "success_ever": result.success_ever_rate.as_dict(),
         "final_distance_cm": result.final_distance_cm.as_dict(),
+        "steps_needed": None if result.steps_needed is None else result.steps_needed.as_dict(),
         "seconds_per_decision": result.seconds_per_decision.as_dict(),
         "why_counts": result.why_counts,
         "unreachable_commands": int(result.unreachable.sum()),
         "by_episode": {
             "success": result.successes.tolist(),
+            "steps_needed": [episode.steps_needed for episode in result.episodes],
             "distance_cm": [[_rounded(one) for one in row] for row in result.distance_cm.tolist()],
             "seconds": [[_rounded(one) for one in row] for row in result.seconds.tolist()],
             "unreachable_commands": result.unreachable.tolist(),

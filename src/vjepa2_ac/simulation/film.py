@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac.data.video_writing import write_video
 from vjepa2_ac.evaluation.captioned import side_by_side
-from vjepa2_ac.simulation.closed_loop import ClosedLoopResult, EpisodeResult
+from vjepa2_ac.simulation.closed_loop_result import ClosedLoopResult, EpisodeResult
 from vjepa2_ac.simulation.motion import CONTROL_RATE_HZ
 
 _HOLD = 4  # as many frames as this are the first and the last picture of an episode shown

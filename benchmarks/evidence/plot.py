@@ -1,0 +1,102 @@
+"""How does it look? Goals reached by each method, the way to the goal, error by the number of demonstrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cells import BASES, BEST, METHODS
+from results import REACHED_CM, Figures, last, main_cells, pick, reached
+
+from vjepa2_ac.evaluation.proportion import share_of
+
+
+def draw(results: Sequence[Figures], path: Path) -> None:
+    """Draw reach against error for the main table, the way to the goal, and error by demonstrations."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13.0, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    bars, ways, counts = figure.subplots(1, 3, width_ratios=(1.5, 1.0, 0.9))
+    _bars(bars, results)
+    _ways(ways, results)
+    _counts(counts, results)
+    figure.savefig(path, dpi=110)
+
+
+_COLOURS = {"zero-shot": "#999999", "LoRA": "#1f77b4", "full": "#2ca02c", "scratch": "#d62728"}
+
+
+def _bars(axes: Any, results: Sequence[Figures]) -> None:
+    names = list(METHODS)
+    for side, base in enumerate(BASES):
+        for place, name in enumerate(names):
+            method = METHODS[name]
+            of = "none" if method.kind == "scratch" else base
+            found = main_cells(results, of, name)
+            if not found or (of == "none" and side):
+                continue
+            flags = [flag for one in found for flag in reached(one)]
+            share = share_of(sum(flags), len(flags))
+            at = place + (0.0 if of == "none" else 0.4 * side - 0.2)
+            error = [[share.value - share.low], [share.high - share.value]]
+            look = {"color": _COLOURS[method.kind], "alpha": 1.0 if side or of == "none" else 0.55}
+            axes.bar(at, share.value, 0.8 if of == "none" else 0.38, yerr=error, capsize=2, **look)
+    axes.set_xticks(range(len(names)), names, rotation=40, ha="right")
+    axes.set_ylim(0, 1.05)
+    axes.set_ylabel("goals reached: within 5 cm at the end")
+    axes.set_title(
+        "Reach after a change of camera and look, 20 demonstrations\n(pale: base of one camera, full: of many)"
+    )
+
+
+def _ways(axes: Any, results: Sequence[Figures]) -> None:
+    lines: list[tuple[str, str, str, Callable[[Figures], Any]]] = [
+        ("do nothing", "zero-shot", "#bbbbbb", lambda one: one["baselines"]["do nothing"]),
+        ("random", "zero-shot", "#dddd88", lambda one: one["baselines"]["random"]),
+        ("oracle", "zero-shot", "#000000", lambda one: one["baselines"]["oracle"]),
+        ("zero-shot", "zero-shot", _COLOURS["zero-shot"], lambda one: one["reach"]["l1"]),
+        (BEST, BEST, _COLOURS["LoRA"], lambda one: one["reach"]["l1"]),
+        ("full", "full", _COLOURS["full"], lambda one: one["reach"]["l1"]),
+    ]
+    for label, method, colour, part in lines:
+        found = main_cells(results, "many cameras", method)
+        if found:
+            way = np.concatenate([part(one)["distance_cm"] for one in found]).mean(axis=0)
+            axes.plot(range(len(way)), way, color=colour, label=label, marker=".")
+    axes.axhline(REACHED_CM, color="#888888", linestyle=":", linewidth=1)
+    axes.set_xlabel("model steps of 0.27 s")
+    axes.set_ylabel("mean distance to the goal, cm")
+    axes.set_title("On the way there (base of many cameras)")
+    if axes.get_lines():
+        axes.legend(fontsize=8)
+
+
+def _counts(axes: Any, results: Sequence[Figures]) -> None:
+    for base, style in (*((base, "-" if base == "many cameras" else "--") for base in BASES), ("none", "-")):
+        for method in ("scratch",) if base == "none" else (BEST, "full"):
+            found = {
+                episodes: pick(results, shift="look", base=base, method=method, episodes=episodes)
+                for episodes in (10, 20, 40)
+            }
+            points = {count: np.mean([last(one) for one in cells]) for count, cells in found.items() if cells}
+            label = method if base == "none" else f"{method}, {base}"
+            if points:
+                axes.plot(
+                    list(points),
+                    list(points.values()),
+                    style,
+                    marker="o",
+                    color=_COLOURS[METHODS[method].kind],
+                    label=label,
+                )
+    axes.set_xscale("log", base=2)
+    axes.set_xticks([10, 20, 40], ["10", "20", "40"])
+    axes.set_xlabel("demonstrations")
+    axes.set_ylabel("error 0.8 s ahead / persistence")
+    axes.set_title("By the number of demonstrations")
+    if axes.get_lines():
+        axes.legend(fontsize=8)

@@ -1,0 +1,46 @@
+"""Which figures are there of the cells that are done, and which of them belong together?"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cells import METHODS
+
+REACHED_CM = 5.0
+Figures = dict[str, Any]
+
+
+def read_results(folder: Path) -> list[Figures]:
+    """Return the figures of every cell that is done."""
+    return [json.loads(path.read_text()) for path in sorted((folder / "results").glob("*.json"))]
+
+
+def pick(results: Sequence[Figures], **wanted: Any) -> list[Figures]:
+    """Return the cells of which these are true, by seed."""
+    found = [one for one in results if all(one["cell"][key] == value for key, value in wanted.items())]
+    return sorted(found, key=lambda one: one["cell"]["seed"])
+
+
+def of_policy(results: Sequence[Figures], base: str, name: str, shift: str = "look") -> list[Figures]:
+    """Return how far those got who need no model, on the goals of a base's cells."""
+    found = pick(results, shift=shift, base=base, method="zero-shot")
+    return [{"reach": {"l1": one["baselines"][name]}} for one in found if "baselines" in one]
+
+
+def reached(one: Figures, distance: str = "l1") -> list[bool]:
+    """Return which goals a cell reached, by which energy."""
+    return [row[-1] < REACHED_CM for row in one["reach"][distance]["distance_cm"]]
+
+
+def last(one: Figures) -> float:
+    """Return the error at the farthest horizon over persistence."""
+    return float(one["shifted"]["rollout_over_persistence"][-1])
+
+
+def main_cells(results: Sequence[Figures], base: str, method: str) -> list[Figures]:
+    """Return a row of the main table: zero-shot needs no demonstrations, the others have 20."""
+    episodes = 0 if METHODS[method].kind == "zero-shot" else 20
+    return pick(results, shift="look", base=base, method=method, episodes=episodes)
