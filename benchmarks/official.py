@@ -44,7 +44,7 @@ class Official:
         checkout: A checkout of facebookresearch/vjepa2.
         weights: What `to_official` gives.
         sizes: Of the model.
-        adapter: Rank, alpha and dropout.
+        adapter: Rank, alpha and dropout; None: every weight is trained, and there is no adapter.
         training: Optimizer and rollout.
         frames: Of the longest clip.
         encoder: Whether latents are computed in the step.
@@ -52,18 +52,14 @@ class Official:
     """
 
     def __init__(
-        self, checkout: Path, weights: Mapping[str, Any], sizes: ModelSizes, adapter: AdapterConfig,
+        self, checkout: Path, weights: Mapping[str, Any], sizes: ModelSizes, adapter: AdapterConfig | None,
         training: TrainingConfig, *, frames: int, encoder: bool, device: torch.device,
     ) -> None:  # fmt: skip
         self._module = imported(checkout, "src.models.ac_predictor")
         predictor = build_predictor(self._module, sizes, frames)
         predictor.load_state_dict(plain_names(weights["predictor"]))
         self._inner, self._device, self._rollout_steps = predictor, device, training.rollout_steps
-        lora = LoraConfig(
-            r=adapter.rank, lora_alpha=adapter.alpha, use_rslora=adapter.rslora, lora_dropout=adapter.dropout,
-            target_modules=TARGETS,
-        )  # fmt: skip
-        self.predictor = get_peft_model(predictor, lora).to(device).train()
+        self.predictor = (predictor if adapter is None else _with_lora(predictor, adapter)).to(device).train()
         self._encoder = self._frozen_encoder(checkout, weights["encoder"], sizes) if encoder else None
         self.trained = [parameter for parameter in self.predictor.parameters() if parameter.requires_grad]
         self._optimizer = torch.optim.AdamW(self.trained, lr=training.learning_rate, weight_decay=training.weight_decay)
@@ -173,6 +169,14 @@ def _share_adapters(ours: Objective, official: Official) -> list[tuple[str, Tens
 def _gradient(matrix: Tensor, third: int | None) -> Tensor:
     assert matrix.grad is not None
     return matrix.grad if third is None else matrix.grad.chunk(3)[third]
+
+
+def _with_lora(predictor: nn.Module, adapter: AdapterConfig) -> nn.Module:
+    lora = LoraConfig(
+        r=adapter.rank, lora_alpha=adapter.alpha, use_rslora=adapter.rslora, lora_dropout=adapter.dropout,
+        target_modules=TARGETS,
+    )  # fmt: skip
+    return get_peft_model(predictor, lora)  # type: ignore[no-any-return]
 
 
 def plain_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -33,11 +33,14 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.assembly import Run, make_accelerator
 from vjepa2_ac.training.checkpoint import RunState
 from vjepa2_ac.training.cost.flops import clip_flops
+from vjepa2_ac.training.cost.memory import ALLOWANCE, estimate_memory
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.optim import make_optimizer
 from vjepa2_ac.training.step import training_step
 
 OFFICIAL = "official"
+OFFICIAL_FULL = "official_full"  # every weight of its predictor is trained
+COMPILED = "+compile"  # at the end of a way of ours
 PRECISIONS = {"float32": "fp32", "bfloat16": "bf16"}
 _PAST_WARM_UP = 1001  # a step at which the learning rate is what it mostly is
 
@@ -49,6 +52,7 @@ class Setting:
     frames: int
     batch: int
     checkpointing: bool
+    encoder: bool = False  # whether latents are computed in the step
 
 
 def has_checkout(options: argparse.Namespace) -> bool:
@@ -82,27 +86,39 @@ class Bench:
         config = self.config(Setting(max(self.options.frames), 1, checkpointing=False))
         return Official(
             self.options.official, self._weights, self.sizes, config.adapter, config.training,
-            frames=max(self.options.frames), encoder=self.options.encoder, device=self.device,
+            frames=max(self.options.frames), encoder="pixels" in self.options.source, device=self.device,
+        )  # fmt: skip
+
+    @cached_property
+    def official_full(self) -> Official:
+        """The same, trained whole, as it is released; made when it is first timed, for it needs 5 GB."""
+        config = self.config(Setting(max(self.options.frames), 1, checkpointing=False))
+        return Official(
+            self.options.official, self._weights, self.sizes, None, config.training,
+            frames=max(self.options.frames), encoder="pixels" in self.options.source, device=self.device,
         )  # fmt: skip
 
     def compare(self) -> str | None:
         """Return how the official predictor's loss and gradients differ from ours, on a short clip."""
-        setting = Setting(min(max(4, self.options.rollout_steps + 1), *self.options.frames), 1, checkpointing=False)
+        setting = Setting(
+            min(max(4, self.options.rollout_steps + 1), *self.options.frames), 1, False, "pixels" in self.options.source
+        )
         objective = Objective(self.model, self.config(setting).training)
         latents = self.latents(setting)
-        if self.options.encoder:
+        if setting.encoder:
             pixels = pixels_to_input(self.batch(setting).frames.to(self.device), self.options.image_size)
             gap = (self.model.encode(pixels) - self.official.encode(pixels.transpose(1, 2))).abs().max()
             if not gap < 1e-3:  # of values of variance 1
                 return f"latents differ by {float(gap):.2g}"
         return difference(objective, self.official, latents)
 
-    def config(self, setting: Setting) -> Config:
-        """Return what a run of a setting is; its data and base are never opened."""
+    def config(self, setting: Setting, *, whole: bool = False) -> Config:
+        """Return what a run of a setting is (`whole`: without an adapter); its data and base are never opened."""
         options = self.options
         return Config(
             run_dir="benchmark",
-            data=DataConfig(path="none", frames=setting.frames),
+            data=DataConfig(path="none", frames=setting.frames, source="rlds" if setting.encoder else "latents"),
+            adapter=AdapterConfig(kind="none" if whole else "lora"),
             model=ModelConfig(base="none", dtype="bfloat16" if self.precision == "bf16" else "float32"),
             training=TrainingConfig(
                 batch_size=setting.batch, accumulation=1, rollout_steps=options.rollout_steps, device=self.device.type,
@@ -110,34 +126,53 @@ class Bench:
             ),
         )  # fmt: skip
 
-    def flops_per_clip(self, setting: Setting) -> int:
+    def flops_per_clip(self, setting: Setting, way: str = "") -> int:
         """Return the model FLOPs of a clip."""
-        flops = clip_flops(self.config(setting), self.sizes)
-        return flops.total if self.options.encoder else flops.predictor
+        flops = clip_flops(self.config(setting, whole=way == OFFICIAL_FULL), self.sizes)
+        return flops.total if setting.encoder else flops.predictor
+
+    def estimated_gb(self, setting: Setting) -> float:
+        """Return what `doctor` says of the run's GPU memory, less what it allows for and PyTorch does not count."""
+        config = self.config(setting)
+        config = config.model_copy(update={"validation": config.validation.model_copy(update={"batch_size": 1})})
+        estimate = estimate_memory(config, self.sizes)
+        return (estimate.total(checkpointing=setting.checkpointing) - ALLOWANCE) / 1e9
 
     def step(self, setting: Setting, way: str) -> Callable[[], object]:
-        """Return what does one optimizer step and waits for it: the official one, or ours with a kind of attention."""
+        """Return what does one optimizer step and waits for it: an official one, or ours with a kind of attention."""
         latents, pixels = self.latents(setting), None
-        if way == OFFICIAL:
-            if self.options.encoder:
+        if way in {OFFICIAL, OFFICIAL_FULL}:
+            if setting.encoder:
                 frames = self.batch(setting).frames.to(self.device)
                 pixels = pixels_to_input(frames, self.options.image_size).transpose(1, 2).contiguous()
+            official = self.official if way == OFFICIAL else self.official_full
             return partial(
-                self.official.step, latents, pixels, self.dtype, checkpointing=setting.checkpointing
+                official.step, latents, pixels, self.dtype, checkpointing=setting.checkpointing
             )  # it waits for its loss, as it does in training
         for parameter in self.model.parameters():
             if not parameter.requires_grad:
                 parameter.data = parameter.data.to(self.dtype)
-        return partial(self._our_step, self.run(setting), itertools.repeat(self.batch(setting)), latents, way)
+        run, batches = self.run(setting), itertools.repeat(self.batch(setting))
+        return partial(self._our_step, run, batches, None if setting.encoder else latents, way)
 
-    def _our_step(self, run: Run, batches: Any, latents: LatentBatch, attention: str) -> None:
-        self.model.set_attention(attention)  # type: ignore[arg-type]  # checked when it is used
+    def _our_step(self, run: Run, batches: Any, latents: LatentBatch | None, way: str) -> None:
+        self.model.set_attention(way.removesuffix(COMPILED))  # type: ignore[arg-type]  # checked when it is used
+        self.model.set_compiled(way.endswith(COMPILED))
         self.model.set_gradient_checkpointing(run.config.training.gradient_checkpointing)
-        if self.options.encoder:
+        if latents is None:
             training_step(run, batches, step=_PAST_WARM_UP)
             return
         with mock.patch("vjepa2_ac.training.step.encode", return_value=latents):  # they are there already
             training_step(run, batches, step=_PAST_WARM_UP)
+
+    def forget_gradients(self) -> None:
+        """Let go of what a step has left that did not end."""
+        modules = [
+            self.model,
+            *(vars(self)[name].predictor for name in ("official", "official_full") if name in vars(self)),
+        ]
+        for module in modules:
+            module.zero_grad(set_to_none=True)
 
     def run(self, setting: Setting) -> Run:
         """Return the run that `training_step` works on."""
@@ -165,7 +200,7 @@ class Bench:
 
     def batch(self, setting: Setting) -> Batch:
         """Return the same clips as the loader gives them; without pixels where nobody looks at them."""
-        side = self.options.image_size if self.options.encoder else 1
+        side = self.options.image_size if setting.encoder else 1
         shape = (setting.batch, setting.frames, side, side, 3)
         frames = torch.randint(256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
         latents = self.latents(setting)

@@ -1,5 +1,6 @@
 """Benchmarks that nobody runs every day still run, and compare only what computes the same."""
 
+import json
 import re
 import sys
 from collections.abc import Iterator
@@ -99,6 +100,52 @@ def test_quick_benchmark_of_a_training_step_completes_without_the_official_code(
     assert f"official: skipped, for there is no {tmp_path}" in printed
     assert [way for way, _, _ in rows(printed)] == ["dense", "auto"] * 2
     assert [ratio for _, _, ratio in rows(printed)][::2] == [1.0, 1.0]
+
+
+def test_all_rows_of_a_training_step_come_from_one_command_and_what_runs_out_of_memory_says_so(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = sys.modules["timed_steps"].Bench
+    usual = bench.step
+
+    def step(self: Any, setting: Any, way: str) -> Any:
+        if setting.encoder and way == "per_step":
+            raise torch.OutOfMemoryError
+        return usual(self, setting, way)
+
+    monkeypatch.setattr(bench, "step", step)
+    file = tmp_path / "results" / "steps.json"
+    train_step.main([
+        "--quick", "--no-memory", "--official", str(tmp_path), "--source", "cache", "pixels", "--attention", "per_step",
+        "--profile", "--cap-gb", "24", "--json", str(file),
+    ])  # fmt: skip
+    printed = capsys.readouterr().out
+    assert re.search(r"^ +4 +1 +no +per_step +out of memory \(pixels\)$", printed, re.MULTILINE)
+    found = [(row["encoder"], row["way"], row["ms"] is None) for row in json.loads(file.read_text())["rows"]]
+    assert found == [
+        (False, "dense", False), (False, "per_step", False), (True, "dense", False), (True, "per_step", True),
+    ]  # fmt: skip
+    first = json.loads(file.read_text())["rows"][0]
+    assert first["waits"] > 0
+    assert first["compiled_after"] == 0
+
+
+def test_the_largest_batch_is_the_last_that_fits(train_step: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Cuda:
+        device = torch.device("cuda")
+
+    monkeypatch.setattr(train_step, "fitting_step", lambda _, setting, __: setting.batch <= fitting)
+    setting = sys.modules["timed_steps"].Setting(16, 1, checkpointing=True)
+    for fitting in (1, 2, 19, 128, 500):
+        assert train_step.largest_batch(Cuda(), setting, "auto") == min(fitting, 128)
+
+
+def test_doctor_is_asked_about_the_setting_that_is_measured(train_step: Any, tmp_path: Path) -> None:
+    timed = sys.modules["timed_steps"]
+    bench = timed.Bench(train_step.parse(["--quick", "--official", str(tmp_path)]), "bfloat16")
+    small, large = (bench.estimated_gb(timed.Setting(4, batch, False)) for batch in (1, 64))
+    again = bench.estimated_gb(timed.Setting(4, 64, True))
+    assert 0 < small < again < large
 
 
 def test_peak_memory_of_one_way_is_told_as_a_number_alone(
