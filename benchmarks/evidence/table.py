@@ -81,22 +81,29 @@ def place_in(readme: Path) -> tuple[str, str, str, str]:
 
 def summary(results: Sequence[Figures]) -> str:
     """Return the short table: what each method reaches and predicts after the change of camera and look."""
-    head = "| | " + " | ".join(f"base of {base}: reached | distance, cm | error 0.8 s ahead" for base in BASES) + " |"
-    rows = [head, "|---|" + "---|---|---|" * len(BASES)]
+    head = " | ".join(f"base of {base}: reached | left, cm | error 0.8 s ahead" for base in BASES)
+    rows = [f"| | trained | {head} |", "|---|---|" + "---|---|---|" * len(BASES)]
     for name in ("do nothing", "random", "oracle"):
-        parts = []
-        for base in BASES:
-            of_it = of_policy(results, base, name)
-            parts += [_reach(of_it, "l1"), _distance(of_it, "l1"), ""] if of_it else ["", "", ""]
-        rows.append(f"| {name} | {' | '.join(parts)} |")
+        parts = [part for base in BASES for part in (*_short(of_policy(results, base, name)), "")]
+        rows.append(f"| {name} | | {' | '.join(parts)} |")
     for method in METHODS.values():
+        by_base = [main_cells(results, "none" if method.kind == "scratch" else base, method.name) for base in BASES]
+        share = next((one["trained_share"] for found in by_base for one in found), 0.0)
         parts = []
-        for base in BASES:
-            found = main_cells(results, "none" if method.kind == "scratch" else base, method.name)
-            errors = [last(one) for one in found]
-            parts += [_reach(found, "l1"), _distance(found, "l1"), f"{np.mean(errors):.3f}"] if found else ["", "", ""]
-        rows.append(f"| {method.name} | {' | '.join(parts)} |")
+        for found in by_base:
+            parts += [*_short(found), f"{np.mean([last(one) for one in found]):.3f}" if found else ""]
+        rows.append(f"| {method.name} | {f'{share:.1%}' if share else ''} | {' | '.join(parts)} |")
     return "\n".join(rows)
+
+
+def _short(found: Sequence[Figures]) -> tuple[str, str]:
+    """Return the share of goals that were reached with its interval, and what is left on average in cm."""
+    flags = [flag for one in found for flag in reached(one)]
+    if not flags:
+        return "", ""
+    share = share_of(sum(flags), len(flags))
+    left = np.mean([row[-1] for one in found for row in one["reach"]["l1"]["distance_cm"]])
+    return f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]", f"{left:.1f}"
 
 
 def _main(results: Sequence[Figures]) -> str:

@@ -80,8 +80,10 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
     planning = parser.add_argument_group("plans (they take long: see docs/evaluation.md)")
     planning.add_argument(
         "--planning",
-        action="store_true",
-        help="plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score",
+        metavar="planning.key=value",
+        nargs="*",
+        help="plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score;"
+        " settings of the plan of one step, such as planning.samples=200, in place of the config's",
     )
     planning.add_argument(
         "--planning-clips", metavar="N", type=count, default=32, help="clips to plan from, one frame of each (32)"
@@ -104,7 +106,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         reach_cm=options.reach,
         examples=options.examples,
         at_once=options.at_once,
-        planning_clips=options.planning_clips if options.planning else 0,
+        planning_clips=0 if options.planning is None else options.planning_clips,
     )
     data = load_config(options.data, []) if options.data else None
     several, evaluations = len(options.subjects) > 1, []
@@ -119,6 +121,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             out=out,
             probes=probes,
             calibrate=options.calibrate,
+            planning=tuple(options.planning or ()),
         )
         with Stages() as stages:
             measured = evaluate_subject(subject, asked, stage=stages)

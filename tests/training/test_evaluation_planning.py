@@ -1,6 +1,7 @@
 """Plans are measured with the planning section of a config, and clips too short for them are refused at once."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,16 +55,18 @@ def test_plans_are_measured_on_held_out_clips_with_the_configs_settings(
 ) -> None:
     path = written(tmp_path, data_folder, base_folder)
     stages: list[str] = []
+    several = replace(asked(path, tmp_path / "out"), planning=("planning.iterations=2", "planning.cem.elites=3"))
 
     def stage(title: str) -> Progress:
         stages.append(title)
         return lambda *_: None
 
-    evaluation = evaluate_subject(str(base_folder), asked(path, tmp_path / "out"), stage=stage).evaluation
+    evaluation = evaluate_subject(str(base_folder), several, stage=stage).evaluation
     assert {"planning, base", "planning, model"} <= set(stages)
     figures = json.loads((tmp_path / "out/metrics.json").read_text())
     assert figures["planning"]["starts"] == 3
-    assert figures["planning"]["one_step_settings"]["samples"] == 12
+    settings = figures["planning"]["one_step_settings"]
+    assert (settings["samples"], settings["iterations"], settings["cem"]["elites"]) == (12, 2, 3)
     assert set(figures["planning"]["places"]) <= {0, 1}
     assert "Its plans of 3 steps end" in figures["verdict"]
     one, other = (evaluation.models[name].plans for name in ("base", "model"))
@@ -74,6 +77,13 @@ def test_plans_are_measured_on_held_out_clips_with_the_configs_settings(
     assert (one.three_steps == other.three_steps).all(), "the same weights plan the same"
     difference = figures["models"]["model"]["planning"]["difference_to_base"]
     assert difference["missed_cm"] == {"value": 0.0, "low": 0.0, "high": 0.0}
+
+
+@pytest.mark.parametrize("setting", ["seed=3", "planning.sample=3", "planning.samples=1"])
+def test_settings_that_are_none_of_planning_are_refused_before_any_data_are_read(tmp_path: Path, setting: str) -> None:
+    path = written(tmp_path, "no such data", "no such model")
+    with pytest.raises(InputError, match=setting.partition("=")[0].replace(".", r"\.")):
+        evaluate_subject("no such model", replace(asked(path, tmp_path / "out"), planning=(setting,)))
 
 
 def test_clips_too_short_to_plan_on_are_refused_before_any_data_are_read(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import simplejpeg
 from jaxtyping import UInt8
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import read_bytes, unreadable
@@ -41,6 +41,12 @@ def decode_picture(picture: bytes, where: str) -> UInt8[np.ndarray, "height widt
             return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB"))
         with Image.open(io.BytesIO(picture), formats=["PNG"]) as image:
             return _as_rgb(image)
+    except UnidentifiedImageError:  # its words name an object in memory
+        raise InputError(
+            where=where,
+            found=f"{len(picture)} bytes that are no picture, starting with {picture[:4]!r}",
+            needed="a picture: PNG or JPEG",
+        ) from None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(
             where=where,

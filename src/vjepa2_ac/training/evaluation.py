@@ -14,7 +14,8 @@ import torch
 from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, PlanningConfig
+from vjepa2_ac.config_file import config_as_dict, config_from
 from vjepa2_ac.data.clips import pictures_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of
@@ -60,6 +61,7 @@ class Asked:
     out: Path | None = None  # folder for what is written; None: the run's
     probes: Probes = field(default_factory=Probes)
     calibrate: bool = False  # measure the error at other strides, too
+    planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,7 @@ def evaluate_subject(
     asked = asked or Asked()
     config, folder = _config_of(subject, asked)
     _check_long_enough(config, asked.probes)
+    planning = _planning_of(config, asked)
     _check_writable(folder)
     dataset = open_dataset(config.data, progress=stage("looking through the data") if stage else None)
     windows = dataset.windows(asked.split)
@@ -121,7 +124,7 @@ def evaluate_subject(
             contenders,
             clips,
             _about(subject, run, config, dataset, asked),
-            probes=replace(asked.probes, planning=config.planning),
+            probes=replace(asked.probes, planning=planning),
             stage=stage,
         )
     evaluation = replace(
@@ -185,6 +188,20 @@ def _nothing_to_measure(subject: str) -> InputError:
         needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
         fix="To measure a model, name the data with --data CONFIG and a folder with --out",
     )
+
+
+def _planning_of(config: Config, asked: Asked) -> PlanningConfig:
+    """Return how one step is planned: the config's settings, some of them replaced.
+
+    Raises:
+        InputError: A setting is wrong, or is none of planning.
+    """
+    for setting in asked.planning:
+        if not setting.startswith("planning."):
+            raise InputError(
+                where="--planning", found=setting, needed="settings of planning, such as planning.samples=200"
+            )
+    return config_from(config_as_dict(config), asked.planning, where="--planning").planning
 
 
 def _check_long_enough(config: Config, probes: Probes) -> None:
