@@ -166,6 +166,27 @@ def test_no_ratio_is_printed_to_a_predictor_that_computes_something_else(
     assert [way for way, _, _ in rows(printed)] == ["dense", "auto"]
 
 
+@pytest.fixture
+def numerics(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The comparison of what ways learn."""
+    yield from imported_from_where_it_lies("numerics", monkeypatch)
+
+
+def test_ways_learn_the_same_and_one_that_does_not_is_found(
+    numerics: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numerics.main(["--steps", "12"])
+    printed = capsys.readouterr().out
+    assert re.search(r"^per_step: strays by \S+ in 3 steps", printed, re.MULTILINE)
+    assert re.search(r"^bfloat16: \S+ after 16 predictions", printed, re.MULTILINE)
+    from vjepa2_ac.model import attention
+
+    wrong = {**attention._IMPLEMENTATIONS, "per_step": lambda *given: attention._dense(*given) * 1.01}
+    monkeypatch.setattr(attention, "_IMPLEMENTATIONS", wrong)
+    with pytest.raises(SystemExit, match="beyond its tolerance"):
+        numerics.main(["--steps", "12"])
+
+
 DECISION = re.compile(r"^ +(\d+) +(\S+) +(\S+) +\S+ +(\S+)% +(\S+) +(\S+) +(\S+)$", re.MULTILINE)
 """Horizon, way, seconds, MFU, peak memory, ratio to plain, ratio to official."""
 

@@ -1,0 +1,138 @@
+r"""Does a faster way learn the same? Loss curves of two ways on top of each other, and bfloat16 against float32.
+
+    python benchmarks/numerics.py                # per_step against dense: 200 steps, a tiny model
+    python benchmarks/numerics.py --compile      # compiled blocks against plain ones, as well
+    python benchmarks/numerics.py --device cuda --ways per_step flex --compile --layers 24 --width 1024 \
+        --latent-dim 1408 --image-size 256 --frames 16
+
+Each way trains from the same weights on the same clips in the same order, in float32 without dropout. Printed is how
+far its loss strays from the plain way's (dense, not compiled), relative, at worst. AdamW makes much of rounding once
+gradients are small: beside it stands how far the plain way strays from itself when its first weights are off by 1e-7.
+Then 16 predictions are fed back in bfloat16 (weights and autocast) and in float32 from the same weights: the mean
+difference of the last, over the mean of the float32 one. It ends with an error where a tolerance is exceeded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+import torch
+
+from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.training.loss import prediction_losses
+
+# Tolerances: of losses in the first quarter, of all of them over what 1e-7 of the weights does, of bfloat16.
+EARLY, OF_NOISE, ROLLOUT = 1e-4, 3.0, 0.05
+COMPILED = "+compile"
+_ROLLOUT_STEPS, _KNOWN_CLIPS, _LEARNING_RATE = 16, 8, 1e-4
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print both figures for each way; exit with an error where one is beyond its tolerance."""
+    options = parse(arguments)
+    clips = draw(options)
+    plain = curve(options, clips, "dense")
+    print(f"dense: loss {plain[0]:.5f} at first, {plain[-1]:.5f} after {len(plain)} steps")
+    ways = [*options.ways, *(way + COMPILED for way in options.ways if options.compile)]
+    noise = strays(plain, curve(options, clips, "dense", noise=1e-7))
+    print(f"dense from weights that are off by 1e-7: strays by {noise:.1e}")
+    early, beyond = max(1, len(plain) // 4), False
+    for way in ways:
+        found = curve(options, clips, way)
+        first, worst = strays(plain[:early], found[:early]), strays(plain, found)
+        print(f"{way}: strays by {first:.1e} in {early} steps, {worst:.1e} in all (tolerance {EARLY:g}, 3 x noise)")
+        beyond = beyond or not first <= EARLY or not worst <= EARLY + OF_NOISE * noise
+    rounding = bfloat16_error(options)
+    print(f"bfloat16: {rounding:.2e} after {_ROLLOUT_STEPS} predictions (tolerance {ROLLOUT:g})")
+    if beyond or not rounding <= ROLLOUT:
+        sys.exit("beyond its tolerance")
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--ways", nargs="+", default=["per_step"], help="attention: per_step, flex")
+    parser.add_argument("--compile", action="store_true", help="each way once more with compiled blocks")
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--layers", type=int, default=2)
+    parser.add_argument("--width", type=int, default=64, help="of the predictor, 32 a head (64 from 512 on)")
+    parser.add_argument("--latent-dim", type=int, default=32)
+    parser.add_argument("--image-size", type=int, default=32)
+    parser.add_argument("--frames", type=int, default=5)
+    return parser.parse_args(arguments)
+
+
+def build(options: argparse.Namespace) -> WorldModel:
+    """Return the same model whenever it is asked for; its encoder is never used."""
+    heads = options.width // (64 if options.width >= 512 else 32)
+    sizes = ModelSizes(
+        image_size=options.image_size,
+        encoder=EncoderSizes(width=options.latent_dim, heads=2, depth=1),
+        predictor=PredictorSizes(width=options.width, heads=heads, depth=options.layers),
+    )
+    return WorldModel.random(sizes, seed=0).to(options.device)
+
+
+def draw(options: argparse.Namespace) -> list[LatentBatch]:
+    """Return clips to learn by heart, normalised as latents are."""
+    generator = torch.Generator().manual_seed(0)
+    tokens = (options.image_size // 16) ** 2
+    batches = []
+    for _ in range(_KNOWN_CLIPS):
+        latents = torch.randn(1, options.frames, tokens, options.latent_dim, generator=generator)
+        latents = torch.nn.functional.layer_norm(latents, latents.shape[-1:])
+        poses = torch.randn(1, options.frames, 7, generator=generator)
+        given = (value.to(options.device) for value in (latents, poses, poses[:, 1:] - poses[:, :-1]))
+        batches.append(LatentBatch(*given, None, ("a",), (0,)))
+    return batches
+
+
+def curve(options: argparse.Namespace, clips: Sequence[LatentBatch], way: str, noise: float = 0.0) -> list[float]:
+    """Return the losses of a training with a kind of attention, compiled where its name says so."""
+    model = build(options)
+    for parameter in model.parameters() if noise else ():
+        parameter.data *= 1 + noise * torch.randn_like(parameter)
+    add_adapter(model, AdapterConfig(dropout=0.0), seed=0)
+    model.set_attention(way.removesuffix(COMPILED))  # type: ignore[arg-type]  # checked when it is used
+    model.set_compiled(way.endswith(COMPILED))
+    model.train()
+    trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    optimizer = torch.optim.AdamW(trained, lr=_LEARNING_RATE)
+    losses = []
+    for step in range(options.steps):
+        loss = prediction_losses(model, clips[step % len(clips)], rollout_steps=2).total
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        losses.append(loss.item())
+    return losses
+
+
+def strays(plain: Sequence[float], other: Sequence[float]) -> float:
+    """Return the largest relative difference of two curves at the same step."""
+    return max(abs(one - expected) / expected for one, expected in zip(other, plain, strict=True))
+
+
+@torch.no_grad()
+def bfloat16_error(options: argparse.Namespace) -> float:
+    """Return how far the last of a row of predictions in bfloat16 is from the float32 one, relative."""
+    generator = torch.Generator().manual_seed(1)
+    model = build(options).to(torch.bfloat16).eval()
+    first = torch.randn(2, 1, model.num_tokens, model.latent_dim, generator=generator)
+    first = torch.nn.functional.layer_norm(first, first.shape[-1:])
+    poses = torch.randn(2, _ROLLOUT_STEPS, 7, generator=generator) * 0.3
+    given = [value.to(options.device) for value in (first, poses, poses)]
+    with torch.autocast(options.device, torch.bfloat16):
+        rounded = model.rollout(*given)[:, -1]
+    exact = model.float().rollout(*given)[:, -1]  # of the same weights
+    return float((rounded - exact).abs().mean() / exact.abs().mean())
+
+
+if __name__ == "__main__":
+    main()
