@@ -89,13 +89,17 @@ METHODS = {
             for both in (False, True)
             for rank in (4, 8, 16)
         ),
-        Method("full", "full", learning_rate=2e-3),
-        Method("scratch", "scratch", learning_rate=6e-3),
-        Method("scratch, 3x steps", "scratch", times=3, learning_rate=6e-3),
+        Method("full", "full", learning_rate=8e-3),
+        Method("scratch", "scratch", learning_rate=1.2e-2),
+        Method("scratch, 3x steps", "scratch", times=3, learning_rate=1.2e-2),
     )
 }
 
-_RATES = {BEST: (3e-3, 5e-3, 1e-2), "full": (1e-3, 2e-3, 4e-3), "scratch": (1.5e-3, 3e-3, 6e-3, 1.2e-2)}
+_RATES = {
+    BEST: (3e-3, 5e-3, 1e-2),
+    "full": (1e-3, 2e-3, 4e-3, 8e-3, 1.6e-2),
+    "scratch": (1.5e-3, 3e-3, 6e-3, 1.2e-2, 2.4e-2),
+}
 CANDIDATES = {
     f"{name}, lr {rate:g}": replace(METHODS[name], name=f"{name}, lr {rate:g}", learning_rate=rate)
     for name, rates in _RATES.items()
