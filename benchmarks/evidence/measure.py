@@ -15,8 +15,8 @@ from prepare import base_model, data_a, data_shifted, training_episodes
 from vjepa2_ac.config import Config, DataConfig, ModelConfig, PlanningConfig, ValidationConfig
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.loader import batches_of
-from vjepa2_ac.data.windows import Split, far_neighbours, spread
+from vjepa2_ac.data.loader import validation_batches
+from vjepa2_ac.data.windows import Split
 from vjepa2_ac.evaluation.metrics import PredictionErrors, prediction_errors
 from vjepa2_ac.latents import encode_batch
 from vjepa2_ac.model.adapter_end import base_only, merge_adapter
@@ -126,9 +126,7 @@ def reach(cell: Cell, policy: Policy, *, seed: int, goals: int) -> dict[str, Any
 def held_out(model: WorldModel, config: Config, split: Split = "test", clips: int = CLIPS) -> PredictionErrors:
     """Return errors on clips of held-out episodes, from the latents that training used."""
     dataset = with_latents_if_there(config, open_dataset(config.data), model)
-    windows = dataset.windows(split)
-    chosen = [windows[place] for place in far_neighbours(spread(len(windows), clips))]
-    batches = batches_of(dataset, chosen, batch_size=32)
+    batches = validation_batches(dataset, split, clips=clips, batch_size=32)
     model.eval()
     with _bf16():
         return prediction_errors(

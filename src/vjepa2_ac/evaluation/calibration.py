@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Float
 
 from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.loader import batches_of
-from vjepa2_ac.data.windows import Split, far_neighbours, spread
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.bootstrap import Estimate, ratio, ratio_difference
@@ -154,8 +154,7 @@ def calibrate(
     settings = dataset.config.model_copy(update={"frames": frames, "short_episodes": "skip"})
     views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}
     possible, impossible = _possible(views, split)
-    windows = views[possible[-1]].windows(split)
-    chosen = [windows[index] for index in far_neighbours(spread(len(windows), clips))]
+    chosen = validation_windows(views[possible[-1]], split, clips=clips)
     measured = {}
     for done, stride in enumerate(possible):
         batches = batches_of(views[stride], chosen, batch_size=batch_size)

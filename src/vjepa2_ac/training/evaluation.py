@@ -18,8 +18,8 @@ from vjepa2_ac.config import Config, PlanningConfig
 from vjepa2_ac.config_file import config_as_dict, config_from
 from vjepa2_ac.data.clips import pictures_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.loader import batches_of
-from vjepa2_ac.data.windows import Split, far_neighbours, spread
+from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import ClipName, ClipsAgain, Contender, Pictures, Probes, evaluate
@@ -92,8 +92,7 @@ def evaluate_subject(
     planning = _planning_of(config, asked)
     _check_writable(folder)
     dataset = open_dataset(config.data, progress=stage("looking through the data") if stage else None)
-    windows = dataset.windows(asked.split)
-    chosen = [windows[index] for index in far_neighbours(spread(len(windows), asked.clips))]
+    chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     run = load_run(Path(subject), asked.checkpoint) if is_run(subject) else None
     world_model = run.world_model if run else _load_model(subject, config)
     require_widths(world_model, dataset.widths, where=subject)
