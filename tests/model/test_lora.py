@@ -32,6 +32,9 @@ METHODS = {
     "pissa": LORA.model_copy(update={"init": "pissa"}),
     "pissa_dora": LORA.model_copy(update={"init": "pissa", "dora": True}),
     "heads": LORA.model_copy(update={"targets": ("all",), "modules_to_save": ("action_encoder", "state_encoder")}),
+    "ends": LORA.model_copy(
+        update={"modules_to_save": ("predictor_embed", "predictor_proj", "action_encoder", "state_encoder")}
+    ),
     "patterns": LORA.model_copy(
         update={"rslora": False, "rank_pattern": {"fc1": 6, r"blocks\.0\.attn\.q": 2}, "alpha_pattern": {"fc2": 3.0}}
     ),

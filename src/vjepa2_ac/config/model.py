@@ -108,8 +108,8 @@ class AdapterConfig(Section):
     """Linear layers of the predictor that get an adapter, by the last part of their name; besides the defaults:
     predictor_embed, predictor_proj, action_encoder, state_encoder. Or sets: attention (q, k, v, o), mlp (fc1, fc2),
     all (every linear layer)."""
-    modules_to_save: tuple[Literal["action_encoder", "state_encoder"], ...] = ()
-    """Input heads that are trained whole, beside the adapter."""
+    modules_to_save: tuple[Literal["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"], ...] = ()
+    """Layers before and after the blocks that are trained whole, beside the adapter, instead of by one."""
     dora: bool = False
     """Train the length of each row of a weight apart from its direction (DoRA, arXiv 2402.09353)."""
     init: Literal["default", "gaussian", "pissa"] = "default"

@@ -41,7 +41,7 @@ def merge_adapter(model: WorldModel) -> None:
         ValueError: The model has not been adapted.
     """
     adaptation = adaptation_of(model)
-    dtype = model.base_predictor.predictor_embed.weight.dtype
+    dtype = model.base_predictor.predictor_norm.weight.dtype  # never trained beside an adapter
     if adaptation.kind == "lora":
         model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
     elif adaptation.start is not None:

@@ -134,7 +134,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         patches = rearrange(tokens, "batch (time token) width -> batch time token width", time=layout.steps)[
             :, :, layout.conditioning :
         ]
-        return self.predictor_proj(self.predictor_norm(patches))  # type: ignore[no-any-return]  # nn.Module is untyped
+        return _in_own_type(self.predictor_proj, self.predictor_norm(patches), self._dtype)
 
     def initialise(self, generator: Generator) -> None:
         """Give every weight a fresh value, decided by the generator alone."""
@@ -173,12 +173,11 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             raise ValueError(
                 f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
             )
-        dtype = self.predictor_embed.weight.dtype
-        conditions = [_in_own_type(self.action_encoder, actions), _in_own_type(self.state_encoder, states)]
-        if extrinsics is not None:
-            conditions.append(self.extrinsics_encoder(extrinsics.to(dtype)))
-        patches = self.predictor_embed(latents.to(dtype))
-        tokens = torch.cat([torch.stack(conditions, dim=2).to(patches.dtype), patches], dim=2)
+        given = [(self.action_encoder, actions), (self.state_encoder, states)]
+        given += [] if extrinsics is None else [(self.extrinsics_encoder, extrinsics)]
+        conditions = [_in_own_type(layer, values, self._dtype) for layer, values in given]
+        patches = _in_own_type(self.predictor_embed, latents, self._dtype)
+        tokens = torch.cat([torch.stack(conditions, dim=2), patches], dim=2)
         start = 0 if cache is None else cache.tokens // tokens.shape[2]
         return tokens.flatten(1, 2), TokenLayout(latents.shape[1], self.grid, len(conditions), start)
 
@@ -208,11 +207,18 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         initialise(module)
 
     @property
+    def _dtype(self) -> torch.dtype:
+        """The base's type; a head that is trained whole may have another."""
+        return self.predictor_norm.weight.dtype
+
+    @property
     def is_gradient_checkpointing(self) -> bool:
         """Whether blocks are computed again in the backward pass; PEFT asks, and transformers' own answer warns."""
         return self.gradient_checkpointing
 
 
-def _in_own_type(layer: Any, values: Tensor) -> Tensor:
-    """Apply a layer that may be trained, and so be float32, in a predictor of another type."""
-    return layer(values.to(layer.weight.dtype))  # type: ignore[no-any-return]  # PEFT may be around it, untyped
+def _in_own_type(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Apply a layer that may be trained, and so be float32, in a predictor of another type; autocast knows its own."""
+    if torch.is_autocast_enabled(values.device.type):
+        return layer(values)  # type: ignore[no-any-return]  # PEFT may be around it, untyped
+    return layer(values.to(layer.weight.dtype)).to(dtype)  # type: ignore[no-any-return]  # the same

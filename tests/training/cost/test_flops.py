@@ -29,7 +29,8 @@ LORA: dict[str, Any] = {"rank": 4, "alpha": 8, "dropout": 0.0}
 ADAPTERS: dict[str, dict[str, Any]] = {
     "lora": LORA, "value only": {**LORA, "targets": ["v"]}, "late": {**LORA, "targets": ["fc2"]},
     "everywhere": {**LORA, "targets": ["all"]}, "heads": {**LORA, "modules_to_save": ["action_encoder"]},
-    "none": {"kind": "none"}, "ranks": {**LORA, "rank_pattern": {"fc1": 8, "blocks.0.attn.q": 2}},
+    "none": {"kind": "none"}, "ends": {**LORA, "modules_to_save": ["predictor_embed", "predictor_proj"]},
+    "ranks": {**LORA, "rank_pattern": {"fc1": 8, "blocks.0.attn.q": 2}},
 }  # fmt: skip
 
 

@@ -113,6 +113,7 @@ def assert_same(estimate: int, measured: int) -> None:
     assert estimate == pytest.approx(measured, rel=TOLERANCE)
 
 
+ENDS = ["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"]
 MLP_ONLY, ALL = {**LORA, "targets": ["mlp"]}, {**LORA, "targets": ["all"]}
 FP32 = {"training__precision": "fp32", "model__dtype": "float32"}
 FLOAT32_BASE = {"model__dtype": "float32"}
@@ -146,6 +147,8 @@ OTHER: dict[str, tuple[ModelSizes, dict[str, Any], dict[str, Any]]] = {
     "DoRA in fp32": (model_sizes(), {**LORA, "dora": True}, FP32),
     "PiSSA": (model_sizes(), {**LORA, "init": "pissa"}, {}),
     "heads trained whole": (model_sizes(), {**LORA, "modules_to_save": ["action_encoder", "state_encoder"]}, {}),
+    "input and output trained whole": (model_sizes(), {**LORA, "modules_to_save": ENDS}, {}),
+    "output trained whole, fp32": (model_sizes(), {**LORA, "modules_to_save": ENDS[1:2]}, FP32),
     "extrinsics": (model_sizes(extrinsics=True), ALL, {}),
     "MLP only": (model_sizes(), MLP_ONLY, {}),
     "attention only": (model_sizes(), {**LORA, "targets": ["attention"]}, {}),
@@ -170,7 +173,7 @@ def test_each_part_is_what_autograd_keeps_of_it(name: str) -> None:
     assert kept.losses() == measured.losses
 
 
-@pytest.mark.parametrize("name", ["fp32", "heads trained whole", "everything"])
+@pytest.mark.parametrize("name", ["fp32", "heads trained whole", "input and output trained whole", "everything"])
 def test_all_parts_together_are_what_autograd_keeps_of_the_losses(name: str) -> None:
     config, sizes = case(name)
     assert_same(Kept(config, sizes, "cpu").without_checkpointing(), measured_whole(config, sizes))

@@ -19,6 +19,7 @@ ADAPTERS: dict[str, dict[str, Any]] = {
     "all": {**LORA, "targets": ["all"]},
     "all but the heads": {**LORA, "targets": ["all"], "modules_to_save": HEADS},
     "one head whole": {**LORA, "modules_to_save": HEADS[:1]},
+    "the ends whole": {**LORA, "targets": ["all"], "modules_to_save": ["predictor_embed", "predictor_proj", *HEADS]},
     "dora": {**LORA, "dora": True},
     "dora everywhere": {**LORA, "dora": True, "targets": ["all"]},
     "pissa": {**LORA, "init": "pissa"},

@@ -1,9 +1,9 @@
 """What does autograd keep of one layer or one block of the predictor? Counted operation by operation, in bytes.
 
-Only what a gradient needs is kept. A frozen linear layer keeps nothing of its input; its adapter keeps it, cast to the
-arithmetic's type. A norm keeps its input and two statistics a token, attention keeps query, key, value, output and a
-log-sum-exp a head, GELU its input, dropout its mask. DoRA, as PEFT computes it, keeps two outputs of each layer, and
-with dropout a copy of the weights.
+Only what a gradient needs is kept. A frozen linear layer keeps nothing of its input; its adapter, or a weight that is
+trained whole, keeps it, cast to the arithmetic's type. A norm keeps its input and two statistics a token, attention
+keeps query, key, value, output and a log-sum-exp a head, GELU its input, dropout its mask. DoRA, as PEFT computes it,
+keeps two outputs of each layer, and with dropout a copy of the weights.
 
 Devices differ in two of these. CUDA's autocast computes norms in float32 and so keeps a float32 copy of their input,
 where the CPU's leaves the input in bfloat16; and CUDA keeps a mask of one byte, the CPU a float32 one.
@@ -55,6 +55,10 @@ class Setting:
     def trains_everything(self) -> bool:
         """Whether there is no adapter."""
         return self.config.adapter.kind == "none"
+
+    def trains_whole(self, name: str) -> bool:
+        """Return whether a layer's own weight is trained."""
+        return self.trains_everything or name in self.config.adapter.modules_to_save
 
     @property
     def casts_frozen_weights(self) -> bool:
@@ -131,7 +135,7 @@ def layer_bytes(setting: Setting, name: str, tokens: int, *, reached: bool) -> i
         reached: Whether gradients go further back than this layer.
     """
     layer, number = setting.layers[name], setting.number
-    if setting.trains_everything:
+    if setting.trains_whole(name):
         return tokens * layer.inputs * number
     kept = layer.weight * number if reached and setting.casts_frozen_weights else 0
     rank = setting.ranks.get(name)
@@ -146,8 +150,9 @@ def adapter_casts(setting: Setting, name: str) -> int:
     if setting.number == FLOAT32:
         return 0
     layer = setting.layers[name]
-    trained = layer.weight if setting.trains_everything else setting.ranks.get(name, 0) * (layer.inputs + layer.outputs)
-    return trained * setting.number
+    if setting.trains_whole(name):
+        return layer.weight * setting.number
+    return setting.ranks.get(name, 0) * (layer.inputs + layer.outputs) * setting.number
 
 
 def _dora(setting: Setting, layer: Layer, tokens: int, *, reached: bool) -> int:
