@@ -28,17 +28,15 @@ import os
 import statistics
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import torch
 from official_planner import PLANNER
 from timed_decisions import OFFICIAL, PLAIN, Bench, Way
-from timing import device_name, in_own_process, peak_memory_gb, take_turns
+from timing import add_options, device_name, in_own_process, peak_memory_gb, take_turns
 from torch.profiler import ProfilerActivity, profile
 
 from vjepa2_ac.training.health import matmul_speed
 
-BESIDE = Path(__file__).resolve().parents[2] / "vjepa2"
 QUICK = {
     "layers": 1, "width": 128, "latent_dim": 128, "image_size": 32, "samples": 6, "iterations": 2, "at_once": [4, 1],
     "horizon": [3], "repeats": 1, "threads": 1,
@@ -82,9 +80,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: whether it works")
-    parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: vjepa2 beside this project)")
-    parser.add_argument("--device", default="cpu")
     parser.add_argument("--layers", type=int, help="of the predictor (default: 24; 2 on a CPU)")
     parser.add_argument("--width", type=int, default=1024, help="of the predictor, 64 a head")
     parser.add_argument("--latent-dim", type=int, default=1408, help="width of a latent, a multiple of 64")
@@ -94,10 +89,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--horizon", type=int, nargs="+", help="model steps of a plan (default: 1 2; 2 4 on a CPU)")
     parser.add_argument("--at-once", type=int, nargs="+", help="samples at once: a line each (default: 64; 8 on a CPU)")
     parser.add_argument("--dtype", nargs="+", choices=("float32", "bfloat16"), help="default: bfloat16; CPU: float32")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--warm-up", type=int, default=1, help="rounds that do not count")
-    parser.add_argument("--threads", type=int, default=0, help="0: as torch chooses")
-    parser.add_argument("--memory", action=argparse.BooleanOptionalAction, default=True, help="measure peak memory too")
+    add_options(parser)
     parser.add_argument(
         "--profile", action="store_true", help="say where the time of ours goes, and on CUDA how often the host waits"
     )

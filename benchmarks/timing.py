@@ -16,6 +16,19 @@ from pathlib import Path
 
 import torch
 
+BESIDE = Path(__file__).resolve().parents[2] / "vjepa2"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add what every benchmark beside the official code takes: where, how often, against which checkout."""
+    parser.add_argument("--quick", action="store_true", help="tiny sizes: whether it works")
+    parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: vjepa2 beside this project)")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--warm-up", type=int, default=1, help="rounds that do not count")
+    parser.add_argument("--threads", type=int, default=0, help="0: as torch chooses")
+    parser.add_argument("--memory", action=argparse.BooleanOptionalAction, default=True, help="measure peak memory too")
+
 
 def take_turns(steps: dict[str, Callable[[], object]], options: argparse.Namespace) -> dict[str, list[float]]:
     """Return the seconds of each repeat of each way; rounds to warm up do not count."""

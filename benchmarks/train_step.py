@@ -35,7 +35,7 @@ from typing import Any
 import torch
 from official import PREDICTOR
 from timed_steps import COMPILED, OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, has_checkout
-from timing import device_name, in_own_process, peak_memory_gb, take_turns
+from timing import add_options, device_name, in_own_process, peak_memory_gb, take_turns
 
 from vjepa2_ac.model.lora import trainable_report
 from vjepa2_ac.training.health import matmul_speed
@@ -44,7 +44,6 @@ TITLES = "{:>6} {:>5} {:>13}  {:16}{:>9}{:>9}{:>8}{:>9}{:>9}{:>7} {:>7}{:>9}"
 TITLE_WORDS = (
     "frames", "batch", "checkpointing", "way", "ms", "clips/s", "MFU", "peak GB", "doctor", "off by", "source",
 )  # fmt: skip
-BESIDE = Path(__file__).resolve().parents[2] / "vjepa2"
 WAITS = {  # by what PyTorch's profiler calls them
     "cuda": {"cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize"},
     "cpu": {"aten::_local_scalar_dense"},  # of which some ask no device: only whether counting works
@@ -131,9 +130,6 @@ def line(row: dict[str, Any]) -> str:
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: whether it works")
-    parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: vjepa2 beside this project)")
-    parser.add_argument("--device", default="cpu")
     parser.add_argument("--layers", type=int, help="of the predictor (default: 24; 2 on a CPU)")
     parser.add_argument("--width", type=int, default=1024, help="of the predictor, 64 a head")
     parser.add_argument("--latent-dim", type=int, default=1408, help="width of the encoder, 64 a head")
@@ -158,10 +154,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--full", action="store_true", help="the official step that trains every weight, too")
     parser.add_argument("--profile", action="store_true", help="count waits for the device, and compilations")
     parser.add_argument("--json", type=Path, help="file for all figures")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--warm-up", type=int, default=1, help="rounds that do not count")
-    parser.add_argument("--threads", type=int, default=0, help="0: as torch chooses")
-    parser.add_argument("--memory", action=argparse.BooleanOptionalAction, default=True, help="measure peak memory too")
+    add_options(parser)
     parser.add_argument("--memory-of", help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     if options.quick:
