@@ -17,8 +17,8 @@ _OVER_M = 0.012  # nearer to the place of the grasp than this, fingers can close
 _CLEAR_M = 0.065  # over the place of the grasp, fingers pass over the block
 
 
-class PushOracle:
-    """Pushes the block along the line to its goal. Rotation is left as it is.
+class _Scripted:
+    """Watches the block.
 
     Args:
         limits: What is allowed.
@@ -29,6 +29,10 @@ class PushOracle:
 
     def __init__(self, limits: LimitsConfig, arm: SimulatedArm) -> None:
         self._limits, self._arm = limits, arm
+
+
+class PushOracle(_Scripted):
+    """Pushes the block along the line to its goal. Rotation is left as it is."""
 
     def reset(self, problem: Problem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
         """Learn the goal."""
@@ -54,18 +58,8 @@ class PushOracle:
         return shortened(way, self._limits)
 
 
-class PickOracle:
-    """Goes over the block, down, closes, and lifts. Rotation is left as it is.
-
-    Args:
-        limits: What is allowed.
-        arm: Whose block it watches.
-    """
-
-    name, why = "oracle", "scripted"
-
-    def __init__(self, limits: LimitsConfig, arm: SimulatedArm) -> None:
-        self._limits, self._arm = limits, arm
+class PickOracle(_Scripted):
+    """Goes over the block, down, closes, and lifts. Rotation is left as it is."""
 
     def reset(self, problem: Problem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
         """Learn the goal."""
