@@ -46,7 +46,7 @@ def test_methods_differ_only_in_what_is_trained_and_how_fast(evidence: Any) -> N
     def rest(name: str) -> Any:
         return evidence.cells.METHODS[name].training.model_copy(update={"learning_rate": 1.0})
 
-    assert rest("LoRA r4") == rest("LoRA r16 + in/out") == rest("full") == rest("scratch")
+    assert rest("LoRA r4") == rest("LoRA r32 + in/out") == rest("full") == rest("scratch")
     assert rest("scratch, 3x steps").steps == 3 * rest("scratch").steps
 
 
@@ -127,6 +127,7 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
 
     zero = replace(cell, method="zero-shot", episodes=0)
     before = small.measure.measure(zero, small.folder, goals=1)
+    assert set(small.measure.made_with()) == {"torch", "commit"}
     before["baselines"] = small.measure.baselines(zero, goals=1)
     assert before["trained_share"] == 0
     assert before["shifted"] != figures["shifted"]
@@ -147,6 +148,7 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
     text = (tmp_path / "out" / "evidence.md").read_text()
     assert "LoRA r4 + in/out" in text
     assert "the base's, bit for bit" in text
+    assert "Made with not recorded (2 cells)" in text
     assert "oracle" in text
     assert (tmp_path / "out" / "evidence.png").stat().st_size > 5_000
     new = readme.read_text()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -74,10 +76,19 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
 def measure_alone(cell: Cell, folder: Path, goals: int, choosing: bool) -> dict[str, Any]:
     """Measure a cell in a process of its own, on one thread; beside a zero-shot base, those who need no model, too."""
     torch.set_num_threads(1)
-    figures = measure(cell, folder, goals=goals, choosing=choosing)
+    figures = measure(cell, folder, goals=goals, choosing=choosing) | {"made_with": made_with()}
     if method_of(cell.method).kind == "zero-shot":
         figures["baselines"] = baselines(cell, goals=goals)
     return figures
+
+
+def made_with() -> dict[str, str]:
+    """Return which PyTorch and which commit of this project, if it is a checkout, compute."""
+    git = shutil.which("git")
+    command = [git or "git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=7"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False) if git else None  # noqa: S603
+    commit = found.stdout.strip() if found and found.returncode == 0 else "unknown"
+    return {"torch": torch.__version__, "commit": commit}
 
 
 def config_of(cell: Cell, folder: Path) -> Config:
@@ -155,8 +166,9 @@ def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
     loaded = load_run(run)
     own = sum(value.numel() for value in load_base(loaded.config.model, seed=0).predictor.parameters())
     files = list((loaded.checkpoint / "adapter").rglob("*.safetensors"))
-    lora = [value.numel() for name, value in loaded.world_model.predictor.named_parameters() if "lora_" in name]
-    count = sum(lora) or own
+    weights = loaded.world_model.predictor.named_parameters()
+    adapter = [value.numel() for name, value in weights if "lora_" in name or ".modules_to_save." in name]
+    count = sum(adapter) or own
     return loaded.world_model, {
         "trained_share": count / own,
         "trained_parameters": count,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -19,6 +20,7 @@ _BEGIN, _END = "<!-- made by `make evidence`: begin -->", "<!-- made by `make ev
 
 NOTES = """Read it so:
 
+- *LoRA*: on the layers of the blocks; *+ in/out*: the layers before and after the blocks are trained whole, beside it.
 - *error*: open-loop L1 error over that of copying the first frame, on held-out episodes of the changed world; mean over
   seeds (smallest to largest 0.8 s ahead). *zero / shuffled actions*: one-step error with no actions and with another
   clip's, over persistence.
@@ -28,7 +30,7 @@ NOTES = """Read it so:
 - *L2 energy*: the same when plans are compared by squared error. *error on A, on*: 0.8 s ahead, in the world that the
   base was trained on, adapter on; off: whether switching it off gives the base's figures back to the last bit.
 - *scratch* keeps the frozen encoder of the bases and starts close to copying: a kind start. Learning rates were chosen
-  for the base of many cameras, 20 demonstrations, seed 0, on validation episodes (`--choose`); ranks 4 and 8, the
+  for the base of many cameras, 20 demonstrations, seed 0, on validation episodes (`--choose`); other ranks, the
   turned robot and other numbers of demonstrations inherit them."""
 
 
@@ -46,7 +48,7 @@ def write_tables(folder: Path, out: Path, readme: Path | None = None) -> None:
     text = "\n\n".join(
         part for part in (_main(results), _motion(results), _by_episodes(results), _lora(results)) if part
     )
-    text = f"{text}\n\n{NOTES}"
+    text = f"{text}\n\n{NOTES}\n{_made_with(results)}"
     (out / TABLE).write_text(text + "\n")
     (out / "evidence.json").write_text(json.dumps([_slim(one) for one in results], indent=None) + "\n")
     print(text)
@@ -167,6 +169,15 @@ def _lora(results: Sequence[Figures]) -> str:
                     f" ({spread}); reached {ours}, full fine-tuning {theirs}"
                 )
     return "### LoRA against full fine-tuning\n\n" + "\n".join(lines) if lines else ""
+
+
+def _made_with(results: Sequence[Figures]) -> str:
+    """Return which commits and versions computed the cells, and how many each."""
+    names = Counter(
+        "torch {torch}, commit {commit}".format(**one["made_with"]) if "made_with" in one else "not recorded"
+        for one in results
+    )
+    return "- Made with " + "; ".join(f"{name} ({count} cells)" for name, count in names.most_common()) + "."
 
 
 _HEAD = (
