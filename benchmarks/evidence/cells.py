@@ -84,7 +84,7 @@ METHODS = {
     for method in (
         Method("zero-shot", "zero-shot"),
         *(
-            Method(f"LoRA r{rank}{' + in/out' * both}", "LoRA", rank, both, learning_rate=5e-3)
+            Method(f"LoRA r{rank}{' + in/out' * both}", "LoRA", rank, both, learning_rate=3e-3 if rank > 16 else 5e-3)
             for both in (False, True)
             for rank in (4, 8, 16, 32)
         ),
@@ -95,7 +95,8 @@ METHODS = {
 }
 
 _RATES = {
-    BEST: (3e-3, 5e-3, 8e-3),
+    "LoRA r16 + in/out": (3e-3, 5e-3, 8e-3),
+    BEST: (2e-3, 3e-3, 5e-3, 8e-3),
     "full": (1e-3, 2e-3, 4e-3, 8e-3, 1.6e-2),
     "scratch": (1.5e-3, 3e-3, 6e-3, 1.2e-2, 2.4e-2),
 }

@@ -30,8 +30,8 @@ NOTES = """Read it so:
 - *L2 energy*: the same when plans are compared by squared error. *error on A, on*: 0.8 s ahead, in the world that the
   base was trained on, adapter on; off: whether switching it off gives the base's figures back to the last bit.
 - *scratch* keeps the frozen encoder of the bases and starts close to copying: a kind start. Learning rates were chosen
-  for the base of many cameras, 20 demonstrations, seed 0, on validation episodes (`--choose`); other ranks, the
-  turned robot and other numbers of demonstrations inherit them."""
+  for the base of many cameras, 20 demonstrations, seed 0, on validation episodes (`--choose`), of LoRA for ranks 16 and
+  32 with in/out; all else inherits them."""
 
 
 def write_tables(folder: Path, out: Path, readme: Path | None = None) -> None:
