@@ -73,6 +73,7 @@ def test_a_plan_its_picture_a_table_and_words_come_out(workshop: Path, capsys: p
     status, file = plan(workshop, *QUICK, "--seed", "9", "--nodes", "3")
     assert status == 0
     said = capsys.readouterr().out
+    assert "planning, iterations 2/2" in said
     assert "Plan: planned" in said
     assert "Goes" in said
     assert str(workshop / "out" / "plan.png") in said

@@ -73,6 +73,7 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
 
 def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.console import console
+    from vjepa2_ac.console_evaluation import Stages
     from vjepa2_ac.console_planning import plan_table
     from vjepa2_ac.evaluation.plan_picture import PLAN_PICTURE, plot_plan
     from vjepa2_ac.planning.one_plan import answer
@@ -87,10 +88,12 @@ def _plan(options: argparse.Namespace) -> int:
     steering = load_to_plan(
         options.subject, checkpoint=options.checkpoint, config=options.config, overrides=options.overrides
     )
-    controller = steering.controller(seed=options.seed, extrinsics=extrinsics)
     if not options.durations:
-        question = question.with_equal_durations(controller.config.horizon)
-    found = answer(controller, question, nodes=options.nodes)
+        question = question.with_equal_durations(steering.config.planning.horizon)
+    with Stages() as stages:
+        progress = stages("planning, iterations")
+        controller = steering.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
+        found = answer(controller, question, nodes=options.nodes)
     pictures = {"start": options.start, "goals": options.goal, "mask": options.mask}
     with user_can_write(options.out):
         written = [

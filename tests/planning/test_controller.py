@@ -87,7 +87,7 @@ def test_earlier_frames_are_seen_with_the_actions_that_were_done() -> None:
     states = np.stack([STATE + 0.01 * step for step in range(5)])
     for step, state in enumerate(states):
         run.act(picture(step), state)
-    scene = run._scene()
+    scene = run._scene(run._seen)
     assert len(scene.latents) == 3
     np.testing.assert_allclose(scene.states, states[2:], atol=1e-6)
     np.testing.assert_allclose(scene.actions, actions_from_states(states[2:]), atol=1e-6)
@@ -232,9 +232,25 @@ def test_goals_that_are_all_reached_are_reached() -> None:
 def test_a_new_goal_forgets_what_was_seen() -> None:
     run = controller(context=3)
     actions(run)
-    assert len(run._scene().latents) == 3
+    assert len(run._scene(run._seen).latents) == 3
     actions(run, 1)
-    assert len(run._scene().latents) == 1
+    assert len(run._scene(run._seen).latents) == 1
+
+
+def test_a_decision_that_failed_can_be_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    undisturbed, run = actions(controller(context=3)), controller(context=3)
+    run.reset(picture(100))
+    run.act(picture(0), STATE)
+    for step in (1, 2):
+        with monkeypatch.context() as patch:
+            patch.setattr(run._planner, "plan", fail)
+            with pytest.raises(RuntimeError, match="out of memory"):
+                run.act(picture(step), STATE)
+        np.testing.assert_array_equal(run.act(picture(step), STATE), undisturbed[step])
+
+
+def fail(*_: object) -> None:
+    raise RuntimeError("out of memory")
 
 
 def test_a_model_that_was_in_training_is_put_into_eval_mode() -> None:

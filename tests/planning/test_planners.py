@@ -199,6 +199,13 @@ def test_no_iteration_begins_that_would_end_after_the_time_budget(planner: str, 
     assert math.isfinite(plan.energy)
 
 
+def test_how_far_it_is_is_told_after_every_iteration() -> None:
+    told: list[tuple[int, int]] = []
+    planner = Planner(config("cem", iterations=3), space(), progress=lambda done, total: told.append((done, total)))
+    planner.plan(parabola(torch.zeros(1, 2)), torch.Generator())
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
 @pytest.mark.parametrize("planner", PLANNERS)
 def test_when_time_is_up_no_mean_is_returned_that_is_worse_than_what_was_tried(planner: str) -> None:
     watch = Watch()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 pytest.importorskip("av", reason="the extra `video` is not installed")
@@ -67,6 +68,20 @@ def test_the_same_call_gives_the_same_figures_and_another_seed_others(model: str
         found.append([one["by_episode"]["distance_cm"] for one in figures(tmp_path / name)["policies"].values()])
         assert not (tmp_path / name / FILM).exists()
     assert found[0] == found[1] != found[2]
+
+
+def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tiny_model()
+    with torch.no_grad():
+        broken.base_predictor.predictor_proj.weight.fill_(float("nan"))
+    broken.save_pretrained(tmp_path / "broken")
+    out = tmp_path / "out"
+    assert main(["simulate", str(tmp_path / "broken"), *TWICE, "--films", "0", "--out", str(out), *SMALL]) == 1
+    assert "broken: of 4 decisions no finite energy 4" in capsys.readouterr().out
+    steered, nothing = (figures(out)["policies"][name]["by_episode"] for name in ("broken", "do nothing"))
+    assert steered["distance_cm"] == nothing["distance_cm"]
 
 
 def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.transforms import Crop, pixels_to_input, view
-from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS
+from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.model.heads import widths_of_model
@@ -27,6 +27,7 @@ from vjepa2_ac.planning.plan import Plan
 from vjepa2_ac.planning.planner import Clock, Planner
 from vjepa2_ac.planning.poses import states_along
 
+Seen = tuple[Tensor, np.ndarray]  # latents of a picture, and the state
 Why = Literal["planned", "out of time", "at the goal", "no finite energy"]
 
 _REACHED = 1e-6  # the energy of a picture that is the goal's, to rounding
@@ -62,6 +63,7 @@ class Controller:
         crop: Crop = "released",
         extrinsics: Float[np.ndarray, " 6"] | None = None,
         clock: Clock = time.perf_counter,
+        progress: Progress | None = None,
     ) -> None:
         """Prepare to control.
 
@@ -72,6 +74,7 @@ class Controller:
             crop: As in training (`data.crop`).
             extrinsics: Pose of the camera, where the model uses it.
             clock: What the time budget is measured by.
+            progress: Is told how many iterations of a decision are done.
 
         Raises:
             InputError: The model's states and actions are no poses, or it needs a camera pose and there is none, or
@@ -91,10 +94,10 @@ class Controller:
             )
         self._model, self.config, self.seed, self.crop = world_model.eval(), config, seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
-        self._planner = Planner(config, clock=clock)
+        self._planner = Planner(config, clock=clock, progress=progress)
         self._goal: Goal | None = None
         self._like = np.zeros(0)
-        self._seen: deque[tuple[Tensor, np.ndarray]] = deque(maxlen=config.context)
+        self._seen: list[Seen] = []  # the newest `config.context`
         self._done = 0
         self.decision: Decision | None = None  # the last one
 
@@ -122,7 +125,7 @@ class Controller:
         latents = torch.stack([self._encoded(picture) for picture in goals])
         self._goal = Goal(latents, durations, self._weights(mask, goals[0]))
         self._like, self._done, self.decision = goals[0], 0, None
-        self._seen.clear()
+        self._seen = []
 
     def act(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " 7"]:
         """Return the action of the next model step: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`).
@@ -142,21 +145,21 @@ class Controller:
         require_picture(frame, where="frame", like=self._like)
         state = np.asarray(state, dtype=np.float64)
         require_pose(state, where="state")
-        self._seen.append((self._encoded(frame), state))
+        seen = [*self._seen, (self._encoded(frame), state)][-self.config.context :]
         before = self.decision
-        self.decision = self._decided(self._goal, None if before is None else before.plan)
-        self._done += 1
-        return self.decision.action
+        decision = self._decided(self._goal, seen, None if before is None else before.plan)
+        self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error all is as it was
+        return decision.action
 
-    def _decided(self, goal: Goal, before: Plan | None) -> Decision:
-        latents, state = self._seen[-1]
+    def _decided(self, goal: Goal, seen: Sequence[Seen], before: Plan | None) -> Decision:
+        latents, state = seen[-1]
         places = tuple(goal.place(self._done + step) for step in range(self.config.horizon))
         wanted = goal.ahead(self._done, self.config.horizon)
         still = distance(latents.expand_as(wanted), wanted, self.config.energy.distance, goal.weights)
         energy = float(still[-1] if self.config.energy.steps == "last" else still.sum())
         if float(still.max()) <= _REACHED:
             return Decision(np.zeros(ACTION_DIM), "at the goal", energy, places[0], places, None, None, None)
-        cost = WorldModelCost(self._model, self._scene(), goal, self.config.energy, done=self._done)
+        cost = WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=self._done)
         generator = torch.Generator().manual_seed(self.seed + self._done)
         start = before.start_after(1) if before is not None and self.config.warm_start else None
         plan = self._planner.plan(cost, generator, start)
@@ -164,11 +167,11 @@ class Controller:
         states = states_along(torch.from_numpy(state), plan.actions.double()[None])[0]
         return Decision(plan.actions[0].double().numpy(), why, energy, places[0], places, plan, states.numpy(), cost)
 
-    def _scene(self) -> Scene:
-        states = np.stack([state for _, state in self._seen])
+    def _scene(self, seen: Sequence[Seen]) -> Scene:
+        states = np.stack([state for _, state in seen])
         actions = actions_from_states(states) if len(states) > 1 else np.zeros((0, ACTION_DIM))
         return Scene(
-            latents=torch.stack([latents for latents, _ in self._seen]),
+            latents=torch.stack([latents for latents, _ in seen]),
             states=torch.from_numpy(states).float(),
             actions=torch.from_numpy(actions).float(),
             extrinsics=self._camera,

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.episode import Progress
 from vjepa2_ac.planning.action_space import ActionSpace, pose_space
 from vjepa2_ac.planning.cem import CemSearch
 from vjepa2_ac.planning.gradient import GradientSearch
@@ -30,7 +31,11 @@ class Planner:
     """
 
     def __init__(
-        self, config: PlanningConfig, space: ActionSpace | None = None, clock: Clock = time.perf_counter
+        self,
+        config: PlanningConfig,
+        space: ActionSpace | None = None,
+        clock: Clock = time.perf_counter,
+        progress: Progress | None = None,
     ) -> None:
         """Choose a planner.
 
@@ -38,10 +43,11 @@ class Planner:
             config: Which one, and how long it searches.
             space: What is allowed; None: an arm's actions within `config.limits`.
             clock: What the time budget is measured by.
+            progress: Is told how many iterations of a plan are done.
         """
         self.config = config
         self.space = pose_space(config) if space is None else space
-        self._clock = clock
+        self._clock, self._progress = clock, progress
 
     def plan(self, cost: Cost, generator: Generator, start: Start | None = None) -> Plan:
         """Return the best plan that was found.
@@ -62,6 +68,8 @@ class Planner:
         best = _Best()
         while len(record) < self.config.iterations and self._has_time(began, record):
             record.append(self._iterate(search, cost, best))
+            if self._progress is not None:
+                self._progress(len(record), self.config.iterations)
         stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"
         actions, energy, tried = self._chosen(search.answer(), best, cost, lowest=stopped == "out of time")
         if actions is None:

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_from, load_config
+from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel, fingerprint
@@ -38,12 +39,19 @@ class Steering:
     subject: str  # what was named
     checkpoint: str  # which one, in words; "" of a model
 
-    def controller(self, *, seed: int | None = None, extrinsics: Float[np.ndarray, " 6"] | None = None) -> Controller:
+    def controller(
+        self,
+        *,
+        seed: int | None = None,
+        extrinsics: Float[np.ndarray, " 6"] | None = None,
+        progress: Progress | None = None,
+    ) -> Controller:
         """Return a controller with these settings.
 
         Args:
             seed: Of all decisions; None: the config's.
             extrinsics: Pose of the camera, where the model uses it.
+            progress: Is told how many iterations of a decision are done.
 
         Raises:
             InputError: The model's states are no poses, or it needs a camera pose and there is none.
@@ -54,6 +62,7 @@ class Steering:
             seed=self.config.seed if seed is None else seed,
             crop=self.config.data.crop,
             extrinsics=extrinsics,
+            progress=progress,
         )
 
     def as_dict(self) -> dict[str, Any]:
