@@ -100,7 +100,7 @@ def curve(options: argparse.Namespace, clips: Sequence[LatentBatch], way: str, n
         parameter.data *= 1 + noise * torch.randn_like(parameter)
     add_adapter(model, AdapterConfig(dropout=0.0), seed=0)
     model.set_attention(way.removesuffix(COMPILED))  # type: ignore[arg-type]  # checked when it is used
-    model.set_compiled(way.endswith(COMPILED))
+    model.set_compiled("with gradients" if way.endswith(COMPILED) else "never")
     model.train()
     trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
     optimizer = torch.optim.AdamW(trained, lr=_LEARNING_RATE)

@@ -10,7 +10,8 @@ it. On CUDA the default is the paper's: 800 samples x 10 iterations, horizon 1 a
 plain      the same planner with everything computed again for each step, and poses by SciPy, one after the other
 official   the planner of the official notebook on the official predictor, where a checkout of facebookresearch/vjepa2
            is at --official (`official_planner.py`)
-ours/N     ours, N samples through the predictor at once; plain takes as many as the first of these
+ours/N     ours, N samples through the predictor at once; plain takes as many as the first of these. With --compile
+           once more with compiled blocks (`planning.compile`): N+compiled
 
 Before anything is timed all must choose the same actions, on the same weights with the same seed, in float32: what
 chooses others, or finds other energies, gets no ratio. A ratio over 1 means faster than plain, or than the official
@@ -61,14 +62,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         ceiling = matmul_speed(bench.device, bench.dtype)
         print(f"{dtype}: ceiling {ceiling / 1e12:.3g} TFLOP/s")
         titles = ("s/decision", "samples/s", "MFU", "peak GB", "of plain", "of official")
-        print(f"{'horizon':>7}  {'way':10}" + "".join(f"{title:>12}" for title in titles))
+        print(f"{'horizon':>7}  {'way':19}" + "".join(f"{title:>12}" for title in titles))
         for horizon, same in ways.items():
             seconds = take_turns({way.name: bench.decision(way, horizon) for way in same}, options)
             for way in same:
                 median = statistics.median(seconds[way.name])
                 peak = memory_in_own_process(given, way, horizon, dtype) if options.memory else math.nan
                 print(
-                    f"{horizon:7}  {way.name:10}{median:12.3f}{bench.sequences / median:12.2f}"
+                    f"{horizon:7}  {way.name:19}{median:12.3f}{bench.sequences / median:12.2f}"
                     f"{bench.flops(horizon) / median / ceiling:12.1%}{peak:12.2f}"
                     + "".join(f"{ratio(seconds, base, way.name):12.2f}" for base in (PLAIN, OFFICIAL)),
                     flush=True,
@@ -90,6 +91,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--at-once", type=int, nargs="+", help="samples at once: a line each (default: 64; 8 on a CPU)")
     parser.add_argument("--dtype", nargs="+", choices=("float32", "bfloat16"), help="default: bfloat16; CPU: float32")
     add_options(parser)
+    parser.add_argument("--compile", action="store_true", help="ours once more with compiled blocks")
     parser.add_argument(
         "--profile", action="store_true", help="say where the time of ours goes, and on CUDA how often the host waits"
     )
@@ -106,7 +108,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 def same_ways(bench: Bench, horizon: int) -> list[Way]:
     """Return the ways to compare: those that choose the same actions."""
-    ours = [Way.ours(count) for count in bench.options.at_once]
+    kinds = (False, True) if bench.options.compile else (False,)
+    ours = [Way.ours(count, compiled=compiled) for count in bench.options.at_once for compiled in kinds]
     candidates = [Way(PLAIN, ours[0].at_once)]
     if bench.has_official:
         candidates.append(Way(OFFICIAL, bench.options.samples))

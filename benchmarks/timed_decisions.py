@@ -26,7 +26,7 @@ from vjepa2_ac.planning.plan import Cost, Plan
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.training.cost.flops import plan_flops
 
-PLAIN, OFFICIAL = "plain", "official"
+PLAIN, OFFICIAL, COMPILED = "plain", "official", "+compiled"
 POSE = (0.45, 0.10, 0.35, 3.0, 0.1, -0.4, 0.3)  # of an arm that points down
 WANTED = (0.03, -0.02, 0.04, 0.0, 0.0, 0.0, 0.3)  # the action of each step that leads to the goal
 _OURS = "ours/"
@@ -42,9 +42,9 @@ class Way(NamedTuple):
     at_once: int
 
     @classmethod
-    def ours(cls, at_once: int) -> Way:
-        """Return ours."""
-        return cls(f"{_OURS}{at_once}", at_once)
+    def ours(cls, at_once: int, *, compiled: bool = False) -> Way:
+        """Return ours, perhaps with compiled blocks."""
+        return cls(f"{_OURS}{at_once}{COMPILED * compiled}", at_once)
 
 
 @dataclass(frozen=True)
@@ -181,6 +181,7 @@ class Bench:
         goal = self._goal(config.horizon)
         if way.name == OFFICIAL:
             return self.official.decide(self._scene, goal, config, dtype, seed=0)
+        self.model.set_compiled("always" if way.name.endswith(COMPILED) else "never")
         build = PlainCost if way.name == PLAIN else WorldModelCost
         cost: Cost = build(self.model, self._scene, goal, config.energy)
         return Planner(config).plan(cost, torch.Generator().manual_seed(0))

@@ -157,7 +157,7 @@ class Bench:
 
     def _our_step(self, run: Run, batches: Any, latents: LatentBatch | None, way: str) -> None:
         self.model.set_attention(way.removesuffix(COMPILED))  # type: ignore[arg-type]  # checked when it is used
-        self.model.set_compiled(way.endswith(COMPILED))
+        self.model.set_compiled("with gradients" if way.endswith(COMPILED) else "never")
         self.model.set_gradient_checkpointing(run.config.training.gradient_checkpointing)
         if latents is None:
             training_step(run, batches, step=_PAST_WARM_UP)

@@ -47,6 +47,24 @@ def gcs(_gcs: gcs_server.Gcs, monkeypatch: pytest.MonkeyPatch) -> gcs_server.Gcs
     return _gcs
 
 
+@pytest.fixture
+def traced(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What would be compiled is traced only, and runs as it is: a compiler would take a minute."""
+    import jaxtyping
+    import torch._dynamo
+    from torch._dynamo.utils import counters
+
+    from vjepa2_ac.model import compilation
+
+    monkeypatch.setattr(compilation, "BACKEND", "eager")
+    torch._dynamo.reset()
+    counters.clear()
+    jaxtyping.config.update("jaxtyping_disable", True)  # checks of shapes are not what is compiled
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+    torch._dynamo.reset()
+
+
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
     """Tiny tensors are slower on many threads, and bits depend on their number."""

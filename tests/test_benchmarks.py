@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch._dynamo.utils import counters
 
 from paths import ROOT
 
@@ -206,6 +207,16 @@ def test_quick_benchmark_of_a_decision_completes_without_the_official_code(
         assert 0 < float(of_plain) < 100
         assert of_official == "nan"
     assert lines[0][5] == "1.00"
+
+
+@pytest.mark.usefixtures("traced")
+def test_decisions_with_compiled_blocks_are_timed_beside_those_without(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--compile"])
+    ways = [way for _, way, *_ in DECISION.findall(capsys.readouterr().out)]
+    assert ways == ["plain", "ours/4", "ours/4+compiled", "ours/1", "ours/1+compiled"]
+    assert counters["stats"]["unique_graphs"]
 
 
 def test_peak_memory_of_a_decision_is_told_as_a_number_alone(

@@ -85,4 +85,4 @@ def test_every_knob_stands_in_the_table_with_its_default() -> None:
 
 
 def _in_yaml(text: str) -> str:
-    return {"none": "null", "0": "0.0"}.get(text, text)
+    return {"none": "null", "0": "0.0", "off": "'off'"}.get(text, text)

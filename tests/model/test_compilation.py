@@ -1,10 +1,8 @@
 """Compiled blocks compute what plain ones do, and are compiled a few times, not for every step, layer or length."""
 
 import shutil
-from collections.abc import Iterator
 from typing import Any
 
-import jaxtyping
 import pytest
 import torch
 from torch import Tensor
@@ -17,20 +15,11 @@ from vjepa2_ac.model.lora import add_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.loss import prediction_losses
 
-# PyTorch looks at .grad of what it traces, and keeps its own warning from being shown, not from being raised.
-pytestmark = pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
-
-
-@pytest.fixture(autouse=True)
-def _forgotten(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """What is traced runs as it is: a compiler would take a minute. `benchmarks/numerics.py --compile` has one."""
-    monkeypatch.setattr(compilation, "BACKEND", "eager")
-    torch._dynamo.reset()
-    counters.clear()
-    jaxtyping.config.update("jaxtyping_disable", True)  # checks of shapes are not what is compiled
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
-    torch._dynamo.reset()
+pytestmark = [
+    pytest.mark.usefixtures("traced"),
+    # PyTorch looks at .grad of what it traces, and keeps its own warning from being shown, not from being raised.
+    pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf"),
+]
 
 
 def graphs() -> int:
@@ -54,7 +43,7 @@ def clips(inputs: Any, count: int = 2) -> LatentBatch:
 
 
 def loss_and_gradients(model: WorldModel, batch: LatentBatch, *, compiled: bool, rollout: int = 2) -> list[Tensor]:
-    model.set_compiled(compiled)
+    model.set_compiled("with gradients" if compiled else "never")
     model.zero_grad()
     torch.manual_seed(0)
     loss = prediction_losses(model, batch, rollout).total
@@ -113,7 +102,7 @@ def test_only_with_gradients_and_only_if_asked_for_a_block_is_compiled(
     model = adapted(sizes)
     given = (inputs.latents, inputs.actions, inputs.states)
     model.predict(*given)
-    model.set_compiled(True)
+    model.set_compiled("with gradients")
     with torch.no_grad():
         model.predict(*given)
     assert not asked

@@ -7,8 +7,7 @@ import torch
 
 from same_run import trained_weights
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model import layers
-from vjepa2_ac.training import device
+from vjepa2_ac.model import compilation, layers
 from vjepa2_ac.training.loop import train
 
 
@@ -17,7 +16,7 @@ def test_a_run_that_switches_compilation_on_and_off_is_the_run_that_never_did(
 ) -> None:
     asked: list[str] = []
     monkeypatch.setattr(layers, "compiled", lambda function: asked.append(function.__name__) or function)
-    monkeypatch.setattr(device, "missing_for_compilation", lambda _: None)
+    monkeypatch.setattr(compilation, "missing_for_compilation", lambda _: None)
     constant = {"training__schedule": "constant"}
     train(make_config(run_dir=str(tmp_path / "plain"), **constant), reporter)
     assert not asked
@@ -34,7 +33,7 @@ def test_a_run_that_switches_compilation_on_and_off_is_the_run_that_never_did(
 def test_a_run_that_nothing_can_compile_is_refused_before_anything_is_loaded(
     make_config, reporter, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(device, "missing_for_compilation", lambda kind: f"no compiler for {kind}")
+    monkeypatch.setattr(compilation, "missing_for_compilation", lambda kind: f"no compiler for {kind}")
     with pytest.raises(InputError, match=r"training.compile.*no compiler for cpu.*training.compile=off"):
         train(make_config(training__compile="blocks", data__path="nowhere"), reporter)
 

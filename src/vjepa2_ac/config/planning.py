@@ -131,6 +131,9 @@ class PlanningConfig(Section):
     last action is all there is of it: the arm overshoots (docs/log.md)."""
     context: PositiveInt = 1
     """Frames that the model sees, the present one included (upstream: 1); fewer at the start."""
+    compile: Literal["off", "blocks"] = "off"
+    """blocks: torch.compile for the predictor's blocks; needs a C compiler, and a minute within the first decision. The
+    same energies to rounding. Not of `evaluate --planning`, which computes plainly."""
     limits: LimitsConfig = LimitsConfig()
     """What no action goes beyond."""
     energy: EnergyConfig = EnergyConfig()

@@ -13,15 +13,17 @@ import os
 import shutil
 from collections.abc import Callable
 from functools import cache
-from typing import Any, TypeVar, cast
+from typing import Any, Literal, TypeVar, cast
 
 import torch
 
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.attention import has_triton
 
 BACKEND = "inductor"
 VARIANTS = 24  # that PyTorch may compile of one function; it gives up, with a warning, at 8 if nothing is said
 
+When = Literal["never", "with gradients", "always"]  # blocks are compiled
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -39,6 +41,22 @@ def missing_for_compilation(device: str) -> str | None:
     if any(map(shutil.which, (given,) if given else usual)):
         return None
     return f"no compiler is found ({given or ' or '.join(usual)})"
+
+
+def require_compiler(device: str, *, where: str) -> None:
+    """Refuse to compile blocks for a kind of device, cpu or cuda, where nothing can.
+
+    Args:
+        device: What for.
+        where: The setting that asks for it.
+
+    Raises:
+        InputError: Nothing can; says what is missing.
+    """
+    missing = missing_for_compilation(device)
+    if missing:
+        hint = " (Triton comes with PyTorch for CUDA)" if device == "cuda" else ""
+        raise InputError(where=where, found=f"blocks, but {missing}", fix=f"Set {where}=off, or install it{hint}")
 
 
 @cache

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from vjepa2_ac.model.attention import AttentionKind, block_causal_attention
-from vjepa2_ac.model.compilation import compiled
+from vjepa2_ac.model.compilation import When, compiled
 from vjepa2_ac.model.positions import RotaryTables, rotate
 
 NORM_EPSILON = 1e-6
@@ -78,7 +78,7 @@ class Block(nn.Module):
         self.attn = Attention(width, heads, layer)
         self.norm2 = nn.LayerNorm(width, eps=NORM_EPSILON)
         self.mlp = Mlp(width, hidden, layer)
-        self.compiled = False  # with gradients, its halves are
+        self.compiled: When = "never"  # its halves
 
     def forward(
         self,
@@ -101,7 +101,7 @@ class Block(nn.Module):
                 each, for checkpointing knows of tensors among its arguments only.
         """
         before, after = _before_attention, _after_attention
-        if self.compiled and torch.is_grad_enabled():
+        if self.compiled == "always" or (self.compiled == "with gradients" and torch.is_grad_enabled()):
             before, after = compiled(before), compiled(after)
         query, key, value = before(self, tokens, tables)
         kept = torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None  # a copy: the rest can be freed

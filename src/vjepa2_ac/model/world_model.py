@@ -16,6 +16,7 @@ from torch.nn.functional import layer_norm
 
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.model.attention import AttentionKind
+from vjepa2_ac.model.compilation import When
 from vjepa2_ac.model.encoder import Encoder
 from vjepa2_ac.model.folder import ENCODER, PREDICTOR, load_safetensors, read_sizes, write_folder
 from vjepa2_ac.model.key_value_cache import KeyValueCache
@@ -228,10 +229,10 @@ class WorldModel(nn.Module):
         """Choose whether predictor blocks are computed again in the backward pass instead of being kept."""
         self.base_predictor.gradient_checkpointing = enabled
 
-    def set_compiled(self, enabled: bool) -> None:
-        """Choose whether predictor blocks are compiled where gradients are on (see `model.compilation`)."""
+    def set_compiled(self, when: When) -> None:
+        """Choose when predictor blocks are compiled (see `model.compilation`)."""
         for block in self.base_predictor.blocks:
-            block.compiled = enabled
+            block.compiled = when
 
     def set_attention(self, kind: AttentionKind) -> None:
         """Choose how the predictor computes block-causal attention (see `model.attention`)."""

@@ -26,6 +26,7 @@ from vjepa2_ac.planning.observation import require_extrinsics, require_mask, req
 from vjepa2_ac.planning.plan import Plan
 from vjepa2_ac.planning.planner import Clock, Planner
 from vjepa2_ac.planning.poses import states_along
+from vjepa2_ac.planning.ready import make_ready
 
 Seen = tuple[Tensor, np.ndarray]  # latents of a picture, and the state
 Why = Literal["planned", "out of time", "at the goal", "no finite energy"]
@@ -78,7 +79,7 @@ class Controller:
 
         Raises:
             InputError: The model's states and actions are no poses, or it needs a camera pose and there is none, or
-                none that can be.
+                none that can be; or its blocks cannot be compiled.
         """
         if widths_of_model(world_model.sizes) != POSE_WIDTHS:
             raise InputError(
@@ -92,7 +93,7 @@ class Controller:
                 found=f"{world_model.sizes.predictor.use_extrinsics}, camera pose given: {extrinsics is not None}",
                 needed="a camera pose exactly where the model uses it",
             )
-        self._model, self.config, self.seed, self.crop = world_model.eval(), config, seed, crop
+        self._model, self.config, self.seed, self.crop = make_ready(world_model, config), config, seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
         self._planner = Planner(config, clock=clock, progress=progress)
         self._goal: Goal | None = None

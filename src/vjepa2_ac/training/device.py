@@ -6,7 +6,7 @@ import torch
 
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.compilation import missing_for_compilation
+from vjepa2_ac.model.compilation import require_compiler
 
 
 def is_on_cpu(training: TrainingConfig) -> bool:
@@ -30,13 +30,8 @@ def is_on_cpu(training: TrainingConfig) -> bool:
             needed="a CUDA device: only there are losses scaled so that small gradients do not vanish",
             fix="Set training.precision to bf16 or fp32",
         )
-    missing = missing_for_compilation("cpu" if on_cpu else "cuda") if training.compile == "blocks" else None
-    if missing:
-        raise InputError(
-            where="training.compile",
-            found=f"blocks, but {missing}",
-            fix="Set training.compile=off, or install it" + ("" if on_cpu else " (Triton comes with PyTorch for CUDA)"),
-        )
+    if training.compile == "blocks":
+        require_compiler("cpu" if on_cpu else "cuda", where="training.compile")
     return on_cpu
 
 

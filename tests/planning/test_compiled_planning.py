@@ -1,0 +1,81 @@
+"""Plans with compiled blocks are the plain ones, and a second decision compiles nothing."""
+
+import numpy as np
+import pytest
+import torch
+from torch._dynamo.utils import counters
+
+from planning.tiny import actions, cost, tiny_model
+from vjepa2_ac.config import AdapterConfig
+from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model import compilation
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.ready import make_ready
+
+# PyTorch looks at .grad of what it traces, and keeps its own warning from being shown, not from being raised.
+pytestmark = pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+
+STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
+PLAIN = PlanningConfig(
+    samples=11, iterations=2, horizon=3, cem=CemConfig(elites=4), energy=EnergyConfig(samples_at_once=4)
+)
+COMPILED = PLAIN.model_copy(update={"compile": "blocks"})
+
+
+@pytest.fixture(autouse=True)
+def _with_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compilation, "missing_for_compilation", lambda _: None)
+
+
+def decisions(model: WorldModel, config: PlanningConfig, count: int = 2) -> list[np.ndarray]:
+    pictures = np.random.default_rng(0).integers(0, 256, (count + 1, 48, 48, 3), dtype=np.uint8)
+    run = Controller(model, config)
+    run.reset(pictures[0])
+    return [run.act(picture, STATE) for picture in pictures[1:]]
+
+
+@pytest.mark.usefixtures("traced")
+@pytest.mark.parametrize("adapted", [False, True])
+@pytest.mark.parametrize("planner", ["cem", "gradient"])
+def test_compiled_plans_are_the_plain_ones(adapted: bool, planner: str) -> None:
+    model, planned = tiny_model(adapted=adapted), {"planner": planner}
+    expected = decisions(model, PLAIN.model_copy(update=planned))
+    assert not counters["stats"]
+    found = decisions(model, COMPILED.model_copy(update=planned))
+    assert counters["stats"]["unique_graphs"]
+    assert not counters["graph_break"]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@pytest.mark.usefixtures("traced")
+def test_after_the_first_decision_nothing_is_compiled() -> None:
+    model = tiny_model()
+    decisions(model, COMPILED, count=1)
+    graphs = counters["stats"]["unique_graphs"]
+    assert graphs <= 2 * 4  # two halves; not for each step or part
+    decisions(model, COMPILED.model_copy(update={"horizon": 4, "samples": 9}))
+    assert counters["stats"]["unique_graphs"] == graphs
+
+
+@pytest.mark.usefixtures("traced")
+def test_switched_off_it_is_off_again() -> None:
+    model, tried = tiny_model(), actions(3, 2)
+    make_ready(model, COMPILED)
+    make_ready(model, PLAIN)
+    with torch.no_grad():
+        cost(model)(tried)
+    assert not counters["stats"]
+
+
+def test_what_cannot_be_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_model()
+    add_adapter(model, AdapterConfig(rank=2, dora=True), seed=0)
+    with pytest.raises(InputError, match=r"planning.compile.*DoRA"):
+        Controller(model, COMPILED)
+    monkeypatch.setattr(compilation, "missing_for_compilation", lambda kind: f"no compiler for {kind}")
+    with pytest.raises(InputError, match=r"no compiler for cpu.*planning.compile=off"):
+        Controller(tiny_model(), COMPILED)
+    Controller(model, PLAIN)
