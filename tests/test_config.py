@@ -1,6 +1,7 @@
 """Every knob once; everything that is wrong at once."""
 
 import re
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -108,6 +109,19 @@ def test_the_serial_number_of_a_camera_needs_no_quotes(tmp_path: Path, written: 
     path = write(tmp_path, yaml.safe_dump(MINIMAL))
     for camera in (f"data.camera={written}", f"data.camera=[{written}]"):
         assert load_config(path, ["data.source=droid_raw", camera]).data.cameras == ("22008760",)
+
+
+def test_words_that_yaml_takes_for_truth_values_are_words(tmp_path: Path) -> None:
+    path, sections = write(tmp_path, yaml.safe_dump(MINIMAL)), config_schema()["$defs"]
+    found = []
+    for key in all_keys():
+        section, _, name = key.rpartition(".")
+        knob = next((one["properties"][name] for one in sections.values() if name in one.get("properties", {})), {})
+        for word in knob.get("enum", ()):
+            if section and yaml.safe_load(str(word)) != word:
+                assert attrgetter(key)(load_config(path, [f"{key}={word}"])) == word
+                found.append(key)
+    assert {"data.cache", "training.compile", "planning.compile"} <= set(found)
 
 
 def test_a_key_given_twice_is_an_error(tmp_path: Path) -> None:

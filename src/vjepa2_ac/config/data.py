@@ -7,15 +7,12 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from vjepa2_ac.config.section import PositiveInt, Section, Share
+from vjepa2_ac.config.section import OFF, PositiveInt, Section, Share
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 
 # A serial number is a name, also where YAML takes it for a number.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
-
-# YAML takes off for a truth value.
-_CacheUse = Annotated[Literal["off", "auto", "require"], BeforeValidator(lambda use: "off" if use is False else use)]
 
 _STRIDES_AT_15_HZ = (4, 8, 15)
 
@@ -233,7 +230,7 @@ class DataConfig(Section):
     square: its central square (upstream's evaluation). letterbox: all of it, with black bars."""
     augment: AugmentConfig = AugmentConfig()
     """Random changes of training clips."""
-    cache: _CacheUse = "off"
+    cache: Annotated[Literal["off", "auto", "require"], OFF] = "off"
     """Whether the frozen encoder's latents are kept on disk, so that each frame is encoded once. off: no. auto: those
     that are not there yet are encoded before the first step. require: refuse to start where they are not there."""
     cache_dtype: Literal["bf16", "fp32", "int8"] = "bf16"

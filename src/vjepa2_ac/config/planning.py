@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from vjepa2_ac.config.section import PositiveInt, Section, Share
+from vjepa2_ac.config.section import OFF, PositiveInt, Section, Share
 
 Positive = Annotated[float, Field(gt=0.0)]
 Metre = Annotated[float, Field(ge=0.0, le=1.0)]  # no arm moves farther in a model step: these would be millimetres
@@ -131,7 +131,7 @@ class PlanningConfig(Section):
     last action is all there is of it: the arm overshoots (docs/log.md)."""
     context: PositiveInt = 1
     """Frames that the model sees, the present one included (upstream: 1); fewer at the start."""
-    compile: Literal["off", "blocks"] = "off"
+    compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks; needs a C compiler, and a minute within the first decision. The
     same energies to rounding. Not of `evaluate --planning`, which computes plainly."""
     limits: LimitsConfig = LimitsConfig()

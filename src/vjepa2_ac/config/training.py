@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from vjepa2_ac.config.section import PositiveInt, Section
+from vjepa2_ac.config.section import OFF, PositiveInt, Section
 
 
 class TrainingConfig(Section):
@@ -54,7 +54,7 @@ class TrainingConfig(Section):
     """Arithmetic of the networks (autocast). fp16 scales the loss, and needs CUDA."""
     gradient_checkpointing: bool = False
     """Compute each predictor block again in the backward pass instead of keeping its activations."""
-    compile: Literal["off", "blocks"] = "off"
+    compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks, in training steps only; needs a C compiler, and a minute before
     the first step. The same losses and gradients to rounding; dropout draws other masks."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
