@@ -8,6 +8,10 @@ does; then the training step of a run on pictures and that of one on latents tak
 machine slows them alike. Widths are those of ViT-g and its predictor; by default both are an eighth as deep, for a CPU.
 On a CPU the process's own time over its threads counts, else wall time.
 
+Beside it the encoder alone on random frames: frames/s, which is what a loader must deliver to keep it busy, its MFU
+(`training.cost.flops` over what the device does in a product of matrices), and what share of that speed the whole
+`encode` has, with decoding and writing. Give a fast device enough --episodes to reach its pace.
+
 Then what storing latents in fewer bits costs: the one-step and rollout error of the shipped model on simulated
 episodes, predicted from latents as they are read back, against the true ones, over the error of persistence.
 """
@@ -38,7 +42,10 @@ from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.simulation.record import record_dataset
 from vjepa2_ac.training.assembly import Run, assemble, batches_from
+from vjepa2_ac.training.cost.flops import frame_flops
+from vjepa2_ac.training.device import autocast
 from vjepa2_ac.training.encode import encode_config
+from vjepa2_ac.training.health import matmul_speed
 from vjepa2_ac.training.step import training_step
 
 RATE_HZ, STRIDE = 15, 4
@@ -101,16 +108,22 @@ def measure_speed(options: argparse.Namespace, folder: Path) -> None:
         f"encoder {options.encoder_layers} of 40 layers, predictor {options.predictor_layers} of 24,"
         f" {options.image_size} px, batch {options.batch}; wall or processor's ms a clip, median of {options.repeats}"
     )
-    print(f"{'frames':>6}{'encode frames/s':>17}{'pictures, ms':>14}{'latents, ms':>13}{'ratio':>8}")
+    print(
+        f"{'frames':>6}{'encoder frames/s':>18}{'MFU':>7}{'encode frames/s':>17}{'of encoder':>12}{'pictures, ms':>14}"
+        f"{'latents, ms':>13}{'ratio':>8}"
+    )
     for frames in options.frames:
         pictures = config_of(options, folder, frames, "off")
         latents = config_of(options, folder, frames, "require")
         speed = encode(latents, options.device)
         runs = {"pictures": assemble(pictures, lambda _: None), "latents": assemble(latents, lambda _: None)}
+        alone = encoder_speed(runs["pictures"], options)
+        mfu = alone * frame_flops(sizes) / matmul_speed(torch.device(options.device), dtype)
         seconds = take_turns(runs, options)
         each = {name: 1e3 * statistics.median(some) / options.batch for name, some in seconds.items()}
         ratio = statistics.median(a / b for a, b in zip(seconds["pictures"], seconds["latents"], strict=True))
-        print(f"{frames:6}{speed:17.2f}{each['pictures']:14.0f}{each['latents']:13.0f}{ratio:7.2f}x", flush=True)
+        print(f"{frames:6}{alone:18.2f}{mfu:7.1%}{speed:17.2f}{speed / alone:12.0%}", end="")
+        print(f"{each['pictures']:14.0f}{each['latents']:13.0f}{ratio:7.2f}x", flush=True)
 
 
 def config_of(options: argparse.Namespace, folder: Path, frames: int, cache: str) -> Config:
@@ -138,6 +151,21 @@ def encode(config: Config, device: str) -> float:
     encode_config(config, lambda _: None, progress=lambda done, _: told.append((clock_s(device), done)))
     (began, _), (ended, frames) = told[0], told[-1]
     return frames / (ended - began)
+
+
+@torch.no_grad()
+def encoder_speed(run: Run, options: argparse.Namespace) -> float:
+    """Return the frames per second of the encoder alone: what a loader must deliver."""
+    training, chunk = run.config.training, run.config.model.encode_chunk
+    device = run.world_model.device
+    frames = torch.randn(1, 2 * chunk, 3, options.image_size, options.image_size, device=device)
+    seconds = []
+    with autocast(training, device):
+        for _ in range(options.repeats + 1):
+            start = clock_s(options.device)
+            run.world_model.encode(frames, chunk)
+            seconds.append(clock_s(options.device) - start)
+    return frames.shape[1] / statistics.median(seconds[1:])
 
 
 def take_turns(runs: dict[str, Run], options: argparse.Namespace) -> dict[str, list[float]]:

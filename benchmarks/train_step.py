@@ -15,7 +15,8 @@ All take turns, so that a busy machine slows them alike. On a CPU the process's 
 wall time. MFU: the model FLOPs of `training.cost.flops` over what the device does in a product of matrices, measured
 first. Peak memory, weights included, is of two steps in a process of its own for each line; beside it, what `doctor`
 estimates for our run of that setting, and by how much that is too much. What runs out of memory says so. --profile
-counts, in a step of each way of ours, how often the host waits for the device, and what was compiled after warm-up.
+counts, in a step of each way of ours, how often the host waits for the device, and what was compiled after warm-up;
+beside it the seconds of a setting's first step, which compiles (it counts for the first setting of a process only).
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import json
 import math
 import statistics
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -82,8 +84,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def measure(bench: Bench, setting: Setting, ways: list[str], ceiling: float) -> list[dict[str, Any]]:
     """Return what was measured of each way in a setting; of what runs out of memory, only that."""
-    steps = {way: step for way in ways if (step := fitting_step(bench, setting, way))}
-    before = compiled_graphs()
+    before, steps, first_s = compiled_graphs(), {}, {}
+    for way in ways:
+        began = time.perf_counter()
+        step = fitting_step(bench, setting, way)
+        if step is not None:
+            steps[way], first_s[way] = step, time.perf_counter() - began
     for step in steps.values():  # once more: what is compiled for the second time is compiled here
         step()
     warm = compiled_graphs()
@@ -97,7 +103,12 @@ def measure(bench: Bench, setting: Setting, ways: list[str], ceiling: float) -> 
             continue
         median = statistics.median(seconds[way])
         flops = setting.batch * bench.flops_per_clip(setting, way)
-        row |= {"ms": median * 1e3, "clips_per_s": setting.batch / median, "mfu": flops / median / ceiling}
+        row |= {
+            "first_s": first_s[way],
+            "ms": median * 1e3,
+            "clips_per_s": setting.batch / median,
+            "mfu": flops / median / ceiling,
+        }
         if ways[0] in steps:
             pairs = zip(seconds[ways[0]], seconds[way], strict=True)
             row["ratio"] = statistics.median(base / own for base, own in pairs)
@@ -123,7 +134,8 @@ def line(row: dict[str, Any]) -> str:
     text += f"{row['ms']:9.0f}{row['clips_per_s']:9.3f}{row['mfu']:8.1%}{peak:9.2f}{estimate:9.2f}"
     text += f"{estimate / peak - 1:+7.0%} {source:>7}"
     if "waits" in row:
-        text += f"  [{row['waits']} waits, {row['compiled_after']} compiled after warm-up]"
+        text += f"  [first step {row['first_s']:.1f} s, {row['waits']} waits,"
+        text += f" {row['compiled_after']} compiled after warm-up]"
     return f"{text}{row.get('ratio', math.nan):9.2f}"
 
 

@@ -128,6 +128,7 @@ def test_all_rows_of_a_training_step_come_from_one_command_and_what_runs_out_of_
     ]  # fmt: skip
     first = json.loads(file.read_text())["rows"][0]
     assert first["waits"] > 0
+    assert first["first_s"] > 0
     assert first["compiled_after"] == 0
 
 
@@ -317,7 +318,7 @@ def test_quick_benchmark_of_latents_tells_speed_size_and_added_error(
     import_module("latents").main(["--quick"])
     monkeypatch.delitem(sys.modules, "latents")
     printed = capsys.readouterr().out
-    assert re.search(r"^ +4 +\d+\.\d+ +\d+ +\d+ +\d+\.\d\dx$", printed, re.MULTILINE)
+    assert re.search(r"^ +4 +\d+\.\d+ +\d+\.\d% +\d+\.\d+ +\d+% +\d+ +\d+ +\d+\.\d\dx$", printed, re.MULTILINE)
     hours = [float(hour) for hour in re.findall(r"^ +(?:int8|bf16|fp32) +\S+ +(\d\.\d\d) +\S+$", printed, re.MULTILINE)]
     bf16, fp32, int8 = hours
     assert int8 < bf16 < fp32
