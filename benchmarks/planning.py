@@ -11,7 +11,8 @@ plain      the same planner with everything computed again for each step, and po
 official   the planner of the official notebook on the official predictor, where a checkout of facebookresearch/vjepa2
            is at --official (`official_planner.py`)
 ours/N     ours, N samples through the predictor at once; plain takes as many as the first of these. With --compile
-           once more with compiled blocks (`planning.compile`): N+compiled
+           once more with compiled blocks (`planning.compile`): N+compiled; with --quantize in 8 bits (`planning.quantize`):
+           N+fp8, with the change of its plan's energy
 
 Before anything is timed all must choose the same actions, on the same weights with the same seed, in float32: what
 chooses others, or finds other energies, gets no ratio. A ratio over 1 means faster than plain, or than the official
@@ -66,6 +67,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for horizon, same in ways.items():
             seconds = take_turns({way.name: bench.decision(way, horizon) for way in same}, options)
             for way in same:
+                if way.settings["quantize"] != "off":
+                    added = bench.added_energy(way, horizon)
+                    print(
+                        f"{horizon:7}  {way.name}: the plan's energy changes by {added:+.2%}, as the plain model sees it"
+                    )
+            for way in same:
                 median = statistics.median(seconds[way.name])
                 peak = memory_in_own_process(given, way, horizon, dtype) if options.memory else math.nan
                 print(
@@ -91,6 +98,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--at-once", type=int, nargs="+", help="samples at once: a line each (default: 64; 8 on a CPU)")
     parser.add_argument("--dtype", nargs="+", choices=("float32", "bfloat16"), help="default: bfloat16; CPU: float32")
     add_options(parser)
+    parser.add_argument("--quantize", nargs="+", choices=("int8", "fp8"), default=[], help="ours once more in 8 bits")
     parser.add_argument("--compile", action="store_true", help="ours once more with compiled blocks")
     parser.add_argument(
         "--profile", action="store_true", help="say where the time of ours goes, and on CUDA how often the host waits"
@@ -108,8 +116,12 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 def same_ways(bench: Bench, horizon: int) -> list[Way]:
     """Return the ways to compare: those that choose the same actions."""
-    kinds = (False, True) if bench.options.compile else (False,)
-    ours = [Way.ours(count, compiled=compiled) for count in bench.options.at_once for compiled in kinds]
+    ours = [
+        Way.ours(count, compiled=compiled, quantize=quantize)
+        for count in bench.options.at_once
+        for quantize in ("off", *bench.options.quantize)
+        for compiled in ((False, True) if bench.options.compile else (False,))
+    ]
     candidates = [Way(PLAIN, ours[0].at_once)]
     if bench.has_official:
         candidates.append(Way(OFFICIAL, bench.options.samples))
@@ -117,9 +129,10 @@ def same_ways(bench: Bench, horizon: int) -> list[Way]:
         print(f"official: skipped, for there is no {bench.options.official / PLANNER}")
     same = []
     for way, found in bench.differences([*candidates, *ours], horizon).items():
-        told = "" if found.is_none else ": NO RATIO, for it chooses others"
+        in_8_bits = way.settings["quantize"] != "off"  # which chooses others, and is to say how much worse they are
+        told = "" if found.is_none or in_8_bits else ": NO RATIO, for it chooses others"
         print(f"horizon {horizon}, {way.name}: {found} (float32){told}")
-        same += [way] if found.is_none else []
+        same += [way] if found.is_none or in_8_bits else []
     return same
 
 

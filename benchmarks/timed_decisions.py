@@ -24,6 +24,7 @@ from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goal import Goal
 from vjepa2_ac.planning.plan import Cost, Plan
 from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.planning.ready import make_ready
 from vjepa2_ac.training.cost.flops import plan_flops
 
 PLAIN, OFFICIAL, COMPILED = "plain", "official", "+compiled"
@@ -42,9 +43,16 @@ class Way(NamedTuple):
     at_once: int
 
     @classmethod
-    def ours(cls, at_once: int, *, compiled: bool = False) -> Way:
-        """Return ours, perhaps with compiled blocks."""
-        return cls(f"{_OURS}{at_once}{COMPILED * compiled}", at_once)
+    def ours(cls, at_once: int, *, compiled: bool = False, quantize: str = "off") -> Way:
+        """Return ours, perhaps with compiled blocks or in 8 bits."""
+        kind = "" if quantize == "off" else f"+{quantize}"
+        return cls(f"{_OURS}{at_once}{kind}{COMPILED * compiled}", at_once)
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """What `planning` says of it."""
+        quantize = next((kind for kind in ("int8", "fp8") if f"+{kind}" in self.name), "off")
+        return {"compile": "blocks" if self.name.endswith(COMPILED) else "off", "quantize": quantize}
 
 
 @dataclass(frozen=True)
@@ -117,6 +125,7 @@ class Bench:
         drawn = torch.randn(1, self.model.num_tokens, self.model.latent_dim, generator=torch.Generator().manual_seed(1))
         self._scene = Scene(layer_norm(drawn, drawn.shape[-1:]), torch.tensor([POSE]), torch.zeros(0, 7))
         self._goals = self._reachable()
+        self._in_8_bits: dict[tuple[str, torch.dtype], WorldModel] = {}
         self.has_official = all((options.official / path).is_file() for path in (PREDICTOR, PLANNER))
 
     @cached_property
@@ -135,6 +144,18 @@ class Bench:
         ours = next(plan for way, plan in plans.items() if way.name.startswith(_OURS))
         assert isinstance(ours, Plan)
         return {way: Difference.between(ours, plan) for way, plan in plans.items()}
+
+    @torch.no_grad()
+    def added_energy(self, way: Way, horizon: int) -> float:
+        """Return by what share the energy of its plan is more than that of ours, both as the plain model sees them."""
+        options, plain = self.options, Way.ours(way.at_once)
+        config = self.config(horizon, at_once=way.at_once, samples=options.samples, iterations=options.iterations)
+        cost = WorldModelCost(make_ready(self.model, config), self._scene, self._goal(horizon), config.energy)
+        found, ours = (self._decide(one, config, self.dtype) for one in (way, plain))
+        assert isinstance(found, Plan)
+        assert isinstance(ours, Plan)
+        energy, least = cost(torch.stack([found.actions, ours.actions])).tolist()
+        return energy / least - 1  # type: ignore[no-any-return]  # of a tensor's list
 
     def config(self, horizon: int, *, at_once: int, samples: int, iterations: int) -> PlanningConfig:
         """Return upstream's planner with so much to try."""
@@ -181,10 +202,19 @@ class Bench:
         goal = self._goal(config.horizon)
         if way.name == OFFICIAL:
             return self.official.decide(self._scene, goal, config, dtype, seed=0)
-        self.model.set_compiled("always" if way.name.endswith(COMPILED) else "never")
         build = PlainCost if way.name == PLAIN else WorldModelCost
-        cost: Cost = build(self.model, self._scene, goal, config.energy)
+        cost: Cost = build(self._ready(way, config, dtype), self._scene, goal, config.energy)
         return Planner(config).plan(cost, torch.Generator().manual_seed(0))
+
+    def _ready(self, way: Way, config: PlanningConfig, dtype: torch.dtype) -> WorldModel:
+        """Return the model as a way plans with it; what is quantized is made once."""
+        key = (way.settings["quantize"], dtype)
+        if key[0] == "off":
+            return make_ready(self.model, config.model_copy(update=way.settings))
+        if key not in self._in_8_bits:
+            self._in_8_bits[key] = make_ready(self.model, config.model_copy(update=way.settings))
+        self._in_8_bits[key].set_compiled("always" if way.settings["compile"] == "blocks" else "never")
+        return self._in_8_bits[key]
 
 
 def _poses_one_by_one(states: Tensor, actions: Tensor) -> Tensor:

@@ -41,6 +41,7 @@ HOMES = {
     "av": {"data/video.py", "data/video_writing.py"},
     "h5py": {"data/sources/droid_raw/trajectory.py"},
     "pyarrow": {"data/sources/lerobot/"},
+    "torchao": {"model/quantization.py"},
     "rich": {"console.py", "console_data.py", "console_evaluation.py", "console_planning.py", "console_simulation.py"},
     "tensorflow": set(),
     "torchvision": set(),

@@ -220,6 +220,19 @@ def test_decisions_with_compiled_blocks_are_timed_beside_those_without(
     assert counters["stats"]["unique_graphs"]
 
 
+def test_decisions_in_8_bits_are_timed_and_say_what_they_cost(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("torchao", reason="the extra quantize is not installed")
+    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--quantize", "int8"])
+    printed = capsys.readouterr().out
+    ways = [way for _, way, *_ in DECISION.findall(printed)]
+    assert ways == ["plain", "ours/4", "ours/4+int8", "ours/1", "ours/1+int8"]
+    changes = re.findall(r"ours/[41]\+int8: the plan's energy changes by (\S+)%", printed)
+    assert len(changes) == 2
+    assert all(abs(float(change)) < 10 for change in changes)
+
+
 def test_peak_memory_of_a_decision_is_told_as_a_number_alone(
     planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -55,7 +55,8 @@ def _show_our_warnings() -> None:
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("warning: %(message)s"))
         ours.addHandler(handler)
-    logging.getLogger("bitsandbytes").setLevel(logging.ERROR)
+    for library in ("bitsandbytes", "torchao", "torch.utils._pytree"):  # kernels for other devices; torchao's own past
+        logging.getLogger(library).setLevel(logging.ERROR)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -1,4 +1,4 @@
-"""What is done to a model before it is planned with? Eval mode, and compiled blocks if they are asked for."""
+"""What is done to a model before it is planned with? Eval mode; compiled or quantized blocks if they are asked for."""
 
 from __future__ import annotations
 
@@ -6,15 +6,19 @@ from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.compilation import require_compiler
 from vjepa2_ac.model.lora import uses_dora
+from vjepa2_ac.model.quantization import quantized_copy
 from vjepa2_ac.model.world_model import WorldModel
 
 
 def make_ready(world_model: WorldModel, config: PlanningConfig) -> WorldModel:
-    """Return the same model, ready to plan with.
+    """Return the model to plan with: the same, or a copy in 8 bits that shares its encoder.
 
     Raises:
-        InputError: Its blocks shall be compiled and cannot be: no compiler, or an adapter with DoRA.
+        InputError: Its blocks shall be compiled or quantized and cannot be: a library or the device's ability is
+            missing, or an adapter has DoRA.
     """
+    if config.quantize != "off":
+        world_model = quantized_copy(world_model, config.quantize, where="planning.quantize")
     if config.compile == "blocks":
         require_compiler(world_model.device.type, where="planning.compile")
         if uses_dora(world_model):
