@@ -11,8 +11,8 @@ plain      the same planner with everything computed again for each step, and po
 official   the planner of the official notebook on the official predictor, where a checkout of facebookresearch/vjepa2
            is at --official (`official_planner.py`)
 ours/N     ours, N samples through the predictor at once; plain takes as many as the first of these. With --compile
-           once more with compiled blocks (`planning.compile`): N+compiled; with --quantize in 8 bits (`planning.quantize`):
-           N+fp8, with the change of its plan's energy
+           once more with compiled blocks (`planning.compile`): N+compiled. With --quantize once more in 8 bits
+           (`planning.quantize`): N+fp8, and by how much the energy of its plan changes
 
 Before anything is timed all must choose the same actions, on the same weights with the same seed, in float32: what
 chooses others, or finds other energies, gets no ratio. A ratio over 1 means faster than plain, or than the official
@@ -68,10 +68,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             seconds = take_turns({way.name: bench.decision(way, horizon) for way in same}, options)
             for way in same:
                 if way.settings["quantize"] != "off":
-                    added = bench.added_energy(way, horizon)
-                    print(
-                        f"{horizon:7}  {way.name}: the plan's energy changes by {added:+.2%}, as the plain model sees it"
-                    )
+                    added = f"{bench.added_energy(way, horizon):+.2%}, as the plain model sees it"
+                    print(f"{horizon:7}  {way.name}: the plan's energy changes by {added}")
             for way in same:
                 median = statistics.median(seconds[way.name])
                 peak = memory_in_own_process(given, way, horizon, dtype) if options.memory else math.nan
