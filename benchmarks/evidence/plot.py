@@ -72,7 +72,7 @@ def _ways(axes: Any, results: Sequence[Figures]) -> None:
     axes.set_ylabel("mean distance to the goal, cm")
     axes.set_title("On the way there (base of many cameras)")
     if axes.get_lines():
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, ncols=2, handlelength=3.5, loc="upper center", bbox_to_anchor=(0.5, -0.16))
 
 
 def _counts(axes: Any, results: Sequence[Figures]) -> None:
@@ -99,4 +99,4 @@ def _counts(axes: Any, results: Sequence[Figures]) -> None:
     axes.set_ylabel("error 0.8 s ahead / persistence")
     axes.set_title("By the number of demonstrations")
     if axes.get_lines():
-        axes.legend(fontsize=8)
+        axes.legend(fontsize=8, ncols=2, handlelength=3.5, loc="upper center", bbox_to_anchor=(0.5, -0.16))
