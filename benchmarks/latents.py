@@ -22,12 +22,12 @@ import argparse
 import statistics
 import sys
 import tempfile
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from timing import clock_s
 from torch import Tensor
 
 from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
@@ -112,12 +112,13 @@ def measure_speed(options: argparse.Namespace, folder: Path) -> None:
         f"{'frames':>6}{'encoder frames/s':>18}{'MFU':>7}{'encode frames/s':>17}{'of encoder':>12}{'pictures, ms':>14}"
         f"{'latents, ms':>13}{'ratio':>8}"
     )
+    alone = 0.0
     for frames in options.frames:
         pictures = config_of(options, folder, frames, "off")
         latents = config_of(options, folder, frames, "require")
         speed = encode(latents, options.device)
         runs = {"pictures": assemble(pictures, lambda _: None), "latents": assemble(latents, lambda _: None)}
-        alone = encoder_speed(runs["pictures"], options)
+        alone = alone or encoder_speed(runs["pictures"], options)  # whatever the frames of a clip
         mfu = alone * frame_flops(sizes) / matmul_speed(torch.device(options.device), dtype)
         seconds = take_turns(runs, options)
         each = {name: 1e3 * statistics.median(some) / options.batch for name, some in seconds.items()}
@@ -181,14 +182,6 @@ def take_turns(runs: dict[str, Run], options: argparse.Namespace) -> dict[str, l
     for each in batches.values():
         each.close()
     return seconds
-
-
-def clock_s(device: str) -> float:
-    """Return the time: of the process over its threads, or on CUDA of the clock on the wall."""
-    if device == "cpu":
-        return time.process_time() / torch.get_num_threads()
-    torch.cuda.synchronize()
-    return time.perf_counter()
 
 
 # ---- size --------------------------------------------------------------------------------------------------------

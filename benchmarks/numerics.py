@@ -19,6 +19,7 @@ import sys
 from collections.abc import Sequence
 
 import torch
+from timed_steps import our_ways, take_way
 
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.episode import LatentBatch
@@ -28,7 +29,6 @@ from vjepa2_ac.training.loss import prediction_losses
 
 # Tolerances: of losses in the first quarter, of all of them over what 1e-7 of the weights does, of bfloat16.
 EARLY, OF_NOISE, ROLLOUT = 1e-4, 3.0, 0.05
-COMPILED = "+compile"
 _ROLLOUT_STEPS, _KNOWN_CLIPS, _LEARNING_RATE = 16, 8, 1e-4
 
 
@@ -38,11 +38,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     clips = draw(options)
     plain = curve(options, clips, "dense")
     print(f"dense: loss {plain[0]:.5f} at first, {plain[-1]:.5f} after {len(plain)} steps")
-    ways = [*options.ways, *(way + COMPILED for way in options.ways if options.compile)]
     noise = strays(plain, curve(options, clips, "dense", noise=1e-7))
     print(f"dense from weights that are off by 1e-7: strays by {noise:.1e}")
     early, beyond = max(1, len(plain) // 4), False
-    for way in ways:
+    for way in our_ways(options.ways, compiled=options.compile):
         found = curve(options, clips, way)
         first, worst = strays(plain[:early], found[:early]), strays(plain, found)
         print(f"{way}: strays by {first:.1e} in {early} steps, {worst:.1e} in all (tolerance {EARLY:g}, 3 x noise)")
@@ -99,8 +98,7 @@ def curve(options: argparse.Namespace, clips: Sequence[LatentBatch], way: str, n
     for parameter in model.parameters() if noise else ():
         parameter.data *= 1 + noise * torch.randn_like(parameter)
     add_adapter(model, AdapterConfig(dropout=0.0), seed=0)
-    model.set_attention(way.removesuffix(COMPILED))  # type: ignore[arg-type]  # checked when it is used
-    model.set_compiled("with gradients" if way.endswith(COMPILED) else "never")
+    take_way(model, way)
     model.train()
     trained = [parameter for parameter in model.parameters() if parameter.requires_grad]
     optimizer = torch.optim.AdamW(trained, lr=_LEARNING_RATE)

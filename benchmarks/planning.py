@@ -34,7 +34,7 @@ from collections.abc import Callable, Sequence
 import torch
 from official_planner import PLANNER
 from timed_decisions import OFFICIAL, PLAIN, Bench, Way
-from timing import add_options, device_name, in_own_process, peak_memory_gb, take_turns
+from timing import WAITS, add_options, device_name, in_own_process, peak_memory_gb, take_turns
 from torch.profiler import ProfilerActivity, profile
 
 from vjepa2_ac.training.health import matmul_speed
@@ -45,7 +45,6 @@ QUICK = {
 }  # fmt: skip
 _ON_CPU = {"layers": 2, "samples": 8, "iterations": 2, "horizon": [2, 4], "at_once": [8], "dtype": ["float32"]}
 _ON_CUDA = {"layers": 24, "samples": 800, "iterations": 10, "horizon": [1, 2], "at_once": [64], "dtype": ["bfloat16"]}
-_WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize")
 _PROFILED_ROWS = 15
 
 
@@ -147,7 +146,7 @@ def profiled(decide: Callable[[], object], options: argparse.Namespace) -> str:
     with profile(activities=[ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if on_cuda else [])]) as found:
         decide()
     table = found.key_averages()
-    waits = {one.key: one.count for one in table if one.key in _WAITS}
+    waits = {one.key: one.count for one in table if one.key in WAITS}
     order = "self_device_time_total" if on_cuda else "self_cpu_time_total"
     rows = table.table(sort_by=order, row_limit=_PROFILED_ROWS, max_name_column_width=40)
     return f"{rows}the host waited, in {options.iterations} iterations: {waits}" if on_cuda else rows

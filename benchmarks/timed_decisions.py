@@ -208,13 +208,12 @@ class Bench:
 
     def _ready(self, way: Way, config: PlanningConfig, dtype: torch.dtype) -> WorldModel:
         """Return the model as a way plans with it; what is quantized is made once."""
-        key = (way.settings["quantize"], dtype)
-        if key[0] == "off":
-            return make_ready(self.model, config.model_copy(update=way.settings))
-        if key not in self._in_8_bits:
-            self._in_8_bits[key] = make_ready(self.model, config.model_copy(update=way.settings))
-        self._in_8_bits[key].set_compiled("always" if way.settings["compile"] == "blocks" else "never")
-        return self._in_8_bits[key]
+        model, kind = self.model, way.settings["quantize"]
+        if kind != "off":
+            if (kind, dtype) not in self._in_8_bits:
+                self._in_8_bits[kind, dtype] = make_ready(model, config.model_copy(update={"quantize": kind}))
+            model = self._in_8_bits[kind, dtype]
+        return make_ready(model, config.model_copy(update={"compile": way.settings["compile"]}))
 
 
 def _poses_one_by_one(states: Tensor, actions: Tensor) -> Tensor:

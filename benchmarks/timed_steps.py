@@ -55,6 +55,17 @@ class Setting:
     encoder: bool = False  # whether latents are computed in the step
 
 
+def our_ways(attention: Sequence[str], *, compiled: bool) -> list[str]:
+    """Return ways of ours: kinds of attention, each once more with compiled blocks if that is asked for."""
+    return [*attention, *(way + COMPILED for way in attention if compiled)]
+
+
+def take_way(model: WorldModel, way: str) -> None:
+    """Let a model train in one of our ways."""
+    model.set_attention(way.removesuffix(COMPILED))  # type: ignore[arg-type]  # checked when it is used
+    model.set_compiled("with gradients" if way.endswith(COMPILED) else "never")
+
+
 def has_checkout(options: argparse.Namespace) -> bool:
     """Return whether the official code is where it is looked for."""
     return bool((options.official / PREDICTOR).is_file())
@@ -83,20 +94,12 @@ class Bench:
     def official(self) -> Official:
         """The official step; to be asked for before ours takes its own type."""
         assert self._weights is not None, "no checkout"
-        config = self.config(Setting(max(self.options.frames), 1, checkpointing=False))
-        return Official(
-            self.options.official, self._weights, self.sizes, config.adapter, config.training,
-            frames=max(self.options.frames), encoder="pixels" in self.options.source, device=self.device,
-        )  # fmt: skip
+        return self._official()
 
     @cached_property
     def official_full(self) -> Official:
         """The same, trained whole, as it is released; made when it is first timed, for it needs 5 GB."""
-        config = self.config(Setting(max(self.options.frames), 1, checkpointing=False))
-        return Official(
-            self.options.official, self._weights, self.sizes, None, config.training,
-            frames=max(self.options.frames), encoder="pixels" in self.options.source, device=self.device,
-        )  # fmt: skip
+        return self._official(whole=True)
 
     def compare(self) -> str | None:
         """Return how the official predictor's loss and gradients differ from ours, on a short clip."""
@@ -156,8 +159,7 @@ class Bench:
         return partial(self._our_step, run, batches, None if setting.encoder else latents, way)
 
     def _our_step(self, run: Run, batches: Any, latents: LatentBatch | None, way: str) -> None:
-        self.model.set_attention(way.removesuffix(COMPILED))  # type: ignore[arg-type]  # checked when it is used
-        self.model.set_compiled("with gradients" if way.endswith(COMPILED) else "never")
+        take_way(self.model, way)
         self.model.set_gradient_checkpointing(run.config.training.gradient_checkpointing)
         if latents is None:
             training_step(run, batches, step=_PAST_WARM_UP)
@@ -173,6 +175,13 @@ class Bench:
         ]
         for module in modules:
             module.zero_grad(set_to_none=True)
+
+    def _official(self, *, whole: bool = False) -> Official:
+        config = self.config(Setting(max(self.options.frames), 1, checkpointing=False))
+        return Official(
+            self.options.official, self._weights, self.sizes, None if whole else config.adapter, config.training,
+            frames=max(self.options.frames), encoder="pixels" in self.options.source, device=self.device,
+        )  # fmt: skip
 
     def run(self, setting: Setting) -> Run:
         """Return the run that `training_step` works on."""

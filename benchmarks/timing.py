@@ -16,6 +16,7 @@ from pathlib import Path
 
 import torch
 
+WAITS = {"cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize"}  # as PyTorch's profiler calls them
 BESIDE = Path(__file__).resolve().parents[2] / "vjepa2"
 
 

@@ -36,8 +36,8 @@ from typing import Any
 
 import torch
 from official import PREDICTOR
-from timed_steps import COMPILED, OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, has_checkout
-from timing import add_options, device_name, in_own_process, peak_memory_gb, take_turns
+from timed_steps import OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, has_checkout, our_ways
+from timing import WAITS, add_options, device_name, in_own_process, peak_memory_gb, take_turns
 
 from vjepa2_ac.model.lora import trainable_report
 from vjepa2_ac.training.health import matmul_speed
@@ -46,8 +46,8 @@ TITLES = "{:>6} {:>5} {:>13}  {:16}{:>9}{:>9}{:>8}{:>9}{:>9}{:>7} {:>7}{:>9}"
 TITLE_WORDS = (
     "frames", "batch", "checkpointing", "way", "ms", "clips/s", "MFU", "peak GB", "doctor", "off by", "source",
 )  # fmt: skip
-WAITS = {  # by what PyTorch's profiler calls them
-    "cuda": {"cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize"},
+WAITS_ON = {
+    "cuda": WAITS,
     "cpu": {"aten::_local_scalar_dense"},  # of which some ask no device: only whether counting works
 }
 QUICK = {
@@ -232,11 +232,12 @@ def waits(step: Callable[[], object], device: str) -> int:
     """Return how often the host asks the device for a number in one step, or waits for it otherwise."""
     with torch.profiler.profile() as profile:
         step()
-    return sum(event.count for event in profile.key_averages() if event.key in WAITS[device])
+    return sum(event.count for event in profile.key_averages() if event.key in WAITS_ON[device])
 
 
 def choose_ways(bench: Bench, options: argparse.Namespace) -> list[str]:
     """Return the ways to compare, the baseline first; the official one only if it computes the same."""
+    ours = our_ways(options.attention, compiled=options.compile)
     print(f"ours: {trainable_report(bench.model)}")
     if has_checkout(options):
         count = sum(parameter.numel() for parameter in bench.official.trained)
@@ -244,16 +245,11 @@ def choose_ways(bench: Bench, options: argparse.Namespace) -> list[str]:
         found = bench.compare()
         if found is None:
             print("official: the same loss and gradients on the same weights (float32)")
-            return [OFFICIAL, *([OFFICIAL_FULL] if options.full else []), *our_ways(options)]
+            return [OFFICIAL, *([OFFICIAL_FULL] if options.full else []), *ours]
         print(f"official: NO RATIO, for it does not compute the same: {found}")
     else:
         print(f"official: skipped, for there is no {options.official / PREDICTOR}")
-    return ["dense", *(way for way in our_ways(options) if way != "dense")]
-
-
-def our_ways(options: argparse.Namespace) -> list[str]:
-    """Return the ways of ours that were asked for."""
-    return [*options.attention, *(way + COMPILED for way in options.attention if options.compile)]
+    return ["dense", *(way for way in ours if way != "dense")]
 
 
 def memory_of_way(bench: Bench, options: argparse.Namespace) -> float:

@@ -28,6 +28,7 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.simulation.closed_loop import run_task
 from vjepa2_ac.simulation.policies import DoNothing, Oracle, Planning, Policy, RandomActions
 from vjepa2_ac.training.cached import with_latents_if_there
+from vjepa2_ac.training.cost.parameters import count_parameters
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.quiet import QuietReporter
 from vjepa2_ac.training.runs import load_run
@@ -164,13 +165,11 @@ def _forgetting(model: WorldModel, folder: Path, config: Config) -> dict[str, An
 
 def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
     loaded = load_run(run)
-    own = sum(value.numel() for value in load_base(loaded.config.model, seed=0).predictor.parameters())
+    counts = count_parameters(loaded.config, loaded.world_model.sizes)
+    count = counts.trained if loaded.config.adapter.kind == "lora" else counts.predictor
     files = list((loaded.checkpoint / "adapter").rglob("*.safetensors"))
-    weights = loaded.world_model.predictor.named_parameters()
-    adapter = [value.numel() for name, value in weights if "lora_" in name or ".modules_to_save." in name]
-    count = sum(adapter) or own
     return loaded.world_model, {
-        "trained_share": count / own,
+        "trained_share": count / counts.predictor,
         "trained_parameters": count,
         "adapter_mb": sum(path.stat().st_size for path in files) / 1e6,
     }

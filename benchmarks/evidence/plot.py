@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 from cells import BASES, BEST, METHODS
-from results import REACHED_CM, Figures, last, main_cells, pick, reached
-
-from vjepa2_ac.evaluation.proportion import share_of
+from results import REACHED_CM, Figures, last, main_cells, pick, share_reached
 
 
 def draw(results: Sequence[Figures], path: Path) -> None:
@@ -39,8 +37,7 @@ def _bars(axes: Any, results: Sequence[Figures]) -> None:
             found = main_cells(results, of, name)
             if not found or (of == "none" and side):
                 continue
-            flags = [flag for one in found for flag in reached(one)]
-            share = share_of(sum(flags), len(flags))
+            share = share_reached(found)
             at = place + (0.0 if of == "none" else 0.4 * side - 0.2)
             error = [[share.value - share.low], [share.high - share.value]]
             look = {"color": _COLOURS[method.kind], "alpha": 1.0 if side or of == "none" else 0.55}
@@ -71,8 +68,7 @@ def _ways(axes: Any, results: Sequence[Figures]) -> None:
     axes.set_xlabel("model steps of 0.27 s")
     axes.set_ylabel("mean distance to the goal, cm")
     axes.set_title("On the way there (base of many cameras)")
-    if axes.get_lines():
-        axes.legend(fontsize=8, ncols=2, handlelength=3.5, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    _legend_below(axes)
 
 
 def _counts(axes: Any, results: Sequence[Figures]) -> None:
@@ -98,5 +94,9 @@ def _counts(axes: Any, results: Sequence[Figures]) -> None:
     axes.set_xlabel("demonstrations")
     axes.set_ylabel("error 0.8 s ahead / persistence")
     axes.set_title("By the number of demonstrations")
+    _legend_below(axes)
+
+
+def _legend_below(axes: Any) -> None:
     if axes.get_lines():
         axes.legend(fontsize=8, ncols=2, handlelength=3.5, loc="upper center", bbox_to_anchor=(0.5, -0.16))

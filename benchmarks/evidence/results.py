@@ -9,6 +9,9 @@ from typing import Any
 
 from cells import METHODS
 
+from vjepa2_ac.evaluation.bootstrap import Estimate
+from vjepa2_ac.evaluation.proportion import share_of
+
 REACHED_CM = 5.0
 Figures = dict[str, Any]
 
@@ -33,6 +36,12 @@ def of_policy(results: Sequence[Figures], base: str, name: str, shift: str = "lo
 def reached(one: Figures, distance: str = "l1") -> list[bool]:
     """Return which goals a cell reached, by which energy."""
     return [row[-1] < REACHED_CM for row in one["reach"][distance]["distance_cm"]]
+
+
+def share_reached(found: Sequence[Figures]) -> Estimate:
+    """Return the share of all goals of some cells that were reached, with Wilson's interval."""
+    flags = [flag for one in found for flag in reached(one)]
+    return share_of(sum(flags), len(flags))
 
 
 def last(one: Figures) -> float:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from cells import BASES, BEST, METHODS
 from plot import draw
-from results import Figures, last, main_cells, of_policy, pick, reached, read_results
+from results import Figures, last, main_cells, of_policy, pick, reached, read_results, share_reached
 
 from vjepa2_ac.evaluation.bootstrap import mean_of
 from vjepa2_ac.evaluation.proportion import share_of
@@ -100,10 +100,9 @@ def summary(results: Sequence[Figures]) -> str:
 
 def _short(found: Sequence[Figures]) -> tuple[str, str]:
     """Return the share of goals that were reached with its interval, and what is left on average in cm."""
-    flags = [flag for one in found for flag in reached(one)]
-    if not flags:
+    if not found:
         return "", ""
-    share = share_of(sum(flags), len(flags))
+    share = share_reached(found)
     left = np.mean([row[-1] for one in found for row in one["reach"]["l1"]["distance_cm"]])
     return f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]", f"{left:.1f}"
 
