@@ -6,8 +6,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.training.cost.memory import ALLOWANCE, GIGABYTE, MemoryEstimate
 
 UNTESTED = (
-    "This is arithmetic. What autograd keeps was compared with PyTorch on a CPU; the total has not been compared with"
-    " a GPU's measured peak yet."
+    "This is arithmetic. It was compared with what PyTorch keeps on a CPU and with what lives at once on an imagined"
+    " GPU, not yet with a GPU's measured peak."
 )
 
 
@@ -17,7 +17,7 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
     clips = f"{training.batch_size} clips of {config.data.frames} frames"
     fed_back = training.rollout_steps - 1 if estimate.rollout else 0
     eight_bits = "8 bits where a tensor has 4,096 elements" if training.optimizer == "adamw_8bit" else "float32"
-    guess = f"a guess: four tensors as wide as the MLP{', a weight measured by DoRA' if config.adapter.dora else ''}"
+    gradients = f"gradients on their way back{', and a weight measured by DoRA' if config.adapter.dora else ''}"
     parts = [
         (
             "encoder, frozen", estimate.encoder_weights,
@@ -38,7 +38,7 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
         ("losses", estimate.losses, "without checkpointing"),
         ("all three, checkpointed", estimate.checkpointed, "instead: inputs of blocks, and one block computed again"),
         ("copies", estimate.cast_cache, f"of trained weights in {training.precision}"),
-        ("temporaries", estimate.temporaries, guess),
+        ("temporaries", estimate.temporaries, gradients),
         (
             "validation", estimate.validating,
             f"instead of all that: {config.validation.batch_size} clips, and the keys and values of their rollout",

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch._dynamo.utils import counters
 
+from tracing import tracing
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model import compilation, layers
@@ -15,11 +16,7 @@ from vjepa2_ac.model.lora import add_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.loss import prediction_losses
 
-pytestmark = [
-    pytest.mark.usefixtures("traced"),
-    # PyTorch looks at .grad of what it traces, and keeps its own warning from being shown, not from being raised.
-    pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf"),
-]
+pytestmark = [pytest.mark.usefixtures("traced"), *tracing]
 
 
 def graphs() -> int:

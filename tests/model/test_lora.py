@@ -392,7 +392,7 @@ def test_plain_peft_loads_it_on_the_predictor(model: WorldModel, inputs, tmp_pat
     with torch.no_grad():
         expected = model.predictor(inputs.latents, inputs.actions, inputs.states)
         found = plain.eval()(inputs.latents, inputs.actions, inputs.states)
-    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4 if config.init == "pissa" else 0)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4 if config.init == "pissa" else 1e-6)
 
 
 def test_gradient_checkpointing_changes_no_gradient_of_an_adapter_and_its_dropout(fresh: Fresh, inputs) -> None:

@@ -66,3 +66,9 @@ def test_bfloat16_loses_nothing_but_the_rounding_of_its_result() -> None:
 def test_a_head_without_pairs_is_refused() -> None:
     with pytest.raises(ValueError, match="even"):
         rotary_tables(TokenLayout(1, 1), 7, CPU)
+
+
+def test_gradients_are_those_of_differences() -> None:
+    tables = rotary_tables(TokenLayout(2, 2, 1), 14, torch.device("cpu"))
+    tokens = torch.randn(1, 10, 2, 14, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert torch.autograd.gradcheck(lambda given: rotate(given, tables), tokens.requires_grad_())

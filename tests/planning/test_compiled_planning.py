@@ -6,6 +6,7 @@ import torch
 from torch._dynamo.utils import counters
 
 from planning.tiny import actions, cost, tiny_model
+from tracing import tracing
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
@@ -15,8 +16,7 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.ready import make_ready
 
-# PyTorch looks at .grad of what it traces, and keeps its own warning from being shown, not from being raised.
-pytestmark = pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
+pytestmark = tracing
 
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 PLAIN = PlanningConfig(

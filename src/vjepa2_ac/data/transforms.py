@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -103,10 +104,19 @@ def pixels_to_input(
         resized = torch.cat([_augmented(clip, image_size, augmentation) for clip, augmentation in pairs])
     else:
         raise ValueError(f"{len(augmentations)} augmentations for {batch} clips")
-    mean = torch.tensor(_MEAN, device=frames.device).view(3, 1, 1)
-    std = torch.tensor(_STD, device=frames.device).view(3, 1, 1)
+    mean, std = _mean_and_std(frames.device)
     normalised: Tensor = (resized - mean) / std
     return normalised.reshape(batch, time, 3, image_size, image_size)
+
+
+@lru_cache(maxsize=8)
+def _mean_and_std(device: torch.device) -> tuple[Float[Tensor, "3 1 1"], Float[Tensor, "3 1 1"]]:
+    # Once for each device, since the way there is one that the host waits for; not as a tensor of inference mode.
+    with torch.inference_mode(False):
+        return (
+            torch.tensor(_MEAN, device=device).view(3, 1, 1),
+            torch.tensor(_STD, device=device).view(3, 1, 1),
+        )
 
 
 def _augmented(clip: Tensor, image_size: int, augmentation: Augmentation) -> Float[Tensor, "time 3 size size"]:

@@ -74,12 +74,32 @@ def _dense(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> T
 
 
 def _per_step(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
-    # Slices of keys are views: nothing is copied, and nothing more is kept for the backward pass than key and value.
-    seen = [
-        scaled_dot_product_attention(part, key[:, :, :part_end], value[:, :, :part_end])
-        for part_end, part in _steps_with_end(query, key.shape[2] - query.shape[2], tokens_per_step)
-    ]
+    before = key.shape[2] - query.shape[2]
+    ends = tuple(range(before + tokens_per_step, key.shape[2] + 1, tokens_per_step))
+    parts = torch.split(query, tokens_per_step, dim=2)
+    beginnings: Callable[..., tuple[Tensor, ...]] = _Beginnings.apply
+    steps = zip(parts, beginnings(key, ends), beginnings(value, ends), strict=True)
+    seen = [scaled_dot_product_attention(*inputs) for inputs in steps]
     return seen[0] if len(seen) == 1 else torch.cat(seen, dim=2)
+
+
+class _Beginnings(torch.autograd.Function):
+    """The first tokens of keys or values up to each end, as views: nothing is copied.
+
+    As slices, the gradient of each would be padded with zeros to the full length before it is added to the others;
+    here it is added where it belongs.
+    """
+
+    @staticmethod
+    def forward(_ctx: Any, values: Tensor, ends: tuple[int, ...]) -> tuple[Tensor, ...]:
+        return tuple(values[:, :, :end] for end in ends)
+
+    @staticmethod
+    def backward(_ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:  # the last is of all tokens
+        total = gradients[-1].clone()
+        for gradient in gradients[:-1]:
+            total[:, :, : gradient.shape[2]] += gradient
+        return total, None
 
 
 def _flex(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
@@ -93,11 +113,6 @@ _IMPLEMENTATIONS: dict[str, Callable[[Tensor, Tensor, Tensor, int], Tensor]] = {
     "per_step": _per_step,
     "flex": _flex,
 }
-
-
-def _steps_with_end(query: Tensor, before: int, tokens_per_step: int) -> list[tuple[int, Tensor]]:
-    parts = torch.split(query, tokens_per_step, dim=2)
-    return [(before + (step + 1) * tokens_per_step, part) for step, part in enumerate(parts)]
 
 
 @lru_cache(maxsize=8)

@@ -11,7 +11,7 @@ from transformers import VJEPA2Config
 from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
 from vjepa2_ac.config import ModelSizes
-from vjepa2_ac.model.layers import NORM_EPSILON, initialise, output_std
+from vjepa2_ac.model.layers import NORM_EPSILON, initialise, output_std, without_needless_autocast
 from vjepa2_ac.model.positions import TokenLayout, rotary_tables, rotate
 
 TUBELET = 2  # frames that the encoder sees at once: here the same one twice
@@ -68,8 +68,10 @@ class Encoder(nn.Module):
                 nn.init.trunc_normal_(output.weight, std=output_std(index + 1), generator=generator)
 
     def _encode(self, frames: Tensor) -> Tensor:
-        tubelets = frames[:, None].expand(-1, TUBELET, -1, -1, -1)
-        features: Tensor = self.vit(tubelets).last_hidden_state
+        weight = next(self.vit.parameters())
+        tubelets = frames.to(weight.dtype)[:, None].expand(-1, TUBELET, -1, -1, -1)
+        with without_needless_autocast(tubelets, weight):
+            features: Tensor = self.vit(tubelets).last_hidden_state
         return features
 
 

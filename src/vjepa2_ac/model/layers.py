@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from jaxtyping import Float
@@ -132,12 +133,33 @@ def output_std(layer: int) -> float:
 
 
 def _before_attention(block: Block, tokens: Tensor, tables: RotaryTables) -> tuple[Tensor, Tensor, Tensor]:
-    return block.attn.project(block.norm1(tokens), tables)
+    return block.attn.project(normalised(block.norm1, tokens), tables)
 
 
 def _after_attention(block: Block, tokens: Tensor, gathered: Tensor) -> Tensor:
     tokens = tokens + block.attn.o(gathered.transpose(1, 2).flatten(2))
-    return tokens + block.mlp(block.norm2(tokens))  # type: ignore[no-any-return]  # nn.Module is untyped
+    return tokens + block.mlp(normalised(block.norm2, tokens))  # type: ignore[no-any-return]  # nn.Module is untyped
+
+
+def normalised(norm: nn.LayerNorm, tokens: Tensor) -> Tensor:
+    """Return normalised tokens, cast once to the type that all layers after them compute in."""
+    kind = tokens.device.type
+    if not torch.is_autocast_enabled(kind):
+        return norm(tokens)  # type: ignore[no-any-return]  # nn.Module is untyped
+    with without_needless_autocast(tokens, norm.weight):
+        return norm(tokens).to(torch.get_autocast_dtype(kind))  # type: ignore[no-any-return]  # the same
+
+
+def without_needless_autocast(tokens: Tensor, weights: Tensor) -> AbstractContextManager[object]:
+    """Switch autocast off where tokens and weights have the type that it computes in.
+
+    There it only has norms computed from a float32 copy, and their result cast back by each layer after them. Their
+    kernels compute in float32 as it is: the same numbers, in a fifth of the bytes.
+    """
+    kind = tokens.device.type
+    if torch.is_autocast_enabled(kind) and tokens.dtype == weights.dtype == torch.get_autocast_dtype(kind):
+        return torch.autocast(kind, enabled=False)
+    return nullcontext()
 
 
 def hidden_width(width: int, mlp_ratio: float) -> int:

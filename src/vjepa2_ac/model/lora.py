@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import torch
 from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
 from peft.tuners.lora import LoraLayer
-from torch import Tensor
+from torch import Tensor, nn
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
@@ -25,6 +25,7 @@ from vjepa2_ac.model.adapter_start import (
     start_from,
 )
 from vjepa2_ac.model.heads import fit_heads, require_trained
+from vjepa2_ac.model.lora_linear import LoraLinear
 from vjepa2_ac.model.trained_folder import (
     FULL_WEIGHTS,
     LORA_WEIGHTS,
@@ -202,6 +203,7 @@ def _train_everything(model: WorldModel) -> None:
 
 def _wrap(model: WorldModel, config: LoraConfig) -> None:
     base = model.predictor_fingerprint()
+    config._register_custom_module({nn.Linear: LoraLinear})
     checkpointing = model.base_predictor.gradient_checkpointing
     model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
     init, config.init_lora_weights = config.init_lora_weights, True  # or PEFT cuts PiSSA out of the base, in its type

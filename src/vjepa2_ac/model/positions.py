@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Float32
@@ -70,10 +71,33 @@ def rotate(
     tokens: Float[Tensor, "batch sequence heads head_dim"], tables: RotaryTables
 ) -> Float[Tensor, "batch sequence heads head_dim"]:
     """Return queries or keys turned by their position: computed in float32, returned in the type that came in."""
-    precise = tokens.float()
-    first, second = precise[..., 0::2], precise[..., 1::2]
-    swapped = torch.stack((second, first), dim=-1).flatten(-2)
-    return torch.addcmul(precise * tables.cosine, swapped, tables.signed_sine).to(tokens.dtype)
+    apply: Callable[..., Tensor] = _Rotation.apply
+    return apply(tokens, *tables)
+
+
+class _Rotation(torch.autograd.Function):
+    """Turns pairs, in two passes over the tokens; its gradient is turned back in the same way, and keeps no token."""
+
+    @staticmethod
+    def forward(ctx: Any, tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
+        ctx.save_for_backward(cosine, signed_sine)
+        return _turned(tokens, cosine, signed_sine)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        cosine, signed_sine = ctx.saved_tensors
+        return _turned(gradient, cosine, _swapped(signed_sine)), None, None
+
+
+def _turned(tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
+    # Computed in float32, as the tables are, and written in the type of the tokens, without a pass to cast it.
+    turned = torch.empty_like(tokens)
+    return torch.addcmul(tokens * cosine, _swapped(tokens), signed_sine, out=turned)
+
+
+def _swapped(tokens: Tensor) -> Tensor:
+    """Return the neighbours of each pair in each other's place."""
+    return torch.stack((tokens[..., 1::2], tokens[..., 0::2]), dim=-1).flatten(-2)
 
 
 def _places(layout: TokenLayout, device: torch.device) -> Float32[Tensor, "sequence 3"]:

@@ -15,7 +15,7 @@ from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.episode import ACTION_DIM, EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.model.attention import AttentionKind
 from vjepa2_ac.model.key_value_cache import KeyValueCache
-from vjepa2_ac.model.layers import NORM_EPSILON, Block, hidden_width, initialise
+from vjepa2_ac.model.layers import NORM_EPSILON, Block, hidden_width, initialise, normalised
 from vjepa2_ac.model.positions import TokenLayout, rotary_tables
 
 
@@ -134,7 +134,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         patches = rearrange(tokens, "batch (time token) width -> batch time token width", time=layout.steps)[
             :, :, layout.conditioning :
         ]
-        return _in_own_type(self.predictor_proj, self.predictor_norm(patches), self._dtype)
+        return _in_own_type(self.predictor_proj, normalised(self.predictor_norm, patches), self._dtype)
 
     def initialise(self, generator: Generator) -> None:
         """Give every weight a fresh value, decided by the generator alone."""

@@ -74,10 +74,12 @@ def test_what_is_trained_otherwise_is_counted() -> None:
     assert dora.temporaries > plain.temporaries
 
 
-def test_fp16_keeps_copies_of_bfloat16_weights() -> None:
+def test_fp16_keeps_copies_of_bfloat16_weights_and_float32_copies_for_norms() -> None:
     estimates = [estimate_memory(run_config(training__precision=name), ModelSizes()) for name in ("bf16", "fp16")]
-    copies = 24 * 12 * 1024**2 * 2 + 2 * 1408 * 1024
-    assert estimates[1].teacher_forcing - estimates[0].teacher_forcing == copies - 3 * 1024**2 * 2  # none for latents
+    copies = 24 * 12 * 1024**2 * 2 + 2 * 1408 * 1024 - 3 * 1024**2 * 2  # none for latents
+    tokens, patches = 2 * 5 * 258, 2 * 5 * 256
+    norms = 47 * tokens * 1026 * 2 + (patches * 4 - tokens * 2) * 1024 + patches * 2 * 2  # of blocks, and the last
+    assert estimates[1].teacher_forcing - estimates[0].teacher_forcing == copies + norms
 
 
 def test_a_run_that_fits_needs_no_knob_and_a_large_one_is_told_which() -> None:

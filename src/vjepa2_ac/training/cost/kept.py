@@ -8,7 +8,8 @@ from functools import cached_property
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.training.cost.kept_block import FLOAT32, Kind, Setting, adapter_casts, block_bytes, layer_bytes
 
-_HEADS = ("predictor_embed", "action_encoder", "state_encoder", "extrinsics_encoder")
+_CONDITIONS = ("action_encoder", "state_encoder", "extrinsics_encoder")
+_HEADS = ("predictor_embed", *_CONDITIONS)
 
 
 @dataclass(frozen=True)
@@ -84,11 +85,14 @@ class Kept:
         setting = self._setting
         patches, latent = setting.patches(steps), self.sizes.encoder.width
         reached = fed_back or self._heads_are_trained or self._block_is_trained
-        read = patches if self.device == "cuda" else setting.tokens(steps)  # CUDA's copy is of the patches alone
+        read = patches if setting.copies_for_norms else setting.tokens(steps)  # a copy is of the patches alone
         norm = (read * setting.width + 2 * patches) * setting.norm_number
         normalised = patches * (latent + 2) * FLOAT32
         embedded = layer_bytes(setting, "predictor_embed", patches, reached=fed_back)
-        return reached * norm + normalised + embedded + layer_bytes(setting, "predictor_proj", patches, reached=reached)
+        given = self.config.training.batch_size * steps
+        conditions = sum(layer_bytes(setting, name, given, reached=False) for name in self._conditions)
+        projected = layer_bytes(setting, "predictor_proj", patches, reached=reached)
+        return reached * norm + normalised + embedded + conditions + projected
 
     def _casts(self, index: int) -> int:
         block = f"blocks.{index}."
@@ -101,6 +105,10 @@ class Kept:
 
     def _tokens(self, steps: int) -> int:
         return self._setting.tokens(steps)
+
+    @property
+    def _conditions(self) -> tuple[str, ...]:
+        return _CONDITIONS if self.sizes.predictor.use_extrinsics else _CONDITIONS[:2]
 
     @property
     def _heads_are_trained(self) -> bool:

@@ -1,12 +1,13 @@
 """What does autograd keep of one layer or one block of the predictor? Counted operation by operation, in bytes.
 
 Only what a gradient needs is kept. A frozen linear layer keeps nothing of its input; its adapter, or a weight that is
-trained whole, keeps it, cast to the arithmetic's type. A norm keeps its input and two statistics a token, attention
-keeps query, key, value, output and a log-sum-exp a head, GELU its input, dropout its mask. DoRA, as PEFT computes it,
-keeps two outputs of each layer, and with dropout a copy of the weights.
+trained whole, keeps it, in the arithmetic's type, and an adapter its own two matrices, cast. A norm keeps its input and
+two statistics a token, attention keeps query, key, value, output and a log-sum-exp a head, GELU its input, dropout its
+mask. DoRA, as PEFT computes it, keeps two outputs of each layer, and with dropout a copy of the weights.
 
-Devices differ in two of these. CUDA's autocast computes norms in float32 and so keeps a float32 copy of their input,
-where the CPU's leaves the input in bfloat16; and CUDA keeps a mask of one byte, the CPU a float32 one.
+Devices differ in two of these. Where weights have another type than the arithmetic, CUDA's autocast computes norms from
+a float32 copy and keeps that, where the CPU's leaves the input as it is; and CUDA keeps a mask of one byte, the CPU one
+of the masked tensor's type.
 """
 
 from __future__ import annotations
@@ -42,19 +43,31 @@ class Setting:
     @property
     def norm_number(self) -> int:
         """Bytes of a number that a norm keeps."""
-        return FLOAT32 if self.device == "cuda" else self.number
+        return FLOAT32 if self.copies_for_norms else self.number
+
+    @property
+    def copies_for_norms(self) -> bool:
+        """Whether autocast has norms computed from a copy of their input."""
+        return self.device == "cuda" and (self.casts_frozen_weights or self.trains_everything)
 
     @property
     def mask(self) -> int:
         """Bytes of an element of a dropout mask."""
         if not self.config.adapter.dropout:
             return 0
-        return 1 if self.device == "cuda" else FLOAT32
+        if self.device == "cuda":
+            return 1
+        return self.number if self.is_plain else FLOAT32
 
     @property
     def trains_everything(self) -> bool:
         """Whether there is no adapter."""
         return self.config.adapter.kind == "none"
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether adapters compute in the arithmetic's type (`model.lora_linear`); else PEFT casts to float32."""
+        return not self.config.adapter.dora
 
     def trains_whole(self, name: str) -> bool:
         """Return whether a layer's own weight is trained."""
@@ -70,8 +83,8 @@ class Setting:
     def shares_inputs(self) -> bool:
         """Whether layers that read one tensor keep it once: nothing is masked, and nothing is cast for each."""
         if self.trains_everything:
-            return self.device == "cpu" or self.number == FLOAT32
-        return self.number == FLOAT32 and not self.config.adapter.dropout
+            return True
+        return not self.config.adapter.dropout and (self.is_plain or self.number == FLOAT32)
 
     @cached_property
     def ranks(self) -> dict[str, int]:
@@ -142,17 +155,21 @@ def layer_bytes(setting: Setting, name: str, tokens: int, *, reached: bool) -> i
     if rank is None:
         return kept
     kept += tokens * (layer.inputs * (number + reached * setting.mask) + rank * number)
+    if setting.is_plain:
+        kept += _casts(setting, layer, rank)
     return kept + (_dora(setting, layer, tokens, reached=reached) if setting.config.adapter.dora else 0)
 
 
 def adapter_casts(setting: Setting, name: str) -> int:
-    """Return the bytes of a layer's trained matrices cast to the arithmetic's type: once for all passes."""
-    if setting.number == FLOAT32:
-        return 0
+    """Return the bytes of a layer's trained matrices that autocast casts: once for all passes."""
     layer = setting.layers[name]
     if setting.trains_whole(name):
-        return layer.weight * setting.number
-    return setting.ranks.get(name, 0) * (layer.inputs + layer.outputs) * setting.number
+        return 0 if setting.number == FLOAT32 else layer.weight * setting.number
+    return 0 if setting.is_plain else _casts(setting, layer, setting.ranks.get(name, 0))
+
+
+def _casts(setting: Setting, layer: Layer, rank: int) -> int:
+    return 0 if setting.number == FLOAT32 else rank * (layer.inputs + layer.outputs) * setting.number
 
 
 def _dora(setting: Setting, layer: Layer, tokens: int, *, reached: bool) -> int:

@@ -192,9 +192,14 @@ def _at_work(config: Config, sizes: ModelSizes, frames: int) -> int:
 
 
 def _temporaries(config: Config, sizes: ModelSizes, clips: int) -> int:
-    """Return four float32 tensors as wide as the MLP: the adapter's input and gradients at their widest."""
-    hidden = int(sizes.predictor.width * sizes.predictor.mlp_ratio)
-    return 4 * _tokens(config, sizes, clips) * hidden * FLOAT32
+    """Return what lives for a moment where most does: at the MLP's second layer, on the way back.
+
+    Plain LoRA: two gradients as wide as the MLP, two as wide as a token. Else four as wide as the MLP, in float32.
+    """
+    width, hidden = sizes.predictor.width, int(sizes.predictor.width * sizes.predictor.mlp_ratio)
+    plain = config.adapter.kind == "lora" and not config.adapter.dora
+    token = (2 * hidden + 2 * width) * _number(config) if plain else 4 * hidden * FLOAT32
+    return _tokens(config, sizes, clips) * token
 
 
 def _tokens(config: Config, sizes: ModelSizes, clips: int) -> int:
