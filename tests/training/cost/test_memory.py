@@ -108,7 +108,7 @@ def test_doctor_says_whether_it_fits_and_what_it_has_not_been_compared_with(
     assert main(["doctor", str(path), f"training.batch_size={batch}"]) == status
     said = capsys.readouterr().out
     assert word in said
-    assert "not been compared with a GPU's measured peak" in said
+    assert "not yet with a GPU's measured peak" in said
     assert f"vjepa2-ac data check {path}" in said
 
 
