@@ -1,4 +1,4 @@
-"""What does work need of a GPU? Live bytes, waits of the host, kernels, bytes moved and FLOPs, and so a predicted time."""
+"""What does work need of a GPU? Live bytes, waits of the host, kernels, bytes moved, FLOPs; and so a predicted time."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import torch
 from stand_ins import share_seen
 from torch import Tensor
 from torch._ops import OpOverload
-from torch._subclasses.fake_tensor import DataDependentOutputException
+from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
@@ -102,28 +102,29 @@ class Count(TorchDispatchMode):
             return self._number(func, given, args, kwargs)
         out = func(*args, **kwargs)
         made = _tensors(out)
-        inputs, outputs = ([one for one in some if one.is_cuda] for some in (given, made))
-        known = {_storage(one) for one in inputs}
-        for tensor in chain(inputs, outputs):
+        on_device = [one for one in (*given, *made) if _device(one) == "cuda"]
+        for tensor in on_device:
             self._hold(tensor)
-        if (inputs or outputs) and (func._schema.is_mutable or any(_storage(one) not in known for one in outputs)):
-            copied = [*given, *made] if func._overloadpacket in {_aten._to_copy, _aten.copy_} else []
-            if len({one.device for one in copied}) > 1 and not _is_non_blocking(func, args, kwargs):
+        known = {_storage(one) for one in given}
+        if on_device and (func._schema.is_mutable or any(_storage(one) not in known for one in made)):
+            self._launch(func, args, kwargs, out)
+            if _copies_and_blocks(func, args, kwargs, set(map(_device, (*given, *made)))):
                 self.waits[place(text=True)] += self.times
-            if func._overloadpacket not in _MAKE_NOTHING:
-                flops = _flops(func, args, kwargs, out)
-                self._launch(str(func), inputs, outputs or _written(func, args, kwargs), flops)
         return out
 
-    def _launch(self, name: str, inputs: list[Tensor], outputs: list[Tensor], flops: float) -> None:
-        moved = sum(map(_bytes, inputs)) + sum(map(_bytes, outputs))
-        seconds = self.machine.seconds(name, flops, moved, (inputs or outputs)[0].dtype)
-        self.costs[name, place()].add(Cost(1, seconds, moved, flops), self.times)
+    def _launch(self, func: OpOverload, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> None:
+        if func._overloadpacket in _MAKE_NOTHING:
+            return
+        read, written = _tensors((args, kwargs)), _tensors(out) or _written(func, args, kwargs)
+        touched = [one for one in (*read, *written) if _device(one) == "cuda"]
+        moved, flops = sum(map(_bytes, touched)), _flops(func, args, kwargs, out)
+        seconds = self.machine.seconds(str(func), flops, moved, touched[0].dtype)
+        self.costs[str(func), place()].add(Cost(1, seconds, moved, flops), self.times)
         self._read = None
 
     def _number(self, func: OpOverload, given: list[Tensor], args: Any, kwargs: Any) -> Any:
-        """Return a number of a tensor: the true one where it is known. Another of the same tensor is no further wait."""
-        if given[0].is_cuda:
+        """Return a number of a tensor: the true one where it is known. Another of the same tensor is no more wait."""
+        if _device(given[0]) == "cuda":
             if self._read != _storage(given[0]):
                 self.waits[place(text=True)] += self.times
             self._read = _storage(given[0])
@@ -174,6 +175,11 @@ def _tensors(tree: Any) -> list[Tensor]:
     return [leaf for leaf in tree_leaves(tree) if isinstance(leaf, Tensor)]
 
 
+def _device(tensor: Tensor) -> str:
+    """Return cpu or cuda; asking a fake tensor for its device would be an operation of its own, and take as long."""
+    return tensor.fake_device.type if isinstance(tensor, FakeTensor) else tensor.device.type
+
+
 def _storage(tensor: Tensor) -> int:
     return int(tensor.untyped_storage()._cdata)
 
@@ -192,13 +198,18 @@ def _written(func: OpOverload, args: tuple[Any, ...], kwargs: dict[str, Any]) ->
     return _tensors([value for argument, value in pairs if argument.alias_info and argument.alias_info.is_write])
 
 
-def _is_non_blocking(func: OpOverload, args: tuple[Any, ...], kwargs: dict[str, Any]) -> bool:
-    place_of = next(place for place, one in enumerate(func._schema.arguments) if one.name == "non_blocking")
-    return bool(kwargs.get("non_blocking", args[place_of] if len(args) > place_of else False))
+def _copies_and_blocks(
+    func: OpOverload, args: tuple[Any, ...], kwargs: dict[str, Any], devices: set[str]
+) -> bool:
+    """Return whether an operation carries numbers between host and device, and the host waits until they are there."""
+    if len(devices) < 2 or func._overloadpacket not in {_aten._to_copy, _aten.copy_}:
+        return False
+    number = [argument.name for argument in func._schema.arguments].index("non_blocking")
+    return not kwargs.get("non_blocking", args[number] if len(args) > number else False)
 
 
 def _flops(func: OpOverload, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> float:
-    """Return an operation's products of matrices; of what stands in for FlexAttention, the share that its mask leaves."""
+    """Return the FLOPs of products of matrices; of what stands in for FlexAttention, the share that its mask leaves."""
     formula = flop_registry.get(func._overloadpacket)
     if formula is None:
         return 0.0

@@ -47,7 +47,8 @@ def _torch_folder() -> Path:
 def _compiled(torch: Path) -> Path:
     """Return the library for a PyTorch, compiled once for each version and place."""
     made_of = SOURCE.read_text() + (torch / "version.py").read_text() + str(torch)
-    kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
+    users = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
+    kept = Path(os.environ.get("VJEPA2_AC_CACHE") or users)
     library = kept / f"imagined-gpu-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}.so"
     if library.exists():
         return library

@@ -53,7 +53,8 @@ def _attention(
     is_causal: bool = False, scale: float | None = None, enable_gqa: bool = False,
 ) -> Tensor:  # fmt: skip
     """Return what `scaled_dot_product_attention` takes on a GPU: flash, or efficient with a mask or in float32."""
-    assert not (is_causal or enable_gqa)
+    assert not is_causal
+    assert not enable_gqa
     query, key, value = _as_autocast(query, key, value)
     if attn_mask is None and query.dtype != torch.float32:
         flash = torch.ops.aten._scaled_dot_product_flash_attention
@@ -73,7 +74,8 @@ def _as_autocast(*given: Tensor) -> tuple[Tensor, ...]:
 def _added(mask: Tensor, query: Tensor, key: Tensor) -> Tensor:
     """Return a mask as the efficient kernel wants it: numbers to add, rows aligned, for every batch and head.
 
-    Source: pytorch @ v2.13, aten/src/ATen/native/transformers/attention.cpp, convert_boolean_attn_mask, preprocess_mask.
+    Source: pytorch @ v2.13, aten/src/ATen/native/transformers/attention.cpp, convert_boolean_attn_mask and
+    preprocess_mask.
     """
     if mask.dtype == torch.bool:
         zero, minus_infinity = (query.new_full((), number) for number in (0.0, float("-inf")))

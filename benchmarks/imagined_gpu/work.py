@@ -7,6 +7,7 @@ import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
@@ -82,62 +83,67 @@ def training(options: argparse.Namespace) -> Iterator[Callable[[int], Work]]:
     for source in options.source:
         bench = _Steps(argparse.Namespace(**vars(options) | {"source": [source]}), options.dtype)
         for frames, again, way in itertools.product(options.frames, options.checkpointing, options.attention):
-            setting = timed_steps.Setting(frames, 1, again == "on", source == "pixels")
-            yield lambda batch, bench=bench, setting=setting, way=way: _step(bench, replace(setting, batch=batch), way)  # type: ignore[misc]
-
-
-def _step(bench: _Steps, setting: timed_steps.Setting, way: str) -> Work:
-    step = bench.step(setting, way)
-    source, again = "pixels" if setting.encoder else "cache", "on" if setting.checkpointing else "off"
-    return Work(
-        f"{source}, {setting.frames} frames, batch {setting.batch}, checkpointing {again}, {way}",
-        {"source": source, "frames": setting.frames, "batch": setting.batch, "checkpointing": again, "attention": way},
-        setting.batch * bench.flops_per_clip(setting),
-        lambda _: step(),
-        bench.estimated_gb(setting),
-    )
+            yield partial(_step, bench, timed_steps.Setting(frames, 1, again == "on", source == "pixels"), way)
 
 
 def encoding(options: argparse.Namespace) -> Iterator[Work]:
     """Yield the encoder on so many frames at once."""
     bench = _Steps(argparse.Namespace(**vars(options) | {"source": ["pixels"], "layers": 1}), options.dtype)
-    for batch in options.batch:
-        config = bench.config(timed_steps.Setting(batch, 1, checkpointing=False, encoder=True))
-        config = config.model_copy(update={"model": config.model.model_copy(update={"encode_chunk": batch})})
-        estimate = estimate_memory(config, bench.sizes)
-        frames = torch.empty(1, batch, 3, options.image_size, options.image_size, device="cuda")
-
-        def encode(_: Count, frames: Tensor = frames) -> None:
-            with bench._accelerator(config).autocast():
-                bench.model.encode(frames, frames.shape[1])
-
-        gigabytes = (estimate.encoder_weights + estimate.encoding) / 1e9
-        yield Work(f"{batch} frames", {"batch": batch}, batch * frame_flops(bench.sizes), encode, gigabytes)
+    for frames in options.batch:
+        yield _encoding(bench, frames)
 
 
 def planning(options: argparse.Namespace) -> Iterator[Work]:
     """Yield a whole decision for each horizon and number of samples at once."""
     bench = _Decisions(options, options.dtype)
     for horizon, at_once in itertools.product(options.horizon, options.at_once):
-        few = min(options.samples, at_once)
+        yield _decision(bench, horizon, at_once)
 
-        def decide(
-            count: Count, samples: int = options.samples, iterations: int = min(_ITERATIONS, options.iterations),
-            horizon: int = horizon, at_once: int = at_once,
-        ) -> None:  # fmt: skip
-            bench.count = count
-            config = bench.config(horizon, at_once=at_once, samples=samples, iterations=iterations)
-            with torch.no_grad():
-                bench._decide(timed_decisions.Way.ours(at_once), config, bench.dtype)
 
-        def warm_up(count: Count, few: int = few, decide: Any = decide) -> None:
-            decide(count, samples=few, iterations=1)
+def _step(bench: _Steps, setting: timed_steps.Setting, way: str, batch: int) -> Work:
+    setting = replace(setting, batch=batch)
+    step = bench.step(setting, way)
+    source, again = "pixels" if setting.encoder else "cache", "on" if setting.checkpointing else "off"
+    return Work(
+        f"{source}, {setting.frames} frames, batch {batch}, checkpointing {again}, {way}",
+        {"source": source, "frames": setting.frames, "batch": batch, "checkpointing": again, "attention": way},
+        batch * bench.flops_per_clip(setting),
+        lambda _: step(),
+        bench.estimated_gb(setting),
+    )
 
-        yield Work(
-            f"horizon {horizon}, {options.samples} samples x {options.iterations}, {at_once} at once",
-            {"horizon": horizon, "samples": options.samples, "iterations": options.iterations, "at_once": at_once},
-            bench.flops(horizon), decide, warm_up=warm_up,
-        )  # fmt: skip
+
+def _encoding(bench: _Steps, frames: int) -> Work:
+    shortest = bench.options.rollout_steps + 1  # of a clip, which is what doctor knows of
+    config = bench.config(timed_steps.Setting(max(shortest, frames), 1, checkpointing=False, encoder=True))
+    config = config.model_copy(update={"model": config.model.model_copy(update={"encode_chunk": frames})})
+    estimate = estimate_memory(config, bench.sizes)
+    pixels = torch.empty(1, frames, 3, bench.sizes.image_size, bench.sizes.image_size, device="cuda")
+
+    def encode(_: Count) -> None:
+        with bench._accelerator(config).autocast():
+            bench.model.encode(pixels, frames)
+
+    estimated = (estimate.encoder_weights + estimate.encoding) / 1e9 if frames >= shortest else None
+    return Work(f"{frames} frames", {"batch": frames}, frames * frame_flops(bench.sizes), encode, estimated)
+
+
+def _decision(bench: _Decisions, horizon: int, at_once: int) -> Work:
+    samples, iterations = bench.options.samples, bench.options.iterations
+
+    def decide(count: Count, samples: int = samples, iterations: int = min(_ITERATIONS, iterations)) -> None:
+        bench.count = count
+        config = bench.config(horizon, at_once=at_once, samples=samples, iterations=iterations)
+        with torch.no_grad():
+            bench._decide(timed_decisions.Way.ours(at_once), config, bench.dtype)
+
+    return Work(
+        f"horizon {horizon}, {samples} samples x {iterations}, {at_once} at once",
+        {"horizon": horizon, "samples": samples, "iterations": iterations, "at_once": at_once},
+        bench.flops(horizon),
+        decide,
+        warm_up=lambda count: decide(count, min(samples, at_once), 1),
+    )
 
 
 def imagined_model(
