@@ -57,10 +57,10 @@ def facts() -> dict[str, Any]:
         left, right = (torch.empty(4096, 4096, dtype=torch.bfloat16, device="cuda") for _ in range(2))
         count.reset()
         left @ right
-        found["product"] = vars(count.total)
+        found["product"] = count.total._asdict()
         count.reset()
         left[:, :1].expand(4096, 4096) + right.t()
-        found["sum"] = vars(count.total)
+        found["sum"] = count.total._asdict()
         weights = torch.ones(8, device="cuda", requires_grad=True)
         hook = weights.square()
         hook.register_hook(lambda gradient: gradient * gradient.sum().item())

@@ -45,7 +45,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
                   "--top", "5", "--waits"],
         "encode": ["encode", "--quick"],
         "plan": ["plan", "--quick"],
-        "large": ["train", "--layers", "8", "--batch", "1", "--checkpointing", "off", "on"],
+        "large": ["train", "--layers", "10", "--batch", "1", "--checkpointing", "off", "on"],
     }  # fmt: skip
     given = [[*arguments, "--json", str(out / name)] for name, arguments in runs.items()]
     command = [sys.executable, str(ROOT / "tests" / "imagined_facts.py"), str(FOLDER), json.dumps(given)]

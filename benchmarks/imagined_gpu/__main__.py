@@ -141,7 +141,7 @@ def line(row: dict[str, Any]) -> str:
 def print_more(options: argparse.Namespace, count: Count) -> None:
     """Print where the host waits, and the dearest operations, if that is asked for."""
     if options.waits:
-        for place, times in count.waits.most_common():
+        for place, times in count.waits.items():
             print(f"  {times:6.0f} waits  {place}")
     dearest = sorted(count.costs.items(), key=lambda entry: -entry[1].seconds)[: options.top]
     for (name, place), cost in dearest:

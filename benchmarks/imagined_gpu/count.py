@@ -6,11 +6,13 @@ import linecache
 import re
 import sys
 import weakref
-from collections import Counter, defaultdict
-from dataclasses import dataclass, fields
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import reduce
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, NamedTuple
 
 import torch
 from stand_ins import share_seen
@@ -48,22 +50,20 @@ class Machine:
         return max(flops / (speed * 1e12), moved / (self.bandwidth * self.moved * 1e12), self.least_s)
 
 
-@dataclass
-class Cost:
+class Cost(NamedTuple):
     """What kernels need together."""
 
-    kernels: float = 0
+    kernels: float = 0.0
     seconds: float = 0.0
     bytes: float = 0.0
     flops: float = 0.0
 
-    def add(self, other: Cost, times: float = 1) -> None:
-        """Add what others need."""
-        for field in fields(self):
-            setattr(self, field.name, getattr(self, field.name) + times * getattr(other, field.name))
+    def plus(self, other: Cost, times: float = 1.0) -> Cost:
+        """Return what this needs, and another so many times."""
+        return Cost(*(own + times * more for own, more in zip(self, other, strict=True)))
 
 
-class Count(TorchDispatchMode):
+class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
     """Counts what is done on fake CUDA tensors while it is on; reads of numbers get 1.
 
     Args:
@@ -71,7 +71,7 @@ class Count(TorchDispatchMode):
     """
 
     def __init__(self, machine: Machine) -> None:
-        super().__init__()
+        super().__init__()  # type: ignore[no-untyped-call]  # torch
         self.machine = machine
         self.live = 0
         self.times = 1.0  # how often what comes now is counted
@@ -81,22 +81,23 @@ class Count(TorchDispatchMode):
     def reset(self) -> None:
         """Forget all but what is live."""
         self.peak = self.live
-        self.waits: Counter[str] = Counter()
+        self.waits: dict[str, float] = defaultdict(float)  # by place
         self.costs: dict[tuple[str, str], Cost] = defaultdict(Cost)  # by operation and place
-        self._read: tuple[int, float] | None = None
+        self._read: int | None = None  # the storage whose numbers were read last
 
     @property
     def total(self) -> Cost:
         """What all kernels need."""
-        total = Cost()
-        for cost in self.costs.values():
-            total.add(cost)
-        return total
+        return reduce(Cost.plus, self.costs.values(), Cost())
 
     def __torch_dispatch__(
         self, func: OpOverload, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         kwargs = kwargs or {}
+        if func is torch.ops.prim.device.default:  # is asked thousands of times
+            return args[0].fake_device
+        if func.is_view:
+            return func(*args, **kwargs)
         given = _tensors((args, kwargs))
         if torch.Tag.data_dependent_output in func.tags:
             return self._number(func, given, args, kwargs)
@@ -119,7 +120,8 @@ class Count(TorchDispatchMode):
         touched = [one for one in (*read, *written) if _device(one) == "cuda"]
         moved, flops = sum(map(_bytes, touched)), _flops(func, args, kwargs, out)
         seconds = self.machine.seconds(str(func), flops, moved, touched[0].dtype)
-        self.costs[str(func), place()].add(Cost(1, seconds, moved, flops), self.times)
+        key = str(func), place()
+        self.costs[key] = self.costs[key].plus(Cost(1.0, seconds, moved, flops), self.times)
         self._read = None
 
     def _number(self, func: OpOverload, given: list[Tensor], args: Any, kwargs: Any) -> Any:
@@ -152,14 +154,16 @@ def place(*, text: bool = False) -> str:
 
     In the backward pass it is the line of the operation whose gradient is computed, if autograd's anomaly mode is on.
     """
-    found, frame, backward = [], sys._getframe(1), ""
+    found, backward = [], ""
+    frame: FrameType | None = sys._getframe(1)
     while frame is not None:
         found.append((frame.f_code.co_filename, frame.f_lineno))
         frame = frame.f_back
     outside = [one for one in found if not one[0].startswith(_ELSEWHERE)]
     if not outside:
         backward, node = "backward of ", torch._C._current_autograd_node()
-        lines = "".join(node.metadata.get("traceback_", ())) if node is not None else ""
+        metadata: Any = {} if node is None else node.metadata
+        lines = "".join(metadata.get("traceback_", ()))
         found = [(file, int(line)) for file, line in reversed(_IN_TRACEBACK.findall(lines))]
         outside = [one for one in found if not one[0].startswith(_ELSEWHERE)]
     named = (one for one in outside if any(f"/{package}/" in one[0] for package in _OURS))
@@ -198,9 +202,7 @@ def _written(func: OpOverload, args: tuple[Any, ...], kwargs: dict[str, Any]) ->
     return _tensors([value for argument, value in pairs if argument.alias_info and argument.alias_info.is_write])
 
 
-def _copies_and_blocks(
-    func: OpOverload, args: tuple[Any, ...], kwargs: dict[str, Any], devices: set[str]
-) -> bool:
+def _copies_and_blocks(func: OpOverload, args: tuple[Any, ...], kwargs: dict[str, Any], devices: set[str]) -> bool:
     """Return whether an operation carries numbers between host and device, and the host waits until they are there."""
     if len(devices) < 2 or func._overloadpacket not in {_aten._to_copy, _aten.copy_}:
         return False

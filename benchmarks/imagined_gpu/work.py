@@ -74,7 +74,7 @@ class _Decisions(timed_decisions.Bench):
         def iterated(done: int, of: int) -> None:
             self.count.times = 1.0 if done == of else float(self.options.iterations - 1)
 
-        with _disable_current_modes():  # type: ignore[no-untyped-call]  # torch
+        with _disable_current_modes():
             return Planner(config, progress=iterated).plan(energies, torch.Generator().manual_seed(0))
 
 
@@ -154,7 +154,7 @@ def imagined_model(
     It is made without memory, and its weights are replaced then: `Module.to` cannot replace fake ones.
     """
     hashed = mock.patch("vjepa2_ac.model.world_model.fingerprint", return_value="imagined")
-    with _disable_current_modes(), hashed, torch.device("meta"):  # type: ignore[no-untyped-call]  # torch
+    with _disable_current_modes(), hashed, torch.device("meta"):
         model = WorldModel.empty(sizes)
         if adapter is not None:
             add_adapter(model, adapter, seed=0)
@@ -165,10 +165,8 @@ def imagined_model(
             if old is not None:
                 kind = torch.float32 if old.requires_grad else dtype
                 new = torch.empty(old.shape, dtype=kind, device="cuda")
-                module._parameters[name] = nn.Parameter(new, requires_grad=old.requires_grad)
-        for name, old in module._buffers.items():
-            if old is not None:
-                module._buffers[name] = torch.empty(old.shape, dtype=old.dtype, device="cuda")
+                module._parameters[name] = nn.Parameter(new, old.requires_grad)
+    assert not list(model.buffers())
     return model
 
 
