@@ -41,12 +41,11 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         pytest.skip("no C++ compiler")
     out = tmp_path_factory.mktemp("imagined")
     runs = {
-        "train": ["train", "--quick", "--source", "cache", "pixels", "--attention", "auto", "dense",
-                  "--top", "5", "--waits"],
+        "train": ["train", "--quick", "--source", "cache", "pixels", "--attention", "dense", "--top", "5", "--waits"],
         "encode": ["encode", "--quick"],
         "plan": ["plan", "--quick"],
-        "large": ["train", "--layers", "10", "--batch", "1", "--checkpointing", "off", "on"],
-    }  # fmt: skip
+        "wide": ["train", "--layers", "6", "--frames", "8", "--batch", "1", "--checkpointing", "off", "on"],
+    }
     given = [[*arguments, "--json", str(out / name)] for name, arguments in runs.items()]
     command = [sys.executable, str(ROOT / "tests" / "imagined_facts.py"), str(FOLDER), json.dumps(given)]
     done = subprocess.run(
@@ -100,9 +99,7 @@ def test_the_backward_pass_knows_the_lines_it_belongs_to(told: dict[str, Any]) -
 
 def test_a_training_step_waits_for_the_device_where_it_has_to(told: dict[str, Any]) -> None:
     rows = told["rows"]["train"]
-    assert [(row["source"], row["attention"]) for row in rows] == [
-        (source, way) for source in ("cache", "pixels") for way in ("auto", "dense")
-    ]
+    assert [row["source"] for row in rows] == ["cache", "pixels"]
     for row in rows:
         expected = STEP if row["source"] == "cache" else PIXELS + STEP
         assert sorted(row["waits"].values()) == [1] * len(expected), row["waits"]
@@ -118,17 +115,16 @@ def test_a_decision_waits_twice_an_iteration_and_encoding_never(told: dict[str, 
     assert [row["waits"] for row in told["rows"]["encode"]] == [{}]
 
 
-def test_doctor_says_what_the_step_takes_at_real_widths(told: dict[str, Any]) -> None:
-    for row in told["rows"]["large"]:
+def test_doctor_says_what_a_step_takes_at_real_widths(told: dict[str, Any]) -> None:
+    for row in told["rows"]["wide"]:
         assert row["doctor_gb"] == pytest.approx(row["peak_gb"], rel=0.15), row["work"]
 
 
-def test_the_model_flops_are_those_of_the_operations(told: dict[str, Any]) -> None:
-    off, on = told["rows"]["large"]
-    ceiling = 790.0
-    model = off["floor_ms"] * ceiling / 1e3
-    assert model < off["tflop"] < 1.1 * model  # flash's backward pass computes scores again
-    assert on["tflop"] > 1.2 * off["tflop"]  # checkpointing computes blocks again
+def test_operations_are_the_model_flops_and_what_is_computed_again(told: dict[str, Any]) -> None:
+    kept, again = told["rows"]["wide"]
+    model = 0.79 * kept["floor_ms"]
+    assert 1 < kept["tflop"] / model < 1.1  # flash's backward pass computes scores again
+    assert 0.4 < (again["tflop"] - kept["tflop"]) / model < 0.5  # forward: nearly half, for most weights are frozen
 
 
 def test_the_largest_batch_is_found_in_few_steps(told: dict[str, Any]) -> None:
