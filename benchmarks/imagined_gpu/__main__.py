@@ -5,17 +5,19 @@
     python benchmarks/imagined_gpu encode --batch 8 16 --top 10
     python benchmarks/imagined_gpu plan --horizon 1 2 --at-once 32 64 --samples 800 --iterations 10
 
-Needs a C++ compiler and a PyTorch without CUDA; no GPU. Tensors are fake: they have a shape, a type and a device, but
-no numbers, so what is done never depends on them. The code is ours as it is, on ViT-g with 24 layers unless said
-otherwise; a second step is counted, after one that makes tables and the optimizer's moments.
+Needs a C++ compiler and a PyTorch without CUDA; no GPU. A row takes 10 to 30 seconds. Tensors are fake: they have a
+shape, a type and a device, but no numbers, so what is done never depends on them. The code is ours as it is, on ViT-g
+with 24 layers unless said otherwise; a second step is counted, after one that makes tables and the optimizer's moments.
 
 Exact: what operations PyTorch is asked for, with what shapes and types; FLOPs of products of matrices; how many bytes
-of tensors live at once, each rounded to 512 (`peak GB`, of 10^9); how often the host waits for the device: it reads a
-number of a tensor (`waits`; all numbers of one at once count once), or copies and blocks.
+of tensors live at once, each rounded to 512 (`peak GB`, of 10^9); how often the host waits for the device (`waits`): it
+reads a number of a tensor, all numbers of one at once counting once, or copies without non_blocking. What is told not
+to block is believed, as if all memory of the host were pinned. Latents of a cache are there already, as in train_step.
 
 Not seen, so the peak of a GPU is higher: what a kernel allocates within itself (cuBLAS's workspace, sums in float32 of
 flash attention's backward pass), the CUDA context, holes between blocks. `doctor` is what `vjepa2-ac doctor` says less
 its allowance for just this, and `off by` is how much more that is than the peak (encode: its parts for the encoder).
+An operation whose shape depends on numbers (a mask as an index, nonzero) cannot be imagined, and is an error.
 
 A model, so the time is a prediction: every operation is one kernel, none overlaps with another, none waits for the
 host, and it takes the longest of FLOPs / (ceiling x share), bytes / (bandwidth x 0.9), and 2 us. The share is 0.85 for
