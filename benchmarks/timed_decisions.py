@@ -119,9 +119,7 @@ class Bench:
             encoder=EncoderSizes(width=options.latent_dim, heads=options.latent_dim // 64, depth=1),  # never used
             predictor=PredictorSizes(width=options.width, heads=options.width // 64, depth=options.layers),
         )
-        # Values that either type can hold, so that both have the same; float32 until they have been compared.
-        self.model = WorldModel.random(self.sizes, seed=0, dtype=self.dtype).float().eval()
-        self.model.predictor.to(self.device)
+        self.model = self._model().eval()
         drawn = torch.randn(1, self.model.num_tokens, self.model.latent_dim, generator=torch.Generator().manual_seed(1))
         self._scene = Scene(layer_norm(drawn, drawn.shape[-1:]), torch.tensor([POSE]), torch.zeros(0, 7))
         self._goals = self._reachable()
@@ -204,7 +202,16 @@ class Bench:
             return self.official.decide(self._scene, goal, config, dtype, seed=0)
         build = PlainCost if way.name == PLAIN else WorldModelCost
         cost: Cost = build(self._ready(way, config, dtype), self._scene, goal, config.energy)
+        return self._plan(config, cost)
+
+    def _plan(self, config: PlanningConfig, cost: Cost) -> Plan:
         return Planner(config).plan(cost, torch.Generator().manual_seed(0))
+
+    def _model(self) -> WorldModel:
+        # Values that either type can hold, so that both have the same; float32 until they have been compared.
+        model = WorldModel.random(self.sizes, seed=0, dtype=self.dtype).float()
+        model.predictor.to(self.device)
+        return model
 
     def _ready(self, way: Way, config: PlanningConfig, dtype: torch.dtype) -> WorldModel:
         """Return the model as a way plans with it; what is quantized is made once."""

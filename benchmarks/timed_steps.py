@@ -11,6 +11,7 @@ from typing import Any
 from unittest import mock
 
 import torch
+from accelerate import Accelerator
 from official import PREDICTOR, Official, difference
 from torch.nn.functional import layer_norm
 
@@ -84,11 +85,8 @@ class Bench:
             ),
             predictor=PredictorSizes(width=options.width, heads=options.width // 64, depth=options.layers),
         )
-        # Values that either type can hold, so that both have the same; float32 until they have been compared.
-        self.model = WorldModel.random(self.sizes, seed=0, dtype=self.dtype).float()
-        self._weights = to_official(self.model) if has_checkout(options) else None
-        add_adapter(self.model, AdapterConfig(), seed=0)
-        self.model.to(self.device).train()
+        self._weights: dict[str, Any] | None = None  # where the official code is to get them
+        self.model = self._model().train()
 
     @cached_property
     def official(self) -> Official:
@@ -176,6 +174,16 @@ class Bench:
         for module in modules:
             module.zero_grad(set_to_none=True)
 
+    def _model(self) -> WorldModel:
+        # Values that either type can hold, so that both have the same; float32 until they have been compared.
+        model = WorldModel.random(self.sizes, seed=0, dtype=self.dtype).float()
+        self._weights = to_official(model) if has_checkout(self.options) else None
+        add_adapter(model, AdapterConfig(), seed=0)
+        return model.to(self.device)
+
+    def _accelerator(self, config: Config) -> Accelerator:
+        return make_accelerator(config)
+
     def _official(self, *, whole: bool = False) -> Official:
         config = self.config(Setting(max(self.options.frames), 1, checkpointing=False))
         return Official(
@@ -188,7 +196,7 @@ class Bench:
         config = self.config(setting)
         return Run(
             config=config,
-            accelerator=make_accelerator(config),
+            accelerator=self._accelerator(config),
             world_model=self.model,
             objective=Objective(self.model, config.training),
             optimizer=make_optimizer(self.model, config.training),
