@@ -116,7 +116,9 @@ class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
     def _launch(self, func: OpOverload, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> None:
         if func._overloadpacket in _MAKE_NOTHING:
             return
-        read, written = _tensors((args, kwargs)), _tensors(out) or _written(func, args, kwargs)
+        outputs = {argument.name for argument in func._schema.arguments if argument.is_out}  # are not read
+        read = _tensors((args, [value for name, value in kwargs.items() if name not in outputs]))
+        written = _tensors(out) or _written(func, args, kwargs)
         touched = [one for one in (*read, *written) if _device(one) == "cuda"]
         moved, flops = sum(map(_bytes, touched)), _flops(func, args, kwargs, out)
         seconds = self.machine.seconds(str(func), flops, moved, touched[0].dtype)

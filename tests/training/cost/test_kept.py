@@ -183,7 +183,7 @@ def test_all_parts_together_are_what_autograd_keeps_of_the_losses(name: str) -> 
 def test_what_checkpointing_leaves_is_what_autograd_keeps(name: str) -> None:
     config, sizes = case(name, training__gradient_checkpointing=True)
     kept = Kept(config, sizes, "cpu")
-    assert_same(kept.with_checkpointing() - kept.recomputed(), measured_whole(config, sizes))
+    assert_same(kept.after_forward(), measured_whole(config, sizes))
 
 
 @pytest.mark.parametrize("name", DOMINANT)

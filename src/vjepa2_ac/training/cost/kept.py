@@ -31,18 +31,16 @@ class Kept:
         return self.teacher_forcing() + self.rollout() + self.losses() + self.cast_cache()
 
     def with_checkpointing(self) -> int:
-        """Return what is kept when blocks keep only what they are given, plus one block as it is computed again.
+        """Return the most that is kept at once when blocks keep only what they are given, and are computed again.
 
-        The casts that autocast holds on to (`cast_cache`) come on top: autograd does not keep them.
+        Heads and losses are through when the first block is. The casts that autocast holds on to (`cast_cache`) come on
+        top: autograd does not keep them.
         """
-        passes = len(self._past_of_passes)
-        given = self._tokens(self._steps) if self._heads_are_trained or self._block_is_trained else 0
-        given += passes * self._tokens(1) * 3  # and keys and values that the rollout reuses
-        inputs = self.sizes.predictor.depth * given * self._setting.width * self._setting.number
-        heads = self._head(self._steps, fed_back=False) + passes * self._head(1, fed_back=True)
-        casts = adapter_casts(self._setting, "predictor_proj")
-        casts += adapter_casts(self._setting, "predictor_embed") if passes else 0
-        return inputs + heads + self.losses() + casts + self.recomputed()
+        return self._inputs() + max(self._ends(), self.recomputed())
+
+    def after_forward(self) -> int:
+        """Return what is kept, with checkpointing, when the losses are computed."""
+        return self._inputs() + self._ends()
 
     def teacher_forcing(self) -> int:
         """Return the bytes of the pass over all true frames but the last."""
@@ -68,6 +66,20 @@ class Kept:
         Autocast remembers casts of what is trained only; a frozen weight of another type is cast by each pass.
         """
         return sum(adapter_casts(self._setting, name) for name in self._setting.layers)
+
+    def _inputs(self) -> int:
+        """Return the bytes of what blocks are given."""
+        given = self._tokens(self._steps) if self._heads_are_trained or self._block_is_trained else 0
+        given += len(self._past_of_passes) * self._tokens(1) * 3  # and keys and values that the rollout reuses
+        return self.sizes.predictor.depth * given * self._setting.width * self._setting.number
+
+    def _ends(self) -> int:
+        """Return the bytes of what comes before and after the blocks of all passes, losses included."""
+        passes = len(self._past_of_passes)
+        heads = self._head(self._steps, fed_back=False) + passes * self._head(1, fed_back=True)
+        casts = adapter_casts(self._setting, "predictor_proj")
+        casts += adapter_casts(self._setting, "predictor_embed") if passes else 0
+        return heads + self.losses() + casts
 
     def _pass(self, steps: int, past: int = 0, *, fed_back: bool) -> int:
         reached, kept = fed_back or self._heads_are_trained, 0
