@@ -91,9 +91,7 @@ def test_a_kernel_takes_what_it_computes_or_what_it_moves(told: dict[str, Any]) 
 def test_the_backward_pass_knows_the_lines_it_belongs_to(told: dict[str, Any]) -> None:
     places = told["facts"]["places in the backward pass"]
     assert any(re.fullmatch(r"backward of imagined_facts\.py:\d+", place) for place in places)
-    assert re.search(
-        r"^ .* kernels .* TFLOP +aten\.\S+  backward of vjepa2_ac/\S+:\d+$", told["printed"], re.MULTILINE
-    )
+    assert re.search(r"^ .* kernels .* TFLOP +aten\.\S+  backward of vjepa2_ac/\S+:\d+$", told["printed"], re.MULTILINE)
 
 
 def test_a_training_step_waits_for_the_device_where_it_has_to(told: dict[str, Any]) -> None:
