@@ -14,6 +14,10 @@ import torch
 
 from paths import ROOT
 
+pytestmark = pytest.mark.skipif(
+    torch.version.cuda is not None, reason="a PyTorch with CUDA, beside which none is imagined"
+)
+
 FOLDER = ROOT / "benchmarks" / "imagined_gpu"
 MEBIBYTE = 2**20
 STEP = [  # the lines where a training step waits for its losses, and for the norm of its gradients
@@ -36,8 +40,6 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """All that is asked below, from one process: PyTorch must not have been used before it sees the GPU."""
     if not has_compiler():
         pytest.skip("no C++ compiler")
-    if torch.version.cuda:
-        pytest.skip("a PyTorch with CUDA needs no imagined one")
     out = tmp_path_factory.mktemp("imagined")
     runs = {
         "train": ["train", "--quick", "--source", "cache", "pixels", "--attention", "dense", "--top", "5", "--waits"],
@@ -138,3 +140,10 @@ def test_what_is_missing_is_told_in_one_line(environment: dict[str, str], said: 
     assert done.returncode == 1
     assert said in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_an_official_step_needs_a_checkout(tmp_path: Path) -> None:
+    command = [sys.executable, str(FOLDER), "train", "--quick", "--official", str(tmp_path)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert f"{tmp_path} is no checkout of facebookresearch/vjepa2" in done.stderr

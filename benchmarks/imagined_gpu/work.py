@@ -16,6 +16,7 @@ import timed_decisions
 import timed_steps
 import torch
 from count import Count
+from official import Official
 from stand_ins import FAKE
 from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
@@ -29,6 +30,7 @@ from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.training.cost.flops import frame_flops
 from vjepa2_ac.training.cost.memory import ALLOWANCE, estimate_memory
 
+OFFICIALS = (timed_steps.OFFICIAL_FULL, timed_steps.OFFICIAL)
 _ITERATIONS = 2  # of a decision that are computed: all after the first are alike
 Doing = Callable[[Count], object]
 
@@ -45,7 +47,21 @@ class Work:
     warm_up: Doing | None = None  # None: the same
 
 
+class _ImaginedOfficial(Official):
+    """The official step; no scaler of gradients, which would see no numbers."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        self._scaler = torch.amp.GradScaler("cuda", enabled=False)
+
+    def _placed(self, module: nn.Module) -> nn.Module:
+        with FAKE:
+            return imagined(module, torch.float32)
+
+
 class _Steps(timed_steps.Bench):
+    _kind_of_official = _ImaginedOfficial
+
     def _model(self) -> WorldModel:
         pixels = "pixels" in self.options.source
         return imagined_model(self.sizes, self.dtype, AdapterConfig(), encoder=pixels)
@@ -55,6 +71,10 @@ class _Steps(timed_steps.Bench):
             device=self.device, process_index=0, num_processes=1,
             autocast=lambda: torch.autocast("cuda", self.dtype, enabled=self.dtype != torch.float32),
         )  # fmt: skip
+
+    def _official(self, *, whole: bool = False) -> Official:
+        with _disable_current_modes():
+            return super()._official(whole=whole)
 
 
 class _Decisions(timed_decisions.Bench):
@@ -82,7 +102,8 @@ def training(options: argparse.Namespace) -> Iterator[Callable[[int], Work]]:
     """Yield for each setting what makes a training step of a batch."""
     for source in options.source:
         bench = _Steps(argparse.Namespace(**vars(options) | {"source": [source]}), options.dtype)
-        for frames, again, way in itertools.product(options.frames, options.checkpointing, options.attention):
+        ways = [*options.attention, *(OFFICIALS if timed_steps.has_checkout(options) else ())]
+        for frames, again, way in itertools.product(options.frames, options.checkpointing, ways):
             yield partial(_step, bench, timed_steps.Setting(frames, 1, again == "on", source == "pixels"), way)
 
 
@@ -107,9 +128,9 @@ def _step(bench: _Steps, setting: timed_steps.Setting, way: str, batch: int) -> 
     return Work(
         f"{source}, {setting.frames} frames, batch {batch}, checkpointing {again}, {way}",
         {"source": source, "frames": setting.frames, "batch": batch, "checkpointing": again, "attention": way},
-        batch * bench.flops_per_clip(setting),
+        batch * bench.flops_per_clip(setting, way),
         lambda _: step(),
-        bench.estimated_gb(setting),
+        None if way in OFFICIALS else bench.estimated_gb(setting),
     )
 
 
@@ -160,14 +181,22 @@ def imagined_model(
             add_adapter(model, adapter, seed=0)
         if not encoder:
             model.set_encoder_aside()
-    for module in model.modules():
-        for name, old in module._parameters.items():
-            if old is not None:
-                kind = torch.float32 if old.requires_grad else dtype
-                new = torch.empty(old.shape, dtype=kind, device="cuda")
-                module._parameters[name] = nn.Parameter(new, old.requires_grad)
+    imagined(model, dtype)
     assert not list(model.buffers())
     return model
+
+
+def imagined(module: nn.Module, frozen: torch.dtype) -> nn.Module:
+    """Replace the weights of a module by ones on the imagined GPU; other tensors that it holds stay on the host."""
+    for part in module.modules():
+        for name, old in part._parameters.items():
+            if old is not None:
+                new = torch.empty(old.shape, dtype=torch.float32 if old.requires_grad else frozen, device="cuda")
+                part._parameters[name] = nn.Parameter(new, old.requires_grad)
+        for name, value in vars(part).items():
+            if isinstance(value, Tensor):
+                setattr(part, name, torch.empty(value.shape, dtype=value.dtype))
+    return module
 
 
 def largest_batch(peak_gb: Callable[[int], float], cap_gb: float) -> int:
