@@ -22,7 +22,7 @@ RANK = {
 }  # fmt: skip
 
 HOMES = {
-    "peft": {"model/lora.py"},
+    "peft": {"model/lora.py", "model/lora_linear.py"},
     "transformers": {"model/encoder.py", "model/predictor.py"},
     "accelerate": {"training/"},
     "google": {"data/sources/rlds/tfrecord.py"},
