@@ -1,6 +1,7 @@
 """What is trained? A LoRA adapter on the predictor, or all of the predictor: add, save, load.
 
-PEFT's home, beside the layer in `model.lora_linear`. How the base comes back, and how an adapter becomes part of it: `model.adapter_end`.
+PEFT's home, beside the layer in `model.lora_linear`. How the base comes back, and how an adapter becomes part of it:
+`model.adapter_end`.
 """
 
 from __future__ import annotations
