@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from paths import GOLDEN
+from vjepa2_ac.data import transforms
 from vjepa2_ac.data.transforms import CropBox, crop_box, pixels_to_input, view
 
 FLOAT16_ROUNDING = 2.0**-10  # half a step between 2 and 4
@@ -89,3 +90,10 @@ def test_shrinking_samples_pixels_and_does_not_average_them() -> None:
 def test_a_picture_of_the_mean_colour_becomes_zero() -> None:
     frames = torch.tensor([124, 116, 104], dtype=torch.uint8).expand(1, 1, 8, 8, 3)
     assert pixels_to_input(frames, 8).abs().max() < 0.02
+
+
+def test_what_inference_has_kept_can_be_trained_with() -> None:
+    transforms._mean_and_std.cache_clear()
+    with torch.inference_mode():
+        pixels_to_input(torch.zeros(1, 1, 8, 8, 3, dtype=torch.uint8), 8)
+    assert not any(kept.is_inference() for kept in transforms._mean_and_std(torch.device("cpu")))

@@ -112,3 +112,12 @@ def test_queries_without_a_key_of_their_own_are_refused() -> None:
     query, key = torch.zeros(1, 1, 10, 16), torch.zeros(1, 1, 5, 16)
     with pytest.raises(ValueError, match="10 queries would look at 5 keys"):
         block_causal_attention(query, key, key, PER_STEP)
+
+
+def test_adding_up_gradients_changes_none_that_came_in() -> None:
+    gradients = [torch.randn(1, 1, end, 2, generator=torch.Generator().manual_seed(end)) for end in (2, 4)]
+    before = [gradient.clone() for gradient in gradients]
+    total, _ = attention._Beginnings.backward(None, *gradients)
+    assert all(map(torch.equal, gradients, before))
+    assert torch.equal(total[:, :, :2], before[1][:, :, :2] + before[0])
+    assert torch.equal(total[:, :, 2:], before[1][:, :, 2:])

@@ -67,3 +67,16 @@ def test_bfloat16_weights_give_almost_the_same_latents(fresh: Callable[..., Worl
     latents = fresh(dtype=torch.bfloat16).encode(inputs.frames)
     assert latents.dtype == torch.float32
     assert (latents - fresh().encode(inputs.frames)).abs().mean() < 0.01
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
+def test_features_are_float32_and_layers_of_autocasts_own_type_do_without_it(
+    fresh: Callable[..., WorldModel], inputs, dtype: torch.dtype
+) -> None:
+    network, autocast = fresh(dtype=dtype).present_encoder, []
+    network.vit.layer[0].register_forward_hook(lambda *_: autocast.append(torch.is_autocast_enabled("cpu")))
+    with torch.autocast("cpu", torch.bfloat16):
+        features = network(inputs.frames.flatten(0, 1))
+    assert autocast == [dtype != torch.bfloat16]
+    assert features.dtype == torch.float32
+    assert not torch.equal(features, features.bfloat16())

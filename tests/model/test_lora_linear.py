@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from peft import LoraConfig
+from peft import LoraConfig, get_peft_model
 from peft.tuners.lora import Linear
 from torch import Tensor, nn
 
@@ -14,16 +14,16 @@ from vjepa2_ac.model.lora_linear import LoraLinear, _LowRankLinear
 PLAIN = {"r": 3, "lora_alpha": 5, "use_rslora": True}
 
 
-def layer(kind: type[Linear] = LoraLinear, dtype: torch.dtype = torch.float32, **changes: Any) -> Linear:
+def layer(kind: type[Linear] = LoraLinear, dtype: torch.dtype = torch.float32, **changes: Any) -> Any:
     """Return a layer of 12 inputs and 8 outputs with an adapter that does something."""
     generator = torch.Generator().manual_seed(0)
-    base = nn.Linear(12, 8)
-    config = LoraConfig(**PLAIN | changes)
-    made = kind(base, "default", r=config.r, lora_alpha=config.lora_alpha, config=config)
+    config = LoraConfig(target_modules=["0"], **PLAIN | changes)
+    config._register_custom_module({nn.Linear: kind})
+    made = get_peft_model(nn.Sequential(nn.Linear(12, 8)), config).get_base_model()[0]
     for value in made.parameters():
         value.data = torch.randn(value.shape, generator=generator) / 3
-    base.to(dtype).requires_grad_(False)
-    return made.train()  # type: ignore[no-any-return]  # PEFT has no types
+    made.base_layer.to(dtype).requires_grad_(False)
+    return made.train()
 
 
 def tokens(dtype: torch.dtype = torch.float32) -> Tensor:
@@ -90,19 +90,28 @@ def test_without_training_nothing_is_masked() -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"use_dora": True}, {"disabled": True}, {"merged": True}, {"dtype": torch.bfloat16}],
-    ids=["dora", "switched off", "merged", "types that differ"],
+    [
+        {"use_dora": True},
+        {"lora_bias": True},
+        {"disabled": True},
+        {"merged": True},
+        {"thawed": True},
+        {"flat": True},
+        {"dtype": torch.bfloat16},
+    ],
+    ids=["dora", "bias", "switched off", "merged", "the layer is trained", "one token", "types that differ"],
 )
 def test_what_is_not_plain_is_left_to_peft(by_peft: list[str], changes: dict[str, Any]) -> None:
     dtype = changes.get("dtype", torch.float32)
     outputs = []
     for kind in (LoraLinear, Linear):
-        made = layer(kind, dtype, **{"use_dora": True} if "use_dora" in changes else {})
+        made = layer(kind, dtype, **{name: True for name in ("use_dora", "lora_bias") if name in changes})
+        made.base_layer.requires_grad_("thawed" in changes)
         if "disabled" in changes:
             made.enable_adapters(enabled=False)
         if "merged" in changes:
             made.merge()
-        outputs.append(made(tokens(dtype)))
+        outputs.append(made(tokens(dtype)[0, 0] if "flat" in changes else tokens(dtype)))
     assert torch.equal(*outputs)
     assert by_peft == ["LoraLinear", "Linear"]
 
@@ -115,3 +124,17 @@ def test_gradients_are_those_of_differences(masked: bool, reached: bool) -> None
     weight, bias = draw(4, 6).detach(), draw(4).detach()
     inputs = (draw(2, 3, 6).requires_grad_(reached), draw(2, 3, 6) if masked else None, weight, bias, draw(2, 6))
     assert torch.autograd.gradcheck(_LowRankLinear.apply, (*inputs, draw(4, 2), 0.7))
+
+
+def test_a_frozen_adapter_keeps_nothing_of_its_input() -> None:
+    kept: list[Tensor] = []
+    made, given = layer(), tokens().requires_grad_()
+    for matrices in (made.lora_A, made.lora_B):
+        matrices.requires_grad_(False)
+    with torch.autograd.graph.saved_tensors_hooks(lambda saved: kept.append(saved) or saved, lambda saved: saved):
+        output = made(given)
+    assert {tuple(value.shape) for value in kept} == {(8, 12), (3, 12), (8, 3)}  # weights alone
+    output.sum().backward()
+    expected, other = tokens().requires_grad_(), layer(Linear)
+    other(expected).sum().backward()
+    torch.testing.assert_close(given.grad, expected.grad, rtol=1e-5, atol=1e-6)

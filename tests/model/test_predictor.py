@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.model.layers import normalised
 from vjepa2_ac.model.predictor import ActionConditionedPredictor, PredictorConfig
 from vjepa2_ac.model.world_model import WorldModel
 
@@ -95,3 +96,18 @@ def test_transformers_loads_the_predictor_by_itself(model: WorldModel, tmp_path:
     alone = ActionConditionedPredictor.from_pretrained(tmp_path / "model" / "predictor")
     expected = model.predictor(inputs.latents, inputs.actions, inputs.states)
     assert torch.equal(alone(inputs.latents, inputs.actions, inputs.states), expected)
+
+
+HALF = torch.bfloat16
+
+
+@pytest.mark.parametrize(("weights", "given"), [(HALF, HALF), (torch.float32, HALF), (torch.float32, torch.float32)])
+def test_a_norm_is_left_to_autocast_only_where_types_differ(weights: torch.dtype, given: torch.dtype) -> None:
+    norm, tokens, autocast = torch.nn.LayerNorm(6, dtype=weights), torch.randn(2, 6).to(given), []
+    norm.register_forward_hook(lambda *_: autocast.append(torch.is_autocast_enabled("cpu")))
+    with torch.autocast("cpu", HALF):
+        assert normalised(norm, tokens).dtype == HALF
+    assert autocast == [weights != HALF]
+    if weights == given:
+        assert normalised(norm, tokens).dtype == given
+        assert not autocast[1]

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
+from torch.nn.functional import layer_norm
 from transformers import VJEPA2Config
 from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
@@ -29,6 +30,7 @@ class Encoder(nn.Module):
         self.image_size = sizes.image_size
         self.vit = VJEPA2Encoder(_config(sizes))
         _share_exact_tables(self.vit, TokenLayout(1, sizes.image_size // sizes.patch_size))
+        self.vit.layernorm = _PreciseNorm(sizes.encoder.width, eps=NORM_EPSILON)
         self.requires_grad_(False)
         self.eval()
 
@@ -36,7 +38,7 @@ class Encoder(nn.Module):
     def forward(
         self, frames: Float[Tensor, "frames 3 height width"], chunk: int = 16
     ) -> Float[Tensor, "frames tokens dim"]:
-        """Return the features of normalised frames, not yet layer-normalised, in the type the network computes in.
+        """Return the features of normalised frames, not yet layer-normalised without affine, in float32.
 
         Args:
             frames: Frames normalised as in training.
@@ -86,6 +88,13 @@ class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformer
         """Return queries or keys [batch heads sequence head_dim] turned by their position."""
         tables = rotary_tables(self.layout, qk.shape[-1], qk.device)
         return rotate(qk.transpose(1, 2), tables).transpose(1, 2)
+
+
+class _PreciseNorm(nn.LayerNorm):
+    """The last norm, in float32: its result is normalised once more, and rounding it before would be for nothing."""
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        return layer_norm(tokens.float(), self.normalized_shape, self.weight.float(), self.bias.float(), self.eps)
 
 
 def _share_exact_tables(vit: Any, layout: TokenLayout) -> None:

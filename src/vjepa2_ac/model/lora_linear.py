@@ -17,8 +17,9 @@ class LoraLinear(Linear):  # type: ignore[misc]  # PEFT has no types
 
     PEFT casts tokens to the adapter's float32 and autocast casts them back; dropout, scaling and adding are passes of
     their own, and so are their gradients. Here nothing is cast but the two small matrices, and the matrix products
-    scale and add. In float32 the same to rounding; in bfloat16 it rounds less often. Whatever is not plain LoRA
-    (DoRA, an adapter that is switched off or merged, types that nothing brings together) is left to PEFT.
+    scale and add. In float32 the same to rounding; in bfloat16 it rounds less often. Whatever is not plain LoRA on a
+    frozen layer (DoRA, an adapter that is switched off or merged, types that nothing brings together) is left to PEFT.
+    Hooks on the layer and the matrices inside are not called, and there are no second derivatives.
     """
 
     def forward(self, tokens: Float[Tensor, "*batch inputs"], *args: Any, **kwargs: Any) -> Tensor:
@@ -38,8 +39,11 @@ class LoraLinear(Linear):  # type: ignore[misc]  # PEFT has no types
     def _dtype_of_plain_lora(self, tokens: Tensor) -> torch.dtype | None:
         """Return the type to compute in; None where PEFT shall compute."""
         adapters, layer = self.active_adapters, self.base_layer
-        plain = len(adapters) == 1 and adapters[0] in self.lora_A and not self.lora_variant
-        if self.disable_adapters or self.merged or not plain or type(layer).forward is not nn.Linear.forward:
+        if self.disable_adapters or self.merged or len(adapters) != 1 or adapters[0] not in self.lora_A:
+            return None
+        if self.lora_variant or self.lora_bias.get(adapters[0]) or type(layer).forward is not nn.Linear.forward:
+            return None
+        if tokens.dim() < 2 or any(own.requires_grad for own in layer.parameters()):
             return None
         if torch.is_autocast_enabled(tokens.device.type):
             return torch.get_autocast_dtype(tokens.device.type)
@@ -50,7 +54,8 @@ class LoraLinear(Linear):  # type: ignore[misc]  # PEFT has no types
 class _LowRankLinear(torch.autograd.Function):
     """`tokens @ weight.T + bias + scale * masked @ first.T @ second.T`, the weight frozen; all of one type.
 
-    What is kept for the gradient is the adapter's input (masked, else the tokens) and what is between its matrices.
+    What is kept for the gradient is the adapter's input (masked, else the tokens) and what is between its matrices;
+    of a frozen adapter neither.
     """
 
     @staticmethod
@@ -68,7 +73,9 @@ class _LowRankLinear(torch.autograd.Function):
         inner = linear(read, first)
         result = linear(tokens, weight, bias)
         _add_product(result.flatten(0, -2), inner, second.T, scale)
-        ctx.save_for_backward(read, inner, weight if ctx.needs_input_grad[0] else None, first, second)
+        needed = (ctx.needs_input_grad[4], ctx.needs_input_grad[5], ctx.needs_input_grad[0])
+        kept = (value if is_needed else None for value, is_needed in zip((read, inner, weight), needed, strict=True))
+        ctx.save_for_backward(*kept, first, second)
         ctx.scale, ctx.is_masked = scale, masked is not None
         return result
 
@@ -85,7 +92,8 @@ class _LowRankLinear(torch.autograd.Function):
             of_tokens = of_tokens.view(shape)
         if ctx.needs_input_grad[1]:
             of_masked = (to_inner * ctx.scale @ first).view(shape)
-        of_first, of_second = to_inner.T @ read * ctx.scale, rows.T @ inner * ctx.scale
+        of_first = None if read is None else to_inner.T @ read * ctx.scale
+        of_second = None if inner is None else rows.T @ inner * ctx.scale
         return of_tokens, of_masked, None, None, of_first, of_second, None
 
 

@@ -217,3 +217,30 @@ def test_nothing_is_kept_for_a_rollout_that_does_not_count() -> None:
     assert one.rollout() == 0
     assert one.losses() < three.losses()
     assert one.with_checkpointing() < three.with_checkpointing()
+
+
+def test_with_checkpointing_the_larger_of_both_moments_counts() -> None:
+    config, sizes = case("predictions and losses", training__gradient_checkpointing=True)
+    ends = Kept(config, sizes, "cpu")
+    assert ends.with_checkpointing() == ends.after_forward()  # losses outweigh a block
+    config, sizes = case("GELU", training__gradient_checkpointing=True)
+    block = Kept(config, sizes, "cpu")
+    assert block.with_checkpointing() == block._inputs() + block.recomputed() > block.after_forward()
+
+
+@pytest.mark.parametrize(
+    ("adapter", "changes", "copies"),
+    [
+        (LORA, {}, False),
+        (LORA, FLOAT32_BASE, True),
+        ({"kind": "none"}, {}, True),
+        (LORA, FP32, False),
+        ({"kind": "none"}, FP32, False),
+    ],
+)
+def test_norms_have_a_copy_where_autocast_makes_one(
+    adapter: dict[str, Any], changes: dict[str, Any], copies: bool
+) -> None:
+    config = run_config(adapter, **changes)
+    assert Setting(config, model_sizes(), "cuda").copies_for_norms == copies
+    assert not Setting(config, model_sizes(), "cpu").copies_for_norms

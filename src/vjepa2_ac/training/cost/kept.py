@@ -33,8 +33,9 @@ class Kept:
     def with_checkpointing(self) -> int:
         """Return the most that is kept at once when blocks keep only what they are given, and are computed again.
 
-        Heads and losses are through when the first block is. The casts that autocast holds on to (`cast_cache`) come on
-        top: autograd does not keep them.
+        When the longest pass computes its blocks again, its losses and what came after its blocks are gone; inputs of
+        trained heads that are still there then are small, and left out. The casts that autocast holds on to
+        (`cast_cache`) come on top: autograd does not keep them.
         """
         return self._inputs() + max(self._ends(), self.recomputed())
 

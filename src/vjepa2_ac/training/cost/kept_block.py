@@ -48,7 +48,8 @@ class Setting:
     @property
     def copies_for_norms(self) -> bool:
         """Whether autocast has norms computed from a copy of their input."""
-        return self.device == "cuda" and (self.casts_frozen_weights or self.trains_everything)
+        other = self.casts_frozen_weights or self.trains_everything
+        return self.device == "cuda" and self.number != FLOAT32 and other
 
     @property
     def mask(self) -> int:

@@ -187,7 +187,7 @@ def _at_work(config: Config, sizes: ModelSizes, frames: int) -> int:
     attention = width * (4 * number + 5 * FLOAT32)  # residual, query, key, value; normed, and four while rotating
     mlp = width * (2 * number + 2 * FLOAT32) + 2 * hidden * number  # residual and output; normed, cast; around GELU
     pixels = frames * 3 * sizes.image_size**2 * FLOAT32
-    features = frames * _tokens_per_frame(sizes) * width * (number + FLOAT32)  # as computed, and as float32
+    features = frames * _tokens_per_frame(sizes) * width * 2 * FLOAT32  # as computed, and normalised
     return tokens * max(attention, mlp) + pixels + features
 
 
