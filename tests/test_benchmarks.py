@@ -13,6 +13,7 @@ import torch
 from torch._dynamo.utils import counters
 
 from paths import ROOT
+from tracing import tracing
 
 ELSEWHERE = """
 from torch import nn
@@ -211,6 +212,8 @@ def test_quick_benchmark_of_a_decision_completes_without_the_official_code(
 
 
 @pytest.mark.usefixtures("traced")
+@tracing[0]
+@tracing[1]
 def test_decisions_with_compiled_blocks_are_timed_beside_those_without(
     planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
