@@ -42,7 +42,7 @@ class Official:
 
     Args:
         checkout: A checkout of facebookresearch/vjepa2.
-        weights: What `to_official` gives; None: its own random ones.
+        weights: What `to_official` gives.
         sizes: Of the model.
         adapter: Rank, alpha and dropout; None: every weight is trained, and there is no adapter.
         training: Optimizer and rollout.
@@ -52,13 +52,12 @@ class Official:
     """
 
     def __init__(
-        self, checkout: Path, weights: Mapping[str, Any] | None, sizes: ModelSizes, adapter: AdapterConfig | None,
+        self, checkout: Path, weights: Mapping[str, Any], sizes: ModelSizes, adapter: AdapterConfig | None,
         training: TrainingConfig, *, frames: int, encoder: bool, device: torch.device,
     ) -> None:  # fmt: skip
         self._module = imported(checkout, "src.models.ac_predictor")
         predictor = build_predictor(self._module, sizes, frames)
-        if weights is not None:
-            predictor.load_state_dict(plain_names(weights["predictor"]))
+        self._load(predictor, weights, "predictor")
         self._inner, self._device, self._rollout_steps = predictor, device, training.rollout_steps
         self.predictor = self._placed(predictor if adapter is None else _with_lora(predictor, adapter)).train()
         self._encoder = self._frozen_encoder(checkout, weights, sizes) if encoder else None
@@ -114,11 +113,13 @@ class Official:
         following = self.predictor(latents.flatten(1, 2), actions, states)
         return layer_norm(following, following.shape[-1:]).unflatten(1, latents.shape[1:3])
 
-    def _frozen_encoder(self, checkout: Path, weights: Mapping[str, Any] | None, sizes: ModelSizes) -> nn.Module:
+    def _frozen_encoder(self, checkout: Path, weights: Mapping[str, Any], sizes: ModelSizes) -> nn.Module:
         network = _encoder(imported(checkout, "src.models.vision_transformer"), sizes)
-        if weights is not None:
-            network.load_state_dict(plain_names(weights["encoder"]))
+        self._load(network, weights, "encoder")
         return self._placed(network.requires_grad_(False))
+
+    def _load(self, module: nn.Module, weights: Mapping[str, Any], part: str) -> None:
+        module.load_state_dict(plain_names(weights[part]))
 
     def _placed(self, module: nn.Module) -> nn.Module:
         return module.to(self._device)

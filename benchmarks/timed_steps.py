@@ -186,6 +186,7 @@ class Bench:
         return make_accelerator(config)
 
     def _official(self, *, whole: bool = False) -> Official:
+        assert self._weights is not None, "no checkout"
         config = self.config(Setting(max(self.options.frames), 1, checkpointing=False))
         return self._kind_of_official(
             self.options.official, self._weights, self.sizes, None if whole else config.adapter, config.training,

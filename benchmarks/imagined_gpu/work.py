@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
@@ -54,6 +54,9 @@ class _ImaginedOfficial(Official):
         super().__init__(*given, **named)
         self._scaler = torch.amp.GradScaler("cuda", enabled=False)
 
+    def _load(self, module: nn.Module, weights: Mapping[str, Any], part: str) -> None:
+        """Leave it as it is: there are no numbers."""
+
     def _placed(self, module: nn.Module) -> nn.Module:
         with FAKE:
             return imagined(module, torch.float32)
@@ -63,6 +66,7 @@ class _Steps(timed_steps.Bench):
     _kind_of_official = _ImaginedOfficial
 
     def _model(self) -> WorldModel:
+        self._weights = {}  # without numbers
         pixels = "pixels" in self.options.source
         return imagined_model(self.sizes, self.dtype, AdapterConfig(), encoder=pixels)
 
