@@ -72,7 +72,7 @@ class _LowRankLinear(torch.autograd.Function):
         read = (tokens if masked is None else masked).flatten(0, -2)
         inner = linear(read, first)
         result = linear(tokens, weight, bias)
-        _add_product(result.flatten(0, -2), inner, second.T, scale)
+        result = _plus_product(result.flatten(0, -2), inner, second.T, scale).view_as(result)
         needed = (ctx.needs_input_grad[4], ctx.needs_input_grad[5], ctx.needs_input_grad[0])
         kept = (value if is_needed else None for value, is_needed in zip((read, inner, weight), needed, strict=True))
         ctx.save_for_backward(*kept, first, second)
@@ -88,7 +88,7 @@ class _LowRankLinear(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             of_tokens = rows @ weight
             if not ctx.is_masked:
-                _add_product(of_tokens, to_inner, first, ctx.scale)
+                of_tokens = _plus_product(of_tokens, to_inner, first, ctx.scale)
             of_tokens = of_tokens.view(shape)
         if ctx.needs_input_grad[1]:
             of_masked = (to_inner * ctx.scale @ first).view(shape)
@@ -97,5 +97,8 @@ class _LowRankLinear(torch.autograd.Function):
         return of_tokens, of_masked, None, None, of_first, of_second, None
 
 
-def _add_product(total: Tensor, left: Tensor, right: Tensor, scale: float) -> None:
-    torch.addmm(total, left, right, alpha=scale, out=total)  # in place, and PyTorch's counter of FLOPs knows it
+def _plus_product(total: Tensor, left: Tensor, right: Tensor, scale: float) -> Tensor:
+    """Return `total + scale * left @ right` in the memory of the total; a compiler decides that by itself."""
+    if torch.compiler.is_compiling():  # torch 2.11 would lose the gradient of the result (PyTorch issue 180642)
+        return torch.addmm(total, left, right, alpha=scale)
+    return torch.addmm(total, left, right, alpha=scale, out=total)  # which PyTorch's counter of FLOPs knows
