@@ -3,14 +3,17 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import peft
 import pytest
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model import predictor
 from vjepa2_ac.model.adapter_end import base_only, merge_adapter
 from vjepa2_ac.model.lora import (
     add_adapter,
@@ -393,6 +396,24 @@ def test_plain_peft_loads_it_on_the_predictor(model: WorldModel, inputs, tmp_pat
         expected = model.predictor(inputs.latents, inputs.actions, inputs.states)
         found = plain.eval()(inputs.latents, inputs.actions, inputs.states)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-4 if config.init == "pissa" else 1e-6)
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.5])
+def test_only_with_dropout_a_block_computed_again_needs_the_state_of_random_numbers(
+    fresh: Fresh, inputs, monkeypatch: pytest.MonkeyPatch, dropout: float
+) -> None:
+    kept: list[bool] = []
+
+    def watched(block: Any, *given: Any, preserve_rng_state: bool, **how: Any) -> Any:
+        kept.append(preserve_rng_state)
+        return checkpoint(block, *given, preserve_rng_state=preserve_rng_state, **how)
+
+    monkeypatch.setattr(predictor, "checkpoint", watched)
+    model = fresh()
+    model.set_gradient_checkpointing(True)  # before there is an adapter
+    add_adapter(model, AdapterConfig(rank=2, dropout=dropout), seed=0)
+    model.predict(inputs.latents, inputs.actions, inputs.states)
+    assert kept == [dropout > 0] * len(model.base_predictor.blocks)
 
 
 def test_gradient_checkpointing_changes_no_gradient_of_an_adapter_and_its_dropout(fresh: Fresh, inputs) -> None:

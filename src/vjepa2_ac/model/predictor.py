@@ -98,6 +98,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         self.predictor_proj = nn.Linear(width, config.latent_dim)
         self.attention: AttentionKind = "auto"
         self.gradient_checkpointing = False  # the name transformers switches
+        self.has_dropout = False  # in its blocks: then a block computed again draws the same masks again
         self.post_init()
 
     @property
@@ -193,7 +194,8 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         for index, block in enumerate(self.blocks):
             past = () if cache is None else cache.layer(index)
             if self.gradient_checkpointing and torch.is_grad_enabled():
-                tokens, kept = checkpoint(block, tokens, *how, kept_tokens, *past, use_reentrant=False)
+                given = (tokens, *how, kept_tokens, *past)
+                tokens, kept = checkpoint(block, *given, use_reentrant=False, preserve_rng_state=self.has_dropout)
             else:
                 tokens, kept = block(tokens, *how, kept_tokens, *past)
             if kept is not None:

@@ -227,7 +227,9 @@ class WorldModel(nn.Module):
 
     def set_gradient_checkpointing(self, enabled: bool) -> None:
         """Choose whether predictor blocks are computed again in the backward pass instead of being kept."""
-        self.base_predictor.gradient_checkpointing = enabled
+        predictor = self.base_predictor
+        predictor.gradient_checkpointing = enabled
+        predictor.has_dropout = any(isinstance(one, nn.Dropout) and one.p > 0 for one in predictor.blocks.modules())
 
     def set_compiled(self, when: When) -> None:
         """Choose when predictor blocks are compiled (see `model.compilation`)."""
