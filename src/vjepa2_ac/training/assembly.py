@@ -110,6 +110,7 @@ def assemble(
     add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
     note(str(trainable_report(world_model)))
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
+    world_model.set_attention(config.training.attention)
     world_model.set_compiled("with gradients" if config.training.compile == "blocks" else "never")
     if dataset.config.source == "latents":
         world_model.set_encoder_aside()
