@@ -126,7 +126,7 @@ def test_attention_between_compiled_halves_and_computed_again_is_the_plain_one(
 
 
 @pytest.fixture
-def flex_is_traced(traced: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def flex_is_traced(monkeypatch: pytest.MonkeyPatch) -> None:
     """FlexAttention goes through torch.compile as on CUDA, but what is traced runs as it is."""
     original = attention._flex_attention
     monkeypatch.setattr(attention, "_flex_attention", lambda _: original(True))
@@ -138,7 +138,7 @@ def attended(clips: int) -> Tensor:
 
 
 @pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
-@pytest.mark.usefixtures("flex_is_traced")
+@pytest.mark.usefixtures("traced", "flex_is_traced")
 def test_flex_is_compiled_for_more_numbers_of_clips_than_pytorch_allows_by_itself() -> None:
     plain = block_causal_attention(*(one.detach()[:1] for one in drawn()), PER_STEP, "dense")
     numbers = range(1, 13)
@@ -148,7 +148,7 @@ def test_flex_is_compiled_for_more_numbers_of_clips_than_pytorch_allows_by_itsel
 
 
 @pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
-@pytest.mark.usefixtures("flex_is_traced")
+@pytest.mark.usefixtures("traced", "flex_is_traced")
 def test_where_flex_would_not_be_compiled_any_more_is_an_error_with_a_way_out() -> None:
     attended(1)
     with dynamo.patch(recompile_limit=2):

@@ -58,8 +58,8 @@ class TrainingConfig(Section):
     """blocks: torch.compile for the predictor's blocks, in training steps only; needs a C compiler, and a minute before
     the first step. The same losses and gradients to rounding; dropout draws other masks."""
     attention: Literal["auto", "per_step"] = "auto"
-    """auto: FlexAttention in training steps on CUDA, compiled before the first one. per_step: one plain attention for each
-    model step, which compiles nothing. The same losses and gradients to rounding."""
+    """auto: FlexAttention in training steps on CUDA, which is compiled for each size of a batch. per_step: one plain
+    attention for each model step, which compiles nothing. The same losses and gradients to rounding."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: CUDA where there is one."""
     allow_weak_base: bool = False

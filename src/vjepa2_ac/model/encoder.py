@@ -99,7 +99,8 @@ class _FramePatches(nn.Conv3d):
         frames = tubelets[:, :, 0]
         patches = rearrange(frames, "n c (rows p) (columns q) -> n (rows columns) (c p q)", p=side, q=side)
         embedded = linear(patches, self.weight.sum(dim=2).flatten(1), self.bias)
-        return embedded.transpose(1, 2).unflatten(2, (1, frames.shape[-2] // side, -1))
+        rows = frames.shape[-2] // side
+        return rearrange(embedded, "n (time rows columns) dim -> n dim time rows columns", time=1, rows=rows)
 
 
 class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformers has no types
