@@ -124,7 +124,7 @@ def test_gradients_are_those_of_differences(masked: bool, reached: bool) -> None
     torch.manual_seed(0)
     weight, bias = draw(4, 6).detach(), draw(4).detach()
     inputs = (draw(2, 3, 6).requires_grad_(reached), draw(2, 3, 6) if masked else None, weight, bias, draw(2, 6))
-    assert torch.autograd.gradcheck(_LowRankLinear.apply, (*inputs, draw(4, 2), 0.7))
+    assert torch.autograd.gradcheck(_LowRankLinear.apply, (*inputs, draw(4, 2), None, None, 0.7))
 
 
 def test_a_frozen_adapter_keeps_nothing_of_its_input() -> None:

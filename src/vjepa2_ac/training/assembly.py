@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from datetime import timedelta
+from functools import cached_property
 from pathlib import Path
 
 import torch
 from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 from accelerate.utils import InitProcessGroupKwargs
+from torch import nn
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -21,14 +23,16 @@ from vjepa2_ac.evaluation.calibration import Calibration
 from vjepa2_ac.latents import encode_batch, extrinsics_for
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import add_adapter, save_trained, trainable_report
+from vjepa2_ac.model.lora_linear import CastMatrices
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.best import best_so_far, measured_on
 from vjepa2_ac.training.cached import with_latents
 from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, write_checkpoint
-from vjepa2_ac.training.device import is_on_cpu
+from vjepa2_ac.training.device import PRECISIONS, is_on_cpu
 from vjepa2_ac.training.embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.loss import Objective
-from vjepa2_ac.training.optim import make_optimizer
+from vjepa2_ac.training.micro_step import CapturedMicroStep, MicroStep, captured_on_cuda
+from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 from vjepa2_ac.training.processes import from_first, of_all
 from vjepa2_ac.training.resume import micro_batches_of, say_what_is_new, take_up, take_up_loss_scale
 from vjepa2_ac.training.run_folder import CHECKPOINTS
@@ -60,6 +64,32 @@ class Run:
     def encodes(self) -> bool:
         """Whether clips are pictures that go through the encoder, not latents of a cache."""
         return self.dataset.config.source != "latents"
+
+    @cached_property
+    def trained(self) -> list[nn.Parameter]:
+        """What the optimizer moves."""
+        return list(trained_parameters(self.objective))
+
+    @cached_property
+    def cast_matrices(self) -> CastMatrices:
+        """The adapter in the type that a step computes in."""
+        return CastMatrices(self.world_model.predictor, PRECISIONS[self.config.training.precision])
+
+    @property
+    def micro_step(self) -> MicroStep | CapturedMicroStep:
+        """What adds the gradients of some clips."""
+        return self.captured or self._plain_micro_step
+
+    @cached_property
+    def captured(self) -> CapturedMicroStep | None:
+        """The same as a graph, where that is asked for."""
+        if not self.config.training.cuda_graph:
+            return None
+        return CapturedMicroStep(self._plain_micro_step, self.trained, captured_on_cuda)
+
+    @property
+    def _plain_micro_step(self) -> MicroStep:
+        return MicroStep(self.objective, self.accelerator, self.scaler)
 
     @property
     def clips_per_step(self) -> int:

@@ -8,6 +8,8 @@ from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.compilation import require_compiler
 
+PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
+
 
 def is_on_cpu(training: TrainingConfig) -> bool:
     """Return whether a run computes on a CPU; else on CUDA.
@@ -30,6 +32,10 @@ def is_on_cpu(training: TrainingConfig) -> bool:
             needed="a CUDA device: only there are losses scaled so that small gradients do not vanish",
             fix="Set training.precision to bf16 or fp32",
         )
+    if training.cuda_graph and on_cpu:
+        raise InputError(
+            where="training.cuda_graph", found="true, on a CPU", needed="a CUDA device", fix="Set it to false"
+        )
     if training.compile == "blocks":
         require_compiler("cpu" if on_cpu else "cuda", where="training.compile")
     return on_cpu
@@ -37,6 +43,5 @@ def is_on_cpu(training: TrainingConfig) -> bool:
 
 def autocast(training: TrainingConfig, device: torch.device) -> torch.autocast:
     """Return the arithmetic that `training.precision` asks for, as Accelerate gives it to a run."""
-    kinds = {"bf16": torch.bfloat16, "fp16": torch.float16}
-    kind = kinds.get(training.precision)
+    kind = None if training.precision == "fp32" else PRECISIONS[training.precision]
     return torch.autocast(device.type, dtype=kind, enabled=kind is not None)
