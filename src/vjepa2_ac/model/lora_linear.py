@@ -32,8 +32,10 @@ class LoraLinear(Linear):  # type: ignore[misc]  # PEFT has no types
             return super().forward(tokens, *args, **kwargs)  # type: ignore[no-any-return]
         name, layer = self.active_adapters[0], self.base_layer
         matrices = self.lora_A[name].weight, self.lora_B[name].weight
-        cast: tuple[Tensor | None, ...] | None = self.cast
-        if cast is None or self.cast[0].dtype != dtype:
+        cast: tuple[Tensor | None, ...]
+        if self.cast is not None and self.cast[0].dtype == dtype:
+            cast = self.cast
+        else:
             cast = tuple(None if one.dtype == dtype else one.detach().to(dtype) for one in matrices)
         weight, bias = (None if own is None else own.to(dtype) for own in (layer.weight, layer.bias))
         tokens = tokens.to(dtype)
