@@ -170,11 +170,6 @@ def test_where_blocks_would_not_be_compiled_any_more_is_an_error_with_a_way_out(
             call(torch.ones(3), 2)
 
 
-def test_steps_are_put_together_as_the_layer_after_them_reads_them() -> None:
-    gathered = block_causal_attention(*drawn(), PER_STEP, "per_step")
-    assert gathered.transpose(1, 2).is_contiguous()  # so that it is not copied once more
-
-
 @pytest.mark.parametrize("kind", ["dense", "per_step"])
 def test_a_step_sees_itself_and_the_past_but_not_the_future(kind: AttentionKind) -> None:
     query, key, value = (x.detach() for x in drawn())

@@ -76,10 +76,7 @@ def _per_step(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -
     beginnings: Callable[..., tuple[Tensor, ...]] = _Beginnings.apply
     steps = zip(parts, beginnings(key, ends), beginnings(value, ends), strict=True)
     seen = [scaled_dot_product_attention(*inputs) for inputs in steps]
-    if len(seen) == 1:
-        return seen[0]
-    # Put together as the layer after it reads them, heads beside each other, or it would copy all of it once more.
-    return torch.cat([one.transpose(1, 2) for one in seen], dim=1).transpose(1, 2)
+    return seen[0] if len(seen) == 1 else torch.cat(seen, dim=2)
 
 
 class _Beginnings(torch.autograd.Function):
