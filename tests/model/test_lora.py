@@ -1,5 +1,6 @@
 """The laws of an adapter."""
 
+import copy
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -369,6 +370,19 @@ def test_merging_in_bfloat16_rounds_once(fresh: Fresh, inputs) -> None:
     expected = (layer.base_layer.weight.float() + layer.get_delta_weight("default").float()).bfloat16()
     merge_adapter(model)
     assert torch.equal(model.predictor.blocks[0].attn.q.weight, expected)
+
+
+@both_kinds
+def test_merging_under_autocast_is_merging(fresh: Fresh, inputs, config: AdapterConfig) -> None:
+    model = fresh()
+    add_adapter(model, config, seed=0)
+    train(model, inputs)
+    other = copy.deepcopy(model)
+    merge_adapter(model)
+    with torch.autocast("cpu", torch.bfloat16):
+        merge_adapter(other)
+    for name, value in model.predictor.state_dict().items():
+        assert torch.equal(value, other.predictor.state_dict()[name]), name
 
 
 def test_a_model_with_an_adapter_on_is_not_saved_as_a_base(model: WorldModel, tmp_path: Path) -> None:

@@ -51,7 +51,8 @@ class TrainingConfig(Section):
     max_grad_norm: Annotated[float, Field(gt=0.0)] | None = 1.0
     """Gradients are scaled down to this norm; null: never (the released recipe)."""
     precision: Literal["bf16", "fp16", "fp32"] = "bf16"
-    """Arithmetic of the networks (autocast). fp16 scales the loss, and needs CUDA."""
+    """Arithmetic of the networks (autocast). bf16 needs compute capability 8.0 on CUDA (Ampere). fp16 scales the loss,
+    and needs CUDA."""
     gradient_checkpointing: bool = False
     """Compute each predictor block again in the backward pass instead of keeping its activations."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"

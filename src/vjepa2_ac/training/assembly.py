@@ -28,7 +28,7 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.best import best_so_far, measured_on
 from vjepa2_ac.training.cached import with_latents
 from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, write_checkpoint
-from vjepa2_ac.training.device import PRECISIONS, is_on_cpu
+from vjepa2_ac.training.device import PRECISIONS, computing_device
 from vjepa2_ac.training.embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.micro_step import CapturedMicroStep, MicroStep, captured_on_cuda
@@ -166,10 +166,11 @@ def make_accelerator(config: Config) -> Accelerator:
     Where there are several processes it joins them.
 
     Raises:
-        InputError: CUDA was asked for and there is none, fp16 without CUDA, or a launch that cannot be followed.
+        InputError: CUDA was asked for and there is none, the device does not compute so (fp16 on a CPU, bf16 on an old
+            GPU), or a launch that cannot be followed.
     """
     check_launch(config)
-    training, on_cpu = config.training, is_on_cpu(config.training)
+    training, on_cpu = config.training, computing_device(config.training).type == "cpu"
     AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
     precision = "no" if training.precision == "fp32" else training.precision
     patience = InitProcessGroupKwargs(timeout=LONGEST_WAIT)
