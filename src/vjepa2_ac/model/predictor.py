@@ -149,7 +149,8 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         spends most of its training on learning to copy. Exact where the predictor is as wide as a latent.
         """
         shape = self.predictor_embed.weight.shape
-        drawn = torch.randn(max(shape), min(shape), generator=generator).double()  # or threads would change last bits
+        drawn = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)
+        drawn = drawn.double()  # or threads would change last bits
         rotation, triangle = torch.linalg.qr(drawn)
         rotation = rotation * triangle.diagonal().sign()
         with torch.no_grad():
