@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
@@ -15,6 +15,8 @@ from accelerate.utils import InitProcessGroupKwargs
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader, validation_batches
+from vjepa2_ac.data.prefetch import Batches
+from vjepa2_ac.data.streams import Copies, copies_for
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.evaluation.calibration import Calibration
@@ -60,6 +62,11 @@ class Run:
     def encodes(self) -> bool:
         """Whether clips are pictures that go through the encoder, not latents of a cache."""
         return self.dataset.config.source != "latents"
+
+    @property
+    def copies(self) -> Copies:
+        """How batches get to the run's device."""
+        return copies_for(self.accelerator.device)
 
     @property
     def clips_per_step(self) -> int:
@@ -145,7 +152,7 @@ def make_accelerator(config: Config) -> Accelerator:
     return Accelerator(mixed_precision=precision, cpu=on_cpu, kwargs_handlers=[patience])
 
 
-def batches_from(run: Run) -> Generator[Batch, None, None]:
+def batches_from(run: Run) -> Batches:
     """Yield the micro-batches of this process from where the run stands."""
     return training_loader(
         run.dataset,
@@ -154,6 +161,7 @@ def batches_from(run: Run) -> Generator[Batch, None, None]:
         start_position=run.state.clips_done,
         rank=run.accelerator.process_index,
         world_size=run.accelerator.num_processes,
+        copies=run.copies,
     )
 
 
