@@ -35,6 +35,7 @@ from vjepa2_ac.training.processes import from_first, of_all
 from vjepa2_ac.training.resume import micro_batches_of, say_what_is_new, take_up, take_up_loss_scale
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 from vjepa2_ac.training.sharding import check_launch, share_if_asked, whole_moments, whole_weights
+from vjepa2_ac.training.shared_memory import say_if_shared_memory_is_small
 from vjepa2_ac.training.stride import choose_stride, require_learned, with_stride
 from vjepa2_ac.training.torch_file import write_torch
 from vjepa2_ac.training.trackers import require_installed
@@ -113,6 +114,7 @@ def assemble(
     world_model = world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, first_clip)
     dataset = with_latents(config, dataset, world_model, accelerator, note, encoding=encoding, check_only=check_only)
+    say_if_shared_memory_is_small(config, dataset, first_clip, accelerator, note)
     fit_to_data(world_model, config, dataset, note)
     add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
     note(str(trainable_report(world_model)))
