@@ -43,6 +43,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     out = tmp_path_factory.mktemp("imagined")
     runs = {
         "train": ["train", "--quick", "--source", "cache", "pixels", "--attention", "dense", "--top", "5", "--waits"],
+        "augmented": ["train", "--quick", "--source", "pixels", "--attention", "dense", "--augment"],
         "encode": ["encode", "--quick"],
         "plan": ["plan", "--quick", "--adapter"],
         "wide": ["train", "--layers", "6", "--frames", "8", "--batch", "1", "--checkpointing", "off", "on"],
@@ -99,7 +100,9 @@ def test_the_backward_pass_knows_the_lines_it_belongs_to(told: dict[str, Any]) -
 def test_a_training_step_waits_for_the_device_where_it_has_to(told: dict[str, Any]) -> None:
     rows = told["rows"]["train"]
     assert [row["source"] for row in rows] == ["cache", "pixels"]
-    for row in rows:
+    (augmented,) = told["rows"]["augmented"]
+    assert augmented["kernels"] > rows[1]["kernels"]
+    for row in (*rows, augmented):
         assert sorted(row["waits"].values()) == [1] * len(STEP), row["waits"]
         for line in STEP:
             assert [place for place in row["waits"] if re.match(line, place)], (line, row["waits"])

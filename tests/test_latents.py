@@ -1,9 +1,11 @@
 """What is drawn for a clip is applied before it is encoded."""
 
+from dataclasses import replace
+
 import torch
 
 from vjepa2_ac.config import ModelSizes
-from vjepa2_ac.episode import Augmentation, Batch
+from vjepa2_ac.episode import Augmentation, Batch, LatentBatch
 from vjepa2_ac.latents import encode_batch
 from vjepa2_ac.model.world_model import WorldModel
 
@@ -39,3 +41,20 @@ def test_an_augmented_batch_gives_the_latents_of_the_cropped_pictures() -> None:
     torch.testing.assert_close(found[:1], latents(batch(frames[:1, :, 4:34, 6:42])))
     torch.testing.assert_close(found[1:], latents(batch(frames))[1:])
     assert not torch.allclose(found[0], latents(batch(frames))[0], atol=1e-3)
+
+
+def test_what_is_on_its_way_to_the_device_is_taken_from_there() -> None:
+    model = WorldModel.random(ModelSizes.model_validate(TINY), seed=0)
+    given = batch(torch.randint(0, 256, (2, 2, 40, 50, 3), dtype=torch.uint8))
+    there = given.mapped(lambda tensor: tensor + 1)
+    held = [there]
+    ahead = replace(given, on_device=lambda: held.pop() if held else None)
+
+    def encoded(of: Batch) -> LatentBatch:
+        return encode_batch(model, of, device=torch.device("cpu"), chunk=4)
+
+    for expected in (encoded(there), encoded(given)):  # taken once; then the batch itself is copied
+        found = encoded(ahead)
+        assert torch.equal(found.latents, expected.latents)
+        assert torch.equal(found.states, expected.states)
+        assert torch.equal(found.actions, expected.actions)

@@ -1,6 +1,7 @@
 """How much would it take on a GPU? Our code at real sizes on one that is not there: memory, waits, FLOPs, and a time.
 
     python benchmarks/imagined_gpu train --source cache pixels --batch 1 2 8 --checkpointing off on --attention per_step
+    python benchmarks/imagined_gpu train --source pixels --augment --waits
     python benchmarks/imagined_gpu train --largest 24 --checkpointing on       # GB: what batch fits
     python benchmarks/imagined_gpu train --source pixels --checkpointing on --official ../vjepa2   # beside its step
     python benchmarks/imagined_gpu encode --batch 8 16 --top 10
@@ -174,6 +175,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     train.add_argument("--largest", type=float, metavar="GB", help="instead: the largest batch that fits")
     train.add_argument("--checkpointing", nargs="+", choices=("off", "on"), default=["off"])
     train.add_argument("--attention", nargs="+", choices=("auto", "flex", "per_step", "dense"), default=["auto"])
+    train.add_argument("--augment", action="store_true", help="clips of pixels are cropped and jittered")
     train.add_argument("--rollout-steps", type=int, default=2)
     train.add_argument("--official", type=Path, help="a checkout of facebookresearch/vjepa2: its step, too")
     plan = parser.add_argument_group("plan")

@@ -21,8 +21,10 @@ from stand_ins import FAKE
 from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
-from vjepa2_ac.config import AdapterConfig, Config, ModelSizes
+from vjepa2_ac.config import AdapterConfig, AugmentConfig, Config, ModelSizes
 from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.data.augment import draw
+from vjepa2_ac.episode import Batch
 from vjepa2_ac.model.lora import add_adapter
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.plan import Cost, Plan
@@ -31,6 +33,7 @@ from vjepa2_ac.training.cost.flops import frame_flops
 from vjepa2_ac.training.cost.memory import ALLOWANCE, estimate_memory
 
 OFFICIALS = (timed_steps.OFFICIAL_FULL, timed_steps.OFFICIAL)
+_AUGMENT = AugmentConfig(crop_scale=(0.3, 1.0), brightness=0.4, contrast=0.4, saturation=0.4)
 _ITERATIONS = 2  # of a decision that are computed: all after the first are alike
 Doing = Callable[[Count], object]
 
@@ -75,6 +78,13 @@ class _Steps(timed_steps.Bench):
 
     def _drawn(self, shape: tuple[int, ...]) -> Tensor:
         return torch.empty(shape, device=self.device)
+
+    def batch(self, setting: timed_steps.Setting) -> Batch:
+        batch = super().batch(setting)
+        if not (self.options.augment and setting.encoder):
+            return batch
+        sizes, clips = batch.frames.shape[2:4], range(setting.batch)
+        return replace(batch, augmentations=tuple(draw(_AUGMENT, *sizes, seed=0, position=clip) for clip in clips))
 
     def _accelerator(self, config: Config) -> Any:  # noqa: ARG002  # Accelerate's own asks the driver
         return SimpleNamespace(

@@ -31,6 +31,7 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
         ("trained", estimate.trained, f"{counts.trained:,} weights in float32"),
         ("gradients", estimate.gradients, "float32"),
         ("optimizer", estimate.moments, f"AdamW's two moments, {eight_bits}"),
+        ("next batch", estimate.arriving, "on its way while this one is computed"),
         ("latents", estimate.latents, f"{clips}, float32"),
         ("encoder, at work", estimate.encoding, f"{config.model.encode_chunk} frames at once; before the predictor"),
         ("predictor, teacher forcing", estimate.teacher_forcing, "kept for the backward pass, without checkpointing"),

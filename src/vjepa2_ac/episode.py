@@ -23,7 +23,7 @@ A clip of T frames has T states and T - 1 actions.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -64,6 +64,10 @@ class StoredLatents:
 
     values: Num[Tensor, "*batch time tokens dim"]  # bfloat16, float32 or int8
     scales: Float32[Tensor, "*batch time tokens"] | None = None  # of int8: what a value of 1 means, for each token
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> StoredLatents:
+        """Return the same with each tensor replaced."""
+        return StoredLatents(change(self.values), None if self.scales is None else change(self.scales))
 
 
 @runtime_checkable
@@ -150,6 +154,37 @@ class Batch:
     bytes_fetched: int = 0  # over the network, for these clips
     latents: StoredLatents | None = None
     cameras: tuple[str | None, ...] = ()  # one per clip; None: the config's first
+    on_device: Callable[[], Batch | None] | None = None  # gives, once, the copy of it that is on its way to the device
+
+    def mapped(self, change: Callable[[Tensor], Tensor]) -> Batch:
+        """Return the batch with each tensor replaced."""
+        return replace(
+            self,
+            frames=None if self.frames is None else change(self.frames),
+            states=change(self.states),
+            actions=change(self.actions),
+            extrinsics=None if self.extrinsics is None else change(self.extrinsics),
+            latents=None if self.latents is None else self.latents.mapped(change),
+        )
+
+    def pin_memory(self) -> Batch:
+        """Return the batch in pinned memory, where a copy to the device starts from without the host's waiting.
+
+        DataLoader calls a method of this name, where it pins.
+        """
+        return self.mapped(lambda tensor: tensor.pin_memory())
+
+    @property
+    def nbytes(self) -> int:
+        """The bytes of all its tensors."""
+        sizes: list[int] = []
+
+        def count(tensor: Tensor) -> Tensor:
+            sizes.append(tensor.nbytes)
+            return tensor
+
+        self.mapped(count)
+        return sum(sizes)
 
 
 @dataclass(frozen=True)

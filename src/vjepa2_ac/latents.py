@@ -29,13 +29,15 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
 
     Args:
         world_model: The model whose frozen encoder is used.
-        batch: Clips as the loader gives them: uint8 pixels, cropped, of any size; or latents.
+        batch: Clips as the loader gives them: uint8 pixels, cropped, of any size; or latents. If they are on their way
+            to the device, what arrives there is taken.
         device: Where the model is.
         chunk: Frames that go through the encoder at once.
 
     Raises:
         InputError: The model wants camera poses and a clip has none; or cached latents are of another width.
     """
+    batch = _arrived(batch)
     extrinsics = extrinsics_for(world_model, batch)
     return LatentBatch(
         latents=_latents_of(world_model, batch, device, chunk),
@@ -71,6 +73,12 @@ def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Conf
     """
     if dataset.config.source == "latents":  # else the weights need not be hashed
         require_encoding(dataset, encoding_of(world_model, config))
+
+
+def _arrived(batch: Batch) -> Batch:
+    """Return the copy of a batch on the device; the batch itself where there is none, or it was taken before."""
+    there = None if batch.on_device is None else batch.on_device()
+    return batch if there is None else there
 
 
 def _latents_of(

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import pytest
 import torch
 
 from memory_source import MemorySource
+from recording_cuda import Pinning, RecordingCuda, recorded_copies
 from synthetic import synthetic_states, write_synthetic_droid
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset as opening
@@ -212,6 +214,42 @@ def test_workers_end_with_the_run_however_it_ends(droid: Path, tmp_path: Path, d
     if death == "error":
         assert said.endswith("RuntimeError: boom\n")
         assert "Warning" not in said
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_batches_for_a_device_are_pinned_by_the_loader(
+    droid: Path, monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    expected = take(2, config_of(droid))
+    pinning, cuda = Pinning(monkeypatch), RecordingCuda()
+    with closing(
+        training_loader(
+            open_dataset(config_of(droid, workers=workers)), seed=1, batch_size=2, copies=recorded_copies(cuda)
+        )
+    ) as batches:
+        found = [next(batches), next(batches)]
+    assert_same(found, expected)
+    assert all(any(batch.frames is one for one in pinning.pinned) for batch in found)
+    assert all(any(batch.states is one for one in pinning.pinned) for batch in found)
+    assert cuda.told.count("side 1: to device") == 2 * 3
+    assert "side 1: to pinned memory" not in cuda.told, "that is the loader's work"
+    main = threading.current_thread().name
+    assert (main in pinning.threads) == (not workers), "beside the workers, a thread of its own does it"
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_an_error_passes_the_pinning_unharmed(
+    spoiled: Callable[..., Path], monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    def spoil(features: dict[str, tuple[Any, Any]]) -> None:
+        features["steps/observation/exterior_image_1_left"][1][:] = [b"GIF89a"] * 12
+
+    config, copies = config_of(spoiled(spoil), workers=workers, validation_share=0.0), recorded_copies(RecordingCuda())
+    Pinning(monkeypatch)
+    with pytest.raises(InputError, match="not a JPEG") as caught:
+        take(60, config, copies=copies)
+    assert type(caught.value) is InputError
+    assert caught.value.needed == "a JPEG picture"
 
 
 def test_pictures_of_two_sizes_do_not_stack(droid: Path) -> None:
@@ -505,5 +543,5 @@ def test_many_validation_clips_are_read_by_workers_and_are_the_same(
         return list(validation_batches(dataset, "validation", clips=30, batch_size=4))
 
     alone = chosen(0)
-    monkeypatch.setattr(loader, "_CLIPS_WORTH_WORKERS", 1)
+    monkeypatch.setattr(loader, "CLIPS_WORTH_WORKERS", 1)
     assert_same(chosen(1), alone)

@@ -1,5 +1,6 @@
 """Every chunk has one shape, whatever episodes its frames are of; what cannot be read takes nothing else with it."""
 
+import weakref
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -7,8 +8,10 @@ import pytest
 import torch
 
 from memory_source import MemorySource
+from recording_cuda import RecordingCuda, recorded_copies
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data import dataset
+from vjepa2_ac.data.streams import NO_COPIES
 from vjepa2_ac.encoding.ahead import Part, Unreadable, Wanted, decoded_ahead
 from vjepa2_ac.encoding.chunks import Chunks, Encoded
 from vjepa2_ac.encoding.room import FRAMES_AT_ONCE
@@ -50,7 +53,7 @@ def wanted(number: int, frames: int) -> Wanted:
 
 
 def encoded(encode: Brightness, parts: list[Part | Unreadable]) -> list[Encoded | Unreadable]:
-    return list(Chunks(encode, chunk=CHUNK, image_size=2, device=torch.device("cpu")).encoded(parts))
+    return list(Chunks(encode, chunk=CHUNK, image_size=2, copies=NO_COPIES).encoded(parts))
 
 
 @pytest.mark.parametrize("scales", [False, True])
@@ -82,6 +85,65 @@ def test_an_episode_that_breaks_half_way_leaves_the_others_whole() -> None:
     assert [one.wanted for one in done if isinstance(one, Unreadable)] == [broken]
     assert [one.wanted for one in done if isinstance(one, Encoded)] == [first, last]
     assert done[-1].latents.values[:, 0, 0].tolist() == [20, 21, 22, 23, 24, 25]
+
+
+# ---- copies beside the encoder -------------------------------------------------------------------------------------
+
+
+class Enqueued(Brightness):
+    """Tells the device that a chunk is encoded."""
+
+    def __init__(self, cuda: RecordingCuda) -> None:
+        super().__init__(scales=True)
+        self._cuda = cuda
+
+    def __call__(self, inputs: torch.Tensor) -> StoredLatents:
+        self._cuda.told.append("computing: encode")
+        return super().__call__(inputs)
+
+
+def test_the_next_chunk_is_encoded_while_the_one_before_it_comes() -> None:
+    one, cuda = wanted(0, 3 * CHUNK), RecordingCuda()
+    parts = [part(one, first, first + CHUNK) for first in range(0, 3 * CHUNK, CHUNK)]
+    chunks = Chunks(Enqueued(cuda), chunk=CHUNK, image_size=2, copies=recorded_copies(cuda))
+    (found,) = chunks.encoded(parts)
+    (expected,) = encoded(Brightness(scales=True), parts)
+    assert torch.equal(found.latents.values, expected.latents.values)
+    assert torch.equal(found.latents.scales, expected.latents.scales)
+
+    def chunk(event: int) -> list[str]:
+        return [
+            "side 1: to pinned memory", "side 1: to device", f"side 1: event {event}",
+            f"computing: waits for event {event}", "memory in use by computing", "computing: encode",
+            f"computing: event {event + 1}", f"side 2: waits for event {event + 1}",
+            *["memory in use by side 2", "side 2: to pinned memory"] * 2, f"side 2: event {event + 2}",
+        ]  # fmt: skip
+
+    assert cuda.told == [
+        *chunk(1), *chunk(4), "host: waits for event 3", *chunk(7), "host: waits for event 6",
+        "host: waits for event 9",
+    ]  # fmt: skip
+
+
+def test_no_pinned_memory_is_held_until_an_episode_is_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.Tensor, "is_pinned", lambda _: True)
+    one, cuda, made = wanted(0, 3 * CHUNK), RecordingCuda(), list[weakref.ref[torch.Tensor]]()
+
+    def pinned_copy(tensor: torch.Tensor) -> torch.Tensor:
+        copy = tensor.clone()
+        made.append(weakref.ref(copy.untyped_storage()))
+        return copy
+
+    def parts() -> Iterator[Part]:
+        for first in range(0, 3 * CHUNK, CHUNK):
+            yield part(one, first, first + CHUNK)
+            alive.append(sum(storage() is not None for storage in made))
+
+    alive: list[int] = []
+    monkeypatch.setattr(cuda, "pinned_copy", pinned_copy)
+    list(Chunks(Brightness(scales=False), chunk=CHUNK, image_size=2, copies=recorded_copies(cuda)).encoded(parts()))
+    assert len(made) == 3
+    assert alive == [1, 1, 1], "of the chunk that is under way"
 
 
 # ---- decoding ahead ----------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from unittest import mock
 
 import torch
 from accelerate import Accelerator
@@ -14,6 +15,7 @@ from torch.distributed.tensor import DTensor
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_as_dict, load_config, parse_config
 from vjepa2_ac.console import ConsoleReporter
+from vjepa2_ac.training import optim
 from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, make_accelerator
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.step import gradients, training_step
@@ -82,6 +84,21 @@ def check_parts(config: Config, accelerator: Accelerator) -> None:
     assert not any(isinstance(value, DTensor) for value in run.world_model.encoder.parameters())
 
 
+def check_fused(config: Config, accelerator: Accelerator) -> None:
+    """AdamW as it is on CUDA moves the parts as it does on a CPU."""
+    moved = []
+    for fused in (False, True):
+        with mock.patch.object(optim, "_are_on_cuda", lambda _, fused=fused: fused):
+            run = assemble(config, lambda _: None, accelerator=accelerator)
+        assert all(bool(group["fused"]) == fused for group in run.optimizer.param_groups)
+        batches = batches_from(run)
+        for step in (1, 2):
+            training_step(run, batches, step)
+        moved.append([weight.detach().full_tensor() for weight in run.world_model.base_predictor.parameters()])
+    for plain, other in zip(*moved, strict=True):
+        torch.testing.assert_close(other, plain, rtol=1e-4, atol=1e-6)
+
+
 def main() -> None:
     torch.set_num_threads(1)
     folder = Path(sys.argv[1])
@@ -93,6 +110,7 @@ def main() -> None:
     accelerator = make_accelerator(config)
     check_gradients(config, accelerator)
     check_parts(config, accelerator)
+    check_fused(config, accelerator)
     leave, Accelerator.end_training = Accelerator.end_training, lambda _: None  # this process has more to do
     # Two steps, then two more: goes on from what was shared. Then from what one process alone has written.
     train(changed(config, steps=2), ConsoleReporter(), allow_config_change=True)

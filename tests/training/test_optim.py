@@ -4,16 +4,20 @@ import importlib.util
 import io
 import json
 import sys
+from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
 from pydantic import ValidationError
+from torch._subclasses.fake_tensor import FakeTensorMode
 
 from paths import GOLDEN
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.training.optim import learning_rate_at, make_optimizer, parameter_groups
+from vjepa2_ac.training import optim
+from vjepa2_ac.training.optim import learning_rate_at, load_moments, make_optimizer, parameter_groups
 
 
 def test_warmup_stable_decay_equals_the_official_schedule() -> None:
@@ -80,6 +84,88 @@ def test_weight_decay_spares_biases_and_norms_and_frozen_weights_are_left_out() 
     assert exempt["weight_decay"] == 0.0
     optimizer = make_optimizer(module, TrainingConfig(betas=(0.8, 0.9)))
     assert optimizer.defaults["betas"] == (0.8, 0.9)
+
+
+@pytest.fixture
+def fuse(monkeypatch: pytest.MonkeyPatch) -> Callable[[bool], None]:
+    """Decides whether AdamW is fused; a CPU can do that, too."""
+    return lambda fused: monkeypatch.setattr(optim, "_are_on_cuda", lambda _: fused)
+
+
+def test_adamw_is_fused_on_cuda_and_nowhere_else() -> None:
+    module = torch.nn.Linear(3, 2)
+    assert not any(group["fused"] for group in make_optimizer(module, TrainingConfig()).param_groups)
+    with FakeTensorMode():
+        there = on_imagined_cuda(module)
+        assert all(group["fused"] for group in make_optimizer(there, TrainingConfig()).param_groups)
+        there.bias = torch.nn.Parameter(torch.empty(2))
+        assert not any(group["fused"] for group in make_optimizer(there, TrainingConfig()).param_groups)
+
+
+def on_imagined_cuda(module: torch.nn.Linear) -> torch.nn.Linear:
+    there = torch.nn.Linear(*module.weight.shape[::-1], device="meta")
+    there.weight, there.bias = (torch.nn.Parameter(torch.empty(p.shape, device="cuda")) for p in module.parameters())
+    return there
+
+
+def moments_of(optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+    """Return the state of an optimizer as a checkpoint holds it."""
+    kept = io.BytesIO()
+    torch.save(optimizer.state_dict(), kept)
+    kept.seek(0)
+    return dict(torch.load(kept, weights_only=True, map_location="cpu"))
+
+
+def test_the_count_of_steps_of_a_fused_optimizer_is_on_the_device() -> None:
+    module = torch.nn.Linear(128, 4)
+    plain = make_optimizer(module, TrainingConfig())
+    take_steps(module, plain, range(2))
+    with FakeTensorMode(allow_non_fake_inputs=True):
+        there = on_imagined_cuda(module)
+        fused = make_optimizer(there, TrainingConfig())
+        load_moments(fused, moments_of(plain))
+        assert {value.device.type for state in fused.state.values() for value in state.values()} == {"cuda"}
+
+
+@pytest.mark.parametrize("kinds", [(False, True), (True, False), (True, True)])
+def test_a_run_goes_on_with_the_moments_of_a_fused_optimizer_and_of_a_plain_one(
+    fuse: Callable[[bool], None], kinds: tuple[bool, bool]
+) -> None:
+    training = TrainingConfig(learning_rate=1e-2)
+    weights = []
+    for before, after in ((False, False), kinds):
+        torch.manual_seed(0)
+        module, resumed = torch.nn.Linear(128, 8), torch.nn.Linear(128, 8)
+        fuse(before)
+        optimizer = make_optimizer(module, training)
+        take_steps(module, optimizer, range(3))
+        fuse(after)
+        resumed.load_state_dict(module.state_dict())
+        again = make_optimizer(resumed, training)
+        load_moments(again, moments_of(optimizer))
+        assert [bool(group["fused"]) for group in again.param_groups] == [after, after]
+        assert again.state_dict()["state"].keys() == optimizer.state_dict()["state"].keys()
+        for index, state in optimizer.state_dict()["state"].items():
+            for name, value in state.items():
+                found = again.state_dict()["state"][index][name]
+                assert found.dtype == value.dtype
+                assert torch.equal(found, value)
+        take_steps(resumed, again, range(3, 6))
+        assert all(state["step"] == 6 for state in again.state.values())
+        weights.append(resumed.weight)
+    torch.testing.assert_close(weights[1], weights[0], rtol=1e-5, atol=1e-7)
+
+
+def test_moments_of_another_number_of_groups_are_refused() -> None:
+    module = torch.nn.Linear(128, 4)
+    optimizer = make_optimizer(module, TrainingConfig())
+    take_steps(module, optimizer, range(1))
+    without_bias = torch.nn.Linear(128, 4, bias=False)
+    other = make_optimizer(without_bias, TrainingConfig())
+    take_steps(without_bias, other, range(1))
+    for one, another in ((optimizer, other), (other, optimizer)):
+        with pytest.raises(ValueError, match="different number of parameter groups"):
+            load_moments(one, moments_of(another))
 
 
 with_bitsandbytes = pytest.mark.skipif(

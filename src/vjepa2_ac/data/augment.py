@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -86,5 +87,10 @@ def _blend(pixels: Tensor, plainer: Tensor, factor: float) -> Tensor:
 
 
 def _grey(pixels: Tensor) -> Float[Tensor, "time 1 height width"]:
-    weights = torch.tensor((_RED, _GREEN, _BLUE), device=pixels.device).view(3, 1, 1)
-    return (pixels * weights).sum(dim=1, keepdim=True)
+    return (pixels * _weights(pixels.device)).sum(dim=1, keepdim=True)
+
+
+@lru_cache(maxsize=8)
+def _weights(device: torch.device) -> Float[Tensor, "3 1 1"]:
+    with torch.inference_mode(False):  # once for each device, as the mean and std of `transforms`
+        return torch.tensor((_RED, _GREEN, _BLUE), device=device).view(3, 1, 1)

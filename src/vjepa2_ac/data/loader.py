@@ -30,6 +30,8 @@ from vjepa2_ac.data.clips import Wish, clip_at, collate, no_clips, read_clip
 from vjepa2_ac.data.dataset import Dataset, open_source
 from vjepa2_ac.data.exclusion import named
 from vjepa2_ac.data.kept import drawn
+from vjepa2_ac.data.prefetch import Batches, Row
+from vjepa2_ac.data.streams import NO_COPIES, Copies
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.data.windows import ClipOrder, Split, far_neighbours, spread
 from vjepa2_ac.episode import Augmentation, Batch, Clip, Skipped
@@ -38,12 +40,19 @@ from vjepa2_ac.remote import UnreachableError
 
 __all__ = ["batches_of", "clip_at", "collate", "open_source", "training_loader", "validation_batches"]
 
-_CLIPS_WORTH_WORKERS = 256  # fewer validation clips are read before the workers have started
+CLIPS_WORTH_WORKERS = 256  # fewer validation clips are read before the workers have started
 
 
 def training_loader(
-    dataset: Dataset, *, seed: int, batch_size: int, start_position: int = 0, rank: int = 0, world_size: int = 1
-) -> Generator[Batch, None, None]:
+    dataset: Dataset,
+    *,
+    seed: int,
+    batch_size: int,
+    start_position: int = 0,
+    rank: int = 0,
+    world_size: int = 1,
+    copies: Copies = NO_COPIES,
+) -> Batches:
     """Yield the micro-batches of one rank, without end, from any position of the run at once.
 
     The run is one row of clips. Micro-batch m of rank r holds the `batch_size` clips from position
@@ -51,15 +60,19 @@ def training_loader(
     from is start_position + m * world_size * batch_size. Where `data.broken_episodes` is skip, clips that cannot be
     read are missing from their micro-batch, which may even be empty; no other clip takes their place.
 
+    Where batches are copied to a device ahead (`copies`), they are in pinned memory.
+
     Raises:
         InputError: There is nothing to train on, or a clip cannot be read, also where a worker met it.
     """
     clips = _Clips(dataset, _TrainingClips(dataset.config, ClipOrder(dataset.windows("train"), seed)))
     rows = _rows(start_position + rank * batch_size, batch_size, batch_size * world_size)
-    return _batches(clips, rows, dataset.config.workers)
+    return _batches(clips, rows, dataset.config.workers, copies)
 
 
-def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size: int) -> Iterator[Batch]:
+def validation_batches(
+    dataset: Dataset, split: Split, *, clips: int, batch_size: int, copies: Copies = NO_COPIES
+) -> Iterator[Batch]:
     """Yield a fixed set of at most `clips` clips of a split, evenly spread over its windows, in batches.
 
     The set follows from the data alone: neither the seed nor the number of shards changes it. Neighbours in it are
@@ -68,7 +81,7 @@ def validation_batches(dataset: Dataset, split: Split, *, clips: int, batch_size
     Raises:
         InputError: The split is empty, or a clip cannot be read.
     """
-    return batches_of(dataset, validation_windows(dataset, split, clips=clips), batch_size=batch_size)
+    return batches_of(dataset, validation_windows(dataset, split, clips=clips), batch_size=batch_size, copies=copies)
 
 
 def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tuple[int, int]]:
@@ -81,7 +94,9 @@ def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tu
     return [windows[index] for index in far_neighbours(spread(len(windows), clips))]
 
 
-def batches_of(dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int) -> Iterator[Batch]:
+def batches_of(
+    dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int, copies: Copies = NO_COPIES
+) -> Iterator[Batch]:
     """Yield the clips that start at these (episode, first control step), in this order, in batches.
 
     Where `data.broken_episodes` is skip, a batch may be smaller; none is empty. Many clips are read by workers.
@@ -91,9 +106,9 @@ def batches_of(dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_si
     """
     count = len(windows)
     rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
-    workers = dataset.config.workers if count >= _CLIPS_WORTH_WORKERS else 0
+    workers = dataset.config.workers if count >= CLIPS_WORTH_WORKERS else 0
     clips = _Clips(dataset, _ChosenClips(dataset.config, dataset.table, list(windows)))
-    return _some_of(_batches(clips, iter(rows), workers), dataset)
+    return _some_of(_batches(clips, iter(rows), workers, copies), dataset)
 
 
 def _some_of(batches: Iterator[Batch], dataset: Dataset) -> Iterator[Batch]:
@@ -154,21 +169,13 @@ class _ChosenClips:
 
 
 @dataclass(frozen=True)
-class _Row:
-    """What a worker sends home for one micro-batch."""
-
-    batch: Batch
-    skipped: tuple[Skipped, ...] = ()
-
-
-@dataclass(frozen=True)
-class _Clips(TorchDataset[_Row]):
+class _Clips(TorchDataset[Row]):
     """Clips by position, read a micro-batch at a time."""
 
     dataset: Dataset
     wishes: _Wishes
 
-    def __getitems__(self, positions: list[int]) -> _Row | InputError:
+    def __getitems__(self, positions: list[int]) -> Row | InputError:
         """Return a micro-batch, or the error that prevents it: DataLoader could not carry that one home unharmed."""
         before = storage.bytes_fetched()
         try:
@@ -177,8 +184,8 @@ class _Clips(TorchDataset[_Row]):
             skipped = tuple(one for one in read if isinstance(one, Skipped))
             fetched = storage.bytes_fetched() - before
             if not clips:
-                return _Row(no_clips(self.dataset.config.frames, self.dataset.widths, fetched), skipped)
-            return _Row(collate(clips, fetched), skipped)
+                return Row(no_clips(self.dataset.config.frames, self.dataset.widths, fetched), skipped)
+            return Row(collate(clips, fetched), skipped)
         except InputError as error:
             return error
 
@@ -206,7 +213,13 @@ def _rows(first: int, length: int, distance: int) -> Iterator[list[int]]:
         yield list(range(start, start + length))
 
 
-def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int) -> Generator[Batch, None, None]:
+def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int, copies: Copies) -> Batches:
+    return Batches(_read(clips, positions, workers, pinned=copies.overlap), clips.dataset.broken, copies)
+
+
+def _read(
+    clips: _Clips, positions: Iterator[list[int]], workers: int, *, pinned: bool
+) -> Generator[Row | InputError, None, None]:
     # A fork server has no threads: a plain fork may hang in OpenMP or CUDA, and Python warns of it.
     context = multiprocessing.get_context("forkserver") if workers else None
     if context is not None:
@@ -221,6 +234,7 @@ def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int) -> Gen
         multiprocessing_context=context,
         worker_init_fn=_end_with_the_run if workers else None,
         prefetch_factor=clips.dataset.config.prefetch if workers else None,
+        pin_memory=pinned,
     )
     others = set(multiprocessing.active_children())
     rows = iter(loader)
@@ -228,12 +242,7 @@ def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int) -> Gen
     at_exit = partial(_end, ours)
     atexit.register(at_exit)  # multiprocessing's own way is SIGTERM, and to wait for those that are deaf to it
     try:
-        for row in rows:
-            if isinstance(row, InputError):
-                raise row
-            for one in row.skipped:  # noted here, when its turn has come: whatever workers there are, at the same step
-                clips.dataset.broken.met(one.episode_id, one.reason)
-            yield row.batch
+        yield from rows
     finally:
         del rows  # asks the workers to end, and waits a while
         _end(ours)

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from vjepa2_ac.data.sources.latents.folder import Manifest
 from vjepa2_ac.data.sources.latents.precision import stored
+from vjepa2_ac.data.streams import copies_for
 from vjepa2_ac.encoding.ahead import Unreadable, decoded_ahead
 from vjepa2_ac.encoding.chunks import Chunks, Encode, Encoded
 from vjepa2_ac.encoding.room import picture_side
@@ -82,7 +83,10 @@ def _written(work: Work, encoder: EncoderAtWork, threads: int) -> Iterator[int]:
     yield 0
     side = picture_side(encoder.world_model.image_size)
     chunks = Chunks(
-        _storing(work, encoder), chunk=encoder.chunk, image_size=encoder.world_model.image_size, device=encoder.device
+        _storing(work, encoder),
+        chunk=encoder.chunk,
+        image_size=encoder.world_model.image_size,
+        copies=copies_for(encoder.device),
     )
     done, under_way = 0, deque[tuple[Future[int], int]]()
     decoded = decoded_ahead(work.dataset, work.left, threads=threads, side=side)

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from vjepa2_ac.data.streams import Copies
 from vjepa2_ac.data.transforms import pixels_to_input
 from vjepa2_ac.encoding.ahead import Part, Unreadable, Wanted
 from vjepa2_ac.episode import Episode, StoredLatents
@@ -41,15 +42,15 @@ class Chunks:
         encode: What is stored of normalised frames, on the device.
         chunk: Frames of a chunk.
         image_size: Height and width of a frame, in pixels.
-        device: Where frames are encoded.
+        copies: How frames get to where they are encoded, and latents back.
     """
 
-    def __init__(self, encode: Encode, *, chunk: int, image_size: int, device: torch.device) -> None:
+    def __init__(self, encode: Encode, *, chunk: int, image_size: int, copies: Copies) -> None:
         self._encode, self._chunk = encode, chunk
-        self._image_size, self._device = image_size, device
+        self._image_size, self._copies = image_size, copies
         self._inputs: list[Tensor] = []  # prepared, not yet encoded
         self._owners: list[Wanted] = []  # of each of these frames
-        self._under_way: deque[tuple[StoredLatents, list[Wanted]]] = deque()
+        self._under_way: deque[tuple[Callable[[], StoredLatents], list[Wanted]]] = deque()
         self._done: dict[Wanted, list[StoredLatents]] = {}
         self._pictures: dict[Wanted, list[np.ndarray]] = {}
         self._ends: deque[tuple[Wanted, Episode]] = deque()  # all of whose frames are here, in order
@@ -72,8 +73,9 @@ class Chunks:
         yield from self._complete(0)
 
     def _add(self, part: Part) -> None:
-        frames = torch.from_numpy(part.frames).to(self._device, non_blocking=True)
-        self._inputs.append(pixels_to_input(frames[None], self._image_size)[0])
+        frames = torch.from_numpy(part.frames)
+        arrived = self._copies.to_device.start(lambda copy: copy(frames))()
+        self._inputs.append(pixels_to_input(arrived[None], self._image_size)[0])
         self._owners += [part.wanted] * len(frames)
         self._done.setdefault(part.wanted, [])
         self._pictures.setdefault(part.wanted, []).append(part.pictures)
@@ -81,20 +83,21 @@ class Chunks:
             self._ends.append((part.wanted, part.recording))
 
     def _start(self) -> None:
-        """Encode one chunk."""
+        """Encode one chunk, and let its latents come as soon as they are there."""
         waiting = torch.cat(self._inputs)
         now, owners = waiting[: self._chunk], self._owners[: self._chunk]
         self._inputs, self._owners = [waiting[self._chunk :]], self._owners[self._chunk :]
         missing = self._chunk - len(now)
         if missing:
             now = torch.cat([now, now[-1:].expand(missing, -1, -1, -1)])
-        self._under_way.append((self._encode(now), owners))
+        self._under_way.append((self._copies.to_host.start(self._encode(now).mapped), owners))
         self.frames += len(owners)
 
     def _complete(self, under_way: int) -> Generator[Encoded, None, None]:
         """Fetch chunks until so many are under way, and yield what is whole by then."""
         while len(self._under_way) > under_way:
-            self._hand_out(*self._under_way.popleft())
+            fetched, owners = self._under_way.popleft()
+            self._hand_out(fetched().mapped(_unpinned), owners)
         while self._ends and self._is_whole(self._ends[0][0]):
             wanted, recording = self._ends.popleft()
             pictures = np.concatenate(self._pictures.pop(wanted))
@@ -102,7 +105,7 @@ class Chunks:
 
     def _hand_out(self, latents: StoredLatents, owners: list[Wanted]) -> None:
         """Give each its own frames of a chunk."""
-        values, scales = latents.values.cpu(), None if latents.scales is None else latents.scales.cpu()
+        values, scales = latents.values, latents.scales
         start = 0
         for owner, frames in itertools.groupby(owners):
             end = start + len(list(frames))
@@ -113,6 +116,11 @@ class Chunks:
 
     def _is_whole(self, wanted: Wanted) -> bool:
         return sum(len(piece.values) for piece in self._done[wanted]) == len(wanted.steps)
+
+
+def _unpinned(tensor: Tensor) -> Tensor:
+    """Return a tensor in memory that may be held for as long as an episode takes: pinned memory is never given back."""
+    return tensor.clone() if tensor.is_pinned() else tensor
 
 
 def _joined(pieces: list[StoredLatents]) -> StoredLatents:

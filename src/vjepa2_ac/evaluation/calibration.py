@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.streams import NO_COPIES, Copies
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
@@ -128,6 +129,7 @@ def calibrate(
     frames: int | None = None,
     clips: int = 64,
     batch_size: int = 8,
+    copies: Copies = NO_COPIES,
     progress: Progress | None = None,
 ) -> Calibration:
     """Measure a model's one-step error over persistence at each stride.
@@ -144,6 +146,7 @@ def calibrate(
         frames: Of a clip; None: the config's, but 8 at most, so that wide strides fit.
         clips: At each stride.
         batch_size: Clips that are measured at once.
+        copies: How they get to the model's device.
         progress: Told (clips done, clips in all).
 
     Raises:
@@ -157,7 +160,7 @@ def calibrate(
     chosen = validation_windows(views[possible[-1]], split, clips=clips)
     measured = {}
     for done, stride in enumerate(possible):
-        batches = batches_of(views[stride], chosen, batch_size=batch_size)
+        batches = batches_of(views[stride], chosen, batch_size=batch_size, copies=copies)
         parts = _measure(model, encode, batches, is_pose=settings.states == "pose")
         tell = _told(progress, done * len(chosen), len(possible) * len(chosen))
         measured[stride] = _Measured.joined(list(tell(parts)))

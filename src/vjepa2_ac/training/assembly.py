@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from functools import cached_property
@@ -17,6 +17,8 @@ from torch import nn
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import training_loader, validation_batches
+from vjepa2_ac.data.prefetch import Batches
+from vjepa2_ac.data.streams import Copies, copies_for
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.evaluation.calibration import Calibration
@@ -37,6 +39,7 @@ from vjepa2_ac.training.processes import from_first, of_all
 from vjepa2_ac.training.resume import micro_batches_of, say_what_is_new, take_up, take_up_loss_scale
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 from vjepa2_ac.training.sharding import check_launch, share_if_asked, whole_moments, whole_weights
+from vjepa2_ac.training.shared_memory import say_if_shared_memory_is_small
 from vjepa2_ac.training.stride import choose_stride, require_learned, with_stride
 from vjepa2_ac.training.torch_file import write_torch
 from vjepa2_ac.training.trackers import require_installed
@@ -92,6 +95,11 @@ class Run:
         return MicroStep(self.objective, self.accelerator, self.scaler)
 
     @property
+    def copies(self) -> Copies:
+        """How batches get to the run's device."""
+        return copies_for(self.accelerator.device)
+
+    @property
     def clips_per_step(self) -> int:
         """Clips of an optimizer step, of all processes together."""
         return self.micro_batches * self.config.training.batch_size * int(self.accelerator.num_processes)
@@ -136,6 +144,7 @@ def assemble(
     world_model = world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, first_clip)
     dataset = with_latents(config, dataset, world_model, accelerator, note, encoding=encoding, check_only=check_only)
+    say_if_shared_memory_is_small(config, dataset, first_clip, accelerator, note)
     fit_to_data(world_model, config, dataset, note)
     add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
     note(str(trainable_report(world_model)))
@@ -177,7 +186,7 @@ def make_accelerator(config: Config) -> Accelerator:
     return Accelerator(mixed_precision=precision, cpu=on_cpu, kwargs_handlers=[patience])
 
 
-def batches_from(run: Run) -> Generator[Batch, None, None]:
+def batches_from(run: Run) -> Batches:
     """Yield the micro-batches of this process from where the run stands."""
     return training_loader(
         run.dataset,
@@ -186,6 +195,7 @@ def batches_from(run: Run) -> Generator[Batch, None, None]:
         start_position=run.state.clips_done,
         rank=run.accelerator.process_index,
         world_size=run.accelerator.num_processes,
+        copies=run.copies,
     )
 
 

@@ -20,6 +20,7 @@ from vjepa2_ac.config_file import config_as_dict, config_from
 from vjepa2_ac.data.clips import pictures_of
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
+from vjepa2_ac.data.streams import copies_for
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
@@ -118,7 +119,8 @@ def evaluate_subject(
             progress=stage("calibrating strides") if stage else None,
         ).as_dict()
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
-    clips = _clips(through_cache, chosen, config.validation.batch_size, encode, world_model.image_size)
+    read = partial(batches_of, batch_size=config.validation.batch_size, copies=copies_for(accelerator.device))
+    clips = _clips(through_cache, chosen, read, encode, world_model.image_size)
     with accelerator.autocast():
         evaluation = evaluate(
             contenders,
@@ -295,7 +297,7 @@ def _like(world_model: WorldModel, other: str, config: Config, subject: str) -> 
 def _clips(
     dataset: Dataset,
     windows: Sequence[tuple[int, int]],
-    batch_size: int,
+    batches: Callable[[Dataset, Sequence[tuple[int, int]]], Iterable[Batch]],
     encode: Callable[[Batch], LatentBatch],
     image_size: int,
 ) -> ClipsAgain:
@@ -304,7 +306,7 @@ def _clips(
 
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, Pictures]]:
         wanted = windows if names is None else [by_name[name] for name in names]
-        for batch in batches_of(dataset, wanted, batch_size=batch_size):
+        for batch in batches(dataset, wanted):
             yield encode(batch), partial(_pictures, dataset, batch, image_size)
 
     return ClipsAgain(len(windows), read)

@@ -1,7 +1,8 @@
 """Is a run well, and is the machine busy? Figures of one optimizer step, for the journal and for the console.
 
 update_to_weight    norm of the update over the norm of the weights before it, of all that is trained together
-data_wait_share     share of the step's wall time that was spent waiting for the loader
+data_wait_share     share of the step's wall time that was spent waiting for the loader; on CUDA only what the device
+                    stood idle, since it computes what it has while the host waits
 samples_per_second  clips, of all processes
 tokens_per_second   patch tokens of the frames of these clips
 mfu                 model FLOPs per second (`training.cost.flops`) over the ceiling: what this device does in a large
@@ -23,9 +24,11 @@ from torch import Tensor
 from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.data.prefetch import fetch_ahead
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.training.cost.flops import clip_flops
 from vjepa2_ac.training.device import PRECISIONS
+from vjepa2_ac.training.stopwatch import HostStopwatch, Stopwatch
 
 MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "memory_gb"})
 """Figures of the machine: two runs that are the same differ in them."""
@@ -35,14 +38,20 @@ _CUDA_MATRIX, _CPU_MATRIX = 8192, 512
 
 
 class TimedBatches:
-    """Hands on batches, and knows how long it was waited for them.
+    """Hands on batches, and knows how long it was waited for them, also when they are fetched ahead.
 
     Args:
         batches: The loader's.
+        stopwatch: Measures the waiting; None: by the host's clock.
     """
 
-    def __init__(self, batches: Iterator[Batch]) -> None:
-        self._batches, self.waited_s = batches, 0.0
+    def __init__(self, batches: Iterator[Batch], stopwatch: Stopwatch | None = None) -> None:
+        self._batches, self._stopwatch = batches, stopwatch or HostStopwatch()
+
+    @property
+    def waited_s(self) -> float:
+        """Seconds of all waiting so far."""
+        return self._stopwatch.seconds
 
     def __iter__(self) -> TimedBatches:
         """Return itself."""
@@ -50,11 +59,13 @@ class TimedBatches:
 
     def __next__(self) -> Batch:
         """Return the next batch."""
-        started = time.perf_counter()
-        try:
+        with self._stopwatch.running():
             return next(self._batches)
-        finally:
-            self.waited_s += time.perf_counter() - started
+
+    def fetch_ahead(self) -> None:
+        """Fetch the next batch where that can be done ahead."""
+        with self._stopwatch.running():
+            fetch_ahead(self._batches)
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,7 @@ from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open
 from vjepa2_ac.training.run_lock import RunLock
 from vjepa2_ac.training.start_folder import require_start_folder
 from vjepa2_ac.training.step import gradients, training_step
+from vjepa2_ac.training.stopwatch import stopwatch_for
 from vjepa2_ac.training.stride import CALIBRATION, with_settled_stride
 from vjepa2_ac.training.trackers import open_trackers
 
@@ -173,7 +174,7 @@ def _loop(
     reporter.started(run.state.step, training.steps)
     clock = CheckpointClock(run.config.checkpoint)
     with stop_on_signals() as stop, contextlib.closing(batches_from(run)) as batches:
-        timed = TimedBatches(batches)
+        timed = TimedBatches(batches, stopwatch_for(device))
         for step in range(run.state.step + 1, training.steps + 1):
             last = step == training.steps
             is_logged = step % training.log_every == 0 or last
@@ -237,7 +238,11 @@ def _validate(run: Run, reporter: Reporter) -> PredictionErrors:
     config = run.config
     run.world_model.eval()
     batches = validation_batches(
-        run.dataset, "validation", clips=config.validation.clips, batch_size=config.validation.batch_size
+        run.dataset,
+        "validation",
+        clips=config.validation.clips,
+        batch_size=config.validation.batch_size,
+        copies=run.copies,
     )
     with run.accelerator.autocast():
         errors = prediction_errors(run.world_model, (encode(run, batch) for batch in batches))

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
+from vjepa2_ac.data.prefetch import fetch_ahead
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import is_url
@@ -52,7 +53,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     torch.manual_seed(step_seed(run.config.seed, step, run.accelerator.process_index))
     learning_rate = learning_rate_at(step, run.config.training)
     set_learning_rate(run.optimizer, learning_rate)
-    taken = gradients(run, batches, LookBack())
+    taken = gradients(run, batches, LookBack(), more=step < run.config.training.steps)
     update = Update(run.trained) if measure_update else None
     if taken.clips:  # without a clip there are no gradients, and nothing moves
         run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
@@ -70,7 +71,9 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     }
 
 
-def gradients(run: Run, batches: Iterator[Batch], look_back: LookBack | None = None) -> Gradients:
+def gradients(
+    run: Run, batches: Iterator[Batch], look_back: LookBack | None = None, *, more: bool = False
+) -> Gradients:
     """Accumulate and clip the gradients of the next micro-batches of all processes; the weights do not move.
 
     Loss and gradient are means over the clips of the step. Where clips are left out (`data.broken_episodes`: skip) they
@@ -80,6 +83,7 @@ def gradients(run: Run, batches: Iterator[Batch], look_back: LookBack | None = N
         run: The run.
         batches: Where its micro-batches come from.
         look_back: Saves clips into the run's folder where a loss or gradient is not finite; None: nothing is written.
+        more: Whether another step follows, whose first micro-batch is fetched while the device is still at work.
 
     Raises:
         InputError: A loss or gradient is not finite; names the clips of this process.
@@ -89,6 +93,8 @@ def gradients(run: Run, batches: Iterator[Batch], look_back: LookBack | None = N
     expected = run.clips_per_step
     with run.cast_matrices.current():
         totals, seen, fetched = _accumulate(run, batches, look_back)
+    if more:
+        fetch_ahead(batches)
     *losses, clips, fetched_by_all = sums(run.accelerator, [*totals.tolist(), len(seen), fetched])
     if not clips:
         return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(fetched_by_all))

@@ -10,6 +10,7 @@ from accelerate import Accelerator
 
 from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.streams import copies_for
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
@@ -130,5 +131,6 @@ def calibrate_model(
             frames=frames,
             clips=clips,
             batch_size=config.validation.batch_size,
+            copies=copies_for(accelerator.device),
             progress=progress,
         )

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -128,8 +129,21 @@ def test_a_run_on_latents_has_no_encoder_beside_the_predictor() -> None:
     )
     assert on_latents.encoder_weights == on_latents.encoding == on_pictures.caching == 0
     saved = on_pictures.total(checkpointing=False) - on_latents.total(checkpointing=False)
-    assert saved >= on_pictures.encoder_weights > 2e9
+    assert saved >= on_pictures.encoder_weights - on_latents.arriving
+    assert on_pictures.encoder_weights > 2e9
     assert on_pictures.encoder_weights < on_latents.caching < on_latents.total(checkpointing=False)
+
+
+@pytest.mark.parametrize(("cache_dtype", "number"), [("int8", 1), ("bf16", 2), ("fp32", 4)])
+def test_the_next_batch_is_there_in_the_type_of_the_cache_or_as_pixels(cache_dtype: str, number: int) -> None:
+    sizes, frames = ModelSizes(), 3 * 16
+    config = run_config(data__frames=16, training__batch_size=3, data__cache_dtype=cache_dtype)
+    cached = config.model_copy(update={"data": config.data.model_copy(update={"cache": "auto"})})
+    pixels, latents = (estimate_memory(one, sizes) for one in (config, cached))
+    assert pixels.arriving == frames * 256 * 256 * 3
+    assert latents.arriving == frames * 256 * 1408 * number
+    without = replace(latents, arriving=0)
+    assert latents.total(checkpointing=True) - without.total(checkpointing=True) == latents.arriving
 
 
 def test_encoding_a_cache_is_the_peak_where_the_predictor_is_small() -> None:

@@ -26,6 +26,7 @@ GIGABYTE = 10**9
 ALLOWANCE = 3 * GIGABYTE // 2  # CUDA context 0.5, cuBLAS workspaces, holes between blocks: not computed, allowed for
 USUAL_GPU = 24 * GIGABYTE
 
+_BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
 _SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # of bitsandbytes
 
 
@@ -40,6 +41,7 @@ class MemoryEstimate:
     trained: int
     gradients: int
     moments: int
+    arriving: int  # the next batch, on its way to the GPU; pictures as if they were of the model's size
     latents: int
     encoding: int  # activations of the encoder, for one chunk of frames, and the frames
     teacher_forcing: int
@@ -48,7 +50,7 @@ class MemoryEstimate:
     cast_cache: int  # copies of trained weights in the arithmetic's type
     checkpointed: int  # all of teacher forcing, rollout and losses, when blocks are computed again
     temporaries: int
-    optimizer_temporaries: int
+    optimizer_temporaries: int  # AdamW is fused; but of logged steps `update_to_weight` needs what was before
     validating: int  # all of a batch of validation
     caching: int  # all of encoding a cache, which is over before the rest begins
 
@@ -56,7 +58,7 @@ class MemoryEstimate:
     def standing(self) -> int:
         """What is there all the time."""
         weights = self.encoder_weights + self.predictor_weights + self.trained
-        return weights + self.moments + ALLOWANCE
+        return weights + self.moments + self.arriving + ALLOWANCE
 
     def total(self, *, checkpointing: bool) -> int:
         """Return the peak with or without gradient checkpointing."""
@@ -85,6 +87,7 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
         trained=parameters.trained * FLOAT32,
         gradients=parameters.trained * FLOAT32,
         moments=sum(_moments(config, size) for size in trained_tensors(config, sizes)),
+        arriving=_arriving(config, sizes),
         latents=_latents(config, sizes, config.training.batch_size),
         encoding=_encoding(config, sizes, config.training.batch_size),
         teacher_forcing=kept.teacher_forcing(),
@@ -93,7 +96,7 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
         cast_cache=kept.cast_cache(),
         checkpointed=kept.with_checkpointing(),
         temporaries=_temporaries(config, sizes, config.training.batch_size) + _dora_temporaries(config, sizes),
-        optimizer_temporaries=parameters.trained * FLOAT32 if config.training.optimizer == "adamw" else 0,
+        optimizer_temporaries=parameters.trained * FLOAT32,
         validating=_validating(config, sizes),
         caching=parameters.encoder * number + _caching(config, sizes) if config.data.cache != "off" else 0,
     )
@@ -155,6 +158,13 @@ def _moments(config: Config, elements: int) -> int:
     if config.training.optimizer == "adamw" or elements < _SMALLEST_IN_8_BITS:
         return 2 * elements * FLOAT32
     return 2 * (elements + -(-elements // _ELEMENTS_OF_A_SCALE) * FLOAT32)
+
+
+def _arriving(config: Config, sizes: ModelSizes) -> int:
+    frames = config.training.batch_size * config.data.frames
+    if not config.data.takes_latents:
+        return frames * 3 * sizes.image_size**2
+    return frames * _tokens_per_frame(sizes) * sizes.encoder.width * _BYTES_OF_CACHED[config.data.cache_dtype]
 
 
 def _latents(config: Config, sizes: ModelSizes, clips: int) -> int:

@@ -1,0 +1,173 @@
+"""How do tensors cross between host and device while the device computes? On streams of their own, by pinned memory."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol, TypeVar, runtime_checkable
+
+import torch
+from torch import Tensor
+
+_T = TypeVar("_T")
+Change = Callable[[Tensor], Tensor]
+
+
+class Cuda:
+    """What is asked of a CUDA device beside computing; a test puts a recording fake in its place.
+
+    Streams and events are PyTorch's.
+
+    Args:
+        device: Which one.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+
+    def new_stream(self) -> Any:
+        """Return another stream than the one that computes."""
+        return torch.cuda.Stream(self._device)  # type: ignore[no-untyped-call]  # torch
+
+    def computing(self) -> Any:
+        """Return the stream that computes."""
+        return torch.cuda.current_stream(self._device)
+
+    def on(self, stream: Any) -> contextlib.AbstractContextManager[object]:
+        """Let what is enqueued in the context go to a stream."""
+        return torch.cuda.stream(stream)
+
+    def to_device(self, pinned: Tensor) -> Tensor:
+        """Enqueue the copy of a pinned tensor, and return where it will be."""
+        return pinned.to(self._device, non_blocking=True)
+
+    def pinned_copy(self, tensor: Tensor) -> Tensor:
+        """Return a copy in pinned memory; of a tensor of the device it is enqueued only."""
+        return torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)
+
+    def used_by(self, tensor: Tensor, stream: Any) -> None:
+        """Let the memory of a tensor not be given away before a stream, not the one it was made on, is done with it."""
+        tensor.record_stream(stream)
+
+    def timestamp(self) -> Any:
+        """Enqueue an event that notes the time where the device computes, and return it."""
+        event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]  # torch
+        event.record(self.computing())
+        return event
+
+
+@runtime_checkable
+class Copying(Protocol):
+    """Copies in one direction."""
+
+    def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
+        """Start to copy tensors, and return what gives the copies.
+
+        Args:
+            mapped: Replaces each of them, such as `Batch.mapped`; it is called once, at once.
+        """
+        ...
+
+
+class ToDevice:
+    """Copies tensors to the device, on a stream of its own. Nothing waits but the computing that takes the copies.
+
+    What is not pinned is pinned first: a copy from other memory would be waited for.
+
+    Args:
+        cuda: The device.
+    """
+
+    def __init__(self, cuda: Cuda) -> None:
+        self._cuda, self._stream = cuda, cuda.new_stream()
+
+    def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
+        """Start to copy; what is returned lets computing wait for the copies, not the host, and gives them."""
+        cuda, copies = self._cuda, list[Tensor]()
+
+        def copy(tensor: Tensor) -> Tensor:
+            copies.append(cuda.to_device(tensor if tensor.is_pinned() else cuda.pinned_copy(tensor)))
+            return copies[-1]
+
+        with cuda.on(self._stream):
+            moved = mapped(copy)
+        done = self._stream.record_event()
+
+        def taken() -> _T:
+            computing = cuda.computing()
+            computing.wait_event(done)
+            for tensor in copies:
+                cuda.used_by(tensor, computing)
+            return moved
+
+        return taken
+
+
+class ToHost:
+    """Copies tensors from the device into pinned memory, on a stream of its own, once they are computed.
+
+    Args:
+        cuda: The device.
+    """
+
+    def __init__(self, cuda: Cuda) -> None:
+        self._cuda, self._stream = cuda, cuda.new_stream()
+
+    def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
+        """Start to copy; what is returned waits for these copies and for nothing enqueued since, and gives them."""
+        cuda, stream = self._cuda, self._stream
+
+        def copy(tensor: Tensor) -> Tensor:
+            cuda.used_by(tensor, stream)
+            return cuda.pinned_copy(tensor)
+
+        stream.wait_event(cuda.computing().record_event())
+        with cuda.on(stream):
+            moved = mapped(copy)
+        done = stream.record_event()
+
+        def taken() -> _T:
+            done.synchronize()
+            return moved
+
+        return taken
+
+
+class AtOnce:
+    """Copies where nothing could overlap; on a CPU nothing is copied at all.
+
+    Args:
+        device: Where to.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self._device = device
+
+    def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
+        """Copy."""
+        moved = mapped(lambda tensor: tensor.to(self._device))
+        return lambda: moved
+
+
+@dataclass(frozen=True)
+class Copies:
+    """Copies in both directions."""
+
+    to_device: Copying
+    to_host: Copying
+    overlap: bool  # whether the device computes meanwhile
+
+
+_HOST = torch.device("cpu")
+NO_COPIES = Copies(AtOnce(_HOST), AtOnce(_HOST), overlap=False)
+
+
+@lru_cache(maxsize=8)
+def copies_for(device: torch.device) -> Copies:
+    """Return how tensors get to a device and back; the same streams whenever it is asked for."""
+    if device.type != "cuda":
+        return Copies(AtOnce(device), AtOnce(_HOST), overlap=False)
+    cuda = Cuda(device)
+    return Copies(ToDevice(cuda), ToHost(cuda), overlap=True)
