@@ -73,9 +73,9 @@ def plain_curve(options: argparse.Namespace, clips: Sequence[LatentBatch], rows:
     """Return what the plain way learns, and add it as a row."""
     losses = curve(options, clips, PLAIN)
     noise = strays(losses, curve(options, clips, PLAIN, noise=_NOISE))
+    rows.add({"way": PLAIN, "losses": losses, "strays": noise})
     print(f"{PLAIN}: loss {losses[0]:.5f} at first, {losses[-1]:.5f} after {len(losses)} steps")
     print(f"{PLAIN} from weights that are off by {_NOISE:g}: strays by {noise:.1e}", flush=True)
-    rows.add({"way": PLAIN, "losses": losses, "strays": noise})
     return Curve(losses, noise)
 
 

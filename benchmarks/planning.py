@@ -80,8 +80,8 @@ def measure(options: argparse.Namespace, given: list[str], dtype: str, rows: Row
         for horizon, same in ways.items():
             for way in same:
                 row = memory_row(options, given, dtype, horizon, way)
-                print(memory_line(row), flush=True)
                 rows.add(row)
+                print(memory_line(row), flush=True)
 
 
 def measure_time(options: argparse.Namespace, dtype: str, rows: Rows) -> dict[int, list[Way]]:
@@ -116,8 +116,8 @@ def time_horizon(bench: Bench, horizon: int, same: Sequence[Way], ceiling: float
     for way, row in zip(same, rows_so_far(), strict=True):
         if way.is_in_8_bits and row["problem"] is None:
             row["added_energy"] = energy_of(bench, way, horizon)
-        print(time_line(row), flush=True)
         rows.add(row)
+        print(time_line(row), flush=True)
     if bench.options.profile:
         named = {"measured": "profile", "horizon": horizon, "way": same[-1].name}
         rows.attempt(partial(profile_decision, decisions[same[-1].name], bench, rows, named), **named)

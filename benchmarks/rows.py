@@ -77,7 +77,7 @@ def problem_of(error: Exception) -> str:
 
 def cell(value: float | None, width: int, form: str) -> str:
     """Return a number as wide as its column, a dash where there is none."""
-    return f"{'-':>{width}}" if value is None else f"{value:{width}{form}}"
+    return f"{'-' if value is None else format(value, form):>{width}}"
 
 
 def _finite(value: Any) -> Any:

@@ -77,8 +77,8 @@ def measure(options: argparse.Namespace, given: list[str], dtype: str, rows: Row
         print(f"{dtype}, memory\n{MEMORY_TITLES}")
         for setting, way in itertools.product(settings, ways):
             row = memory_row(options, given, dtype, setting, way)
-            print(memory_line(row), flush=True)
             rows.add(row)
+            print(memory_line(row), flush=True)
 
 
 def measure_time(options: argparse.Namespace, dtype: str, settings: Sequence[Setting], rows: Rows) -> list[str]:
@@ -115,8 +115,8 @@ def time_setting(bench: Bench, setting: Setting, ways: Sequence[str], ceiling: f
     for row in rows_so_far():
         if row["problem"] is None and bench.options.profile and row["way"] not in {OFFICIAL, OFFICIAL_FULL}:
             row |= {**compiled, "waits": waits_of(steps[row["way"]], bench)}
-        print(time_line(row), flush=True)
         rows.add(row)
+        print(time_line(row), flush=True)
 
 
 def time_row(
@@ -172,8 +172,11 @@ def choose_ways(bench: Bench, options: argparse.Namespace, rows: Rows) -> list[s
         print(f"official: skipped, for there is no {options.official / PREDICTOR}")
         return plain
     named = {"measured": "same loss and gradients", "dtype": str(bench.dtype).removeprefix("torch."), "way": OFFICIAL}
-    same = rows.attempt(partial(is_official_the_same, bench, rows, named), **named)
-    return [OFFICIAL, *([OFFICIAL_FULL] if options.full else []), *ours] if same else plain
+    if rows.attempt(partial(is_official_the_same, bench, rows, named), **named):
+        return [OFFICIAL, *([OFFICIAL_FULL] if options.full else []), *ours]
+    bench.keep_only(plain[0])
+    bench.let_go_of_a_step()
+    return plain
 
 
 def is_official_the_same(bench: Bench, rows: Rows, named: Row) -> bool:

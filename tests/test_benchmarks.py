@@ -193,6 +193,26 @@ def step_memory(train_step: Any) -> Any:
     return sys.modules[train_step.memory_row.__module__]
 
 
+def test_on_cuda_a_peak_stands_beside_doctors_estimate(
+    step_memory: Any, train_step: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = train_step.parse(["--device", "cuda", "--frames", "16", "--batch", "2", "--cap-gb", "24"])
+    (setting,) = step_memory.asked(options)
+    asked: list[tuple[list[str], str, float]] = []
+
+    def peak_alone(_: object, command: list[str], *given: Any) -> dict[str, Any]:
+        asked.append((command, *given))
+        return {"peak_gb": 10.0, "problem": None}
+
+    monkeypatch.setattr(step_memory, "peak_alone", peak_alone)
+    monkeypatch.setattr(step_memory.Bench, "estimated_gb", lambda *_: 11.5)
+    row = step_memory.memory_row(options, [], "bfloat16", setting, "auto")
+    assert asked[0][1:] == ("cuda", 24.0)
+    assert step_memory.memory_line(row).split() == ["16", "2", "no", "cache", "auto", "10.00", "11.50", "+15%"]
+    whole = step_memory.memory_row(options, [], "bfloat16", setting, "official_full")
+    assert step_memory.memory_line(whole).split()[-3:] == ["10.00", "-", "-"]
+
+
 def test_the_largest_batch_is_the_last_that_fits(step_memory: Any) -> None:
     for fitting in (0, 1, 2, 19, 128, 500):
         assert step_memory.largest_batch(lambda batch, fitting=fitting: batch <= fitting) == min(fitting, 128)
