@@ -1,9 +1,10 @@
-# make demo · make evidence · make test · make lint · make soak · make bench · make base: each creates the environment it needs.
+# make demo · make evidence · make test · make test-oldest · make lint · make soak · make bench · make base: each creates the environment it needs.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
+OLDEST := .venv-oldest
 
-.PHONY: demo demo-seeds base evidence test soak lint format bench clean
+.PHONY: demo demo-seeds base evidence test test-oldest soak lint format bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
@@ -32,6 +33,17 @@ evidence: $(INSTALLED)  ## does LoRA help? every method side by side; goes on wh
 test: $(INSTALLED)  ## the whole test suite
 	$(BIN)/pytest -q
 
+# There is no CPU wheel of PyTorch 2.11: this takes the one with CUDA, 5 GB in all, which runs without a GPU, too.
+$(OLDEST)/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(OLDEST)
+	grep -v -e '^torch==' -e '^transformers==' -e '^tokenizers==' -e '^huggingface_hub==' constraints.txt > $(OLDEST)/constraints.txt
+	$(OLDEST)/bin/pip install --quiet --disable-pip-version-check -c $(OLDEST)/constraints.txt \
+		torch==2.11.0 transformers==5.17.0 -e ".[sim,dev]"
+	touch $@
+
+test-oldest: $(OLDEST)/installed  ## model, training and what is compiled, on the oldest PyTorch and transformers allowed
+	$(OLDEST)/bin/pytest -q tests/model tests/training tests/planning tests/encoding
+
 soak: $(INSTALLED)  ## runs that are killed 20 times each (0 and 2 loader workers, with and without a best checkpoint)
 	VJEPA2_AC_SOAK=20 $(BIN)/pytest -q --log-cli-level=INFO tests/training/test_soak.py
 
@@ -51,4 +63,4 @@ bench: $(INSTALLED)  ## figures of this machine; each prints a ratio against a n
 	$(BIN)/python benchmarks/planning.py
 
 clean:
-	rm -rf .venv demo
+	rm -rf .venv .venv-oldest demo

@@ -6,7 +6,7 @@
 Everything is as in a run: a data set of a simulated arm (180x320 JPEGs in RLDS), encoded by what `vjepa2-ac encode`
 does; then the training step of a run on pictures and that of one on latents take turns, loader and all, so that a busy
 machine slows them alike. Widths are those of ViT-g and its predictor; by default both are an eighth as deep, for a CPU.
-On a CPU the process's own time over its threads counts, else wall time.
+On a CPU the process's own time over its threads counts, else wall time; the median.
 
 Beside it the encoder alone on random frames: frames/s, which is what a loader must deliver to keep it busy, its MFU
 (`training.cost.flops` over what the device does in a product of matrices), and what share of that speed the whole
@@ -14,6 +14,8 @@ Beside it the encoder alone on random frames: frames/s, which is what a loader m
 
 Then what storing latents in fewer bits costs: the one-step and rollout error of the shipped model on simulated
 episodes, predicted from latents as they are read back, against the true ones, over the error of persistence.
+
+--json is written after every row. A row that fails says so, and the exit status is 1 then, when all else was measured.
 """
 
 from __future__ import annotations
@@ -23,11 +25,15 @@ import statistics
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from timing import clock_s
+from memory import let_go
+from random_models import no_fingerprints
+from rows import Row, Rows, cell
+from timing import Turns, about, add_basics, add_repeats, clock_s, introduction, prepare, ratio, rounds, settle
 from torch import Tensor
 
 from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
@@ -58,19 +64,23 @@ QUICK = {
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print speed, size and added error."""
-    options = parse(arguments)
-    print(f"torch {torch.__version__}, {options.device}, {torch.get_num_threads()} threads, {options.precision}")
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    options = parse(given)
+    prepare(options)
+    print(f"{introduction(options)}, {options.precision}")
+    rows = Rows(options.json, **about(options, given))
+    with tempfile.TemporaryDirectory() as folder, no_fingerprints():
+        rows.attempt(partial(measure_speed, options, Path(folder), rows), measured="speed")
+        let_go(options.device)
+        print_sizes(options, rows)
     with tempfile.TemporaryDirectory() as folder:
-        measure_speed(options, Path(folder))
-        print_sizes(options)
-        measure_error(options, Path(folder))
+        rows.attempt(partial(measure_error, options, Path(folder), rows), measured="added error")
+    rows.finish()
 
 
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: whether it works")
-    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("--encoder-layers", type=int, default=5, help="of 40")
     parser.add_argument("--predictor-layers", type=int, default=3, help="of 24")
     parser.add_argument("--width", type=int, default=1024, help="of the predictor, 64 a head")
@@ -81,50 +91,76 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--episodes", type=int, default=8, help="to train on")
     parser.add_argument("--test-episodes", type=int, default=40, help="to measure the added error on, of each domain")
     parser.add_argument("--domains", nargs="+", default=["random", "B"], help="of the simulated arm, for the same")
-    parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--workers", type=int, default=0, help="of the loader; 0 counts reading as part of the step")
     parser.add_argument("--precision", default="bf16", choices=("bf16", "fp32"))
-    options = parser.parse_args(sys.argv[1:] if arguments is None else arguments)
-    if options.quick:
-        vars(options).update(QUICK)
-    return options
+    add_basics(parser)
+    add_repeats(parser)
+    return settle(parser.parse_args(arguments), QUICK)
 
 
 # ---- speed -------------------------------------------------------------------------------------------------------
 
 
-def measure_speed(options: argparse.Namespace, folder: Path) -> None:
+def measure_speed(options: argparse.Namespace, folder: Path, rows: Rows) -> None:
     """Time training steps on pictures and on latents of the same clips."""
-    sizes = ModelSizes(
-        image_size=options.image_size,
-        encoder=EncoderSizes(width=options.latent_dim, heads=options.latent_dim // 64, depth=options.encoder_layers),
-        predictor=PredictorSizes(width=options.width, heads=options.width // 64, depth=options.predictor_layers),
-    )
     dtype = torch.bfloat16 if options.precision == "bf16" else torch.float32
-    WorldModel.random(sizes, seed=0, dtype=dtype).save_pretrained(folder / "model")
+    sizes = sizes_of(options)
+    WorldModel.random(sizes, seed=0, dtype=dtype, device=options.device).save_pretrained(folder / "model")
     steps = (max(options.frames) - 1) * STRIDE + 9
-    record_dataset(folder / "data", domain="A", episodes=options.episodes, steps=steps, seed=1)
+    record_dataset(
+        folder / "data", domain="A", episodes=options.episodes, steps=steps, seed=1, workers=max(1, options.workers)
+    )
     print(
         f"encoder {options.encoder_layers} of 40 layers, predictor {options.predictor_layers} of 24,"
         f" {options.image_size} px, batch {options.batch}; wall or processor's ms a clip, median of {options.repeats}"
     )
     print(
         f"{'frames':>6}{'encoder frames/s':>18}{'MFU':>7}{'encode frames/s':>17}{'of encoder':>12}{'pictures, ms':>14}"
-        f"{'latents, ms':>13}{'ratio':>8}"
+        f"{'min':>8}{'latents, ms':>13}{'min':>8}{'ratio':>8}"
     )
-    alone = 0.0
+    alone = encoder_speed(assemble(config_of(options, folder, options.frames[0], "off"), lambda _: None), options)
+    mfu = alone * frame_flops(sizes) / matmul_speed(torch.device(options.device), dtype)
+    rows.add({"measured": "encoder alone", "frames_per_s": alone, "mfu": mfu})
     for frames in options.frames:
-        pictures = config_of(options, folder, frames, "off")
-        latents = config_of(options, folder, frames, "require")
-        speed = encode(latents, options.device)
-        runs = {"pictures": assemble(pictures, lambda _: None), "latents": assemble(latents, lambda _: None)}
-        alone = alone or encoder_speed(runs["pictures"], options)  # whatever the frames of a clip
-        mfu = alone * frame_flops(sizes) / matmul_speed(torch.device(options.device), dtype)
-        seconds = take_turns(runs, options)
-        each = {name: 1e3 * statistics.median(some) / options.batch for name, some in seconds.items()}
-        ratio = statistics.median(a / b for a, b in zip(seconds["pictures"], seconds["latents"], strict=True))
+        let_go(options.device)
+        row = rows.attempt(partial(speed_row, options, folder, frames, rows), measured="speed", frames=frames)
+        if row is None:
+            continue
+        rows.add(row)
+        speed = row["encode_frames_per_s"]
         print(f"{frames:6}{alone:18.2f}{mfu:7.1%}{speed:17.2f}{speed / alone:12.0%}", end="")
-        print(f"{each['pictures']:14.0f}{each['latents']:13.0f}{ratio:7.2f}x", flush=True)
+        cells = (("pictures_ms", 14), ("pictures_min_ms", 8), ("latents_ms", 13), ("latents_min_ms", 8))
+        print("".join(cell(row[name], width, ".0f") for name, width in cells), end="")
+        print(f"{cell(row['ratio'], 7, '.2f')}x  {row['problem'] or ''}".rstrip(), flush=True)
+
+
+def speed_row(options: argparse.Namespace, folder: Path, frames: int, rows: Rows) -> Row:
+    """Return how fast a clip is encoded for the cache, and trained on from pictures and from latents."""
+    pictures, latents = (config_of(options, folder, frames, cache) for cache in ("off", "require"))
+    row: Row = {"measured": "speed", "frames": frames, "encode_frames_per_s": encode(latents, options.device)}
+    rows.so_far(row)
+    runs = {"pictures": assemble(pictures, lambda _: None), "latents": assemble(latents, lambda _: None)}
+    batches = {name: batches_from(run) for name, run in runs.items()}
+    steps = {name: partial(training_step, run, batches[name], PAST_WARM_UP) for name, run in runs.items()}
+    turns: dict[str, Turns] = {}
+    for seen in rounds(steps, options, partial(let_go, options.device)):
+        turns = seen
+    for each in batches.values():
+        each.close()
+    for name, one in turns.items():
+        for key, seconds in (("ms", one.median_s), ("min_ms", one.least_s)):
+            row[f"{name}_{key}"] = seconds and 1e3 * seconds / options.batch
+    problems = [f"{one.problem} ({name})" for name, one in turns.items() if one.problem]
+    return {**row, "ratio": ratio(turns["pictures"], turns["latents"]), "problem": "; ".join(problems) or None}
+
+
+def sizes_of(options: argparse.Namespace) -> ModelSizes:
+    """Return the sizes of the model that speed is measured with."""
+    return ModelSizes(
+        image_size=options.image_size,
+        encoder=EncoderSizes(width=options.latent_dim, heads=options.latent_dim // 64, depth=options.encoder_layers),
+        predictor=PredictorSizes(width=options.width, heads=options.width // 64, depth=options.predictor_layers),
+    )
 
 
 def config_of(options: argparse.Namespace, folder: Path, frames: int, cache: str) -> Config:
@@ -169,56 +205,55 @@ def encoder_speed(run: Run, options: argparse.Namespace) -> float:
     return frames.shape[1] / statistics.median(seconds[1:])
 
 
-def take_turns(runs: dict[str, Run], options: argparse.Namespace) -> dict[str, list[float]]:
-    """Return the seconds of each repeat of a training step; the first round does not count."""
-    batches = {name: batches_from(run) for name, run in runs.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in runs}
-    for repeat in range(options.repeats + 1):
-        for name, run in runs.items():
-            start = clock_s(options.device)
-            training_step(run, batches[name], PAST_WARM_UP + repeat)
-            if repeat:
-                seconds[name].append(clock_s(options.device) - start)
-    for each in batches.values():
-        each.close()
-    return seconds
-
-
 # ---- size --------------------------------------------------------------------------------------------------------
 
 
-def print_sizes(options: argparse.Namespace) -> None:
-    """Print the gigabytes of an hour of robot data in each type."""
+def print_sizes(options: argparse.Namespace, rows: Rows) -> None:
+    """Print and add the gigabytes of an hour of robot data in each type."""
     tokens = (options.image_size // 16) ** 2
     print(f"{'stored as':>10}{'MB a frame':>12}{'GB an hour':>12}{f'with start_every={STRIDE}':>22}")
     for kind in DTYPES:
         frame = bytes_per_frame(tokens, options.latent_dim, kind) + picture_bytes(options.image_size)
         hour = frame * RATE_HZ * 3600 / 1e9
         print(f"{kind:>10}{frame / 1e6:12.3f}{hour:12.2f}{hour / STRIDE:22.2f}")
+        rows.add({"measured": "size", "stored_as": kind, "frame_mb": frame / 1e6, "hour_gb": hour})
 
 
 # ---- added error -------------------------------------------------------------------------------------------------
 
 
-def measure_error(options: argparse.Namespace, folder: Path) -> None:
-    """Print the error over persistence of the shipped model from latents as they are read back."""
+def measure_error(options: argparse.Namespace, folder: Path, rows: Rows) -> None:
+    """Print and add the error over persistence of the shipped model from latents as they are read back."""
     model = load_base(ModelConfig(base="builtin:sim-tiny", dtype="float32"), seed=0).eval()
     print(
         f"{'domain':>8}{'stored as':>11}{'one step':>10}{'added':>10}{'rollout':>10}{'added':>10}{'stored error':>14}"
     )
     for number, domain in enumerate(options.domains):
-        place = folder / f"test {domain}"
-        record_dataset(place, domain=domain, episodes=options.test_episodes, steps=33, seed=7 + number)
-        batches = list(latents_of(model, place, folder / "kept"))
-        true: tuple[float, float] | None = None
-        for kind in ("fp32", "bf16", "int8"):
-            one_step, rollout = errors(model, batches, kind)
-            true = true or (one_step, rollout)
-            off = statistics.mean(float((read(b.latents, kind) - b.latents).abs().mean()) for b in batches)
-            print(
-                f"{domain:>8}{kind:>11}{one_step:10.5f}{one_step / true[0] - 1:+10.3%}{rollout:10.5f}"
-                f"{rollout / true[1] - 1:+10.3%}{off:14.5f}"
-            )
+        named = {"measured": "added error", "domain": domain}
+        rows.attempt(partial(measure_domain, options, folder, model, number, rows), **named)
+
+
+def measure_domain(options: argparse.Namespace, folder: Path, model: WorldModel, number: int, rows: Rows) -> None:
+    """Print and add a row for each type that latents are stored in, on episodes of one domain."""
+    domain = options.domains[number]
+    place = folder / f"test {domain}"
+    workers = max(1, options.workers)
+    record_dataset(place, domain=domain, episodes=options.test_episodes, steps=33, seed=7 + number, workers=workers)
+    batches = list(latents_of(model, place, folder / "kept"))
+    true: tuple[float, float] | None = None
+    for kind in ("fp32", "bf16", "int8"):
+        one_step, rollout = errors(model, batches, kind)
+        true = true or (one_step, rollout)
+        off = statistics.mean(float((read(b.latents, kind) - b.latents).abs().mean()) for b in batches)
+        added = one_step / true[0] - 1, rollout / true[1] - 1
+        print(
+            f"{domain:>8}{kind:>11}{one_step:10.5f}{added[0]:+10.3%}{rollout:10.5f}{added[1]:+10.3%}{off:14.5f}",
+            flush=True,
+        )
+        rows.add({
+            "measured": "added error", "domain": domain, "stored_as": kind, "one_step": one_step, "rollout": rollout,
+            "added_one_step": added[0], "added_rollout": added[1], "stored_error": off,
+        })  # fmt: skip
 
 
 def latents_of(model: WorldModel, path: Path, kept: Path) -> Iterator[LatentBatch]:

@@ -13,7 +13,7 @@ import importlib.util
 import sys
 import types
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -55,10 +55,10 @@ class Official:
         self, checkout: Path, weights: Mapping[str, Any], sizes: ModelSizes, adapter: AdapterConfig | None,
         training: TrainingConfig, *, frames: int, encoder: bool, device: torch.device,
     ) -> None:  # fmt: skip
-        self._module = imported(checkout, "src.models.ac_predictor")
-        predictor = build_predictor(self._module, sizes, frames)
+        self._device, self._rollout_steps = device, training.rollout_steps
+        module = imported(checkout, "src.models.ac_predictor")
+        self._inner = predictor = self._built(partial(build_predictor, module, sizes, frames))
         self._load(predictor, weights, "predictor")
-        self._inner, self._device, self._rollout_steps = predictor, device, training.rollout_steps
         self.predictor = self._placed(predictor if adapter is None else _with_lora(predictor, adapter)).train()
         self._encoder = self._frozen_encoder(checkout, weights, sizes) if encoder else None
         self.trained = [parameter for parameter in self.predictor.parameters() if parameter.requires_grad]
@@ -114,9 +114,13 @@ class Official:
         return layer_norm(following, following.shape[-1:]).unflatten(1, latents.shape[1:3])
 
     def _frozen_encoder(self, checkout: Path, weights: Mapping[str, Any], sizes: ModelSizes) -> nn.Module:
-        network = _encoder(imported(checkout, "src.models.vision_transformer"), sizes)
+        module = imported(checkout, "src.models.vision_transformer")
+        network = self._built(partial(_encoder, module, sizes))
         self._load(network, weights, "encoder")
         return self._placed(network.requires_grad_(False))
+
+    def _built(self, build: Callable[[], nn.Module]) -> nn.Module:
+        return built_on(self._device, build)
 
     def _load(self, module: nn.Module, weights: Mapping[str, Any], part: str) -> None:
         module.load_state_dict(plain_names(weights[part]))
@@ -188,6 +192,20 @@ def _with_lora(predictor: nn.Module, adapter: AdapterConfig) -> nn.Module:
 def plain_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return float32 weights by the names that the official modules give them."""
     return {name.removeprefix("module."): value.float() for name, value in weights.items()}
+
+
+def built_on(device: torch.device, build: Callable[[], nn.Module]) -> nn.Module:
+    """Return a module whose first weights are drawn on a device: they are replaced, and shall cost no time.
+
+    What it holds besides, such as its mask, is made on the host, as without this.
+    """
+    with device:
+        module = build()
+    for part in module.modules():
+        for name, value in list(vars(part).items()):
+            if isinstance(value, Tensor):
+                setattr(part, name, value.cpu())
+    return module
 
 
 def build_predictor(module: Any, sizes: ModelSizes, frames: int) -> nn.Module:

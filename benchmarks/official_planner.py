@@ -9,12 +9,13 @@ autocast (its attention refuses to be cast), the mask is made for the plan's len
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest import mock
 
 import torch
-from official import build_predictor, imported, plain_names
+from official import build_predictor, built_on, imported, plain_names
 from torch import Tensor
 
 from vjepa2_ac.config import ModelSizes
@@ -39,7 +40,8 @@ class OfficialPlanner:
     def __init__(
         self, checkout: Path, weights: Mapping[str, Any], sizes: ModelSizes, *, steps: int, device: torch.device
     ) -> None:
-        predictor = build_predictor(imported(checkout, "src.models.ac_predictor"), sizes, steps)
+        module = imported(checkout, "src.models.ac_predictor")
+        predictor = built_on(device, partial(build_predictor, module, sizes, steps))
         predictor.load_state_dict(plain_names(weights))
         self._predictor, self._device = predictor.to(device).eval(), device
         with mock.patch("logging.basicConfig"):  # it would take every message of this program

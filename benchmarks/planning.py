@@ -12,30 +12,36 @@ official   the planner of the official notebook on the official predictor, where
            is at --official (`official_planner.py`)
 ours/N     ours, N samples through the predictor at once; plain takes as many as the first of these. With --compile
            once more with compiled blocks (`planning.compile`): N+compiled. With --quantize once more in 8 bits
-           (`planning.quantize`): N+fp8, and by how much the energy of its plan changes
+           (`planning.quantize`), of bfloat16 weights: N+fp8, and by how much the energy of its plan changes. The first
+           N once more with a float32 LoRA on, made ready as `plan RUN` does it: N+adapter (--no-adapter: not)
 
-Before anything is timed all must choose the same actions, on the same weights with the same seed, in float32: what
-chooses others, or finds other energies, gets no ratio. A ratio over 1 means faster than plain, or than the official
-one. All take turns; on a CPU the process's own time over its threads counts, else wall time. MFU: the model FLOPs of
-`training.cost.flops` over what the device does in a product of matrices, measured first; the same for every way. Peak
-memory, weights included, is of two decisions in a process of its own for each line.
+Before anything is timed all but those in 8 bits must choose the same actions, on the same weights with the same seed,
+in float32: what chooses others, or finds other energies, gets no ratio. A ratio over 1 means faster than plain, or than
+the official one. All take turns; on a CPU the process's own time over its threads counts, else wall time; the median,
+and the fastest. MFU: the model FLOPs of `training.cost.flops` over what the device does in a product of matrices,
+measured first; the same for every way. `retries`: how often the allocator had to give memory back while a way was
+timed, whose time then does not count. Peak memory, weights included, is of two decisions in a pass of its own, after
+all times: each line alone on the device, or on a CPU in a process of its own.
+
+--json is written after every round. What runs out of memory says so; what fails otherwise, too, and the exit status is
+1 then, when all else was measured.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
-import statistics
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
-import torch
+from decision_ways import OFFICIAL, PLAIN, Way
+from memory import is_expandable, let_go, peak_alone, peak_gb
 from official_planner import PLANNER
-from timed_decisions import OFFICIAL, PLAIN, Bench, Way
-from timing import WAITS, add_options, device_name, in_own_process, peak_memory_gb, take_turns
-from torch.profiler import ProfilerActivity, profile
+from rows import Row, Rows, cell, problem_of
+from timed_decisions import Bench
+from timing import Turns, about, add_options, introduction, prepare, profiled, ratio, rounds, settle
 
 from vjepa2_ac.training.health import matmul_speed
 
@@ -46,40 +52,152 @@ QUICK = {
 _ON_CPU = {"layers": 2, "samples": 8, "iterations": 2, "horizon": [2, 4], "at_once": [8], "dtype": ["float32"]}
 _ON_CUDA = {"layers": 24, "samples": 800, "iterations": 10, "horizon": [1, 2], "at_once": [64], "dtype": ["bfloat16"]}
 _PROFILED_ROWS = 15
+_NAMES = f"{'horizon':>7}  {'way':22}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Print a line for each horizon and way: seconds a decision, MFU, peak memory, ratios to plain and official."""
+    """Print a line for each horizon and way: seconds a decision, MFU, ratios to plain and official; peak memory."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     options = parse(given)
+    prepare(options)
     if options.memory_of:
-        print(json.dumps(memory_of_way(Bench(options, options.dtype[0]), options)))
+        way = Way(options.memory_of[0], int(options.memory_of[1]))
+        print(json.dumps(memory_of_way(options, options.dtype[0], options.horizon[0], way)))
         return
     _introduce(options)
+    rows = Rows(options.json, **about(options, given))
     for dtype in options.dtype:
-        bench = Bench(options, dtype)
-        ways = {horizon: same_ways(bench, horizon) for horizon in options.horizon}  # before ours takes its own type
+        rows.attempt(partial(measure, options, given, dtype, rows), dtype=dtype)
+    rows.finish()
+
+
+def measure(options: argparse.Namespace, given: list[str], dtype: str, rows: Rows) -> None:
+    """Measure all horizons in one precision: first time, then memory."""
+    ways = measure_time(options, dtype, rows)
+    let_go(options.device)
+    if options.memory:
+        print(f"{dtype}, memory\n{_NAMES}{'peak GB':>12}")
+        for horizon, same in ways.items():
+            for way in same:
+                row = memory_row(options, given, dtype, horizon, way)
+                print(memory_line(row), flush=True)
+                rows.add(row)
+
+
+def measure_time(options: argparse.Namespace, dtype: str, rows: Rows) -> dict[int, list[Way]]:
+    """Time all horizons, if that is asked for, and return the ways of each; nothing stays on the device."""
+    bench = Bench(options, dtype)
+    rows.about["expandable_segments"] = is_expandable(options.device)
+    ways = {horizon: same_ways(bench, horizon, rows) for horizon in options.horizon}  # before ours takes its own type
+    if options.time:
         ceiling = matmul_speed(bench.device, bench.dtype)
         print(f"{dtype}: ceiling {ceiling / 1e12:.3g} TFLOP/s")
-        titles = ("s/decision", "samples/s", "MFU", "peak GB", "of plain", "of official")
-        print(f"{'horizon':>7}  {'way':19}" + "".join(f"{title:>12}" for title in titles))
+        titles = ("s/decision", "min", "samples/s", "MFU", "retries", "of plain", "of official")
+        print(_NAMES + "".join(f"{title:>12}" for title in titles))
         for horizon, same in ways.items():
-            seconds = take_turns({way.name: bench.decision(way, horizon) for way in same}, options)
-            for way in same:
-                if way.settings["quantize"] != "off":
-                    added = f"{bench.added_energy(way, horizon):+.2%}, as the plain model sees it"
-                    print(f"{horizon:7}  {way.name}: the plan's energy changes by {added}")
-            for way in same:
-                median = statistics.median(seconds[way.name])
-                peak = memory_in_own_process(given, way, horizon, dtype) if options.memory else math.nan
-                print(
-                    f"{horizon:7}  {way.name:19}{median:12.3f}{bench.sequences / median:12.2f}"
-                    f"{bench.flops(horizon) / median / ceiling:12.1%}{peak:12.2f}"
-                    + "".join(f"{ratio(seconds, base, way.name):12.2f}" for base in (PLAIN, OFFICIAL)),
-                    flush=True,
-                )
-            if options.profile:
-                print(profiled(bench.decision(same[-1], horizon), options))
+            named = {"dtype": dtype, "horizon": horizon}
+            rows.attempt(partial(time_horizon, bench, horizon, same, ceiling, rows), **named)
+    return ways
+
+
+def time_horizon(bench: Bench, horizon: int, same: Sequence[Way], ceiling: float, rows: Rows) -> None:
+    """Add a row for each way, and if that is asked for one of where the time goes in the last one."""
+    device = bench.options.device
+    let_go(device)
+    seen: dict[str, Turns] = {}  # nothing before the first round is over
+
+    def rows_so_far() -> list[Row]:
+        return [time_row(bench, horizon, way, seen, ceiling) for way in same]
+
+    decisions = {way.name: bench.decision(way, horizon) for way in same}
+    for so_far in rounds(decisions, bench.options, partial(let_go, device)):
+        seen = so_far
+        rows.so_far(*rows_so_far())
+    for way, row in zip(same, rows_so_far(), strict=True):
+        if way.is_in_8_bits and row["problem"] is None:
+            row["added_energy"] = energy_of(bench, way, horizon)
+        print(time_line(row), flush=True)
+        rows.add(row)
+    if bench.options.profile:
+        named = {"measured": "profile", "horizon": horizon, "way": same[-1].name}
+        rows.attempt(partial(profile_decision, decisions[same[-1].name], bench, rows, named), **named)
+
+
+def time_row(bench: Bench, horizon: int, way: Way, seen: Mapping[str, Turns], ceiling: float) -> Row:
+    """Return what was seen of a way so far."""
+    turns = seen.get(way.name)
+    figures = (turns or Turns()).figures()
+    seconds = figures["s"]
+    return {
+        "measured": "time", "dtype": str(bench.dtype).removeprefix("torch."), "ceiling": ceiling, "horizon": horizon,
+        "way": way.name, "at_once": way.at_once, **figures, "samples_per_s": seconds and bench.sequences / seconds,
+        "mfu": seconds and bench.flops(horizon) / seconds / ceiling,
+        **{f"ratio_to_{base}": ratio(seen.get(base), turns) for base in (PLAIN, OFFICIAL)},
+    }  # fmt: skip
+
+
+def energy_of(bench: Bench, way: Way, horizon: int) -> float | str:
+    """Return by what share the energy of its plan is more than that of ours, or how asking failed."""
+    try:
+        return bench.added_energy(way, horizon)
+    except Exception as error:
+        return problem_of(error)
+
+
+def time_line(row: Row) -> str:
+    """Return a row of the table of times."""
+    if row["problem"]:
+        return f"{names_of(row)}{row['problem']}"
+    text = f"{names_of(row)}{row['s']:12.3f}{row['min_s']:12.3f}{row['samples_per_s']:12.2f}{row['mfu']:12.1%}"
+    text += f"{row['alloc_retries']:12}" + "".join(
+        cell(row[f"ratio_to_{base}"], 12, ".2f") for base in (PLAIN, OFFICIAL)
+    )
+    added = row.get("added_energy")
+    if added is None:
+        return text
+    told = added if isinstance(added, str) else f"changes by {added:+.2%}, as the plain model sees it"
+    return f"{text}  [the plan's energy: {told}]"
+
+
+def profile_decision(decide: Callable[[], object], bench: Bench, rows: Rows, named: Row) -> None:
+    """Add and print where the time of a decision goes, and on CUDA how often the host waits for the device in it."""
+    on_cuda = bench.options.device != "cpu"
+    found = profiled(decide, bench.options.device)
+    order = "self_device_time_total" if on_cuda else "self_cpu_time_total"
+    dearest = sorted(found.events, key=lambda event: -getattr(event, order))[:_PROFILED_ROWS]
+    costs = [{"name": one.key, "ms": getattr(one, order) / 1e3, "count": one.count} for one in dearest]
+    rows.add({**named, "waits": found.waits, "dearest": costs})
+    print(found.events.table(sort_by=order, row_limit=_PROFILED_ROWS, max_name_column_width=40))
+    if on_cuda:
+        print(f"the host waited, in {bench.options.iterations} iterations: {found.waits}")
+
+
+def memory_row(options: argparse.Namespace, given: list[str], dtype: str, horizon: int, way: Way) -> Row:
+    """Return the peak of a way."""
+    own = ["--horizon", str(horizon), "--dtype", dtype, "--memory-of", way.name, str(way.at_once)]
+    alone = partial(memory_of_way, options, dtype, horizon, way)
+    return {
+        "measured": "memory", "dtype": dtype, "horizon": horizon, "way": way.name,
+        **peak_alone(alone, [__file__, *given, *own], options.device),
+    }  # fmt: skip
+
+
+def memory_of_way(options: argparse.Namespace, dtype: str, horizon: int, way: Way) -> float:
+    """Return the peak in 10^9 bytes of two decisions of one way, with nothing of the others in memory."""
+    bench = Bench(options, dtype)
+    decide = bench.decision(way, horizon)
+    bench.keep_only(way)
+    return peak_gb(decide, options.device)
+
+
+def memory_line(row: Row) -> str:
+    """Return a row of the table of memory."""
+    return names_of(row) + (row["problem"] or f"{row['peak_gb']:12.2f}")
+
+
+def names_of(row: Row) -> str:
+    """Return the beginning of a row of a table: what horizon, and which way."""
+    return f"{row['horizon']:7}  {row['way']:22}"
 
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -98,80 +216,64 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     parser.add_argument("--quantize", nargs="+", choices=("int8", "fp8"), default=[], help="ours once more in 8 bits")
     parser.add_argument("--compile", action="store_true", help="ours once more with compiled blocks")
     parser.add_argument(
+        "--adapter", action=argparse.BooleanOptionalAction, default=True, help="ours once more with an adapter on"
+    )
+    parser.add_argument(
         "--profile", action="store_true", help="say where the time of ours goes, and on CUDA how often the host waits"
     )
     parser.add_argument("--memory-of", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args(arguments)
     defaults = _ON_CPU if options.device == "cpu" else _ON_CUDA
     vars(options).update({name: value for name, value in defaults.items() if getattr(options, name) is None})
-    if options.quick:
-        vars(options).update(QUICK)
-    if options.threads:
-        torch.set_num_threads(options.threads)
-    return options
+    return settle(options, QUICK)
 
 
-def same_ways(bench: Bench, horizon: int) -> list[Way]:
-    """Return the ways to compare: those that choose the same actions."""
-    ours = [
-        Way.ours(count, compiled=compiled, quantize=quantize)
-        for count in bench.options.at_once
-        for quantize in ("off", *bench.options.quantize)
-        for compiled in ((False, True) if bench.options.compile else (False,))
-    ]
-    candidates = [Way(PLAIN, ours[0].at_once)]
-    if bench.has_official:
-        candidates.append(Way(OFFICIAL, bench.options.samples))
-    else:
-        print(f"official: skipped, for there is no {bench.options.official / PLANNER}")
+def same_ways(bench: Bench, horizon: int, rows: Rows) -> list[Way]:
+    """Return the ways to compare: those that choose the same actions, and those in 8 bits, which choose others."""
     same = []
-    for way, found in bench.differences([*candidates, *ours], horizon).items():
-        in_8_bits = way.settings["quantize"] != "off"  # which chooses others, and is to say how much worse they are
-        told = "" if found.is_none or in_8_bits else ": NO RATIO, for it chooses others"
-        print(f"horizon {horizon}, {way.name}: {found} (float32){told}")
-        same += [way] if found.is_none or in_8_bits else []
+    for way in candidates(bench):
+        if way.is_in_8_bits:
+            print(f"horizon {horizon}, {way.name}: not compared, for it chooses others")
+            same.append(way)
+            continue
+        named = {"measured": "same actions", "horizon": horizon, "way": way.name}
+        if rows.attempt(partial(chooses_the_same, bench, way, horizon, rows, named), **named):
+            same.append(way)
     return same
 
 
-def ratio(seconds: dict[str, list[float]], base: str, way: str) -> float:
-    """Return how much faster than a base: the median over neighbours in time; not a number where there is no base."""
-    if base not in seconds:
-        return math.nan
-    return statistics.median(b / o for b, o in zip(seconds[base], seconds[way], strict=True))
+def chooses_the_same(bench: Bench, way: Way, horizon: int, rows: Rows, named: Row) -> bool:
+    """Return whether a way decides as ours does, and say so."""
+    found = bench.difference(way, horizon)
+    rows.add({**named, "difference": str(found), "is_none": found.is_none})
+    told = "" if found.is_none else ": NO RATIO, for it chooses others"
+    print(f"horizon {horizon}, {way.name}: {found} (float32){told}")
+    return found.is_none
 
 
-def profiled(decide: Callable[[], object], options: argparse.Namespace) -> str:
-    """Return where the time of a decision goes, and how often the host waits for the device in it."""
-    on_cuda = options.device != "cpu"
-    with profile(activities=[ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if on_cuda else [])]) as found:
-        decide()
-    table = found.key_averages()
-    waits = {one.key: one.count for one in table if one.key in WAITS}
-    order = "self_device_time_total" if on_cuda else "self_cpu_time_total"
-    rows = table.table(sort_by=order, row_limit=_PROFILED_ROWS, max_name_column_width=40)
-    return f"{rows}the host waited, in {options.iterations} iterations: {waits}" if on_cuda else rows
-
-
-def memory_of_way(bench: Bench, options: argparse.Namespace) -> float:
-    """Return the peak in 10^9 bytes of two decisions of one way, with nothing of the other in memory."""
-    way = Way(options.memory_of[0], int(options.memory_of[1]))
-    if way.name == OFFICIAL:
-        bench.keep_official_only()
-    return peak_memory_gb(bench.decision(way, options.horizon[0]), options.device)
-
-
-def memory_in_own_process(given: list[str], way: Way, horizon: int, dtype: str) -> float:
-    """Return the peak memory of one way in a fresh process."""
-    own = ["--horizon", str(horizon), "--dtype", dtype, "--memory-of", way.name, str(way.at_once)]
-    return in_own_process(__file__, [*given, *own])
+def candidates(bench: Bench) -> list[Way]:
+    """Return all ways that are asked for."""
+    options = bench.options
+    kinds = (False, True) if options.compile else (False,)
+    ours = [
+        Way.ours(count, compiled=compiled, quantize=quantize)
+        for count in options.at_once
+        for quantize in ("off", *options.quantize)
+        for compiled in kinds
+    ]
+    adapted = [Way.ours(options.at_once[0], compiled=compiled, adapter=True) for compiled in kinds]
+    official = [Way(OFFICIAL, options.samples)] if bench.has_official else []
+    if not official:
+        print(f"official: skipped, for there is no {options.official / PLANNER}")
+    return [Way(PLAIN, options.at_once[0]), *official, *ours, *(adapted if options.adapter else ())]
 
 
 def _introduce(options: argparse.Namespace) -> None:
     load = ", ".join(f"{one:.1f}" for one in os.getloadavg())
     print(
-        f"torch {torch.__version__}, {device_name(options.device)}, {torch.get_num_threads()} threads, load {load};"
+        f"{introduction(options)}, load {load};"
         f" {options.layers} layers of width {options.width}, {options.image_size} px, {options.samples} samples x"
-        f" {options.iterations} iterations, {options.repeats} repeats"
+        f" {options.iterations} iterations, {options.repeats} repeats after {options.warm_up}"
     )
 
 

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import copy
+from collections.abc import Callable
 from functools import cached_property, partial
-from typing import NamedTuple
 from unittest import mock
 
 import torch
+from decision_ways import OFFICIAL, PLAIN, Difference, Way
 from official import PREDICTOR
 from official_planner import PLANNER, OfficialPlanner
-from torch import Tensor
+from random_models import no_fingerprints, random_model
+from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 
-from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
 from vjepa2_ac.geometry import apply_action
+from vjepa2_ac.model.lora import add_adapter, lora_layers
 from vjepa2_ac.model.weights import to_official
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
@@ -27,59 +29,10 @@ from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.ready import make_ready
 from vjepa2_ac.training.cost.flops import plan_flops
 
-PLAIN, OFFICIAL, COMPILED = "plain", "official", "+compiled"
 POSE = (0.45, 0.10, 0.35, 3.0, 0.1, -0.4, 0.3)  # of an arm that points down
 WANTED = (0.03, -0.02, 0.04, 0.0, 0.0, 0.0, 0.3)  # the action of each step that leads to the goal
-_OURS = "ours/"
 _COMPARED_SAMPLES, _COMPARED_ITERATIONS = 8, 2
-_SAME_ACTIONS = 1e-5  # metres, and of the gripper
-_SAME_ENERGIES = 1e-4  # of the largest
-
-
-class Way(NamedTuple):
-    """How a decision is made: plain, official, or ours with so many samples at once."""
-
-    name: str
-    at_once: int
-
-    @classmethod
-    def ours(cls, at_once: int, *, compiled: bool = False, quantize: str = "off") -> Way:
-        """Return ours, perhaps with compiled blocks or in 8 bits."""
-        kind = "" if quantize == "off" else f"+{quantize}"
-        return cls(f"{_OURS}{at_once}{kind}{COMPILED * compiled}", at_once)
-
-    @property
-    def settings(self) -> dict[str, str]:
-        """What `planning` says of it."""
-        quantize = next((kind for kind in ("int8", "fp8") if f"+{kind}" in self.name), "off")
-        return {"compile": "blocks" if self.name.endswith(COMPILED) else "off", "quantize": quantize}
-
-
-@dataclass(frozen=True)
-class Difference:
-    """How far two plans are apart."""
-
-    actions: float  # the largest of a number of them
-    energies: float | None  # of elites, the largest as a share of the largest energy; None where they are not known
-
-    @classmethod
-    def between(cls, ours: Plan, other: Plan | Tensor) -> Difference:
-        """Compare with a plan, or with mere actions."""
-        if isinstance(other, Tensor):
-            return cls(float((ours.actions - other).abs().max()), None)
-        energies, others = (torch.cat([one.elite_energies for one in plan.iterations]) for plan in (ours, other))
-        return cls(
-            float((ours.actions - other.actions).abs().max()), float((energies - others).abs().max() / energies.max())
-        )
-
-    def __str__(self) -> str:
-        energies = "" if self.energies is None else f", energies by {self.energies:.1g} of the largest"
-        return f"actions differ by {self.actions:.1g} at most{energies}"
-
-    @property
-    def is_none(self) -> bool:
-        """Whether it is rounding."""
-        return self.actions <= _SAME_ACTIONS and (self.energies or 0.0) <= _SAME_ENERGIES
+_OF_AN_ADAPTER = 0.01  # standard deviation of its second matrices
 
 
 class PlainCost:
@@ -120,10 +73,12 @@ class Bench:
             predictor=PredictorSizes(width=options.width, heads=options.width // 64, depth=options.layers),
         )
         self.model = self._model().eval()
-        drawn = torch.randn(1, self.model.num_tokens, self.model.latent_dim, generator=torch.Generator().manual_seed(1))
+        tokens, width = self.model.num_tokens, self.model.latent_dim
+        drawn = torch.randn(1, tokens, width, generator=torch.Generator().manual_seed(1))
         self._scene = Scene(layer_norm(drawn, drawn.shape[-1:]), torch.tensor([POSE]), torch.zeros(0, 7))
         self._goals = self._reachable()
-        self._in_8_bits: dict[tuple[str, torch.dtype], WorldModel] = {}
+        self._made_ready: dict[tuple[str, bool, torch.dtype], WorldModel] = {}
+        self._plans: dict[int, Plan] = {}  # of ours in float32, by their horizon
         self.has_official = all((options.official / path).is_file() for path in (PREDICTOR, PLANNER))
 
     @cached_property
@@ -134,14 +89,34 @@ class Bench:
             self.options.official, weights, self.sizes, steps=max(self.options.horizon), device=self.device
         )
 
-    def differences(self, ways: Sequence[Way], horizon: int) -> dict[Way, Difference]:
-        """Return how the decisions of each way differ from those of ours, in float32 and with few samples."""
-        few = partial(self.config, horizon, samples=_COMPARED_SAMPLES, iterations=_COMPARED_ITERATIONS)
+    @cached_property
+    def adapted(self) -> WorldModel:
+        """Ours as a trained run has it: a LoRA in float32, frozen; with it the same predictions as without.
+
+        To be asked for before ours takes its own type. The base is less what the adapter adds, which is not zero.
+        """
+        return self._adapted()
+
+    def difference(self, way: Way, horizon: int) -> Difference:
+        """Return how the decision of a way differs from that of ours, in float32 and with few samples.
+
+        Args:
+            way: Any that is not in 8 bits.
+            horizon: Model steps of the plan.
+        """
+        return Difference.between(self._expected(horizon), self._decided_in_float32(way, horizon))
+
+    def _expected(self, horizon: int) -> Plan:
+        if horizon not in self._plans:
+            plan = self._decided_in_float32(Way.ours(self.options.at_once[0]), horizon)
+            assert isinstance(plan, Plan)
+            self._plans[horizon] = plan
+        return self._plans[horizon]
+
+    def _decided_in_float32(self, way: Way, horizon: int) -> Plan | Tensor:
+        config = self.config(horizon, at_once=way.at_once, samples=_COMPARED_SAMPLES, iterations=_COMPARED_ITERATIONS)
         with mock.patch("torch.randn", _drawn_on_the_cpu(torch.randn)):
-            plans = {way: self._decide(way, few(at_once=way.at_once), torch.float32) for way in ways}
-        ours = next(plan for way, plan in plans.items() if way.name.startswith(_OURS))
-        assert isinstance(ours, Plan)
-        return {way: Difference.between(ours, plan) for way, plan in plans.items()}
+            return self._decide(way, config, torch.float32)
 
     @torch.no_grad()
     def added_energy(self, way: Way, horizon: int) -> float:
@@ -164,7 +139,9 @@ class Bench:
 
     def decision(self, way: Way, horizon: int) -> Callable[[], object]:
         """Return what makes one decision, with the weights in the type that is timed (official: by autocast)."""
-        if way.name != OFFICIAL:
+        if way.has_adapter:
+            _cast_frozen(self.adapted, self.dtype)
+        elif way.name != OFFICIAL:
             self.model.predictor.to(self.dtype)
         options = self.options
         config = self.config(horizon, at_once=way.at_once, samples=options.samples, iterations=options.iterations)
@@ -191,10 +168,11 @@ class Bench:
     def _goal(self, horizon: int) -> Goal:
         return Goal(self._goals[horizon - 1 : horizon])
 
-    def keep_official_only(self) -> None:
-        """Let go of our model."""
-        _ = self.official
-        self.model.predictor = torch.nn.Identity()
+    def keep_only(self, way: Way) -> None:
+        """Let go of what a way does not need, once its decision is there."""
+        _ = self.official if way.name == OFFICIAL else None
+        if way.name == OFFICIAL or way.has_adapter:
+            self.model.predictor = nn.Identity()
 
     def _decide(self, way: Way, config: PlanningConfig, dtype: torch.dtype) -> Plan | Tensor:
         goal = self._goal(config.horizon)
@@ -208,19 +186,50 @@ class Bench:
         return Planner(config).plan(cost, torch.Generator().manual_seed(0))
 
     def _model(self) -> WorldModel:
-        # Values that either type can hold, so that both have the same; float32 until they have been compared.
-        model = WorldModel.random(self.sizes, seed=0, dtype=self.dtype).float()
-        model.predictor.to(self.device)
+        model = random_model(self.sizes, self.dtype, self.device)
+        model.encoder.cpu()  # nobody looks
         return model
 
+    @torch.no_grad()
+    def _adapted(self) -> WorldModel:
+        model = _copy(self.model)
+        with no_fingerprints():
+            add_adapter(model, AdapterConfig(), seed=0)
+        generator = torch.Generator(self.device).manual_seed(1)
+        for layer in lora_layers(model).values():
+            layer.lora_B["default"].weight.normal_(std=_OF_AN_ADAPTER, generator=generator)
+            layer.base_layer.weight -= layer.get_delta_weight("default")
+        model.predictor.requires_grad_(False)
+        return model.eval()
+
     def _ready(self, way: Way, config: PlanningConfig, dtype: torch.dtype) -> WorldModel:
-        """Return the model as a way plans with it; what is quantized is made once."""
-        model, kind = self.model, way.settings["quantize"]
-        if kind != "off":
-            if (kind, dtype) not in self._in_8_bits:
-                self._in_8_bits[kind, dtype] = make_ready(model, config.model_copy(update={"quantize": kind}))
-            model = self._in_8_bits[kind, dtype]
+        """Return the model as a way plans with it; what becomes of an adapter, or in 8 bits, is made once."""
+        kind, model = way.settings["quantize"], self.model
+        if way.is_in_8_bits or way.has_adapter:
+            key = kind, way.has_adapter, dtype
+            if key not in self._made_ready:
+                model = self.adapted if way.has_adapter else model
+                if way.is_in_8_bits and model.base_predictor.predictor_norm.weight.dtype != torch.bfloat16:
+                    model = _copy(model, torch.bfloat16)  # fp8 takes no other type
+                with no_fingerprints():
+                    self._made_ready[key] = make_ready(model, config.model_copy(update={"quantize": kind}))
+            model = self._made_ready[key]
         return make_ready(model, config.model_copy(update={"compile": way.settings["compile"]}))
+
+
+def _copy(model: WorldModel, dtype: torch.dtype | None = None) -> WorldModel:
+    """Return a model with a predictor of its own, perhaps in another type."""
+    other = WorldModel.empty(model.sizes)
+    other.encoder, other.predictor = model.encoder, copy.deepcopy(model.predictor).to(dtype)
+    other.adaptation = model.adaptation
+    return other
+
+
+def _cast_frozen(model: WorldModel, dtype: torch.dtype) -> None:
+    """Cast all but the adapter."""
+    for name, parameter in model.predictor.named_parameters():
+        if ".lora_" not in name:
+            parameter.data = parameter.data.to(dtype)
 
 
 def _poses_one_by_one(states: Tensor, actions: Tensor) -> Tensor:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import itertools
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -12,7 +13,11 @@ from unittest import mock
 
 import torch
 from accelerate import Accelerator
+from memory import let_go
 from official import PREDICTOR, Official, difference
+from random_models import no_fingerprints, random_model
+from rows import problem_of
+from torch import Tensor
 from torch.nn.functional import layer_norm
 
 from vjepa2_ac.config import (
@@ -56,6 +61,15 @@ class Setting:
     encoder: bool = False  # whether latents are computed in the step
 
 
+@dataclass(frozen=True)
+class Started:
+    """A way that has done its first steps, or what came in between."""
+
+    step: Callable[[], object] | None
+    first_s: float | None
+    problem: str | None
+
+
 def our_ways(attention: Sequence[str], *, compiled: bool) -> list[str]:
     """Return ways of ours: kinds of attention, each once more with compiled blocks if that is asked for."""
     return [*attention, *(way + COMPILED for way in attention if compiled)]
@@ -73,7 +87,7 @@ def has_checkout(options: argparse.Namespace) -> bool:
 
 
 class Bench:
-    """Our model and the official one in one precision, with the same weights."""
+    """Our model and the official one in one precision, with the same weights; neither is there until it is needed."""
 
     _kind_of_official = Official
 
@@ -88,7 +102,11 @@ class Bench:
             predictor=PredictorSizes(width=options.width, heads=options.width // 64, depth=options.layers),
         )
         self._weights: dict[str, Any] | None = None  # where the official code is to get them
-        self.model = self._model().train()
+
+    @cached_property
+    def model(self) -> WorldModel:
+        """Ours, in float32 until its first step."""
+        return self._model().train()
 
     @cached_property
     def official(self) -> Official:
@@ -166,26 +184,53 @@ class Bench:
         with mock.patch("vjepa2_ac.training.step.encode", return_value=latents):  # they are there already
             training_step(run, batches, step=_PAST_WARM_UP)
 
-    def forget_gradients(self) -> None:
+    def start(self, setting: Setting, way: str) -> Started:
+        """Do the first two steps of a way: what is compiled is compiled here, and what does not fit shows."""
+        began = time.perf_counter()
+        try:
+            step = self.step(setting, way)
+            step()
+            first_s = time.perf_counter() - began
+            step()  # what is compiled for the second time
+            return Started(step, first_s, None)
+        except Exception as error:
+            problem = problem_of(error)
+        self.let_go_of_a_step()
+        return Started(None, None, problem)
+
+    def let_go_of_a_step(self) -> None:
         """Let go of what a step has left that did not end."""
-        modules = [
-            self.model,
-            *(vars(self)[name].predictor for name in ("official", "official_full") if name in vars(self)),
-        ]
+        there = vars(self)
+        modules = [there["model"]] if "model" in there else []
+        modules += [there[name].predictor for name in (OFFICIAL, OFFICIAL_FULL) if name in there]
         for module in modules:
             module.zero_grad(set_to_none=True)
+        let_go(self.options.device)
+
+    def keep_only(self, way: str) -> None:
+        """Let go of what a way does not need, once its step is there."""
+        self._weights = None
+        kept = way if way in {OFFICIAL, OFFICIAL_FULL} else "model"
+        for name in {"model", OFFICIAL, OFFICIAL_FULL} - {kept}:
+            vars(self).pop(name, None)
 
     def _model(self) -> WorldModel:
-        # Values that either type can hold, so that both have the same; float32 until they have been compared.
-        model = WorldModel.random(self.sizes, seed=0, dtype=self.dtype).float()
-        self._weights = to_official(model) if has_checkout(self.options) else None
-        add_adapter(model, AdapterConfig(), seed=0)
-        return model.to(self.device)
+        model = random_model(self.sizes, self.dtype, self.device)
+        if has_checkout(self.options):  # in half the memory; both keep the same
+            official = to_official(model)
+            self._weights = {part: _in_type(official[part], self.dtype) for part in ("encoder", "predictor")}
+        with no_fingerprints():
+            add_adapter(model, AdapterConfig(), seed=0)
+        return model
+
+    def _drawn(self, shape: tuple[int, ...]) -> Tensor:
+        return torch.randn(shape, generator=torch.Generator(self.device).manual_seed(0), device=self.device)
 
     def _accelerator(self, config: Config) -> Accelerator:
         return make_accelerator(config)
 
     def _official(self, *, whole: bool = False) -> Official:
+        _ = self.model  # which gives the weights
         assert self._weights is not None, "no checkout"
         config = self.config(Setting(max(self.options.frames), 1, checkpointing=False))
         return self._kind_of_official(
@@ -210,19 +255,29 @@ class Bench:
 
     def latents(self, setting: Setting) -> LatentBatch:
         """Return random clips."""
-        generator = torch.Generator().manual_seed(0)
-        shape = (setting.batch, setting.frames, self.model.num_tokens, self.model.latent_dim)
-        drawn = layer_norm(torch.randn(shape, generator=generator), shape[-1:])
-        poses = torch.randn(setting.batch, setting.frames, 7, generator=generator) * 0.3
-        states, actions = poses.to(self.device), (poses[:, 1:] - poses[:, :-1]).to(self.device)
-        return LatentBatch(drawn.to(self.device), states, actions, None, ("a",) * setting.batch, (0,) * setting.batch)
+        tokens = (self.sizes.image_size // self.sizes.patch_size) ** 2
+        shape = (setting.batch, setting.frames, tokens, self.sizes.encoder.width)
+        drawn = layer_norm(self._drawn(shape), shape[-1:])
+        states, actions = (value.to(self.device) for value in _states_and_actions(setting))
+        return LatentBatch(drawn, states, actions, None, ("a",) * setting.batch, (0,) * setting.batch)
 
     def batch(self, setting: Setting) -> Batch:
         """Return the same clips as the loader gives them; without pixels where nobody looks at them."""
         side = self.options.image_size if setting.encoder else 1
         shape = (setting.batch, setting.frames, side, side, 3)
         frames = torch.randint(256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-        latents = self.latents(setting)
+        states, actions = _states_and_actions(setting)
         return Batch(
-            frames, latents.states.cpu(), latents.actions.cpu(), None, latents.episode_ids, latents.starts
+            frames, states, actions, None, ("a",) * setting.batch, (0,) * setting.batch
         )  # as pinned memory would be: its way to the device is part of the step
+
+
+def _states_and_actions(setting: Setting) -> tuple[Tensor, Tensor]:
+    """Return poses of random clips and the steps between them: [batch, time, 7] and [batch, time-1, 7]."""
+    generator = torch.Generator().manual_seed(1)
+    poses = torch.randn(setting.batch, setting.frames, 7, generator=generator) * 0.3
+    return poses, poses[:, 1:] - poses[:, :-1]
+
+
+def _in_type(weights: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
+    return {name: value.to(dtype) for name, value in weights.items()}

@@ -1,68 +1,210 @@
-"""How long, and in how much memory? Ways to do one thing take turns, so that a busy machine slows them alike.
+"""How long does each way take? Ways to do one thing take turns, so that a busy machine slows them alike.
 
-On a CPU the process's own time over its threads counts, else wall time.
+On a CPU the process's own time over its threads counts, else wall time. A way that fails says so and takes no more
+turns. On CUDA a way does not count in whose turns the allocator had to give memory back to go on.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
-import sys
+import statistics
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
+from memory import alloc_retries, use_expandable_segments
+from rows import problem_of
+from torch.profiler import ProfilerActivity, profile
 
-WAITS = {"cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize"}  # as PyTorch's profiler calls them
+WAITS_ON = {
+    "cuda": {"cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize"},  # as the profiler calls them
+    "cpu": {"aten::_local_scalar_dense"},  # of which some ask no device: only whether counting works
+}
 BESIDE = Path(__file__).resolve().parents[2] / "vjepa2"
+_REPEATS = {"cuda": (10, 3), "cpu": (3, 1)}  # that count, and to warm up: a GPU's clock has to rise
+
+
+def add_basics(parser: argparse.ArgumentParser) -> None:
+    """Add what every benchmark of this folder takes that computes on a device."""
+    parser.add_argument("--quick", action="store_true", help="tiny sizes: whether it works")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--threads", type=int, default=0, help="0: as torch chooses")
+    parser.add_argument("--json", type=Path, help="file for all figures, written anew after every row")
+
+
+def add_repeats(parser: argparse.ArgumentParser) -> None:
+    """Add how often something is timed."""
+    parser.add_argument("--repeats", type=int, help="of which the median counts (default: 10; 3 on a CPU)")
+    parser.add_argument("--warm-up", type=int, help="rounds before that do not count (default: 3; 1 on a CPU)")
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add what every benchmark beside the official code takes: where, how often, against which checkout."""
-    parser.add_argument("--quick", action="store_true", help="tiny sizes: whether it works")
+    """Add what every benchmark beside the official code takes: where, what, how often, against which checkout."""
+    add_basics(parser)
+    add_repeats(parser)
+    switch = argparse.BooleanOptionalAction
     parser.add_argument("--official", type=Path, default=BESIDE, help="checkout (default: vjepa2 beside this project)")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--warm-up", type=int, default=1, help="rounds that do not count")
-    parser.add_argument("--threads", type=int, default=0, help="0: as torch chooses")
-    parser.add_argument("--memory", action=argparse.BooleanOptionalAction, default=True, help="measure peak memory too")
+    parser.add_argument("--time", action=switch, default=True, help="measure time")
+    parser.add_argument("--memory", action=switch, default=True, help="measure peak memory, in a pass of its own")
 
 
-def take_turns(steps: dict[str, Callable[[], object]], options: argparse.Namespace) -> dict[str, list[float]]:
-    """Return the seconds of each repeat of each way; rounds to warm up do not count."""
-    times: dict[str, list[float]] = {way: [] for way in steps}
-    for repeat in range(options.warm_up + options.repeats):
+def settle(options: argparse.Namespace, quick: Mapping[str, Any]) -> argparse.Namespace:
+    """Give options the tiny sizes of --quick, and repeats as the device needs them where nothing is said."""
+    if options.quick:
+        vars(options).update(quick)
+    if "repeats" in options:
+        repeats, warm_up = _REPEATS[kind_of(options.device)]
+        options.repeats = repeats if options.repeats is None else options.repeats
+        options.warm_up = warm_up if options.warm_up is None else options.warm_up
+    return options
+
+
+def prepare(options: argparse.Namespace) -> None:
+    """Set up PyTorch; to be called before anything is computed."""
+    if options.threads:
+        torch.set_num_threads(options.threads)
+    if options.device != "cpu":
+        use_expandable_segments()
+
+
+def about(options: argparse.Namespace, given: list[str]) -> dict[str, Any]:
+    """Return what holds for all rows of a benchmark."""
+    cudnn = torch.backends.cudnn.version() if options.device != "cpu" else None
+    return {"torch": torch.__version__, "cudnn": cudnn, "device": device_name(options.device), "arguments": given}
+
+
+def introduction(options: argparse.Namespace) -> str:
+    """Return what computes."""
+    return f"torch {torch.__version__}, {device_name(options.device)}, {torch.get_num_threads()} threads"
+
+
+@dataclass
+class Turns:
+    """What was seen of one way so far."""
+
+    seconds: list[float] = field(default_factory=list)
+    retries: int = 0  # times that the allocator gave memory back in turns that count
+    failure: str | None = None
+
+    @property
+    def problem(self) -> str | None:
+        """Why its time does not count, or None."""
+        if self.failure or not self.retries:
+            return self.failure
+        return f"does not count: the allocator gave memory back {self.retries} times to go on"
+
+    @property
+    def median_s(self) -> float | None:
+        """The median; None where it does not count, or there is nothing yet."""
+        return statistics.median(self.seconds) if self.seconds and not self.problem else None
+
+    @property
+    def least_s(self) -> float | None:
+        """The fastest; None as for the median."""
+        return None if self.median_s is None else min(self.seconds)
+
+    def figures(self) -> dict[str, Any]:
+        """Return what a row holds of it."""
+        return {
+            "problem": self.problem, "s": self.median_s, "min_s": self.least_s, "repeats": len(self.seconds),
+            "alloc_retries": self.retries,
+        }  # fmt: skip
+
+
+def rounds(
+    steps: Mapping[str, Callable[[], object]], options: argparse.Namespace, after_failure: Callable[[], object]
+) -> Iterator[dict[str, Turns]]:
+    """Let all take turns, and yield what was seen so far after each round that counts: the same records, filled.
+
+    Args:
+        steps: What is timed, by the way's name.
+        options: Of the command line.
+        after_failure: Is called when one has failed, to let go of what it left.
+    """
+    seen = {way: Turns() for way in steps}
+    for number in range(options.warm_up + options.repeats):
         for way, step in steps.items():
-            start = clock_s(options.device)
-            step()
-            if repeat >= options.warm_up:
-                times[way].append(clock_s(options.device) - start)
-    return times
+            if not seen[way].failure:
+                _take_turn(step, seen[way], options.device, counts=number >= options.warm_up)
+                if seen[way].failure:
+                    after_failure()
+        if number >= options.warm_up:
+            yield seen
 
 
-def peak_memory_gb(work: Callable[[], object], device: str) -> float:
-    """Return the peak in 10^9 bytes of doing something twice: on CUDA of PyTorch's allocator, else resident."""
-    if device != "cpu":
-        torch.cuda.reset_peak_memory_stats()
-    else:
-        with suppress(OSError):  # where the system has it: what building the model took is forgotten
-            Path("/proc/self/clear_refs").write_text("5")
-    work()
-    work()  # of a training step: with the optimizer's moments
-    if device != "cpu":
-        return torch.cuda.max_memory_allocated() / 1e9
-    status = Path("/proc/self/status").read_text()
-    return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) * 1024 / 1e9
+def _take_turn(step: Callable[[], object], turns: Turns, device: str, *, counts: bool) -> None:
+    before = alloc_retries(device)
+    try:
+        start = clock_s(device)
+        step()
+        seconds = clock_s(device) - start
+    except Exception as error:
+        turns.failure = problem_of(error)
+        return
+    if counts:
+        turns.seconds.append(seconds)
+        turns.retries += alloc_retries(device) - before
 
 
-def in_own_process(script: str, arguments: Sequence[str]) -> float:
-    """Return the number that a benchmark prints in a fresh process, in its last line."""
-    command = [sys.executable, script, *arguments]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)  # noqa: S603
-    return float(json.loads(done.stdout.splitlines()[-1]))
+def ratio(base: Turns | None, own: Turns | None) -> float | None:
+    """Return how much faster than a base: the median over neighbours in time; None where one of them does not count."""
+    if base is None or own is None or base.median_s is None or own.median_s is None:
+        return None
+    return statistics.median(b / o for b, o in zip(base.seconds, own.seconds, strict=False))  # a round under way
+
+
+class Profile(NamedTuple):
+    """What the profiler saw of something done once."""
+
+    events: Any  # one for each kind, with `key` and `count`
+    waits: dict[str, int]  # of the host for the device, by what it calls
+
+
+def profiled(work: Callable[[], object], device: str) -> Profile:
+    """Return what is done, and how often the host waits for the device in it.
+
+    The profiler itself waits for the device when it ends: what it counts when nothing is done is taken off.
+    """
+    of_nothing = _profile_of_nothing(device)
+    events = _profile(work, device)
+    return Profile(events, waits(events, of_nothing, device))
+
+
+def waits(events: Iterable[Any], of_nothing: Iterable[Any], device: str) -> dict[str, int]:
+    """Return how often the host waits for the device, or asks it for a number, and by which call.
+
+    Args:
+        events: What the profiler saw.
+        of_nothing: What it saw of doing nothing, which is its own.
+        device: Where.
+    """
+    seen, own = (
+        Counter({event.key: event.count for event in some if event.key in WAITS_ON[kind_of(device)]})
+        for some in (events, of_nothing)
+    )
+    return dict(seen - own)
+
+
+def _profile(work: Callable[[], object], device: str) -> Any:
+    kinds = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if device != "cpu" else [])]
+    with profile(activities=kinds) as found:
+        work()
+    return found.key_averages()
+
+
+@cache
+def _profile_of_nothing(device: str) -> Any:
+    _profile(_nothing, device)  # sets up what is set up once
+    return _profile(_nothing, device)
+
+
+def _nothing() -> None:
+    pass
 
 
 def clock_s(device: str) -> float:
@@ -71,6 +213,11 @@ def clock_s(device: str) -> float:
         return time.process_time() / torch.get_num_threads()
     torch.cuda.synchronize()
     return time.perf_counter()
+
+
+def kind_of(device: str) -> str:
+    """Return cuda for cuda:0, too."""
+    return device.partition(":")[0]
 
 
 def device_name(device: str) -> str:

@@ -23,8 +23,8 @@ def write_adapted_run(config: Config, steps: tuple[int, ...] = (10, 20), best: i
     generator = torch.Generator().manual_seed(2)
     for step in steps:
         with torch.no_grad():
-            for name, value in model.named_parameters():
-                if "lora_" in name:
+            for value in model.parameters():
+                if value.requires_grad:
                     value.add_(0.3 * torch.randn(value.shape, generator=generator))
         state = RunState(step, best_step=best, best_error=0.5)
         write_checkpoint(folder / "checkpoints", state, _saved(model), keep=9)

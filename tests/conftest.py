@@ -1,16 +1,25 @@
 """What every test can use: checked shapes, the shared reference data, tiny settings."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
 from jaxtyping import install_import_hook
 
-_hook = install_import_hook("vjepa2_ac", "beartype.beartype")  # shapes and types of public functions, while testing
+import missing
 
-import pytest  # noqa: E402 - the hook comes first
+ABSENT = missing.absent(os.environ)
+if missing.SHAPES not in ABSENT:
+    _hook = install_import_hook("vjepa2_ac", "beartype.beartype")  # shapes and types of public functions, while testing
 
-import gcs as gcs_server  # noqa: E402
+import gcs as gcs_server  # noqa: E402 - the hook comes first
 from paths import ROOT  # noqa: E402
+
+
+def pytest_report_header() -> list[str]:
+    """Say what is not tested here."""
+    return [missing.WITHOUT[name] for name in ABSENT]
 
 
 @pytest.fixture(scope="session")
@@ -32,6 +41,8 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(scope="session")
 def _gcs() -> Iterator[gcs_server.Gcs]:
+    if missing.STORAGE in ABSENT:
+        pytest.skip(missing.WITHOUT[missing.STORAGE])
     with gcs_server.running() as running:
         yield running
 

@@ -11,9 +11,11 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
-from gcp_storage_emulator.server import Server, create_server
+if TYPE_CHECKING:  # tests that need no storage run without the emulator
+    from gcp_storage_emulator.server import Server
 
 LOOPBACK = "127.0.0.1"
 
@@ -161,6 +163,8 @@ class Gcs:
 @contextmanager
 def running() -> Iterator[Gcs]:
     """Start emulator and proxy on free ports of this machine; stop them in the end."""
+    from gcp_storage_emulator.server import create_server
+
     emulator = create_server(LOOPBACK, 0, in_memory=True)
     emulator.start()
     gcs = Gcs(emulator, emulator._api._httpd.server_address[1])

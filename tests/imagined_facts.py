@@ -3,6 +3,7 @@
 The arguments are the folder of the benchmark, and of each of its runs a list of arguments as JSON: they are done, too.
 """
 
+import copy
 import json
 import runpy
 import sys
@@ -16,8 +17,12 @@ MEBIBYTE = 2**20
 def facts() -> dict[str, Any]:
     import torch
     from count import Count, Machine  # type: ignore[import-not-found]  # of the benchmark
-    from stand_ins import FAKE  # type: ignore[import-not-found]
-    from work import largest_batch  # type: ignore[import-not-found]
+    from stand_ins import FAKE, imagined_gpu  # type: ignore[import-not-found]
+    from work import imagined_model, largest_batch  # type: ignore[import-not-found]
+
+    from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
+    from vjepa2_ac.model.adapter_end import merge_adapter
+    from vjepa2_ac.model.world_model import WorldModel
 
     found: dict[str, Any] = {}
     with FAKE, Count(Machine(tflops=100.0, bandwidth=2.0)) as count:
@@ -69,6 +74,17 @@ def facts() -> dict[str, Any]:
             hook.sin().sum().backward()
         found["waits in the backward pass"] = sum(count.waits.values())
         found["places in the backward pass"] = sorted({place for _, place in count.costs})
+    with imagined_gpu():
+        sizes = ModelSizes(
+            image_size=32,
+            encoder=EncoderSizes(width=64, heads=1, depth=1),
+            predictor=PredictorSizes(width=64, heads=1, depth=1),
+        )
+        model, merged = imagined_model(sizes, torch.bfloat16, AdapterConfig()), WorldModel.empty(sizes)
+        merged.predictor, merged.adaptation = copy.deepcopy(model.predictor), model.adaptation
+        merge_adapter(merged)
+        kinds = ({(str(one.dtype), str(one.device)) for one in some.predictor.parameters()} for some in (model, merged))
+        found["kinds of weights with an adapter, and merged"] = [sorted(some) for some in kinds]
     caps = [2.0, 3.0, 4.3, 21.2, 102.4]  # of which 1.5 GB are the allowance
     found["largest batches"] = [largest_batch(lambda batch: max(1.0 * batch, 0.2 * batch + 0.5), cap) for cap in caps]
     return found

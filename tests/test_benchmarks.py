@@ -1,95 +1,35 @@
 """Benchmarks that nobody runs every day still run, and compare only what computes the same."""
 
 import json
+import math
 import re
 import sys
+import weakref
+from collections import Counter
 from collections.abc import Iterator
-from importlib import import_module
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from torch._dynamo.utils import counters
 
-from paths import ROOT
-from tracing import tracing
-
-ELSEWHERE = """
-from torch import nn
-
-class Mixer(nn.Module):
-    def __init__(self, width):
-        super().__init__()
-        self.qkv, self.proj = nn.Linear(width, 3 * width), nn.Linear(width, width)
-
-    def forward(self, tokens):
-        return self.proj(self.qkv(tokens)[..., : tokens.shape[-1]])
-
-class Mlp(nn.Module):
-    def __init__(self, width):
-        super().__init__()
-        self.fc1, self.fc2 = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
-
-    def forward(self, tokens):
-        return self.fc2(self.fc1(tokens))
-
-class Block(nn.Module):
-    def __init__(self, width):
-        super().__init__()
-        self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
-        self.attn, self.mlp = Mixer(width), Mlp(width)
-
-    def forward(self, tokens):
-        tokens = tokens + self.attn(self.norm1(tokens))
-        return tokens + self.mlp(self.norm2(tokens))
-
-class VisionTransformerPredictorAC(nn.Module):
-    def __init__(self, embed_dim, predictor_embed_dim, depth, **_):
-        super().__init__()
-        self.predictor_embed = nn.Linear(embed_dim, predictor_embed_dim)
-        self.action_encoder, self.state_encoder = (nn.Linear(7, predictor_embed_dim) for _ in range(2))
-        self.extrinsics_encoder = nn.Linear(6, predictor_embed_dim)
-        self.predictor_blocks = nn.ModuleList(Block(predictor_embed_dim) for _ in range(depth))
-        self.predictor_norm = nn.LayerNorm(predictor_embed_dim)
-        self.predictor_proj = nn.Linear(predictor_embed_dim, embed_dim)
-
-    def forward(self, latents, actions, states):
-        tokens = self.predictor_embed(latents)
-        for block in self.predictor_blocks:
-            tokens = block(tokens)
-        return self.predictor_proj(self.predictor_norm(tokens))
-"""
+from benches import ELSEWHERE, drawn_on, imported
 
 
 @pytest.fixture
 def train_step(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The benchmark, imported as where it lies; nothing of it stays."""
-    yield from imported_from_where_it_lies("train_step", monkeypatch)
+    """The benchmark of a training step."""
+    yield from imported("train_step", monkeypatch)
 
 
-@pytest.fixture
-def planning(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """The benchmark of decisions, as well; its name is that of a folder of tests, too."""
-    monkeypatch.delitem(sys.modules, "planning", raising=False)
-    yield from imported_from_where_it_lies("planning", monkeypatch)
-
-
-def imported_from_where_it_lies(name: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    threads, before = torch.get_num_threads(), set(sys.modules)
-    monkeypatch.setattr(sys, "path", [str(ROOT / "benchmarks"), *sys.path])
-    yield import_module(name)
-    torch.set_num_threads(threads)
-    own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")} | {"src", "notebooks"}
-    for module in set(sys.modules) - before:
-        if module.split(".")[0] in own:
-            del sys.modules[module]
-
-
-def rows(printed: str) -> list[tuple[str, float, float]]:
+def rows(printed: str) -> list[tuple[str, float, str]]:
     """Return way, milliseconds and ratio of each line of the table."""
-    found = re.findall(r"^ +\d+ +\d+ +(?:yes|no) +(\w+) +(\d+) .* (\S+)$", printed, re.MULTILINE)
-    return [(way, float(ms), float(ratio)) for way, ms, ratio in found]
+    line = r"^ +\d+ +\d+ +(?:yes|no) +(?:cache|pixels) +(\S+) +(\S+) +(\S+) +\S+ +\S+% +0 +(\S+)"
+    found = re.findall(line, printed, re.MULTILINE)
+    assert all(float(least) <= float(median) for _, median, least, _ in found)
+    return [(way, float(median), ratio) for way, median, _, ratio in found]
 
 
 def test_quick_benchmark_of_a_training_step_completes_without_the_official_code(
@@ -101,7 +41,7 @@ def test_quick_benchmark_of_a_training_step_completes_without_the_official_code(
     printed = capsys.readouterr().out
     assert f"official: skipped, for there is no {tmp_path}" in printed
     assert [way for way, _, _ in rows(printed)] == ["dense", "auto"] * 2
-    assert [ratio for _, _, ratio in rows(printed)][::2] == [1.0, 1.0]
+    assert [ratio for _, _, ratio in rows(printed)][::2] == ["1.00", "1.00"]
 
 
 def test_all_rows_of_a_training_step_come_from_one_command_and_what_runs_out_of_memory_says_so(
@@ -122,25 +62,198 @@ def test_all_rows_of_a_training_step_come_from_one_command_and_what_runs_out_of_
         "--profile", "--cap-gb", "24", "--json", str(file),
     ])  # fmt: skip
     printed = capsys.readouterr().out
-    assert re.search(r"^ +4 +1 +no +per_step +out of memory \(pixels\)$", printed, re.MULTILINE)
-    found = [(row["encoder"], row["way"], row["ms"] is None) for row in json.loads(file.read_text())["rows"]]
+    assert re.search(r"^ +4 +1 +no +pixels +per_step +out of memory$", printed, re.MULTILINE)
+    found = [(row["encoder"], row["way"], row["problem"]) for row in json.loads(file.read_text())["rows"]]
     assert found == [
-        (False, "dense", False), (False, "per_step", False), (True, "dense", False), (True, "per_step", True),
+        (False, "dense", None), (False, "per_step", None), (True, "dense", None), (True, "per_step", "out of memory"),
     ]  # fmt: skip
     first = json.loads(file.read_text())["rows"][0]
+    assert first["repeats"] == 1
+    assert first["min_s"] == first["s"] > 0
     assert first["waits"] > 0
     assert first["first_s"] > 0
     assert first["compiled_after"] == 0
 
 
-def test_the_largest_batch_is_the_last_that_fits(train_step: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Cuda:
-        device = torch.device("cuda")
+def test_a_way_that_fails_is_a_row_and_the_others_are_measured_all_the_same(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, done = sys.modules["timed_steps"].Bench, Counter[str]()
+    usual = bench._our_step
 
-    monkeypatch.setattr(train_step, "fitting_step", lambda _, setting, __: setting.batch <= fitting)
-    setting = sys.modules["timed_steps"].Setting(16, 1, checkpointing=True)
-    for fitting in (1, 2, 19, 128, 500):
-        assert train_step.largest_batch(Cuda(), setting, "auto") == min(fitting, 128)
+    def step(self: Any, run: Any, batches: Any, latents: Any, way: str) -> None:
+        done[way] += 1
+        if way == "per_step" or (way == "auto" and done[way] > 2):  # at once; or when it is timed
+            raise RuntimeError(f"no {way} today\nand no more")
+        usual(self, run, batches, latents, way)
+
+    monkeypatch.setattr(bench, "_our_step", step)
+    file = tmp_path / "steps.json"
+    ways = ["--attention", "per_step", "auto", "dense", "--profile"]
+    with pytest.raises(SystemExit, match="2 of 3 rows failed"):
+        train_step.main(["--quick", "--no-memory", "--official", str(tmp_path), *ways, "--json", str(file)])
+    found = {row["way"]: row["problem"] for row in json.loads(file.read_text())["rows"]}
+    failed = {way: f"failed: RuntimeError: no {way} today" for way in ("per_step", "auto")}
+    assert found == {"dense": None, **failed}
+    printed = capsys.readouterr().out
+    for way, said in failed.items():
+        assert re.search(rf"^ +4 +1 +no +cache +{way} +{said}$", printed, re.MULTILINE)
+    assert [way for way, _, _ in rows(printed)] == ["dense"]
+
+
+def test_what_ends_the_program_leaves_the_rows_that_were_there(
+    train_step: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, done = sys.modules["timed_steps"].Bench, Counter[bool]()
+    usual = bench._our_step
+
+    def step(self: Any, run: Any, batches: Any, latents: Any, way: str) -> None:
+        done[latents is None] += 1
+        if (
+            done[True] > 9
+        ):  # ways take 2 steps each, and 2 of a round to warm up: this is in the third round that counts
+            raise KeyboardInterrupt
+        usual(self, run, batches, latents, way)
+
+    monkeypatch.setattr(bench, "_our_step", step)
+    monkeypatch.setitem(train_step.QUICK, "repeats", 5)
+    file = tmp_path / "steps.json"
+    with pytest.raises(KeyboardInterrupt):
+        train_step.main([
+            "--quick", "--no-memory", "--official", str(tmp_path), "--source", "cache", "pixels", "--json", str(file),
+        ])  # fmt: skip
+    found = json.loads(file.read_text())["rows"]
+    assert [(row["encoder"], row["repeats"], row.get("finished", True)) for row in found] == [
+        (False, 5, True), (False, 5, True), (True, 1, False), (True, 1, False),
+    ]  # fmt: skip
+
+
+def test_an_official_code_that_fails_is_a_row_and_ours_is_measured_without_it(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "src" / "models").mkdir(parents=True)
+    (tmp_path / "src" / "models" / "ac_predictor.py").write_text("raise OSError('not today')")
+    with pytest.raises(SystemExit, match="1 of 3 rows failed"):
+        train_step.main(["--quick", "--no-memory", "--official", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert "official, failed: OSError: not today" in printed
+    assert [way for way, _, _ in rows(printed)] == ["dense", "auto"]
+
+
+def test_memory_is_measured_after_all_times_and_a_process_that_fails_is_a_row(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    models: list[weakref.ref[Any]] = []
+    draw = sys.modules["timed_steps"].random_model
+
+    def drawn(*given: Any) -> Any:
+        model = draw(*given)
+        models.append(weakref.ref(model))
+        return model
+
+    def in_own_process(command: list[str]) -> float:
+        assert not any(model() for model in models)  # or the parent would hold memory meanwhile
+        assert Path(command[0]).name == "train_step.py"
+        way = command[command.index("--memory-of") + 1]
+        if way == "dense":
+            raise RuntimeError("a process of its own ended with -9: it says nothing")
+        return 1.25
+
+    monkeypatch.setattr("timed_steps.random_model", drawn)
+    monkeypatch.setattr("memory.in_own_process", in_own_process)
+    file = tmp_path / "steps.json"
+    with pytest.raises(SystemExit, match="1 of 6 rows failed"):
+        train_step.main([
+            "--quick", "--official", str(tmp_path), "--checkpointing", "on", "--attention", "auto", "per_step",
+            "--json", str(file),
+        ])  # fmt: skip
+    assert len(models) == 1
+    found = json.loads(file.read_text())["rows"]
+    assert [(row["measured"], row["way"]) for row in found] == [
+        (measured, way) for measured in ("time", "memory") for way in ("dense", "auto", "per_step")
+    ]
+    assert [row.get("peak_gb") for row in found] == [None] * 4 + [1.25, 1.25]
+    printed = capsys.readouterr().out
+    assert re.search(r"^ +4 +1 +yes +cache +dense +failed: RuntimeError: .* -9", printed, re.MULTILINE)
+    assert re.search(r"^ +4 +1 +yes +cache +auto +1\.25 +- +-$", printed, re.MULTILINE)
+
+
+def test_memory_alone_is_measured_where_no_time_is_asked_for(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("memory.in_own_process", lambda _: 1.25)
+    monkeypatch.delattr(train_step, "matmul_speed")
+    train_step.main(["--quick", "--no-time", "--official", str(tmp_path)])
+    assert re.search(r"^ +4 +1 +no +cache +auto +1\.25 +- +-$", capsys.readouterr().out, re.MULTILINE)
+
+
+@pytest.fixture
+def step_memory(train_step: Any) -> Any:
+    """What measures the memory of a training step."""
+    return sys.modules[train_step.memory_row.__module__]
+
+
+def test_the_largest_batch_is_the_last_that_fits(step_memory: Any) -> None:
+    for fitting in (0, 1, 2, 19, 128, 500):
+        assert step_memory.largest_batch(lambda batch, fitting=fitting: batch <= fitting) == min(fitting, 128)
+
+
+def test_the_largest_batch_is_looked_for_under_the_cap_and_what_fits_not_is_no_failure(
+    step_memory: Any, train_step: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caps: list[float] = []
+
+    @contextmanager
+    def capped(gigabytes: float, device: str) -> Iterator[None]:
+        assert device == "cuda"
+        caps.append(gigabytes)
+        yield
+        caps.append(0.0)
+
+    class Bench:
+        at_six = "out of memory"
+
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def start(self, setting: Any, way: str) -> Any:
+            assert caps == [24.0]
+            assert way == "auto+compile"
+            problem = None if setting.batch <= 5 else self.at_six if setting.batch == 6 else "out of memory"
+            return SimpleNamespace(problem=problem)
+
+    monkeypatch.setattr(step_memory, "capped", capped)
+    monkeypatch.setattr(step_memory, "Bench", Bench)
+    options = train_step.parse(["--device", "cuda", "--frames", "16", "--batch", "largest", "--cap-gb", "24"])
+    (asked,) = step_memory.asked(options)
+    assert step_memory.find_largest(options, "bfloat16", asked, "auto+compile", train_step.Rows(None)) == 5
+    assert caps == [24.0, 0.0]
+    caps.clear()
+    Bench.at_six = "failed: RuntimeError: nothing of the kind"
+    with pytest.raises(RuntimeError, match="batch 6: failed: RuntimeError: nothing of the kind"):
+        step_memory.find_largest(options, "bfloat16", asked, "auto+compile", train_step.Rows(None))
+
+
+def test_the_batch_that_was_found_is_a_row_and_is_timed(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(train_step.QUICK, "batch", ["largest"])  # on a CPU: 2
+    file = tmp_path / "steps.json"
+    train_step.main(["--quick", "--no-memory", "--official", str(tmp_path), "--json", str(file)])
+    assert re.search(r"^ +4 +2 +no +cache +auto +is the largest batch", capsys.readouterr().out, re.MULTILINE)
+    found = [(row["measured"], row["batch"]) for row in json.loads(file.read_text())["rows"]]
+    assert found == [("largest batch", 2), ("time", 2), ("time", 2)]
+
+
+def test_weights_are_drawn_on_the_device_and_nobody_takes_their_fingerprints(
+    train_step: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(sys.modules["vjepa2_ac.model.world_model"], "hashlib")
+    bench, given = sys.modules["timed_steps"].Bench, ["--quick", "--official", str(tmp_path)]
+    assert bench(train_step.parse(given), "bfloat16").model.adaptation is not None
+    with drawn_on(monkeypatch) as devices:
+        _ = bench(train_step.parse([*given, "--device", "cuda"]), "bfloat16").model
+    assert devices == [torch.device("cuda")]
 
 
 def test_doctor_is_asked_about_the_setting_that_is_measured(train_step: Any, tmp_path: Path) -> None:
@@ -172,7 +285,7 @@ def test_no_ratio_is_printed_to_a_predictor_that_computes_something_else(
 @pytest.fixture
 def numerics(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """The comparison of what ways learn."""
-    yield from imported_from_where_it_lies("numerics", monkeypatch)
+    yield from imported("numerics", monkeypatch)
 
 
 def test_ways_learn_the_same_and_one_that_does_not_is_found(
@@ -190,151 +303,59 @@ def test_ways_learn_the_same_and_one_that_does_not_is_found(
         numerics.main(["--steps", "12"])
 
 
-DECISION = re.compile(r"^ +(\d+) +(\S+) +(\S+) +\S+ +(\S+)% +(\S+) +(\S+) +(\S+)$", re.MULTILINE)
-"""Horizon, way, seconds, MFU, peak memory, ratio to plain, ratio to official."""
-
-
-def test_quick_benchmark_of_a_decision_completes_without_the_official_code(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_way_that_cannot_learn_is_a_row_and_a_loss_that_is_no_number_strays(
+    numerics: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--profile"])
-    printed = capsys.readouterr().out
-    assert f"official: skipped, for there is no {tmp_path}" in printed
-    assert "aten::addmm" in printed
-    lines = DECISION.findall(printed)
-    assert [(horizon, way) for horizon, way, *_ in lines] == [("3", "plain"), ("3", "ours/4"), ("3", "ours/1")]
-    for _, _, seconds, mfu, _, of_plain, of_official in lines:
-        assert 0 < float(seconds) < 60
-        assert 0 < float(mfu) < 150
-        assert 0 < float(of_plain) < 100
-        assert of_official == "nan"
-    assert lines[0][5] == "1.00"
+    from vjepa2_ac.model import attention
+
+    def fails(*_: object) -> None:
+        raise TypeError("no such thing")
+
+    monkeypatch.setattr(attention, "_IMPLEMENTATIONS", {**attention._IMPLEMENTATIONS, "flex": fails})
+    file = tmp_path / "curves.json"
+    with pytest.raises(SystemExit, match="1 of 4 rows failed"):
+        numerics.main(["--quick", "--ways", "flex", "per_step", "--json", str(file)])
+    found = json.loads(file.read_text())["rows"]
+    assert [row["way"] for row in found] == ["dense", "flex", "per_step", "bfloat16"]
+    assert [row.get("problem") for row in found] == [None, "failed: TypeError: no such thing", None, None]
+    assert numerics.strays([1.0, 1.0], [1.0, math.nan]) == math.inf
 
 
-@pytest.mark.usefixtures("traced")
-@tracing[0]
-@tracing[1]
-def test_decisions_with_compiled_blocks_are_timed_beside_those_without(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.fixture
+def latents(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The benchmark of the latent cache."""
+    yield from imported("latents", monkeypatch)
+
+
+def test_latents_that_cannot_be_timed_are_a_row_and_sizes_and_errors_follow(
+    latents: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--compile"])
-    ways = [way for _, way, *_ in DECISION.findall(capsys.readouterr().out)]
-    assert ways == ["plain", "ours/4", "ours/4+compiled", "ours/1", "ours/1+compiled"]
-    assert counters["stats"]["unique_graphs"]
+    def fails(*_: object, **__: object) -> None:
+        raise OSError("disk full")
 
-
-def test_decisions_in_8_bits_are_timed_and_say_what_they_cost(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    pytest.importorskip("torchao", reason="the extra quantize is not installed")
-    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--quantize", "int8"])
-    printed = capsys.readouterr().out
-    ways = [way for _, way, *_ in DECISION.findall(printed)]
-    assert ways == ["plain", "ours/4", "ours/4+int8", "ours/1", "ours/1+int8"]
-    changes = re.findall(r"ours/[41]\+int8: the plan's energy changes by (\S+)%", printed)
-    assert len(changes) == 2
-    assert all(abs(float(change)) < 10 for change in changes)
-
-
-def test_peak_memory_of_a_decision_is_told_as_a_number_alone(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    planning.main(["--quick", "--official", str(tmp_path), "--memory-of", "ours/4", "4"])
-    assert 0.01 < float(capsys.readouterr().out) < 100
-
-
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_no_ratio_is_printed_to_a_decision_that_comes_out_otherwise(
-    planning: Any, dtype: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    poses = sys.modules["timed_decisions"]._poses_one_by_one
-    monkeypatch.setattr("timed_decisions._poses_one_by_one", lambda states, actions: poses(states, -3 * actions))
-    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--dtype", dtype])
-    printed = capsys.readouterr().out
-    assert re.search(r"plain: actions differ by .*: NO RATIO", printed)
-    assert [(way, of_plain) for _, way, _, _, _, of_plain, _ in DECISION.findall(printed)] == [
-        ("ours/4", "nan"), ("ours/1", "nan"),
-    ]  # fmt: skip
-
-
-NOTEBOOK = """
-import torch
-
-class WorldModel:
-    def __init__(self, mpc_args, device, **_):
-        self.asked = mpc_args
-
-    def infer_next_action(self, rep, pose, goal_rep):
-        assert rep.shape == goal_rep.shape == (1, 4, 128)
-        assert pose.shape == (1, 1, 7)
-        assert not torch.is_grad_enabled()
-        assert torch.initial_seed() == 0
-        assert sorted(self.asked) == [
-            "cem_steps", "maxnorm", "momentum_mean", "momentum_mean_gripper", "momentum_std", "momentum_std_gripper",
-            "rollout", "samples", "topk",
-        ]
-        return torch.zeros(self.asked["rollout"], 7) if torch.randn(3, device="cpu").any() else None
-"""
-
-
-def test_no_ratio_is_printed_to_a_notebook_that_plans_otherwise(
-    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "src" / "models").mkdir(parents=True)
-    (tmp_path / "src" / "models" / "ac_predictor.py").write_text(ELSEWHERE)
-    (tmp_path / "notebooks" / "utils").mkdir(parents=True)
-    (tmp_path / "notebooks" / "utils" / "world_model_wrapper.py").write_text(NOTEBOOK)
-    planning.main(["--quick", "--no-memory", "--official", str(tmp_path)])
-    printed = capsys.readouterr().out
-    assert re.search(r"official: actions differ by .*: NO RATIO", printed)
-    assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/1"]
-
-
-def test_a_decision_is_counted_and_timed_in_the_type_and_towards_the_goal_that_were_asked_for(
-    planning: Any, tmp_path: Path
-) -> None:
-    decisions = sys.modules["timed_decisions"]
-    options = planning.parse(["--quick", "--official", str(tmp_path)])
-    bench = decisions.Bench(options, "bfloat16")
-    for horizon in (1, 3):
-        cost = decisions.WorldModelCost(bench.model, bench._scene, bench._goal(horizon), decisions.EnergyConfig())
-        with torch.no_grad():
-            assert float(cost(torch.tensor(decisions.WANTED).expand(1, horizon, -1))) < 1e-5
-            assert float(cost(torch.zeros(1, horizon, 7))) > 1e-3
-    assert bench.model.predictor.dtype == torch.float32  # until all were compared
-    plan = bench.decision(decisions.Way.ours(2), 3)()
-    assert bench.model.predictor.dtype == torch.bfloat16
-    assert len(plan.actions) == 3
-    assert plan.evaluations == bench.sequences
-    assert bench.flops(3) == bench.sequences * decisions.plan_flops(bench.sizes, 3)
-
-
-def test_ways_take_turns_and_a_ratio_is_of_neighbours(planning: Any) -> None:
-    calls: list[str] = []
-    ways = {"plain": lambda: calls.append("p"), "ours/1": lambda: calls.append("o")}
-    times = sys.modules["timing"].take_turns(ways, planning.parse(["--repeats", "2"]))
-    assert "".join(calls) == "popopo"  # the first round warms up
-    assert [len(one) for one in times.values()] == [2, 2]
-    seconds = {"plain": [2.0, 30.0, 8.0], "ours/1": [1.0, 10.0, 2.0]}
-    assert planning.ratio(seconds, "plain", "ours/1") == 3.0
-
-
-def test_on_cuda_the_papers_setting_is_measured(planning: Any) -> None:
-    options = planning.parse(["--device", "cuda"])
-    assert (options.samples, options.iterations, options.horizon, options.layers) == (800, 10, [1, 2], 24)
-    assert (options.width, options.latent_dim, options.image_size, options.dtype) == (1024, 1408, 256, ["bfloat16"])
-    assert planning.parse(["--device", "cuda", "--samples", "9"]).samples == 9
+    monkeypatch.setattr(latents, "record_dataset", fails)
+    file = tmp_path / "latents.json"
+    with pytest.raises(SystemExit, match="2 of 5 rows failed"):
+        latents.main(["--quick", "--json", str(file)])
+    found = json.loads(file.read_text())["rows"]
+    assert [row["measured"] for row in found] == ["speed", "size", "size", "size", "added error"]
+    assert {row.get("problem") for row in found} == {None, "failed: OSError: disk full"}
 
 
 def test_quick_benchmark_of_latents_tells_speed_size_and_added_error(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    latents: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("mujoco", reason="the arm is simulated")
-    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
-    import_module("latents").main(["--quick"])
-    monkeypatch.delitem(sys.modules, "latents")
+    file = tmp_path / "latents.json"
+    latents.main(["--quick", "--json", str(file)])
     printed = capsys.readouterr().out
-    assert re.search(r"^ +4 +\d+\.\d+ +\d+\.\d% +\d+\.\d+ +\d+% +\d+ +\d+ +\d+\.\d\dx$", printed, re.MULTILINE)
+    kinds = [row["measured"] for row in json.loads(file.read_text())["rows"]]
+    assert kinds == ["encoder alone", "speed", *["size"] * 3, *["added error"] * 3]
+    speed = r"^ +4 +\d+\.\d+ +\d+\.\d% +\d+\.\d+ +\d+%( +\d+ +\d+ +\d+ +\d+) +\d+\.\d\dx$"
+    (times,) = re.findall(speed, printed, re.MULTILINE)
+    pictures, least, latents, least_of_latents = map(int, times.split())
+    assert 0 < least <= pictures
+    assert 0 < least_of_latents <= latents
     hours = [float(hour) for hour in re.findall(r"^ +(?:int8|bf16|fp32) +\S+ +(\d\.\d\d) +\S+$", printed, re.MULTILINE)]
     bf16, fp32, int8 = hours
     assert int8 < bf16 < fp32

@@ -37,7 +37,7 @@ def test_every_config_of_the_project_loads(path: Path) -> None:
 def test_default_config_holds_the_mission() -> None:
     config = load_config(ROOT / "configs/default.yaml")
     assert (config.adapter.rank, config.adapter.alpha, config.adapter.rslora) == (16, 32, True)
-    assert (config.training.batch_size, config.training.accumulation, config.training.steps) == (2, 16, 100_000)
+    assert (config.training.batch_size, config.training.accumulation, config.training.steps) == (4, 8, 100_000)
     assert (config.training.learning_rate, config.training.precision) == (1e-4, "bf16")
     assert (config.data.frames, config.model.sizes.image_size) == (16, 256)
     assert (config.checkpoint.every, config.checkpoint.keep) == (1_000, 5)

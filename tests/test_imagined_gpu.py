@@ -45,7 +45,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         "train": ["train", "--quick", "--source", "cache", "pixels", "--attention", "dense", "--top", "5", "--waits"],
         "augmented": ["train", "--quick", "--source", "pixels", "--attention", "dense", "--augment"],
         "encode": ["encode", "--quick"],
-        "plan": ["plan", "--quick"],
+        "plan": ["plan", "--quick", "--adapter"],
         "wide": ["train", "--layers", "6", "--frames", "8", "--batch", "1", "--checkpointing", "off", "on"],
     }
     given = [[*arguments, "--json", str(out / name)] for name, arguments in runs.items()]
@@ -109,11 +109,24 @@ def test_a_training_step_waits_for_the_device_where_it_has_to(told: dict[str, An
 
 
 def test_a_decision_waits_twice_an_iteration_and_encoding_never(told: dict[str, Any]) -> None:
-    (decision,) = told["rows"]["plan"]  # of four iterations
-    assert len(decision["waits"]) == len(DECISION)
-    for line, times in DECISION.items():
-        assert [count for place, count in decision["waits"].items() if re.match(line, place)] == [times]
+    for decision in told["rows"]["plan"]:  # of four iterations, without and with an adapter
+        assert len(decision["waits"]) == len(DECISION)
+        for line, times in DECISION.items():
+            assert [count for place, count in decision["waits"].items() if re.match(line, place)] == [times]
     assert [row["waits"] for row in told["rows"]["encode"]] == [{}]
+
+
+def test_a_decision_with_an_adapter_on_is_counted_beside_the_one_without(told: dict[str, Any]) -> None:
+    plain, adapted = told["rows"]["plan"]
+    assert [row["adapter"] for row in (plain, adapted)] == [False, True]
+    assert adapted["kernels"] >= plain["kernels"]  # as many where the adapter was merged
+    assert adapted["floor_ms"] == plain["floor_ms"]
+
+
+def test_a_model_without_numbers_can_be_copied_and_merged(told: dict[str, Any]) -> None:
+    adapted, merged = told["facts"]["kinds of weights with an adapter, and merged"]
+    assert adapted == [["torch.bfloat16", "cuda:0"], ["torch.float32", "cuda:0"]]
+    assert merged == [["torch.bfloat16", "cuda:0"]]
 
 
 def test_doctor_says_what_a_step_takes_at_real_widths(told: dict[str, Any]) -> None:

@@ -5,7 +5,7 @@
     python benchmarks/imagined_gpu train --largest 24 --checkpointing on       # GB: what batch fits
     python benchmarks/imagined_gpu train --source pixels --checkpointing on --official ../vjepa2   # beside its step
     python benchmarks/imagined_gpu encode --batch 8 16 --top 10
-    python benchmarks/imagined_gpu plan --horizon 1 2 --at-once 32 64 --samples 800 --iterations 10
+    python benchmarks/imagined_gpu plan --horizon 1 2 --at-once 32 64 --samples 800 --iterations 10 --adapter
 
 Needs a C++ compiler and a PyTorch without CUDA; no GPU. A row takes 10 to 30 seconds. Tensors are fake: they have a
 shape, a type and a device, but no numbers, so what is done never depends on them. The code is ours as it is, on ViT-g
@@ -183,6 +183,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     plan.add_argument("--at-once", type=int, nargs="+", default=[64])
     plan.add_argument("--samples", type=int, default=800)
     plan.add_argument("--iterations", type=int, default=10)
+    plan.add_argument("--adapter", action="store_true", help="each once more with a LoRA on, as a trained run has")
     told = parser.add_argument_group("what is imagined, and told")
     told.add_argument("--tflops", type=float, default=790.0, help="ceiling: of a large product in bfloat16")
     told.add_argument("--bandwidth", type=float, default=4.3, help="of the memory, TB/s")

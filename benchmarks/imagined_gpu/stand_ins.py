@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from typing import Any
 from unittest import mock
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 from torch.nn.functional import pad
 
@@ -35,12 +35,34 @@ def imagined_gpu() -> Iterator[None]:
         (torch.cuda, "is_bf16_supported", lambda *_, **__: True),
         (import_module("torch.optim.optimizer"), "_foreach_supported_types", [FakeTensor]),
         (torch.utils._foreach_utils, "_foreach_supported_types", [FakeTensor]),
+        (FakeTensor, "__deepcopy__", _copied),
+        (nn.Module, "_apply", _applied),
     ]
     with ExitStack() as stack:
         for place, name, instead in changes:
             stack.enter_context(mock.patch.object(place, name, instead))
         stack.enter_context(FAKE)
         yield
+
+
+def _copied(own: Tensor, memo: dict[int, Any]) -> Tensor:
+    """Return a copy in the same mode: PyTorch's own brings another, which the first does not take."""
+    with torch.no_grad():
+        copied = own.detach().clone()
+    memo[id(own)] = nn.Parameter(copied, own.requires_grad) if isinstance(own, nn.Parameter) else copied
+    return memo[id(own)]  # type: ignore[no-any-return]  # a memo's
+
+
+def _applied(module: nn.Module, change: Callable[[Tensor], Tensor], recurse: bool = True) -> nn.Module:
+    """Do what moves and casts weights, by replacing them: PyTorch cannot change fake ones where they are."""
+    for child in module.children() if recurse else ():
+        _applied(child, change)
+    for name, own in module._parameters.items():
+        if own is not None:
+            module._parameters[name] = nn.Parameter(change(own.detach()), own.requires_grad)
+    for name, held in module._buffers.items():
+        module._buffers[name] = None if held is None else change(held)
+    return module
 
 
 def share_seen(queries: int, keys: int) -> float:

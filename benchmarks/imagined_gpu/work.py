@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
-from unittest import mock
 
 import timed_decisions
 import timed_steps
 import torch
 from count import Count
 from official import Official
+from random_models import no_fingerprints
 from stand_ins import FAKE
 from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
@@ -57,6 +57,9 @@ class _ImaginedOfficial(Official):
         super().__init__(*given, **named)
         self._scaler = torch.amp.GradScaler("cuda", enabled=False)
 
+    def _built(self, build: Callable[[], nn.Module]) -> nn.Module:
+        return build()  # on the host: there is no device
+
     def _load(self, module: nn.Module, weights: Mapping[str, Any], part: str) -> None:
         """Leave it as it is: there are no numbers."""
 
@@ -72,6 +75,9 @@ class _Steps(timed_steps.Bench):
         self._weights = {}  # without numbers
         pixels = "pixels" in self.options.source
         return imagined_model(self.sizes, self.dtype, AdapterConfig(), encoder=pixels)
+
+    def _drawn(self, shape: tuple[int, ...]) -> Tensor:
+        return torch.empty(shape, device=self.device)
 
     def batch(self, setting: timed_steps.Setting) -> Batch:
         batch = super().batch(setting)
@@ -96,6 +102,11 @@ class _Decisions(timed_decisions.Bench):
 
     def _model(self) -> WorldModel:
         return imagined_model(self.sizes, self.dtype)
+
+    def _adapted(self) -> WorldModel:
+        model = imagined_model(self.sizes, self.dtype, AdapterConfig())
+        model.requires_grad_(False)
+        return model
 
     def _plan(self, config: PlanningConfig, cost: Cost) -> Plan:
         """Search as ever, with numbers; energies are drawn. What follows the first iteration counts for all others."""
@@ -132,7 +143,8 @@ def planning(options: argparse.Namespace) -> Iterator[Work]:
     """Yield a whole decision for each horizon and number of samples at once."""
     bench = _Decisions(options, options.dtype)
     for horizon, at_once in itertools.product(options.horizon, options.at_once):
-        yield _decision(bench, horizon, at_once)
+        for adapter in (False, True) if options.adapter else (False,):
+            yield _decision(bench, horizon, timed_decisions.Way.ours(at_once, adapter=adapter))
 
 
 def _step(bench: _Steps, setting: timed_steps.Setting, way: str, batch: int) -> Work:
@@ -154,31 +166,37 @@ def _encoding(bench: _Steps, frames: int) -> Work:
     config = config.model_copy(update={"model": config.model.model_copy(update={"encode_chunk": frames})})
     estimate = estimate_memory(config, bench.sizes)
     pixels = torch.empty(1, frames, 3, bench.sizes.image_size, bench.sizes.image_size, device="cuda")
+    model = bench.model
 
     def encode(_: Count) -> None:
         with bench._accelerator(config).autocast():
-            bench.model.encode(pixels, frames)
+            model.encode(pixels, frames)
 
     estimated = (estimate.encoder_weights + estimate.encoding) / 1e9 if frames >= shortest else None
     return Work(f"{frames} frames", {"batch": frames}, frames * frame_flops(bench.sizes), encode, estimated)
 
 
-def _decision(bench: _Decisions, horizon: int, at_once: int) -> Work:
-    samples, iterations = bench.options.samples, bench.options.iterations
+def _decision(bench: _Decisions, horizon: int, way: timed_decisions.Way) -> Work:
+    samples, iterations, at_once = bench.options.samples, bench.options.iterations, way.at_once
+    if way.has_adapter:
+        _ = bench.adapted  # what loading it takes is not counted
 
     def decide(count: Count, samples: int = samples, iterations: int = min(_ITERATIONS, iterations)) -> None:
         bench.count = count
         config = bench.config(horizon, at_once=at_once, samples=samples, iterations=iterations)
         with torch.no_grad():
-            bench._decide(timed_decisions.Way.ours(at_once), config, bench.dtype)
+            bench._decide(way, config, bench.dtype)
 
     return Work(
-        f"horizon {horizon}, {samples} samples x {iterations}, {at_once} at once",
-        {"horizon": horizon, "samples": samples, "iterations": iterations, "at_once": at_once},
+        f"horizon {horizon}, {samples} samples x {iterations}, {at_once} at once{', adapter' * way.has_adapter}",
+        {
+            "horizon": horizon, "samples": samples, "iterations": iterations, "at_once": at_once,
+            "adapter": way.has_adapter,
+        },
         bench.flops(horizon),
         decide,
         warm_up=lambda count: decide(count, min(samples, at_once), 1),
-    )
+    )  # fmt: skip
 
 
 def imagined_model(
@@ -188,8 +206,7 @@ def imagined_model(
 
     It is made without memory, and its weights are replaced then: `Module.to` cannot replace fake ones.
     """
-    hashed = mock.patch("vjepa2_ac.model.world_model.fingerprint", return_value="imagined")
-    with _disable_current_modes(), hashed, torch.device("meta"):
+    with _disable_current_modes(), no_fingerprints(), torch.device("meta"):
         model = WorldModel.empty(sizes)
         if adapter is not None:
             add_adapter(model, adapter, seed=0)

@@ -89,7 +89,7 @@ def test_compiled_steps_with_dropout_and_autocast_are_the_plain_ones(sizes: Mode
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Compile nothing, and tell what was asked for."""
     names: list[str] = []
-    monkeypatch.setattr(layers, "compiled", lambda function: names.append(function.__name__) or function)
+    monkeypatch.setattr(layers, "compiled", lambda function, **_: names.append(function.__name__) or function)
     return names
 
 

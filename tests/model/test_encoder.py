@@ -80,3 +80,20 @@ def test_features_are_float32_and_layers_of_autocasts_own_type_do_without_it(
     assert autocast == [dtype != torch.bfloat16]
     assert features.dtype == torch.float32
     assert not torch.equal(features, features.bfloat16())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_patches_are_embedded_as_the_convolution_does_it_on_a_frame_seen_twice(
+    fresh: Callable[..., WorldModel], inputs, dtype: torch.dtype
+) -> None:
+    projection = fresh().encoder.vit.embeddings.patch_embeddings.proj
+    with torch.no_grad():
+        projection.weight *= 10
+        projection.bias.normal_(generator=torch.Generator().manual_seed(0))
+    tubelets = inputs.frames.flatten(0, 1)[:, :, None].expand(-1, -1, 2, -1, -1)
+    given = (tubelets, projection.weight, projection.bias)
+    exact = torch.nn.functional.conv3d(*(one.double() for one in given), stride=projection.stride)
+    found = projection.to(dtype)(tubelets.to(dtype))
+    assert found.shape == exact.shape
+    tolerance = 1e-6 if dtype == torch.float32 else 2e-2
+    assert (found - exact).abs().max() <= tolerance * exact.abs().max()

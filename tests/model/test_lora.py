@@ -1,16 +1,20 @@
 """The laws of an adapter."""
 
+import copy
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import peft
 import pytest
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model import predictor
 from vjepa2_ac.model.adapter_end import base_only, merge_adapter
 from vjepa2_ac.model.lora import (
     add_adapter,
@@ -368,6 +372,19 @@ def test_merging_in_bfloat16_rounds_once(fresh: Fresh, inputs) -> None:
     assert torch.equal(model.predictor.blocks[0].attn.q.weight, expected)
 
 
+@both_kinds
+def test_merging_under_autocast_is_merging(fresh: Fresh, inputs, config: AdapterConfig) -> None:
+    model = fresh()
+    add_adapter(model, config, seed=0)
+    train(model, inputs)
+    other = copy.deepcopy(model)
+    merge_adapter(model)
+    with torch.autocast("cpu", torch.bfloat16):
+        merge_adapter(other)
+    for name, value in model.predictor.state_dict().items():
+        assert torch.equal(value, other.predictor.state_dict()[name]), name
+
+
 def test_a_model_with_an_adapter_on_is_not_saved_as_a_base(model: WorldModel, tmp_path: Path) -> None:
     add_adapter(model, LORA, seed=0)
     with pytest.raises(ValueError, match="an adapter is on"):
@@ -393,6 +410,24 @@ def test_plain_peft_loads_it_on_the_predictor(model: WorldModel, inputs, tmp_pat
         expected = model.predictor(inputs.latents, inputs.actions, inputs.states)
         found = plain.eval()(inputs.latents, inputs.actions, inputs.states)
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-4 if config.init == "pissa" else 1e-6)
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.5])
+def test_only_with_dropout_a_block_computed_again_needs_the_state_of_random_numbers(
+    fresh: Fresh, inputs, monkeypatch: pytest.MonkeyPatch, dropout: float
+) -> None:
+    kept: list[bool] = []
+
+    def watched(block: Any, *given: Any, preserve_rng_state: bool, **how: Any) -> Any:
+        kept.append(preserve_rng_state)
+        return checkpoint(block, *given, preserve_rng_state=preserve_rng_state, **how)
+
+    monkeypatch.setattr(predictor, "checkpoint", watched)
+    model = fresh()
+    model.set_gradient_checkpointing(True)  # before there is an adapter
+    add_adapter(model, AdapterConfig(rank=2, dropout=dropout), seed=0)
+    model.predict(inputs.latents, inputs.actions, inputs.states)
+    assert kept == [dropout > 0] * len(model.base_predictor.blocks)
 
 
 def test_gradient_checkpointing_changes_no_gradient_of_an_adapter_and_its_dropout(fresh: Fresh, inputs) -> None:

@@ -9,6 +9,7 @@ from peft import LoraConfig, get_peft_model
 from peft.tuners.lora import Linear
 from torch import Tensor, nn
 
+from tracing import tracing
 from vjepa2_ac.model.lora_linear import LoraLinear, _LowRankLinear
 
 PLAIN = {"r": 3, "lora_alpha": 5, "use_rslora": True}
@@ -123,7 +124,7 @@ def test_gradients_are_those_of_differences(masked: bool, reached: bool) -> None
     torch.manual_seed(0)
     weight, bias = draw(4, 6).detach(), draw(4).detach()
     inputs = (draw(2, 3, 6).requires_grad_(reached), draw(2, 3, 6) if masked else None, weight, bias, draw(2, 6))
-    assert torch.autograd.gradcheck(_LowRankLinear.apply, (*inputs, draw(4, 2), 0.7))
+    assert torch.autograd.gradcheck(_LowRankLinear.apply, (*inputs, draw(4, 2), None, None, 0.7))
 
 
 def test_a_frozen_adapter_keeps_nothing_of_its_input() -> None:
@@ -138,3 +139,16 @@ def test_a_frozen_adapter_keeps_nothing_of_its_input() -> None:
     expected, other = tokens().requires_grad_(), layer(Linear)
     other(expected).sum().backward()
     torch.testing.assert_close(given.grad, expected.grad, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
+@pytest.mark.usefixtures("traced")
+@pytest.mark.parametrize("autocast", [False, True])
+@pytest.mark.parametrize("rows", [False, True], ids=["tokens of clips", "tokens in rows"])
+def test_compiled_it_learns_what_the_plain_one_learns(rows: bool, autocast: bool) -> None:
+    given = tokens()[0] if rows else tokens()
+    expected = output_and_gradients(layer(), given, autocast=autocast)
+    made = layer()
+    made.forward = torch.compile(made.forward, backend="eager", fullgraph=True)
+    for one, other in zip(output_and_gradients(made, given, autocast=autocast), expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-5, atol=1e-6)

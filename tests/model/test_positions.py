@@ -1,8 +1,10 @@
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
 
+from tracing import tracing
 from vjepa2_ac.model.positions import TokenLayout, rotary_tables, rotate
 
 CPU = torch.device("cpu")
@@ -72,3 +74,23 @@ def test_gradients_are_those_of_differences() -> None:
     tables = rotary_tables(TokenLayout(2, 2, 1), 14, torch.device("cpu"))
     tokens = torch.randn(1, 10, 2, 14, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     assert torch.autograd.gradcheck(lambda given: rotate(given, tables), tokens.requires_grad_())
+
+
+@pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
+@pytest.mark.usefixtures("traced")
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_compiled_a_gradient_comes_through(dtype: torch.dtype) -> None:
+    layout = TokenLayout(steps=2, grid=3, conditioning=2)
+    tables = rotary_tables(layout, 12, CPU)
+    drawn = torch.randn(1, layout.length, 2, 12, generator=torch.Generator().manual_seed(0)).to(dtype)
+
+    def turned_and_learned(turn: Callable[..., torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        given = drawn.clone().requires_grad_()
+        turned = turn(given, tables)
+        (of_given,) = torch.autograd.grad(turned.float().square().sum(), given)
+        return turned, of_given
+
+    compiled = torch.compile(lambda given, tables: rotate(given * 1, tables), backend="eager", fullgraph=True)
+    found, expected = turned_and_learned(compiled), turned_and_learned(rotate)
+    assert expected[1].abs().min() > 0
+    torch.testing.assert_close(found, expected)

@@ -20,6 +20,15 @@ def test_the_same_seed_gives_the_same_model_and_another_seed_another(fresh: Fres
     assert model.encoder_fingerprint() == fresh(seed=3).encoder_fingerprint() != fresh(4).encoder_fingerprint()
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="another device to draw on")
+def test_weights_are_drawn_where_they_are_to_be(model: WorldModel) -> None:
+    drawn, again = (WorldModel.random(model.sizes, 0, at_persistence=True, device="cuda") for _ in range(2))
+    assert {value.device.type for value in drawn.parameters()} == {"cuda"}
+    assert drawn.predictor_fingerprint() == again.predictor_fingerprint()
+    weight = drawn.base_predictor.blocks[0].attn.q.weight
+    assert weight.std() == pytest.approx(0.02, rel=0.2)
+
+
 def test_nothing_of_a_base_is_trained(model: WorldModel) -> None:
     assert not any(value.requires_grad for value in model.parameters())
 

@@ -11,7 +11,7 @@ from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model import compilation
-from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.lora import add_adapter, lora_layers
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.ready import make_ready
@@ -70,11 +70,21 @@ def test_switched_off_it_is_off_again() -> None:
     assert not counters["stats"]
 
 
-def test_what_cannot_be_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("traced")
+def test_an_adapter_that_cannot_be_traced_is_compiled_merged() -> None:
     model = tiny_model()
     add_adapter(model, AdapterConfig(rank=2, dora=True), seed=0)
-    with pytest.raises(InputError, match=r"planning.compile.*DoRA"):
-        Controller(model, COMPILED)
+    for layer in lora_layers(model).values():
+        layer.lora_magnitude_vector["default"].weight.data *= 1.1
+    expected = decisions(model, PLAIN)
+    found = decisions(model, COMPILED)
+    assert counters["stats"]["unique_graphs"]
+    assert not counters["graph_break"]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_what_cannot_be_compiled_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_model()
     monkeypatch.setattr(compilation, "missing_for_compilation", lambda kind: f"no compiler for {kind}")
     with pytest.raises(InputError, match=r"no compiler for cpu.*planning.compile=off"):
         Controller(tiny_model(), COMPILED)

@@ -5,16 +5,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
+from adapted_run import write_adapted_run
 from vjepa2_ac.cli import main
 from vjepa2_ac.config_file import parse_config
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation import planning_score
+from vjepa2_ac.evaluation import evaluate, planning_score
 from vjepa2_ac.evaluation.evaluate import Probes
 from vjepa2_ac.evaluation.planning_protocol import SCORED
+from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.evaluation import Asked, evaluate_subject
 
 QUICK = {"sensitivity_clips": 0, "examples": 0}
@@ -77,6 +80,40 @@ def test_plans_are_measured_on_held_out_clips_with_the_configs_settings(
     assert (one.three_steps == other.three_steps).all(), "the same weights plan the same"
     difference = figures["models"]["model"]["planning"]["difference_to_base"]
     assert difference["missed_cm"] == {"value": 0.0, "low": 0.0, "high": 0.0}
+
+
+@pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(
+    "adapter", [{"rank": 4}, {"rank": 4, "dora": True}, {"kind": "none"}], ids=["lora", "dora", "none"]
+)
+def test_what_was_trained_plans_merged_and_its_errors_are_measured_as_it_is(
+    make_config, adapter: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = {"samples": 12, "iterations": 2, "cem": {"elites": 4}}
+    run = write_adapted_run(make_config(run_dir=str(tmp_path / "a run"), adapter=adapter, planning=small))
+    planned: list[bool] = []
+    measure = evaluate.measure_plans
+
+    def noting(model: WorldModel, starts: Any, *more: Any) -> Any:
+        planned.append(model.adaptation is None)
+        return measure(model, starts, *more)
+
+    monkeypatch.setattr(evaluate, "measure_plans", noting)
+    asking = Asked(clips=3, split="validation", out=tmp_path / "out", probes=Probes(**QUICK, planning_clips=2))
+    found = evaluate_subject(str(run), asking).evaluation.models
+    assert planned == [adapter.get("kind") == "none", True]  # a base whose adapter is switched off plans as it is
+    monkeypatch.setattr("vjepa2_ac.training.evaluation.unadapted_copy", lambda model: model)
+    as_it_is = evaluate_subject(str(run), replace(asking, out=tmp_path / "other")).evaluation.models
+    for name, result in found.items():
+        plans, others = result.plans, as_it_is[name].plans
+        assert plans is not None
+        assert others is not None
+        np.testing.assert_allclose(plans.one_step, others.one_step, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(plans.three_steps, others.three_steps, rtol=0, atol=1e-5)
+        assert (result.true.rollout.l1 == as_it_is[name].true.rollout.l1).all()
+    trained, base = (found[name].plans for name in found if name != "base"), found["base"].plans
+    assert base is not None
+    assert all(plans is not None and (plans.one_step != base.one_step).any() for plans in trained)
 
 
 @pytest.mark.parametrize("setting", ["seed=3", "planning.sample=3", "planning.samples=1"])

@@ -10,9 +10,12 @@ import yaml
 from adapted_run import write_adapted_run
 from vjepa2_ac.config_file import config_as_dict, config_as_yaml
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.predictor import ActionConditionedPredictor
+from vjepa2_ac.model.world_model import WorldModel, fingerprint
 from vjepa2_ac.training.planning import Steering, load_to_plan
 from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open_run_folder, read_run_config
+from vjepa2_ac.training.runs import load_run
 
 PLANNING = {"horizon": 2, "samples": 12, "iterations": 2, "cem": {"elites": 4}}
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
@@ -121,6 +124,69 @@ def test_a_model_of_vectors_is_refused(make_config, tmp_path: Path) -> None:
     path.write_text(config_as_yaml(vectors))
     with pytest.raises(InputError, match="a model of poses"):
         load_to_plan("builtin:sim-tiny", config=path)
+
+
+ADAPTERS = {
+    "lora": {"rank": 4},
+    "dora": {"rank": 4, "dora": True, "modules_to_save": ["predictor_proj", "state_encoder"]},
+    "none": {"kind": "none"},
+}
+
+
+@pytest.mark.parametrize("adapter", ADAPTERS.values(), ids=ADAPTERS)
+def test_a_run_is_merged_in_its_bases_type_and_its_fingerprints_are_those_of_what_was_trained(
+    make_config, adapter: dict
+) -> None:
+    config = make_config(adapter=adapter, model__dtype="bfloat16", training__precision="bf16")
+    run = write_adapted_run(config)
+    steering, trained = load_to_plan(str(run)), load_run(run).world_model
+    assert type(steering.world_model.predictor) is ActionConditionedPredictor
+    assert steering.world_model.adaptation is None
+    assert {value.dtype for value in steering.world_model.parameters()} == {torch.bfloat16}
+    torch.testing.assert_close(prediction(steering.world_model), prediction(trained.eval()), rtol=0, atol=0.1)
+    told = steering.as_dict()["model"]
+    assert told["encoder"] == trained.encoder_fingerprint()
+    assert told["base"] == load_base(config.model, seed=0).predictor_fingerprint()
+    assert told["predictor"] == fingerprint(trained.predictor.state_dict())
+    assert told["dtype"] == "bfloat16"
+
+
+def test_a_base_is_known_by_its_own_weights(base_folder: Path) -> None:
+    base = WorldModel.from_pretrained(base_folder)
+    told = load_to_plan(str(base_folder)).as_dict()["model"]
+    assert told["encoder"] == base.encoder_fingerprint()
+    assert told["base"] == base.predictor_fingerprint()
+    assert told["predictor"] == fingerprint(base.predictor.state_dict())
+
+
+def test_a_run_in_float32_is_planned_with_in_bfloat16_if_that_is_asked_for(run: Path) -> None:
+    steering = load_to_plan(str(run), overrides=["model.dtype=bfloat16"])
+    assert {value.dtype for value in steering.world_model.parameters()} == {torch.bfloat16}
+
+
+def test_how_a_run_was_trained_does_not_keep_it_from_planning_here(make_config) -> None:
+    config = make_config()
+    run = write_adapted_run(
+        config.model_copy(update={"training": config.training.model_copy(update={"precision": "fp16"})})
+    )
+    assert load_to_plan(str(run)).world_model.device.type == "cpu"
+
+
+@pytest.mark.parametrize("kind", ["int8", "fp8"])
+def test_8_bits_in_float32_are_refused_before_a_model_is_loaded(make_config, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "its.yaml"
+    path.write_text(config_as_yaml(make_config(planning__quantize=kind)))
+    told = rf"planning\.quantize: {kind}, with weights in float32\. needed: bfloat16.*Set model\.dtype=bfloat16"
+    with pytest.raises(InputError, match=told):
+        load_to_plan("no such model", config=path)
+
+
+def test_fp8_that_the_device_has_not_is_refused_before_a_model_is_loaded(make_config, tmp_path: Path) -> None:
+    pytest.importorskip("torchao", reason="the extra quantize is not installed")
+    path = tmp_path / "its.yaml"
+    path.write_text(config_as_yaml(make_config(planning__quantize="fp8", training__precision="bf16")))
+    with pytest.raises(InputError, match=r"planning\.quantize: fp8, on cpu"):
+        load_to_plan("no such model", config=path, overrides=["model.dtype=bfloat16"])
 
 
 def test_a_run_from_before_there_was_a_planning_section_goes_on_unchanged(make_config) -> None:

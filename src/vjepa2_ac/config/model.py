@@ -80,7 +80,7 @@ class ModelConfig(Section):
     sizes: ModelSizes = ModelSizes()
     """What an official `.pt` cannot say of itself: image size and heads. Everything else is read from its tensors."""
     dtype: Literal["float32", "bfloat16"] = "bfloat16"
-    """Type of the frozen weights; what is trained is always float32."""
+    """Type of the frozen weights; what is trained is always float32. Plans compute in it."""
     encode_chunk: PositiveInt = 16
     """Frames that go through the encoder at once: bounds its memory."""
 

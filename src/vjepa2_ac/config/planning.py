@@ -135,8 +135,9 @@ class PlanningConfig(Section):
     """blocks: torch.compile for the predictor's blocks; needs a C compiler, and a minute within the first decision. The
     same energies to rounding. Not of `evaluate --planning`, which computes plainly."""
     quantize: Annotated[Literal["off", "int8", "fp8"], OFF] = "off"
-    """int8, fp8: the predictor's blocks compute in 8 bits, with the adapter merged in (torchao, extra quantize). fp8
-    needs compute capability 8.9. Not of planner gradient, nor of `evaluate --planning`."""
+    """int8, fp8: the predictor's blocks compute in 8 bits, with the adapter merged in (torchao, extra quantize); the
+    rest in bfloat16, which model.dtype must be. fp8 needs compute capability 8.9. Not of planner gradient, nor of
+    `evaluate --planning`."""
     limits: LimitsConfig = LimitsConfig()
     """What no action goes beyond."""
     energy: EnergyConfig = EnergyConfig()

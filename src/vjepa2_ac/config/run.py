@@ -50,6 +50,8 @@ class Config(Section):
             raise ValueError("training.precision fp32 needs model.dtype float32: bfloat16 weights compute in bfloat16")
         if self.training.compile != "off" and self.adapter.kind == "lora" and self.adapter.dora:
             raise ValueError("training.compile blocks cannot trace adapter.dora; set one of them off")
+        if self.training.cuda_graph and (self.training.precision == "fp16" or self.adapter.dropout):
+            raise ValueError("training.cuda_graph needs adapter.dropout 0, and bf16 or fp32")
         sizes = self.model.random or self.model.sizes
         if sizes.predictor.use_extrinsics and self.data.source in {"rlds", "lerobot"}:
             raise ValueError(

@@ -51,12 +51,19 @@ class TrainingConfig(Section):
     max_grad_norm: Annotated[float, Field(gt=0.0)] | None = 1.0
     """Gradients are scaled down to this norm; null: never (the released recipe)."""
     precision: Literal["bf16", "fp16", "fp32"] = "bf16"
-    """Arithmetic of the networks (autocast). fp16 scales the loss, and needs CUDA."""
+    """Arithmetic of the networks (autocast). bf16 needs compute capability 8.0 on CUDA (Ampere). fp16 scales the loss,
+    and needs CUDA."""
     gradient_checkpointing: bool = False
     """Compute each predictor block again in the backward pass instead of keeping its activations."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks, in training steps only; needs a C compiler, and a minute before
     the first step. The same losses and gradients to rounding; dropout draws other masks."""
+    cuda_graph: bool = False
+    """Ask the GPU for a whole micro-batch at once instead of kernel by kernel, which at one or two clips takes longer
+    than computing. Not measured yet. Keeps the memory of a step all the time; not with fp16, dropout or FSDP."""
+    attention: Literal["auto", "per_step"] = "auto"
+    """auto: FlexAttention in training steps on CUDA, which is compiled for each size of a batch. per_step: one plain
+    attention for each model step, which compiles nothing. The same losses and gradients to rounding."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """auto: CUDA where there is one."""
     allow_weak_base: bool = False

@@ -28,6 +28,7 @@ from vjepa2_ac.evaluation.result import (
     Example,
     Landscapes,
     ModelResult,
+    Plans,
     Predicted,
     Role,
     Sensitivity,
@@ -50,6 +51,7 @@ class Contender:
     role: Role
     model: Predictor
     switched: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext  # on while it predicts
+    to_plan: Callable[[], Predictor] | None = None  # gives what plans in its place, and is held only while it does
 
 
 @dataclass(frozen=True)
@@ -114,11 +116,7 @@ def evaluate(
                 result,
                 sensitivity=_sensitivity(contender, seen.starts, pool, probes, about, stage),
                 landscapes=_landscapes(contender, seen.starts, known, pool, probes, about, stage),
-                plans=measure_plans(
-                    contender.model, seen.planned, probes.planning, _bar(stage, f"planning, {contender.name}")
-                )
-                if seen.planned
-                else None,
+                plans=_plans(contender, seen.planned, probes, stage),
             )
     nothing = _joined(seen.persistence)
     evaluation = Evaluation(
@@ -251,6 +249,18 @@ def _landscapes(
         at_once=probes.at_once,
         progress=_bar(stage, f"energy landscapes, {contender.name}"),
     )
+
+
+def _plans(
+    contender: Contender,
+    starts: Sequence[PlanningStart],
+    probes: Probes,
+    stage: Callable[[str], Progress] | None,
+) -> Plans | None:
+    if not starts:
+        return None
+    model = contender.model if contender.to_plan is None else contender.to_plan()
+    return measure_plans(model, starts, probes.planning, _bar(stage, f"planning, {contender.name}"))
 
 
 def _episodes(evaluation: Evaluation) -> tuple[EpisodeScore, ...]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
+
+import torch
 
 from vjepa2_ac.model.adapter_start import set_original_weights
 from vjepa2_ac.model.lora import adaptation_of, lora_layers
@@ -34,20 +37,46 @@ def base_only(model: WorldModel) -> Iterator[None]:
             value.requires_grad_(requires_grad)
 
 
+def base_dtype(model: WorldModel) -> torch.dtype:
+    """Return the type of the predictor's weights before anything of it was trained, in float32: `model.dtype`."""
+    if model.adaptation is not None and model.adaptation.kind == "none" and model.adaptation.start:
+        return next(iter(model.adaptation.start.values())).dtype
+    weight: torch.Tensor = model.base_predictor.predictor_norm.weight  # never trained beside an adapter
+    return weight.dtype
+
+
 def merge_adapter(model: WorldModel) -> None:
     """Make what was trained part of the predictor: added in float32, then cast to the base's type, frozen.
+
+    Autocast around it changes nothing.
 
     Raises:
         ValueError: The model has not been adapted.
     """
-    adaptation = adaptation_of(model)
-    dtype = model.base_predictor.predictor_norm.weight.dtype  # never trained beside an adapter
-    if adaptation.kind == "lora":
-        model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
-    elif adaptation.start is not None:
-        dtype = next(iter(adaptation.start.values())).dtype
+    dtype = base_dtype(model)
+    if adaptation_of(model).kind == "lora":
+        with _without_autocast(model.device.type):  # or the update would be computed in its type
+            model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
     model.predictor.to(dtype).requires_grad_(False)
     model.adaptation = model.fresh_heads = None
+
+
+def unadapted_copy(model: WorldModel) -> WorldModel:
+    """Return a model for inference that shares the encoder and has a predictor of its own, what was trained merged.
+
+    The given one stays as it is.
+    """
+    own = WorldModel.empty(model.sizes)
+    own.encoder, own.predictor = model.encoder, copy.deepcopy(model.predictor)
+    own.adaptation, own.fresh_heads = model.adaptation, model.fresh_heads
+    if own.adaptation is not None:
+        merge_adapter(own)
+    return own.eval()
+
+
+def _without_autocast(device: str) -> AbstractContextManager[object]:
+    """Switch autocast off on a kind of device; some, as meta, have none."""
+    return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()
 
 
 @contextmanager

@@ -10,7 +10,6 @@ Three exact ways to compute it:
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, Literal, get_args
@@ -19,6 +18,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import scaled_dot_product_attention
+
+from vjepa2_ac.model.compilation import compiled, has_triton
 
 AttentionKind = Literal["auto", "dense", "per_step", "flex"]
 ATTENTION_KINDS: tuple[str, ...] = get_args(AttentionKind)
@@ -37,11 +38,12 @@ def block_causal_attention(
     """Return the attention in which a token of step t sees all tokens of steps <= t.
 
     `auto` takes `flex` on CUDA where Triton is installed, with gradients on and at least four steps; `per_step`
-    everywhere else. Each length is compiled anew and PyTorch compiles eight at most: lengths vary in evaluation and
-    planning, and the short ones at the start of a rollout are not worth it.
+    everywhere else. Each length and each number of clips is compiled anew: lengths vary in evaluation and planning, and
+    the short ones at the start of a rollout are not worth it.
 
     Raises:
         ValueError: A sequence is not a whole number of steps, fewer keys than queries are given, or an unknown kind.
+        InputError: FlexAttention was compiled for too many sizes; uncompiled it would hold all scores in memory.
     """
     for length in (query.shape[2], key.shape[2]):
         if length % tokens_per_step:
@@ -60,12 +62,6 @@ def best_kind(device: torch.device, head_dim: int, steps: int, *, gradients: boo
     """Return what `auto` takes: see `block_causal_attention`."""
     fits_flex = device.type == "cuda" and head_dim >= _FLEX_HEAD_DIM and steps >= _FLEX_STEPS and gradients
     return "flex" if fits_flex and has_triton() else "per_step"
-
-
-@lru_cache(maxsize=1)
-def has_triton() -> bool:
-    """Return whether Triton is installed, without which nothing is compiled for CUDA."""
-    return importlib.util.find_spec("triton") is not None
 
 
 def _dense(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:
@@ -138,9 +134,8 @@ def _flex_mask(queries: int, keys: int, tokens_per_step: int, device: torch.devi
         )
 
 
-@lru_cache(maxsize=2)
-def _flex_attention(compiled: bool) -> Callable[..., Any]:
+def _flex_attention(is_compiled: bool) -> Callable[..., Any]:
     from torch.nn.attention.flex_attention import flex_attention
 
     attend: Callable[..., Any] = flex_attention
-    return torch.compile(attend, dynamic=False) if compiled else attend
+    return compiled(attend, way_out="training.attention=per_step", dynamic=False) if is_compiled else attend

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from einops import rearrange
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
-from torch.nn.functional import layer_norm
+from torch.nn.functional import layer_norm, linear
 from transformers import VJEPA2Config
 from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
@@ -22,13 +23,15 @@ class Encoder(nn.Module):
     """Turns frames into features, each frame by itself; frozen, and always in eval mode.
 
     The network is the encoder of transformers' `VJEPA2Model` (its masked predictor is never built), with rotary
-    tables computed once and in float32: transformers makes angles in the type of the weights.
+    tables computed once and in float32 (transformers makes angles in the type of the weights), and with patches
+    embedded by one product of matrices.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
         super().__init__()
         self.image_size = sizes.image_size
         self.vit = VJEPA2Encoder(_config(sizes))
+        self.vit.embeddings.patch_embeddings.proj = _FramePatches(sizes.encoder.width, sizes.patch_size)
         _share_exact_tables(self.vit, TokenLayout(1, sizes.image_size // sizes.patch_size))
         self.vit.layernorm = _PreciseNorm(sizes.encoder.width, eps=NORM_EPSILON)
         self.requires_grad_(False)
@@ -75,6 +78,29 @@ class Encoder(nn.Module):
         with without_needless_autocast(tubelets, weight):
             features: Tensor = self.vit(tubelets).last_hidden_state
         return features
+
+
+class _FramePatches(nn.Conv3d):
+    """The patch embedding of a tubelet that is one frame over and over: the kernel is summed over time, once.
+
+    Half the arithmetic of the convolution, and a product of matrices, which every version of cuDNN leaves alone: some
+    have no fast convolution in three dimensions in bfloat16.
+    """
+
+    def __init__(self, width: int, patch_size: int) -> None:
+        kernel = (TUBELET, patch_size, patch_size)
+        super().__init__(3, width, kernel_size=kernel, stride=kernel)
+
+    def forward(
+        self, tubelets: Float[Tensor, "frames 3 time height width"]
+    ) -> Float[Tensor, "frames dim 1 rows columns"]:
+        """Return what the convolution would, of tubelets whose frames are all alike."""
+        side = self.kernel_size[-1]
+        frames = tubelets[:, :, 0]
+        patches = rearrange(frames, "n c (rows p) (columns q) -> n (rows columns) (c p q)", p=side, q=side)
+        embedded = linear(patches, self.weight.sum(dim=2).flatten(1), self.bias)
+        rows = frames.shape[-2] // side
+        return rearrange(embedded, "n (time rows columns) dim -> n dim time rows columns", time=1, rows=rows)
 
 
 class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformers has no types

@@ -167,11 +167,6 @@ def lora_layers(model: WorldModel) -> dict[str, Any]:
     return {name: layer for name, layer in found if isinstance(layer, LoraLayer)}
 
 
-def uses_dora(model: WorldModel) -> bool:
-    """Return whether an adapter is on, and it is one with DoRA."""
-    return isinstance(model.predictor, PeftModel) and bool(_lora_config(model).use_dora)
-
-
 def adaptation_of(model: WorldModel) -> Adaptation:
     """Return how a model was adapted.
 

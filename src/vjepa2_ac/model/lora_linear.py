@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -22,19 +23,26 @@ class LoraLinear(Linear):  # type: ignore[misc]  # PEFT has no types
     Hooks on the layer and the matrices inside are not called, and there are no second derivatives.
     """
 
+    cast: tuple[Tensor, Tensor] | None = None  # its matrices in the arithmetic's type, while `CastMatrices` holds them
+
     def forward(self, tokens: Float[Tensor, "*batch inputs"], *args: Any, **kwargs: Any) -> Tensor:
         """Return what the layer and its adapter make of each token."""
         dtype = self._dtype_of_plain_lora(tokens)
         if dtype is None or args or kwargs:
             return super().forward(tokens, *args, **kwargs)  # type: ignore[no-any-return]
         name, layer = self.active_adapters[0], self.base_layer
-        first, second = (matrices[name].weight.to(dtype) for matrices in (self.lora_A, self.lora_B))
+        matrices = self.lora_A[name].weight, self.lora_B[name].weight
+        cast: tuple[Tensor | None, ...]
+        if self.cast is not None and self.cast[0].dtype == dtype:
+            cast = self.cast
+        else:
+            cast = tuple(None if one.dtype == dtype else one.detach().to(dtype) for one in matrices)
         weight, bias = (None if own is None else own.to(dtype) for own in (layer.weight, layer.bias))
         tokens = tokens.to(dtype)
         dropout = self.lora_dropout[name]
         masked = None if isinstance(dropout, nn.Identity) or not self.training else dropout(tokens)
         apply: Callable[..., Tensor] = _LowRankLinear.apply
-        return apply(tokens, masked, weight, bias, first, second, self.scaling[name])
+        return apply(tokens, masked, weight, bias, *matrices, *cast, self.scaling[name])
 
     def _dtype_of_plain_lora(self, tokens: Tensor) -> torch.dtype | None:
         """Return the type to compute in; None where PEFT shall compute."""
@@ -51,11 +59,50 @@ class LoraLinear(Linear):  # type: ignore[misc]  # PEFT has no types
         return tokens.dtype if same else None
 
 
+class CastMatrices:
+    """The matrices of adapters in the arithmetic's type, cast together once a step, and not at each of their uses.
+
+    Args:
+        module: In which the adapters are.
+        dtype: Of the arithmetic.
+    """
+
+    def __init__(self, module: nn.Module, dtype: torch.dtype) -> None:
+        self._layers = [
+            layer
+            for layer in module.modules()
+            if isinstance(layer, LoraLinear) and [one.weight.dtype != dtype for one in _matrices(layer)] == [True, True]
+        ]
+        self._own = [one.weight for layer in self._layers for one in _matrices(layer)]
+        self._cast = [torch.empty_like(one, dtype=dtype, requires_grad=False) for one in self._own]
+
+    @contextmanager
+    def current(self) -> Iterator[None]:
+        """Cast now, and let all layers use that meanwhile: the matrices must not change."""
+        if self._own:
+            with torch.no_grad():
+                torch._foreach_copy_(self._cast, self._own)
+        for layer, first, second in zip(self._layers, self._cast[::2], self._cast[1::2], strict=True):
+            layer.cast = (first, second)
+        try:
+            yield
+        finally:
+            for layer in self._layers:
+                layer.cast = None
+
+
+def _matrices(layer: LoraLinear) -> list[nn.Linear]:
+    """Return the two of the one adapter that is computed here; none where there are several."""
+    names = layer.active_adapters
+    return [layer.lora_A[names[0]], layer.lora_B[names[0]]] if len(names) == 1 and names[0] in layer.lora_A else []
+
+
 class _LowRankLinear(torch.autograd.Function):
     """`tokens @ weight.T + bias + scale * masked @ first.T @ second.T`, the weight frozen; all of one type.
 
-    What is kept for the gradient is the adapter's input (masked, else the tokens) and what is between its matrices;
-    of a frozen adapter neither.
+    Where the matrices have another type, they are given once more in this one, which is what is computed with; their
+    gradients have their own. What is kept for the gradient is the adapter's input (masked, else the tokens) and what
+    is between its matrices; of a frozen adapter neither.
     """
 
     @staticmethod
@@ -67,12 +114,16 @@ class _LowRankLinear(torch.autograd.Function):
         bias: Tensor | None,
         first: Tensor,
         second: Tensor,
+        first_cast: Tensor | None,
+        second_cast: Tensor | None,
         scale: float,
     ) -> Tensor:
+        ctx.own_dtype = first.dtype
+        first, second = first if first_cast is None else first_cast, second if second_cast is None else second_cast
         read = (tokens if masked is None else masked).flatten(0, -2)
         inner = linear(read, first)
         result = linear(tokens, weight, bias)
-        _add_product(result.flatten(0, -2), inner, second.T, scale)
+        result = _plus_product(result.flatten(0, -2), inner, second.T, scale).view_as(result)
         needed = (ctx.needs_input_grad[4], ctx.needs_input_grad[5], ctx.needs_input_grad[0])
         kept = (value if is_needed else None for value, is_needed in zip((read, inner, weight), needed, strict=True))
         ctx.save_for_backward(*kept, first, second)
@@ -88,14 +139,17 @@ class _LowRankLinear(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             of_tokens = rows @ weight
             if not ctx.is_masked:
-                _add_product(of_tokens, to_inner, first, ctx.scale)
+                of_tokens = _plus_product(of_tokens, to_inner, first, ctx.scale)
             of_tokens = of_tokens.view(shape)
         if ctx.needs_input_grad[1]:
             of_masked = (to_inner * ctx.scale @ first).view(shape)
-        of_first = None if read is None else to_inner.T @ read * ctx.scale
-        of_second = None if inner is None else rows.T @ inner * ctx.scale
-        return of_tokens, of_masked, None, None, of_first, of_second, None
+        of_first = None if read is None else (to_inner.T @ read * ctx.scale).to(ctx.own_dtype)
+        of_second = None if inner is None else (rows.T @ inner * ctx.scale).to(ctx.own_dtype)
+        return of_tokens, of_masked, None, None, of_first, of_second, None, None, None
 
 
-def _add_product(total: Tensor, left: Tensor, right: Tensor, scale: float) -> None:
-    torch.addmm(total, left, right, alpha=scale, out=total)  # in place, and PyTorch's counter of FLOPs knows it
+def _plus_product(total: Tensor, left: Tensor, right: Tensor, scale: float) -> Tensor:
+    """Return `total + scale * left @ right` in the memory of the total; a compiler decides that by itself."""
+    if torch.compiler.is_compiling():  # torch 2.11 would lose the gradient of the result (PyTorch issue 180642)
+        return torch.addmm(total, left, right, alpha=scale)
+    return torch.addmm(total, left, right, alpha=scale, out=total)  # which PyTorch's counter of FLOPs knows

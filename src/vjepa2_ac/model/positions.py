@@ -90,7 +90,12 @@ class _Rotation(torch.autograd.Function):
 
 
 def _turned(tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
-    # Computed in float32, as the tables are, and written in the type of the tokens, without a pass to cast it.
+    # Computed in float32, as the tables are, and written in the type of the tokens, without a pass to cast it. A
+    # compiler fuses that pass by itself, and torch 2.11 loses the gradient of what an autograd.Function writes in place
+    # and then returns (PyTorch issue 180642); there even a cast that changes nothing loses it.
+    if torch.compiler.is_compiling():
+        turned = torch.addcmul(tokens * cosine, _swapped(tokens), signed_sine)
+        return turned if turned.dtype == tokens.dtype else turned.to(tokens.dtype)
     turned = torch.empty_like(tokens)
     return torch.addcmul(tokens * cosine, _swapped(tokens), signed_sine, out=turned)
 

@@ -98,6 +98,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         self.predictor_proj = nn.Linear(width, config.latent_dim)
         self.attention: AttentionKind = "auto"
         self.gradient_checkpointing = False  # the name transformers switches
+        self.has_dropout = False  # in its blocks: then a block computed again draws the same masks again
         self.post_init()
 
     @property
@@ -148,7 +149,8 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         spends most of its training on learning to copy. Exact where the predictor is as wide as a latent.
         """
         shape = self.predictor_embed.weight.shape
-        drawn = torch.randn(max(shape), min(shape), generator=generator).double()  # or threads would change last bits
+        drawn = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)
+        drawn = drawn.double()  # or threads would change last bits
         rotation, triangle = torch.linalg.qr(drawn)
         rotation = rotation * triangle.diagonal().sign()
         with torch.no_grad():
@@ -193,7 +195,8 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         for index, block in enumerate(self.blocks):
             past = () if cache is None else cache.layer(index)
             if self.gradient_checkpointing and torch.is_grad_enabled():
-                tokens, kept = checkpoint(block, tokens, *how, kept_tokens, *past, use_reentrant=False)
+                given = (tokens, *how, kept_tokens, *past)
+                tokens, kept = checkpoint(block, *given, use_reentrant=False, preserve_rng_state=self.has_dropout)
             else:
                 tokens, kept = block(tokens, *how, kept_tokens, *past)
             if kept is not None:

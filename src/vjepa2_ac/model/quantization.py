@@ -1,18 +1,19 @@
 """How does a predictor compute in 8 bits? A copy whose blocks have 8-bit weights and round what they are given.
 
 torchao's home. For inference only: weights have one scale an output, what goes into a layer one a token, found anew
-each time. Heads, norms and attention stay as they are.
+each time. Heads, norms and attention stay as they are, and compute in bfloat16: torchao's fp8 takes no other weights,
+and a model that may be rounded to 8 bits has no use for float32 around them.
 """
 
 from __future__ import annotations
 
-import copy
 from typing import Any, Literal
 
 import torch
+from torch import nn
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter_end import merge_adapter
+from vjepa2_ac.model.adapter_end import base_dtype, unadapted_copy
 from vjepa2_ac.model.world_model import WorldModel
 
 Kind = Literal["int8", "fp8"]
@@ -29,23 +30,44 @@ def quantized_copy(world_model: WorldModel, kind: Kind, *, where: str) -> WorldM
         where: The setting that asks for it.
 
     Raises:
-        InputError: torchao is not installed, or the device does not compute so.
+        InputError: torchao is not installed, the device does not compute so, the weights are not bfloat16, or a layer
+            cannot be in 8 bits.
     """
+    require_8_bits(kind, base_dtype(world_model), world_model.device, where=where)
     quantize, config = _torchao(kind, where)
-    if kind == "fp8" and not _has_fp8(world_model.device):
+    smaller = unadapted_copy(world_model)
+    quantize(smaller.base_predictor.blocks, config)
+    _require_everywhere(smaller.base_predictor.blocks, kind, where)
+    return smaller
+
+
+def require_8_bits(kind: Kind, dtype: torch.dtype, device: torch.device, *, where: str) -> None:
+    """Refuse to compute in 8 bits where that cannot be: known before there are weights.
+
+    Args:
+        kind: int8 or fp8.
+        dtype: Of the weights that would be quantized.
+        device: What would compute.
+        where: The setting that asks for it.
+
+    Raises:
+        InputError: Says which of all this does not do, and what to set.
+    """
+    if dtype != torch.bfloat16:
         raise InputError(
             where=where,
-            found=f"fp8, on {world_model.device.type}",
+            found=f"{kind}, with weights in {str(dtype).removeprefix('torch.')}",
+            needed="bfloat16, in which everything computes that is not in 8 bits",
+            fix=f"Set model.dtype=bfloat16, or {where}=off",
+        )
+    _torchao(kind, where)
+    if kind == "fp8" and not _has_fp8(device):
+        raise InputError(
+            where=where,
+            found=f"fp8, on {device.type}",
             needed="a CUDA device of compute capability 8.9 or more (Ada, Hopper or later)",
             fix=f"Set {where}=int8 or off",
         )
-    smaller = WorldModel.empty(world_model.sizes)
-    smaller.encoder, smaller.predictor = world_model.encoder, copy.deepcopy(world_model.predictor)
-    smaller.adaptation, smaller.fresh_heads = world_model.adaptation, world_model.fresh_heads
-    if smaller.adaptation is not None:
-        merge_adapter(smaller)
-    quantize(smaller.base_predictor.blocks, config)
-    return smaller.eval()
 
 
 def _torchao(kind: Kind, where: str) -> tuple[Any, Any]:
@@ -66,6 +88,18 @@ def _torchao(kind: Kind, where: str) -> tuple[Any, Any]:
     if kind == "int8":
         return quantize_, Int8DynamicActivationInt8WeightConfig()
     return quantize_, Float8DynamicActivationFloat8WeightConfig(granularity=PerRow())
+
+
+def _require_everywhere(blocks: nn.Module, kind: Kind, where: str) -> None:
+    """Refuse layers that torchao passes over without a word: fp8 has products of multiples of 16 only."""
+    for name, layer in blocks.named_modules():
+        if isinstance(layer, nn.Linear) and type(layer.weight.data) is torch.Tensor:
+            raise InputError(
+                where=where,
+                found=f"{kind}, and layer {name} from {layer.in_features} to {layer.out_features}",
+                needed="multiples of 16",
+                fix=f"Set {where}=off",
+            )
 
 
 def _has_fp8(device: torch.device) -> bool:

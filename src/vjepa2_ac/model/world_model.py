@@ -70,14 +70,21 @@ class WorldModel(nn.Module):
 
     @classmethod
     def random(
-        cls, sizes: ModelSizes, seed: int, dtype: torch.dtype = torch.float32, *, at_persistence: bool = False
+        cls,
+        sizes: ModelSizes,
+        seed: int,
+        dtype: torch.dtype = torch.float32,
+        *,
+        at_persistence: bool = False,
+        device: torch.device | str = "cpu",
     ) -> WorldModel:
-        """Return a freshly initialised model: the same weights for the same sizes and seed.
+        """Return a freshly initialised model: the same weights for the same sizes, seed and kind of device.
 
-        Weights are drawn as in the released recipe; `at_persistence` lets the predictor begin close to copying.
+        Weights are drawn as in the released recipe; `at_persistence` lets the predictor begin close to copying. They
+        are drawn where they are to be: the full size takes half a minute of one CPU core, and no time on a GPU.
         """
-        model = cls.empty(sizes).to_empty(device="cpu")
-        generator = torch.Generator().manual_seed(seed)
+        model = cls.empty(sizes).to_empty(device=device)
+        generator = torch.Generator(device).manual_seed(seed)
         model.present_encoder.initialise(generator)
         model.base_predictor.initialise(generator)
         if at_persistence:
@@ -227,7 +234,9 @@ class WorldModel(nn.Module):
 
     def set_gradient_checkpointing(self, enabled: bool) -> None:
         """Choose whether predictor blocks are computed again in the backward pass instead of being kept."""
-        self.base_predictor.gradient_checkpointing = enabled
+        predictor = self.base_predictor
+        predictor.gradient_checkpointing = enabled
+        predictor.has_dropout = any(isinstance(one, nn.Dropout) and one.p > 0 for one in predictor.blocks.modules())
 
     def set_compiled(self, when: When) -> None:
         """Choose when predictor blocks are compiled (see `model.compilation`)."""

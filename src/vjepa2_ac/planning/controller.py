@@ -69,7 +69,8 @@ class Controller:
         """Prepare to control.
 
         Args:
-            world_model: A base, one with an adapter, or merged; it is put into eval mode.
+            world_model: A base or merged, which is put into eval mode; or one that was trained, of which a merged copy
+                plans (see `planning.ready`).
             config: How to plan.
             seed: Of all decisions.
             crop: As in training (`data.crop`).
@@ -79,7 +80,7 @@ class Controller:
 
         Raises:
             InputError: The model's states and actions are no poses, or it needs a camera pose and there is none, or
-                none that can be; or its blocks cannot be compiled.
+                none that can be; or its blocks cannot be compiled or in 8 bits.
         """
         if widths_of_model(world_model.sizes) != POSE_WIDTHS:
             raise InputError(

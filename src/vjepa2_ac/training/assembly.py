@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import timedelta
+from functools import cached_property
 from pathlib import Path
 
 import torch
 from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 from accelerate.utils import InitProcessGroupKwargs
+from torch import nn
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
@@ -23,14 +25,16 @@ from vjepa2_ac.evaluation.calibration import Calibration
 from vjepa2_ac.latents import encode_batch, extrinsics_for
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.lora import add_adapter, save_trained, trainable_report
+from vjepa2_ac.model.lora_linear import CastMatrices
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.best import best_so_far, measured_on
 from vjepa2_ac.training.cached import with_latents
 from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, write_checkpoint
-from vjepa2_ac.training.device import is_on_cpu
+from vjepa2_ac.training.device import PRECISIONS, computing_device
 from vjepa2_ac.training.embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.loss import Objective
-from vjepa2_ac.training.optim import make_optimizer
+from vjepa2_ac.training.micro_step import CapturedMicroStep, MicroStep, captured_on_cuda
+from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 from vjepa2_ac.training.processes import from_first, of_all
 from vjepa2_ac.training.resume import micro_batches_of, say_what_is_new, take_up, take_up_loss_scale
 from vjepa2_ac.training.run_folder import CHECKPOINTS
@@ -63,6 +67,32 @@ class Run:
     def encodes(self) -> bool:
         """Whether clips are pictures that go through the encoder, not latents of a cache."""
         return self.dataset.config.source != "latents"
+
+    @cached_property
+    def trained(self) -> list[nn.Parameter]:
+        """What the optimizer moves."""
+        return list(trained_parameters(self.objective))
+
+    @cached_property
+    def cast_matrices(self) -> CastMatrices:
+        """The adapter in the type that a step computes in."""
+        return CastMatrices(self.world_model.predictor, PRECISIONS[self.config.training.precision])
+
+    @property
+    def micro_step(self) -> MicroStep | CapturedMicroStep:
+        """What adds the gradients of some clips."""
+        return self.captured or self._plain_micro_step
+
+    @cached_property
+    def captured(self) -> CapturedMicroStep | None:
+        """The same as a graph, where that is asked for."""
+        if not self.config.training.cuda_graph:
+            return None
+        return CapturedMicroStep(self._plain_micro_step, self.trained, captured_on_cuda)
+
+    @property
+    def _plain_micro_step(self) -> MicroStep:
+        return MicroStep(self.objective, self.accelerator, self.scaler)
 
     @property
     def copies(self) -> Copies:
@@ -119,6 +149,7 @@ def assemble(
     add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
     note(str(trainable_report(world_model)))
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
+    world_model.set_attention(config.training.attention)
     world_model.set_compiled("with gradients" if config.training.compile == "blocks" else "never")
     if dataset.config.source == "latents":
         world_model.set_encoder_aside()
@@ -144,10 +175,11 @@ def make_accelerator(config: Config) -> Accelerator:
     Where there are several processes it joins them.
 
     Raises:
-        InputError: CUDA was asked for and there is none, fp16 without CUDA, or a launch that cannot be followed.
+        InputError: CUDA was asked for and there is none, the device does not compute so (fp16 on a CPU, bf16 on an old
+            GPU), or a launch that cannot be followed.
     """
     check_launch(config)
-    training, on_cpu = config.training, is_on_cpu(config.training)
+    training, on_cpu = config.training, computing_device(config.training).type == "cpu"
     AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
     precision = "no" if training.precision == "fp32" else training.precision
     patience = InitProcessGroupKwargs(timeout=LONGEST_WAIT)

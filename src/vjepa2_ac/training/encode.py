@@ -28,7 +28,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.latents import encoding_of
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.training.device import autocast, is_on_cpu
+from vjepa2_ac.training.device import autocast, computing_device
 
 Note = Callable[[str], None]
 
@@ -62,7 +62,7 @@ def encode_config(
         InputError: Something cannot be used, or there is no room for it.
     """
     require_encodable(config)
-    is_on_cpu(config.training)
+    device = computing_device(config.training)
     dataset = open_dataset(config.data, progress=looked_through)
     model = load_base(config.model, seed=config.seed)
     writer = writer_for(config, dataset, model, out)
@@ -74,7 +74,6 @@ def encode_config(
         note(f"{in_words(lacking)}. It is encoded again.")
         begin_again(writer, lacking)
     share = Share(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
-    device = _device(config)
     at_work = encoder_at_work(config, model, device)
     return EncodedSet(writer.folder, encode_share(config, dataset, writer, at_work, share, note, progress))
 
@@ -156,10 +155,3 @@ def smaller_caches(config: Config) -> tuple[str, ...]:
     if data.start_every % data.model_stride:
         knobs.append(f"data.start_every: {data.model_stride}")
     return tuple(knobs)
-
-
-def _device(config: Config) -> torch.device:
-    """Return the device of this process among those on its machine."""
-    if is_on_cpu(config.training):
-        return torch.device("cpu")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -29,10 +30,10 @@ from vjepa2_ac.evaluation.html_report.page import write_report
 from vjepa2_ac.evaluation.metrics_file import METRICS_FILE, write_metrics
 from vjepa2_ac.evaluation.planning_protocol import FRAMES
 from vjepa2_ac.evaluation.plots import plot_evaluation
-from vjepa2_ac.evaluation.result import About, Evaluation, TrainingCurve
+from vjepa2_ac.evaluation.result import About, Evaluation, Role, TrainingCurve
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.latents import encode_batch, require_widths
-from vjepa2_ac.model.adapter_end import base_only
+from vjepa2_ac.model.adapter_end import base_only, unadapted_copy
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.storage import user_can_write
@@ -92,13 +93,13 @@ def evaluate_subject(
     _check_long_enough(config, asked.probes)
     planning = _planning_of(config, asked)
     _check_writable(folder)
+    accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=stage("looking through the data") if stage else None)
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     run = load_run(Path(subject), asked.checkpoint) if is_run(subject) else None
     world_model = run.world_model if run else _load_model(subject, config)
     require_widths(world_model, dataset.widths, where=subject)
     through_cache = with_latents_if_there(config, dataset, world_model)
-    accelerator = make_accelerator(config)
     contenders, notes = _contenders(subject, config, run, world_model, asked)
     if through_cache.config.source == "latents" and not asked.calibrate:
         world_model.set_encoder_aside()
@@ -237,7 +238,7 @@ def _contenders(
         if world_model.fresh_heads is not None:
             notes = (_NO_BASE,)
         else:
-            found.append(Contender(BASE, "base", world_model, partial(base_only, world_model)))
+            found.append(_contender(BASE, "base", world_model, partial(base_only, world_model)))
     elif BASE in against and run is None:
         if config.model.base is None:
             raise InputError(
@@ -249,8 +250,17 @@ def _contenders(
         if other != BASE:
             taken = {each.name for each in found} | {name, BASE, "persistence"}
             called = Path(other).name if Path(other).name not in taken else other
-            found.append(Contender(called, "other", _like(world_model, other, config, subject)))
-    return [*found, Contender(name, "trained", world_model)], notes
+            found.append(_contender(called, "other", _like(world_model, other, config, subject)))
+    return [*found, _contender(name, "trained", world_model)], notes
+
+
+def _contender(
+    name: str, role: Role, model: WorldModel, switched: Callable[[], AbstractContextManager[object]] = nullcontext
+) -> Contender:
+    """Return a model to measure as it is; a merged copy plans in its place (see `planning.ready`)."""
+    adaptation = model.adaptation
+    plans_as_it_is = adaptation is None or (role == "base" and adaptation.kind == "lora")  # whose adapter is off then
+    return Contender(name, role, model, switched, None if plans_as_it_is else partial(unadapted_copy, model))
 
 
 def _like(world_model: WorldModel, other: str, config: Config, subject: str) -> WorldModel:

@@ -27,6 +27,7 @@ from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.prefetch import fetch_ahead
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.training.cost.flops import clip_flops
+from vjepa2_ac.training.device import PRECISIONS
 from vjepa2_ac.training.stopwatch import HostStopwatch, Stopwatch
 
 MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "memory_gb"})
@@ -34,7 +35,6 @@ MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_secon
 
 _CEILING_S = 0.2
 _CUDA_MATRIX, _CPU_MATRIX = 8192, 512
-_TYPES = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
 
 
 class TimedBatches:
@@ -91,7 +91,7 @@ class Throughput:
             encodes: Whether the encoder's work counts; latents from a cache need none.
         """
         tokens = config.data.frames * (sizes.image_size // sizes.patch_size) ** 2
-        ceiling = processes * matmul_speed(device, _TYPES[config.training.precision])
+        ceiling = processes * matmul_speed(device, PRECISIONS[config.training.precision])
         flops = clip_flops(config, sizes)
         return cls(flops.total if encodes else flops.predictor, tokens, ceiling, device)
 

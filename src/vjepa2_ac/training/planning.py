@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -18,26 +18,46 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_from, load_config
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter_end import merge_adapter
 from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.model.world_model import WorldModel, fingerprint
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.training.chosen import NEWEST
-from vjepa2_ac.training.device import is_on_cpu
+from vjepa2_ac.training.device import has_bf16, is_on_cpu, require_type_of_weights
 from vjepa2_ac.training.run_folder import CONFIG
 from vjepa2_ac.training.runs import is_run, load_run
 
 # Settings that planning heeds; the others are of training, and changing them here would do nothing.
 _HEEDED = ("planning.", "seed", "data.crop", "data.stride", "model.dtype", "model.sizes.", "training.device")
+_ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
+
+
+class Fingerprints(NamedTuple):
+    """Hashes of a model's weights."""
+
+    encoder: str
+    base: str  # of the predictor before it was adapted
+    predictor: str  # with what was trained
+
+    @classmethod
+    def of(cls, model: WorldModel) -> Fingerprints:
+        """Hash a model, an adapter apart from its base."""
+        known, whole = model.adaptation, fingerprint(model.predictor.state_dict())
+        if known is not None:
+            return cls(known.encoder, known.base, whole)
+        return cls(model.encoder_fingerprint(), model.predictor_fingerprint(), whole)
 
 
 @dataclass(frozen=True)
 class Steering:
-    """A world model on its device, in eval mode, its adapter on; and how to plan with it."""
+    """A world model on its device, in eval mode, what was trained merged into it; and how to plan with it."""
 
     world_model: WorldModel
     config: Config  # of it: planning, seed, data.crop and data.stride count
     subject: str  # what was named
     checkpoint: str  # which one, in words; "" of a model
+    fingerprints: Fingerprints | None = None  # of a run's weights before they were merged; None: of the world model
 
     def controller(
         self,
@@ -68,16 +88,14 @@ class Steering:
     def as_dict(self) -> dict[str, Any]:
         """Return which model this is, as plain values: what was named, and hashes of the weights."""
         model = self.world_model
-        dtype = next(model.parameters()).dtype  # of the frozen weights
+        dtype = next(model.parameters()).dtype
         return {
             "version": __version__,
             "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             "model": {
                 "subject": self.subject,
                 "checkpoint": self.checkpoint or None,
-                "encoder": model.encoder_fingerprint(),
-                "base": model.predictor_fingerprint() if model.adaptation is None else model.adaptation.base,
-                "predictor": fingerprint(model.predictor.state_dict()),
+                **(self.fingerprints or Fingerprints.of(model))._asdict(),
                 "dtype": str(dtype).removeprefix("torch."),
                 "device": model.device.type,
                 "image_size": model.image_size,
@@ -93,7 +111,8 @@ def load_to_plan(
     """Load what to plan with.
 
     The settings of a run are those of its config: planning, seed, crop, stride, type of the weights. Those of a model
-    are the given config's; without one the defaults, and float32 weights on a CPU.
+    are the given config's; without one the defaults, and float32 weights where the device has no bfloat16, or is a CPU.
+    What a run has trained is merged before it is on the device (see `planning.ready`): it is there once.
 
     Args:
         subject: The folder of a run; or a model: what `model.base` takes.
@@ -110,10 +129,12 @@ def load_to_plan(
         raise InputError(
             where=subject, found="data.states: vector", needed="a model of poses: actions are limited in metres"
         )
-    device = torch.device("cpu" if is_on_cpu(its.training) else "cuda")
+    device = _device_to_plan_on(its)
     if is_run(subject):
         run = load_run(Path(subject), checkpoint, its)
-        return Steering(run.world_model.to(device).eval(), its, subject, run.chosen)
+        known = Fingerprints.of(run.world_model)
+        merge_adapter(run.world_model)
+        return Steering(run.world_model.to(device).eval(), its, subject, run.chosen, known)
     if checkpoint != NEWEST:
         raise InputError(
             where=f"--checkpoint {checkpoint}",
@@ -121,6 +142,20 @@ def load_to_plan(
             needed="a run: a model has no checkpoints to choose from",
         )
     return Steering(load_base(its.model, seed=its.seed).to(device).eval(), its, subject, "")
+
+
+def _device_to_plan_on(config: Config) -> torch.device:
+    """Return the device, once it is certain that it computes in the type that planning does: without autocast.
+
+    Raises:
+        InputError: It does not, or not in the 8 bits that are asked for.
+    """
+    device = torch.device("cpu" if is_on_cpu(config.training) else "cuda")
+    require_type_of_weights(config.model, device)
+    kind = config.planning.quantize
+    if kind != "off":
+        require_8_bits(kind, getattr(torch, config.model.dtype), device, where="planning.quantize")
+    return device
 
 
 def _run_config(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
@@ -131,15 +166,15 @@ def _run_config(subject: str, config: str | Path | None, overrides: Sequence[str
             needed="one config",
             fix="Change single settings behind the run's name, such as planning.horizon=2",
         )
-    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(subject)}"])
+    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(subject)}", _ANY_TYPE])
 
 
 def _model_config(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
     if config is None:
-        dtype = "bfloat16" if torch.cuda.is_available() else "float32"
+        dtype = "bfloat16" if torch.cuda.is_available() and has_bf16() else "float32"
         plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
         return config_from(plain, overrides, where="command line")
-    its = load_config(config, overrides)
+    its = load_config(config, [*overrides, _ANY_TYPE])
     return its.model_copy(update={"model": its.model.model_copy(update={"base": subject, "random": None})})
 
 

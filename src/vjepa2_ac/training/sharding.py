@@ -133,6 +133,8 @@ def _check_run(config: Config) -> None:
         raise _refusal(
             "FSDP with training.compile blocks", "off: together they are untried", "Set training.compile=off"
         )
+    if config.training.cuda_graph:
+        raise _refusal("FSDP with training.cuda_graph", "false: together they are untried", "Set it to false")
     if config.data.broken_episodes == "skip":
         raise _refusal(
             "FSDP with data.broken_episodes skip",

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.data.prefetch import fetch_ahead
@@ -20,7 +20,7 @@ from vjepa2_ac.training.assembly import Run, encode
 from vjepa2_ac.training.checkpoint import checkpoint_name
 from vjepa2_ac.training.health import Update
 from vjepa2_ac.training.not_finite import LookBack
-from vjepa2_ac.training.optim import learning_rate_at, set_learning_rate, trained_parameters
+from vjepa2_ac.training.optim import learning_rate_at, set_learning_rate
 from vjepa2_ac.training.processes import add_up_gradients, sums
 from vjepa2_ac.training.run_folder import NOT_FINITE
 
@@ -54,11 +54,11 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     learning_rate = learning_rate_at(step, run.config.training)
     set_learning_rate(run.optimizer, learning_rate)
     taken = gradients(run, batches, LookBack(), more=step < run.config.training.steps)
-    update = Update(trained_parameters(run.objective)) if measure_update else None
+    update = Update(run.trained) if measure_update else None
     if taken.clips:  # without a clip there are no gradients, and nothing moves
         run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
         run.scaler.update()
-    run.optimizer.zero_grad(set_to_none=True)
+    run.optimizer.zero_grad(set_to_none=not run.config.training.cuda_graph)  # a graph adds to those that it knows
     return {
         "loss": taken.forced_loss + taken.rollout_loss,
         "loss_teacher_forcing": taken.forced_loss,
@@ -88,25 +88,11 @@ def gradients(
     Raises:
         InputError: A loss or gradient is not finite; names the clips of this process.
     """
-    run.world_model.train()
+    if not run.world_model.training:  # after a validation
+        run.world_model.train()
     expected = run.clips_per_step
-    totals = torch.zeros(2, device=run.accelerator.device)
-    seen: list[str] = []
-    fetched = 0
-    for _ in range(run.micro_batches):
-        batch = next(batches)
-        fetched += batch.bytes_fetched
-        if not batch.starts:
-            continue
-        seen += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
-        parts = expected / len(batch.starts)
-        latents = encode(run, batch)
-        with run.accelerator.autocast():
-            forced, rollout = run.objective(latents)
-        run.scaler.scale((forced + rollout) / parts).backward()
-        totals += torch.stack([forced.detach(), rollout.detach()]) / parts
-        if look_back is not None:
-            look_back.add(batch, forced + rollout)
+    with run.cast_matrices.current():
+        totals, seen, fetched = _accumulate(run, batches, look_back)
     if more:
         fetch_ahead(batches)
     *losses, clips, fetched_by_all = sums(run.accelerator, [*totals.tolist(), len(seen), fetched])
@@ -118,17 +104,35 @@ def gradients(
     return Gradients(forced_loss, rollout_loss, norm, int(clips), int(fetched_by_all))
 
 
+def _accumulate(run: Run, batches: Iterator[Batch], look_back: LookBack | None) -> tuple[Tensor, list[str], int]:
+    """Return the losses of this process's clips, as parts of the step's; names of the clips; and bytes fetched."""
+    totals = torch.zeros(2, device=run.accelerator.device)
+    seen: list[str] = []
+    fetched = 0
+    for _ in range(run.micro_batches):
+        batch = next(batches)
+        fetched += batch.bytes_fetched
+        if not batch.starts:
+            continue
+        seen += [f"{name} from step {start}" for name, start in zip(batch.episode_ids, batch.starts, strict=True)]
+        parts = run.clips_per_step / len(batch.starts)
+        losses = run.micro_step(encode(run, batch), parts)
+        totals += losses / parts
+        if look_back is not None:
+            look_back.add(batch, losses.sum())
+    return totals, seen, fetched
+
+
 def _settle(run: Run, factor: float) -> float:
     """Make the sums of scaled parts of all processes the gradient of the mean, clip it, and return its norm before."""
-    trained = list(trained_parameters(run.objective))
-    add_up_gradients(run.accelerator, trained)
+    add_up_gradients(run.accelerator, run.trained)
     run.scaler.unscale_(run.optimizer)
     if factor != 1:
-        for parameter in trained:
+        for parameter in run.trained:
             if parameter.grad is not None:
                 parameter.grad *= factor
     limit = run.config.training.max_grad_norm
-    norm = nn.utils.clip_grad_norm_(trained, math.inf if limit is None else limit)
+    norm = nn.utils.clip_grad_norm_(run.trained, math.inf if limit is None else limit)
     return float(norm.full_tensor() if isinstance(norm, DTensor) else norm)
 
 

@@ -17,8 +17,6 @@ from dataclasses import dataclass
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.training.cost.parameters import adapter_ranks, linear_layers
 
-_TUBELET = 2  # frames that the encoder's first layer takes at once
-
 
 @dataclass(frozen=True)
 class ClipFlops:
@@ -73,7 +71,7 @@ def frame_flops(sizes: ModelSizes) -> int:
     """Return the operations of encoding one frame."""
     encoder = sizes.encoder
     tokens, width, hidden = _patches(sizes), encoder.width, int(encoder.width * encoder.mlp_ratio)
-    embedding = 2 * tokens * 3 * _TUBELET * sizes.patch_size**2 * width
+    embedding = 2 * tokens * 3 * sizes.patch_size**2 * width  # the frames of a tubelet are one
     linear = 2 * tokens * (4 * width**2 + 2 * width * hidden)
     return embedding + encoder.depth * (linear + 4 * tokens**2 * width)
 

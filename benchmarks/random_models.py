@@ -1,0 +1,27 @@
+"""What is measured where no weights are needed? Models with random ones, drawn on the device in no time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from unittest import mock
+
+import torch
+
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.model.world_model import WorldModel
+
+
+def random_model(sizes: ModelSizes, dtype: torch.dtype, device: torch.device | str) -> WorldModel:
+    """Return a float32 model on a device; its weights have values that `dtype` can hold, too, so casting changes none.
+
+    The same for the same sizes and kind of device.
+    """
+    return WorldModel.random(sizes, seed=0, dtype=dtype, device=device).float()
+
+
+@contextmanager
+def no_fingerprints() -> Iterator[None]:
+    """Let models be adapted, merged and cached without the SHA-256 of their weights: seconds that nobody asked for."""
+    with mock.patch("vjepa2_ac.model.world_model.fingerprint", return_value="of a benchmark"):
+        yield

@@ -1,0 +1,152 @@
+"""A model that was trained is planned with as its base is: merged, in the type of its weights, and itself untouched."""
+
+import copy
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from planning.tiny import actions, cost, tiny_model
+from vjepa2_ac.config import AdapterConfig
+from vjepa2_ac.config.planning import CemConfig, PlanningConfig
+from vjepa2_ac.episode import Widths
+from vjepa2_ac.model.heads import fit_heads
+from vjepa2_ac.model.lora import add_adapter
+from vjepa2_ac.model.predictor import ActionConditionedPredictor
+from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.planning import controller
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.ready import make_ready
+
+PLAIN = PlanningConfig(samples=16, iterations=2, horizon=2, cem=CemConfig(elites=4))
+STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
+ADAPTERS = {
+    "lora": AdapterConfig(rank=4, alpha=8.0, dropout=0.1),
+    "heads": AdapterConfig(rank=4, alpha=8.0, modules_to_save=("predictor_embed", "predictor_proj", "action_encoder")),
+    "dora": AdapterConfig(rank=4, alpha=8.0, dora=True),
+    "pissa": AdapterConfig(rank=4, alpha=8.0, init="pissa"),
+    "none": AdapterConfig(kind="none"),
+}
+every_adapter = pytest.mark.parametrize("adapter", ADAPTERS.values(), ids=ADAPTERS)
+PRODUCTS = ("mm", "addmm", "bmm", "baddbmm")
+
+
+def trained_model(adapter: AdapterConfig, dtype: torch.dtype = torch.float32) -> WorldModel:
+    """Return a tiny model in which all that is trained was moved."""
+    model = tiny_model().to(dtype)
+    add_adapter(model, adapter, seed=0)
+    generator = torch.Generator().manual_seed(2)
+    for value in model.parameters():
+        if value.requires_grad:
+            value.data += 0.02 * torch.randn(value.shape, generator=generator)
+    return model.eval()
+
+
+def decided(model: WorldModel, config: PlanningConfig = PLAIN) -> list[np.ndarray]:
+    pictures = np.random.default_rng(0).integers(0, 256, (3, 48, 48, 3), dtype=np.uint8)
+    run = Controller(model, config)
+    run.reset(pictures[0])
+    return [run.act(picture, STATE) for picture in pictures[1:]]
+
+
+class Types(TorchDispatchMode):
+    """Notes which types go into products of matrices."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: set[torch.dtype] = set()
+        self.products = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        del types
+        if function.overloadpacket.__name__ in PRODUCTS or "attention" in function.overloadpacket.__name__:
+            self.products += 1
+            self.seen |= {one.dtype for one in args if isinstance(one, torch.Tensor)}
+        return function(*args, **(kwargs or {}))
+
+
+@contextmanager
+def types_in_the_predictor(monkeypatch: pytest.MonkeyPatch) -> Iterator[Types]:
+    found, forward = Types(), ActionConditionedPredictor.forward
+
+    def noting(self: Any, *args: Any, **kwargs: Any) -> Any:
+        with found:
+            return forward(self, *args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ActionConditionedPredictor, "forward", noting)
+        yield found
+
+
+@every_adapter
+def test_the_same_is_decided_as_by_the_model_that_was_trained(
+    adapter: AdapterConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model, tried = trained_model(adapter), actions(20, 2)
+    with torch.no_grad():
+        expected, of_base = cost(model)(tried), cost(tiny_model())(tried)
+        torch.testing.assert_close(cost(make_ready(model, PLAIN))(tried), expected, rtol=1e-5, atol=0)
+    assert (expected - of_base).norm() > 1e-3 * of_base.norm(), "training changed something"
+    found = decided(model)
+    monkeypatch.setattr(controller, "make_ready", lambda given, _: given)
+    np.testing.assert_allclose(found, decided(model), rtol=0, atol=1e-5)
+
+
+@every_adapter
+@torch.no_grad()
+def test_in_bfloat16_energies_are_those_of_float32_to_rounding(adapter: AdapterConfig) -> None:
+    model, tried = trained_model(adapter, torch.bfloat16), actions(50, 2)
+    precise, base = copy.deepcopy(model).float(), tiny_model().to(torch.bfloat16)
+    exact, of_base = cost(precise)(tried), cost(copy.deepcopy(base).float())(tried)
+    rounding = (cost(base)(tried) - of_base).norm() / of_base.norm()  # of a model that was never trained
+    error = (cost(make_ready(model, PLAIN))(tried) - exact).norm() / exact.norm()
+    assert error < 2 * rounding < 0.01
+
+
+@every_adapter
+def test_every_product_of_a_plan_in_bfloat16_is_of_bfloat16(
+    adapter: AdapterConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = trained_model(adapter, torch.bfloat16)
+    with types_in_the_predictor(monkeypatch) as found:
+        decided(model)
+    assert found.products > 50
+    assert found.seen == {torch.bfloat16}
+
+
+@every_adapter
+def test_the_model_that_is_given_stays_as_it_is(adapter: AdapterConfig) -> None:
+    model = trained_model(adapter, torch.bfloat16).train()
+    weights = {name: value.clone() for name, value in model.state_dict().items()}
+    trained = [value.requires_grad for value in model.parameters()]
+    adaptation, predictor = model.adaptation, model.predictor
+    ready = make_ready(model, PLAIN)
+    assert ready.encoder is model.encoder
+    assert ready.adaptation is None
+    assert not any(part.training for part in ready.modules())
+    assert {value.dtype for value in ready.parameters()} == {torch.bfloat16}
+    assert model.predictor is predictor
+    assert model.predictor.training
+    assert model.adaptation is adaptation
+    assert [value.requires_grad for value in model.parameters()] == trained
+    assert model.state_dict().keys() == weights.keys()
+    assert all(torch.equal(value, weights[name]) for name, value in model.state_dict().items())
+
+
+def test_fresh_heads_are_planned_with_as_they_were_trained() -> None:
+    model = tiny_model().to(torch.bfloat16)
+    fit_heads(model, Widths(state=8, action=7), seed=0)
+    add_adapter(model, AdapterConfig(rank=4, modules_to_save=("state_encoder",)), seed=0)
+    model.get_submodule("predictor.base_model.model.state_encoder.modules_to_save.default").weight.data += 0.1
+    head = make_ready(model, PLAIN).predictor.state_encoder
+    expected = model.base_predictor.state_encoder.modules_to_save["default"].weight
+    assert torch.equal(head.weight, expected.bfloat16())
+
+
+def test_a_base_is_not_copied() -> None:
+    model = tiny_model()
+    assert make_ready(model, PLAIN) is model

@@ -1,0 +1,262 @@
+"""Rows of benchmarks outlive them, a time that does not count says so, and memory is measured alone."""
+
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from benches import imported
+
+
+@pytest.fixture
+def timing(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """How ways take turns."""
+    yield from imported("timing", monkeypatch)
+
+
+@pytest.fixture
+def rows(timing: Any) -> Any:
+    """What keeps rows."""
+    return sys.modules[timing.problem_of.__module__]
+
+
+@pytest.fixture
+def memory(timing: Any) -> Any:
+    """What measures memory."""
+    return sys.modules[timing.alloc_retries.__module__]
+
+
+def options(**more: Any) -> SimpleNamespace:
+    return SimpleNamespace(**{"device": "cpu", "repeats": 2, "warm_up": 1} | more)
+
+
+# ---- rows ----
+
+
+def test_a_row_is_on_disk_as_soon_as_it_is_there_and_what_is_unfinished_is_marked(rows: Any, tmp_path: Path) -> None:
+    file = tmp_path / "results" / "rows.json"
+    table = rows.Rows(file, torch="2")
+    table.add({"way": "a", "ms": math.nan})
+    assert json.loads(file.read_text()) == {"torch": "2", "rows": [{"way": "a", "ms": None}]}
+    table.so_far({"way": "b"})
+    assert json.loads(file.read_text())["rows"][1:] == [{"way": "b", "finished": False}]
+    table.add({"way": "b"})
+    assert json.loads(file.read_text())["rows"][1:] == [{"way": "b"}]
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_the_file_is_replaced_as_a_whole(rows: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "rows.json"
+    table = rows.Rows(file)
+    table.add({"way": "a"})
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))  # killed while it is written
+    with pytest.raises(KeyboardInterrupt):
+        table.add({"way": "b"})
+    assert json.loads(file.read_text())["rows"] == [{"way": "a"}]
+
+
+def test_what_fails_is_a_row_and_the_end_is_an_error_but_out_of_memory_is_a_result(
+    rows: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def runs_out() -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    table = rows.Rows(None)
+    assert table.attempt(lambda: 3, way="a") == 3
+    assert table.attempt(runs_out, way="b") is None
+    table.finish()
+    assert table.attempt([].pop, way="c") is None
+    with pytest.raises(SystemExit, match="1 of 2 rows failed") as end:
+        table.finish()
+    assert end.value.code not in {None, 0}
+    said = capsys.readouterr()
+    assert said.out.splitlines() == ["b, out of memory", "c, failed: IndexError: pop from empty list"]
+    assert "Traceback" in said.err
+
+
+# ---- time ----
+
+
+def test_ways_take_turns_and_a_ratio_is_of_neighbours(timing: Any) -> None:
+    calls: list[str] = []
+    ways = {"plain": lambda: calls.append("p"), "ours": lambda: calls.append("o")}
+    seen = [
+        {way: len(turns.seconds) for way, turns in so_far.items()} for so_far in timing.rounds(ways, options(), list)
+    ]
+    assert "".join(calls) == "popopo"  # the first round warms up
+    assert seen == [{"plain": 1, "ours": 1}, {"plain": 2, "ours": 2}]
+    base, own = timing.Turns([2.0, 30.0, 8.0]), timing.Turns([1.0, 10.0, 2.0])
+    assert timing.ratio(base, own) == 3.0
+    assert (base.median_s, base.least_s) == (8.0, 2.0)
+
+
+def test_a_way_that_fails_takes_no_more_turns_and_what_it_left_is_cleared(timing: Any) -> None:
+    calls: list[str] = []
+
+    def fails() -> None:
+        calls.append("f")
+        if calls.count("f") == 2:
+            raise ValueError("enough")
+
+    *_, seen = timing.rounds({"f": fails, "o": lambda: calls.append("o")}, options(), lambda: calls.append("!"))
+    assert "".join(calls) == "fof!oo"
+    assert seen["f"].figures() == {
+        "problem": "failed: ValueError: enough", "s": None, "min_s": None, "repeats": 0, "alloc_retries": 0,
+    }  # fmt: skip
+    assert timing.ratio(seen["f"], seen["o"]) is None
+    assert len(seen["o"].seconds) == 2
+
+
+def test_a_time_in_which_the_allocator_gave_memory_back_does_not_count(
+    timing: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    retries = [0]
+    fake_cuda(monkeypatch, memory_stats=lambda: {"num_alloc_retries": retries[0]})
+
+    def grows_once(at: int) -> Callable[[], None]:
+        left = [at]
+
+        def step() -> None:
+            left[0] -= 1
+            retries[0] += not left[0]
+
+        return step
+
+    ways = {"warming up": grows_once(1), "timed": grows_once(3), "never": grows_once(-1)}
+    *_, seen = timing.rounds(ways, options(device="cuda"), list)
+    assert [turns.retries for turns in seen.values()] == [0, 1, 0]
+    assert "the allocator gave memory back 1 times" in seen["timed"].problem
+    assert seen["timed"].figures()["s"] is None
+    assert timing.ratio(seen["never"], seen["timed"]) is None
+    assert timing.ratio(seen["never"], seen["warming up"]) > 0
+
+
+def test_the_profilers_own_wait_does_not_count(timing: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def events(**counts: int) -> list[SimpleNamespace]:
+        return [SimpleNamespace(key=key, count=count) for key, count in counts.items()]
+
+    step = events(cudaLaunchKernel=500, cudaStreamSynchronize=2, cudaDeviceSynchronize=2)
+    own = events(cudaDeviceSynchronize=1, cudaStreamSynchronize=0)
+    assert timing.waits(step, own, "cuda:0") == {"cudaStreamSynchronize": 2, "cudaDeviceSynchronize": 1}
+    assert timing.waits(own, own, "cuda") == {}
+
+    class Profiler:
+        """As PyTorch's: it waits for the device when it ends, and the first time when it begins."""
+
+        first = True
+
+        def __init__(self, activities: object) -> None:
+            assert len(activities) == 2  # type: ignore[arg-type]  # a list
+
+        def __enter__(self) -> "Profiler":
+            self.waits, Profiler.first = 1 + Profiler.first, False
+            doing.append(self)
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            doing.pop()
+
+        def key_averages(self) -> list[SimpleNamespace]:
+            return events(cudaDeviceSynchronize=self.waits)
+
+    def work() -> None:
+        doing[-1].waits += 2
+
+    doing: list[Profiler] = []
+    monkeypatch.setattr(timing, "profile", Profiler)
+    assert timing.profiled(work, "cuda").waits == {"cudaDeviceSynchronize": 2}
+    assert timing.profiled(lambda: None, "cuda").waits == {}
+
+
+# ---- memory ----
+
+
+def fake_cuda(monkeypatch: pytest.MonkeyPatch, **more: Any) -> list[str]:
+    """Stand in for what benchmarks ask of CUDA; return the list of what was asked."""
+    called: list[str] = []
+    answers: dict[str, Any] = {
+        "synchronize": lambda: None,
+        "empty_cache": lambda: called.append("empty"),
+        "reset_peak_memory_stats": lambda: called.append("reset"),
+        "max_memory_allocated": lambda: 12 * 10**9,
+        "get_device_properties": lambda _: SimpleNamespace(total_memory=96 * 10**9),
+        "set_per_process_memory_fraction": lambda share: called.append(f"at most {share}"),
+    }
+    for name, answer in {**answers, **more}.items():
+        monkeypatch.setattr(torch.cuda, name, answer)
+    return called
+
+
+def test_on_cuda_a_peak_is_of_two_times_alone_in_this_process_and_under_the_cap(
+    memory: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called = fake_cuda(monkeypatch)
+    monkeypatch.setattr("subprocess.run", None)
+
+    def measure() -> float:
+        called.append("built")
+        return float(memory.peak_gb(lambda: called.append("step"), "cuda"))
+
+    assert memory.peak_alone(measure, ["never"], "cuda", cap_gb=24.0) == {"peak_gb": 12.0, "problem": None}
+    measured = ["built", "empty", "reset", "step", "step"]
+    assert called == ["empty", "empty", "at most 0.25", *measured, "at most 1.0", "empty"]
+    called.clear()
+    assert memory.peak_alone(measure, ["never"], "cuda")["peak_gb"] == 12.0
+    assert called == ["empty", *measured, "empty"]
+
+
+def test_what_does_not_fit_under_the_cap_is_a_result_and_the_cap_ends(
+    memory: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called = fake_cuda(monkeypatch)
+
+    def measure() -> float:
+        raise torch.OutOfMemoryError
+
+    found = memory.peak_alone(measure, ["never"], "cuda", cap_gb=24.0)
+    assert found == {"peak_gb": None, "problem": "out of memory"}
+    assert called[-2:] == ["at most 1.0", "empty"]
+
+
+@pytest.mark.parametrize(
+    ("program", "peak", "problem"),
+    [
+        ("print('hello'); print(1.5)", 1.5, None),
+        ("import sys; sys.exit('no room')", None, "RuntimeError: a process of its own ended with 1: no room"),
+        (
+            "import os; os.kill(os.getpid(), 9)",
+            None,
+            "RuntimeError: a process of its own ended with -9: it says nothing",
+        ),
+        ("print('hello')", None, "JSONDecodeError: Expecting value: line 1 column 1 (char 0)"),
+    ],
+)
+def test_on_a_cpu_a_peak_is_of_a_process_of_its_own_whatever_becomes_of_it(
+    memory: Any, program: str, peak: float | None, problem: str | None
+) -> None:
+    found = memory.peak_alone([].pop, ["-c", program], "cpu")
+    assert found == {"peak_gb": peak, "problem": problem and f"failed: {problem}"}
+
+
+@pytest.mark.parametrize("said", ["PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF", None])
+def test_the_allocator_grows_what_it_has_unless_the_environment_says_otherwise(
+    memory: Any, said: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr(torch._C, "_accelerator_setAllocatorSettings", told.append)
+    for name in ("PYTORCH_ALLOC_CONF", "PYTORCH_CUDA_ALLOC_CONF"):
+        monkeypatch.delenv(name, raising=False)
+    if said:
+        monkeypatch.setenv(said, "max_split_size_mb:512")
+    else:
+        monkeypatch.setenv("PYTORCH_ALLOC_CONF", "")  # so that it is put back
+    memory.use_expandable_segments()
+    assert told == ([] if said else ["expandable_segments:True"])
+    assert os.environ[said or "PYTORCH_ALLOC_CONF"] == ("max_split_size_mb:512" if said else "expandable_segments:True")

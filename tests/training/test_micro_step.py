@@ -1,0 +1,150 @@
+"""A micro-step that is captured once and replayed learns what the plain one learns; so do matrices cast once a step."""
+
+import itertools
+from collections.abc import Callable, Iterator
+from contextlib import nullcontext
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.episode import Batch
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.lora_linear import CastMatrices, LoraLinear
+from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, make_accelerator
+from vjepa2_ac.training.micro_step import Body, CapturedMicroStep, MicroStep
+from vjepa2_ac.training.step import training_step
+
+STEPS = 3
+
+
+class Recorder:
+    """Stands for a CUDA graph: a replay does again what was recorded, if gradients lie where they lay then."""
+
+    def __init__(self, run: Run) -> None:
+        self.run, self.captures, self.replays = run, 0, 0
+
+    def __call__(self, body: Body) -> Body:
+        for _ in range(2):  # to warm up, which adds gradients
+            body()
+        self.captures += 1
+        places = self.places()
+
+        def replay() -> None:
+            assert self.places() == places
+            self.replays += 1
+            body()
+
+        return replay
+
+    def places(self) -> list[int]:
+        return [parameter.grad.data_ptr() for parameter in self.run.trained if parameter.grad is not None]
+
+
+def some_of(batch: Batch, clips: int) -> Batch:
+    parts = {name: value[:clips] for name, value in vars(batch).items() if isinstance(value, Tensor)}
+    return replace(batch, **parts, episode_ids=batch.episode_ids[:clips], starts=batch.starts[:clips])
+
+
+def uneven(batches: Iterator[Batch]) -> Iterator[Batch]:
+    """Leave out clips, as where some cannot be read: of the third micro-batch one, of the fifth all."""
+    for number, batch in enumerate(batches):
+        yield some_of(batch, {2: 1, 4: 0}.get(number, len(batch.starts)))
+
+
+def learned(run: Run, batches: Iterator[Batch]) -> list[Tensor]:
+    figures = [training_step(run, batches, step) for step in range(1, STEPS + 1)]
+    losses = torch.tensor([[row["loss"], row["grad_norm"]] for row in figures], dtype=torch.float64)
+    return [losses, *(parameter.detach().clone() for parameter in run.trained)]
+
+
+@pytest.fixture
+def make_run(make_config: Callable[..., Config], reporter) -> Callable[..., Run]:
+    def make(**changes: object) -> Run:
+        config = make_config(
+            adapter__dropout=0.0, training__batch_size=2, training__accumulation=2, training__learning_rate=1e-2,
+            training__warmup_steps=0, **changes,
+        )  # fmt: skip
+        return assemble(config, reporter.note)
+
+    return make
+
+
+def captured(run: Run) -> Recorder:
+    """Let a run capture its micro-step, on whatever device."""
+    recorder = Recorder(run)
+    training = run.config.training.model_copy(update={"cuda_graph": True})
+    run.config = run.config.model_copy(update={"training": training})
+    run.captured = CapturedMicroStep(MicroStep(run.objective, run.accelerator, run.scaler), run.trained, recorder)
+    return recorder
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("order", [lambda batches: batches, uneven], ids=["even", "uneven"])
+def test_a_captured_micro_step_learns_what_the_plain_one_learns(make_run, order, precision: str) -> None:
+    plain, other = (make_run(training__precision=precision) for _ in range(2))
+    expected = learned(plain, order(batches_from(plain)))
+    recorder = captured(other)
+    found = learned(other, order(batches_from(other)))
+    assert all(map(torch.equal, found, expected))
+    assert recorder.captures == 1
+    assert recorder.replays == 2 * STEPS - (2 if order is uneven else 0)
+
+
+def test_a_micro_step_captured_in_the_middle_of_a_step_adds_to_the_gradients_that_are_there(make_run) -> None:
+    run = make_run()
+    recorder = captured(run)
+    run.world_model.train()
+    first, second = (encode(run, batch) for batch in itertools.islice(batches_from(run), 2))
+    plain = MicroStep(run.objective, run.accelerator, run.scaler)
+
+    def gradients(*steps: Callable[..., Tensor]) -> list[Tensor]:
+        run.optimizer.zero_grad()
+        for step, latents in zip(steps, (first, second), strict=True):
+            step(latents, 2.0)
+        return [parameter.grad.clone() for parameter in run.trained]
+
+    expected = gradients(plain, plain)
+    assert all(map(torch.equal, gradients(plain, run.micro_step), expected))
+    assert (recorder.captures, recorder.replays) == (1, 1)
+
+
+def test_matrices_cast_once_a_step_learn_what_those_cast_at_each_use_learn(make_run, monkeypatch) -> None:
+    run, other = make_run(training__precision="bf16"), make_run(training__precision="bf16")
+    seen: list[bool] = []
+    plain = LoraLinear.forward
+
+    def watched(layer: LoraLinear, tokens: Tensor) -> Tensor:
+        seen.append(layer.cast is not None)
+        return plain(layer, tokens)
+
+    monkeypatch.setattr(LoraLinear, "forward", watched)
+    found = learned(run, batches_from(run))
+    assert seen
+    assert all(seen)
+    monkeypatch.setattr(CastMatrices, "current", lambda _: nullcontext())
+    seen.clear()
+    expected = learned(other, batches_from(other))
+    assert not any(seen)
+    assert all(map(torch.equal, found, expected))
+    assert not any(layer.cast for layer in run.world_model.modules() if isinstance(layer, LoraLinear))
+
+
+def test_in_float32_nothing_is_cast(make_run) -> None:
+    run = make_run(training__precision="fp32")
+    assert any(isinstance(layer, LoraLinear) for layer in run.world_model.modules())
+    with run.cast_matrices.current():
+        assert not any(layer.cast for layer in run.world_model.modules() if isinstance(layer, LoraLinear))
+
+
+def test_a_graph_on_a_cpu_is_refused(make_config) -> None:
+    with pytest.raises(InputError, match=r"training.cuda_graph.*a CUDA device"):
+        make_accelerator(make_config(training__cuda_graph=True, adapter__dropout=0.0))
+
+
+@pytest.mark.parametrize("changes", [{"training__precision": "fp16"}, {"adapter__dropout": 0.1}])
+def test_a_graph_that_would_repeat_random_numbers_or_a_loss_scale_is_refused(make_config, changes) -> None:
+    with pytest.raises(InputError, match=r"training.cuda_graph needs adapter.dropout 0, and bf16 or fp32"):
+        make_config(training__cuda_graph=True, **({"adapter__dropout": 0.0} | changes))
