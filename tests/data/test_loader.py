@@ -27,6 +27,7 @@ from vjepa2_ac.data import loader
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import clip_at, collate, training_loader, validation_batches
 from vjepa2_ac.data.sources.rlds.tfrecord import index_records
+from vjepa2_ac.data.streams import copies_for
 from vjepa2_ac.episode import Batch, Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states, apply_action, matrices_from_euler, states_in_camera_frame
@@ -235,6 +236,21 @@ def test_batches_for_a_device_are_pinned_by_the_loader(
     assert "side 1: to pinned memory" not in cuda.told, "that is the loader's work"
     main = threading.current_thread().name
     assert (main in pinning.threads) == (not workers), "beside the workers, a thread of its own does it"
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("workers", [0, 1])
+def test_batches_reach_a_cuda_device_as_they_are(droid: Path, workers: int) -> None:
+    dataset = open_dataset(config_of(droid, workers=workers))
+    copies = copies_for(torch.device("cuda"))
+    with closing(training_loader(dataset, seed=1, batch_size=2, copies=copies)) as batches:
+        found = [next(batches)]
+        batches.fetch_ahead()
+        found.append(next(batches))
+    assert all(batch.frames.is_pinned() for batch in found)
+    there = [batch.on_device() for batch in found]
+    assert all(batch.frames.is_cuda for batch in there)
+    assert_same([batch.mapped(torch.Tensor.cpu) for batch in there], take(2, config_of(droid)))
 
 
 @pytest.mark.parametrize("workers", [0, 1])
