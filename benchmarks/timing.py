@@ -192,7 +192,7 @@ def waits(events: Iterable[Any], of_nothing: Iterable[Any], device: str) -> dict
 
 def _profile(work: Callable[[], object], device: str) -> Any:
     kinds = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if device != "cpu" else [])]
-    with profile(activities=kinds) as found:
+    with profile(activities=kinds, acc_events=True) as found:  # PyTorch 2.11 warns without it
         work()
     return found.key_averages()
 

@@ -152,7 +152,7 @@ def test_the_profilers_own_wait_does_not_count(timing: Any, monkeypatch: pytest.
 
         first = True
 
-        def __init__(self, activities: object) -> None:
+        def __init__(self, activities: object, **_: object) -> None:
             assert len(activities) == 2  # type: ignore[arg-type]  # a list
 
         def __enter__(self) -> "Profiler":
