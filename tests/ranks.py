@@ -30,5 +30,7 @@ def finish(processes: list[subprocess.Popen], status: int = 0) -> list[tuple[str
     finally:
         for process in processes:
             process.kill()
+        for process in processes:
+            process.communicate()  # of those that hung; their pipes are closed so
     assert [process.returncode for process in processes] == [status] * len(processes), said
     return said
