@@ -35,7 +35,7 @@ from vjepa2_ac.data.loader import clip_at, training_loader
 from vjepa2_ac.data.sources.rlds.dataset_info import find_shards, index_shards
 from vjepa2_ac.data.sources.rlds.tfrecord import decode_example, read_record
 from vjepa2_ac.data.sources.rlds.writer import write_droid_rlds
-from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.data.table import FORMAT, EpisodeTable
 from vjepa2_ac.data.windows import ClipOrder, windows_of
 from vjepa2_ac.episode import EpisodeInfo
 
@@ -176,7 +176,7 @@ def measure_index(config: DataConfig) -> None:
     del infos
     with multiprocessing.get_context("spawn").Pool(1) as fresh:  # memory freed by this process would be used again
         clips, opened, taken, memory = fresh.apply(_open_index, (config,))
-    size = (Path(str(config.disk_cache.dir)) / "index" / "synthetic.index").stat().st_size / 1e6
+    size = (Path(str(config.disk_cache.dir)) / "index" / f"synthetic.table{FORMAT}.index").stat().st_size / 1e6
     print(f"\nindex of {DROID_EPISODES:,} episodes, {size:.1f} MB: opened in {opened:.2f} s;", end="")
     print(f" with the order of {clips:,} clips {taken:.2f} s, {memory:.0f} MB")
 

@@ -52,10 +52,15 @@ def inspection_lines(inspection: Inspection) -> list[str]:
         "success": "not known" if success is None else f"{success:.1%} of {known:,} episodes of which it is known",
         "left out": removed or "nothing",
         "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
+        "duplicates": str(inspection.duplicates) + _copies_are_listed(inspection),
         "sample": f"{len(inspection.sample):,} episodes, for what follows",
         **(_pose_rows(inspection) if inspection.is_pose else _vector_rows(inspection)),
     }
     return [f"{name:<16}{text}" for name, text in rows.items()]
+
+
+def _copies_are_listed(inspection: Inspection) -> str:
+    return "; inspect.json lists the copies" if inspection.duplicates.copies else ""
 
 
 def _pose_rows(inspection: Inspection) -> dict[str, str]:

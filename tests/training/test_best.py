@@ -54,6 +54,7 @@ def test_the_best_stays_where_a_run_goes_on_with_what_it_had(make_config, report
         ({"data__fields": {"gripper": "openness"}}, {"data.fields.gripper"}),
         ({"validation__clips": 2}, {"its clips"}),
         ({"data__validation_share": 0.75}, {"its clips"}),
+        ({"data__split_by": r"episode_(\d+)"}, {"its clips"}),
     ],
 )
 def test_what_changes_the_measurement_is_named(make_config, change: dict[str, object], named: set[str]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from copied_sets import write_rlds
 from same_run import assert_same_run, figures, trained_weights
 from vjepa2_ac.config import CheckpointConfig, Config
 from vjepa2_ac.config_file import config_as_yaml
@@ -194,6 +195,23 @@ def test_a_folder_of_another_config_is_refused_and_names_the_key(make_config, re
     train(make_config(), reporter)
     with pytest.raises(InputError, match=r"training\.learning_rate"):
         train(make_config(training__learning_rate=2e-3), reporter)
+
+
+def test_episodes_cannot_change_their_split_within_a_run(make_config, reporter) -> None:
+    train(make_config(training__steps=2), reporter)
+    with pytest.raises(InputError, match=r"it differs in data\.split_by"):
+        train(make_config(training__steps=2, data__split_by=r"episode_(\d+)"), reporter)
+
+
+def test_copies_in_other_splits_are_said_before_the_first_step(make_config, reporter, tmp_path) -> None:
+    folder = write_rlds(tmp_path / "copied", [number // 2 for number in range(16)])
+    train(make_config(data__path=str(folder), data__frames=3, training__steps=1), reporter, check_only=True)
+    (said,) = [note for note in reporter.notes if "copy in another split" in note]
+    assert said.startswith("Warning: 16 episodes have the states of another one: they are 8 different ones. ")
+    assert reporter.steps == []
+    reporter.notes.clear()
+    train(make_config(training__steps=1), reporter, check_only=True)
+    assert not [note for note in reporter.notes if "states of another" in note]
 
 
 def test_another_config_on_purpose_is_written_and_what_changes_is_said(make_config, reporter) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -24,6 +25,22 @@ def _place(path: str) -> str:
 
 
 Place = Annotated[str, AfterValidator(_place)]  # on this machine, where ~ is the user's home, or a URL
+
+
+def _split_by(text: str) -> str:
+    """Take the name of a field, or a pattern with one group; which fields there are only the data set knows."""
+    if re.fullmatch(r"[A-Za-z_]+", text):
+        return text
+    try:
+        groups = re.compile(text).groups
+    except (re.error, OverflowError, RecursionError) as error:
+        raise ValueError(f"{text!r} is no regular expression ({error})") from None
+    if groups != 1:
+        raise ValueError(
+            f"{text!r} has {groups} groups; name a field, or put the part of the identity that episodes share in the"
+            " one group of a regular expression: (...)"
+        )
+    return text
 
 
 class RldsFields(Section):
@@ -212,6 +229,10 @@ class DataConfig(Section):
     """Share of the episodes held out for validation, chosen by a hash of the episode's identity."""
     test_share: Share = 0.05
     """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
+    split_by: Annotated[str, Field(max_length=500), AfterValidator(_split_by)] | None = None
+    """What keeps episodes that belong together in one split, since neighbours tell of one another: a field (lab, day or
+    folder, as the identity says; task, scene, building, operator or day where the data set does), or a regular
+    expression with one group, which is searched in the identity. null: each episode is drawn for itself."""
     outcome: Literal["all", "success", "failure"] = "all"
     """Which demonstrations take part, where the data set tells success from failure."""
     idle: IdleConfig = IdleConfig()

@@ -15,6 +15,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.check_vectors import has_moved, vector_findings
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.finding import Finding, Level
 from vjepa2_ac.data.loader import training_loader
 from vjepa2_ac.data.windows import Split
@@ -97,6 +98,11 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
         short = f"; {len(windows.short):,} episodes are too short" if len(windows.short) else ""
         clip = f"clips of {config.frames} frames at stride {config.stride}"
         yield Finding("ok", split, f"{len(windows):,} {clip} in {episodes:,} episodes{short}")
+    if config.split_by is not None:
+        groups = len(np.unique(dataset.split_hash[dataset.kept.taking_part]))
+        yield Finding("ok", "groups", f"{groups:,} by {config.split_by}, each in one split")
+    duplicates = find_duplicates(dataset)
+    yield Finding("warning" if duplicates.episodes else "ok", "duplicates", str(duplicates))
 
 
 def _shortened(text: str) -> str:

@@ -8,12 +8,13 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, UInt64
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.actions import widths_of
 from vjepa2_ac.data.broken import BrokenEpisodes
 from vjepa2_ac.data.exclusion import included, with_way_out
+from vjepa2_ac.data.grouping import split_hash
 from vjepa2_ac.data.idle_search import FoundRanges, find_ranges
 from vjepa2_ac.data.kept import KeptSteps, Starts, clip_starts
 from vjepa2_ac.data.sources.latents.source import LatentSource
@@ -53,6 +54,12 @@ class Dataset:
     table: EpisodeTable
     kept: KeptSteps
     broken: BrokenEpisodes  # grows in the process that opened the set
+    groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each one's group; None: `data.split_by` names none
+
+    @property
+    def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
+        """What decides the split of each episode."""
+        return self.table.id_hash if self.groups is None else self.groups
 
     def windows(self, split: Split) -> Windows:
         """Return the clips of a split.
@@ -60,7 +67,7 @@ class Dataset:
         Raises:
             InputError: There are none; see `windows_of`.
         """
-        return windows_of(self.table, self.kept.taking_part, self.starts, self.config, split)
+        return windows_of(self.table, self.kept.taking_part, self.starts, self.config, split, self.split_hash)
 
     def with_stride(self, stride: int) -> Dataset:
         """Return the same data at another stride.
@@ -204,7 +211,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
 
     Raises:
         InputError: There is no such set; an episode is broken and `data.broken_episodes` does not skip it, or too many
-            are; two episodes have one identity; a filter cannot be applied; or nothing is left.
+            are; two episodes have one identity; a filter or `data.split_by` cannot be applied; or nothing is left.
     """
     source = open_source(config)
     table = EpisodeTable.of(source.infos(progress))
@@ -223,7 +230,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
             ranges = find_ranges(source, table, config, progress)
         kept = _kept_of(ranges, table, taking_part, broken)
         _say_how_many_are_listed(ranges, table, config)
-    dataset = Dataset(config, source, table, kept, broken)
+    dataset = Dataset(config, source, table, kept, broken, split_hash(table, kept.taking_part, config))
     if not len(dataset.episodes):
         raise _nothing_left(dataset)
     if isinstance(source, LatentSource):

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig
-from vjepa2_ac.data.table import EpisodeTable, NotATableError
+from vjepa2_ac.data.table import FORMAT, EpisodeTable, NotATableError
 
 logger = logging.getLogger(__name__)
 
@@ -66,14 +66,17 @@ def key_of(parts: Mapping[str, object]) -> str:
 def kept_or_built(config: DiskCacheConfig, key: str, build: Callable[[], EpisodeTable]) -> EpisodeTable:
     """Return the table kept under a key; build and keep it where there is none, or a damaged one.
 
-    The key is among the table's `texts`, as `index`: what else is found out of these episodes depends on it.
+    The key is among the table's `texts`, as `index`: what else is found out of these episodes depends on it. The form
+    of the table is no part of the key, but of the file's name: an index of another form is built again, while latent
+    caches and what was fetched of the same files stay good.
     """
 
     def build_marked() -> EpisodeTable:
         table = build()
         return replace(table, texts={**table.texts, "index": key})
 
-    return kept_or_made(config, key, build_marked, to_bytes=EpisodeTable.to_bytes, from_bytes=EpisodeTable.from_bytes)
+    name = f"{key}.table{FORMAT}"
+    return kept_or_made(config, name, build_marked, to_bytes=EpisodeTable.to_bytes, from_bytes=EpisodeTable.from_bytes)
 
 
 def kept_or_made(

@@ -15,6 +15,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import RAW_CAMERAS
 from vjepa2_ac.data.dataset import Dataset, Removed
+from vjepa2_ac.data.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.idle import idle_by_motion
 from vjepa2_ac.data.inspection_vectors import ChangePerStep, change_per_step
 from vjepa2_ac.data.windows import Split, in_split, spread
@@ -68,6 +69,7 @@ class Inspection:
     removed: tuple[Removed, ...]
     episodes_of: dict[Split, int]
     windows_of: dict[Split, int]
+    duplicates: Duplicates
     sample: tuple[ReadEpisode, ...]
     widths: Widths
     still_share: float | None  # of the sample's steps: in a run of idle ones, by the measured motion; None: no poses
@@ -128,6 +130,7 @@ class Inspection:
             "success_known_of": int((self.success >= 0).sum()),
             "removed": [vars(one) for one in self.removed],
             "splits": {name: {"episodes": self.episodes_of[name], "windows": self.windows_of[name]} for name in SPLITS},
+            "duplicates": self.duplicates.as_dict(),
             "sampled_episodes": len(self.sample),
             "state_dim": self.widths.state,
             "action_dim": self.widths.action,
@@ -188,6 +191,7 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
         removed=dataset.removed,
         episodes_of={name: _episodes(dataset, name) for name in SPLITS},
         windows_of={name: _windows(dataset, name) for name in SPLITS},
+        duplicates=find_duplicates(dataset),
         sample=sample,
         widths=dataset.widths,
         still_share=None,
@@ -253,7 +257,7 @@ def _read(dataset: Dataset, episodes: Sequence[int], progress: Progress | None) 
 
 
 def _episodes(dataset: Dataset, split: Split) -> int:
-    return int((in_split(dataset.table.id_hash, dataset.config, split) & dataset.kept.taking_part).sum())
+    return int((in_split(dataset.split_hash, dataset.config, split) & dataset.kept.taking_part).sum())
 
 
 def _windows(dataset: Dataset, split: Split) -> int:

@@ -16,10 +16,14 @@ from typing import Any, overload
 import numpy as np
 from jaxtyping import Int8, Int32, Int64, UInt8, UInt64
 
+from vjepa2_ac.data.labels import Labels
 from vjepa2_ac.data.lines import line_of, pack_lines
 from vjepa2_ac.episode import EpisodeInfo
 
+FORMAT = 2  # of `to_bytes`: with another number an index is built again
+
 _UNKNOWN = -1
+_LOCATOR, _LABEL = "locator.", "label."
 
 
 class NotATableError(ValueError):
@@ -41,7 +45,8 @@ class Problem:
 class EpisodeTable(Sequence[EpisodeInfo]):
     """The usable episodes of a data set, in the source's order, as columns.
 
-    `locators` are columns of the source's own (where an episode lies); `texts` are small values of the whole set.
+    `locators` are columns of the source's own (where an episode lies); `labels` say what an episode belongs to, such as
+    its scene; `texts` are small values of the whole set.
     """
 
     num_steps: Int32[np.ndarray, " episodes"]
@@ -53,6 +58,8 @@ class EpisodeTable(Sequence[EpisodeInfo]):
     problems: tuple[Problem, ...] = ()
     locators: Mapping[str, np.ndarray] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
+    state_hash: UInt64[np.ndarray, " episodes"] | None = None  # `state_hash.hash_of_states`; None: not known of any
+    labels: Mapping[str, Labels] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -62,6 +69,8 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         problems: Sequence[Problem] = (),
         locators: Mapping[str, np.ndarray] | None = None,
         texts: Mapping[str, str] | None = None,
+        state_hashes: Sequence[int] | None = None,
+        labels: Mapping[str, Labels] | None = None,
     ) -> EpisodeTable:
         """Make a table; one that is given is returned as it is."""
         if isinstance(infos, EpisodeTable):
@@ -78,6 +87,8 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             problems=tuple(problems),
             locators=dict(locators or {}),
             texts=dict(texts or {}),
+            state_hash=None if state_hashes is None else np.array(state_hashes, np.uint64),
+            labels=dict(labels or {}),
         )
 
     def __len__(self) -> int:
@@ -119,16 +130,22 @@ class EpisodeTable(Sequence[EpisodeInfo]):
 
     def to_bytes(self) -> bytes:
         """Return the table as a file's content, with checksums."""
-        text = json.dumps({"problems": [vars(problem) for problem in self.problems], "texts": dict(self.texts)})
+        text = json.dumps({
+            "problems": [vars(problem) for problem in self.problems],
+            "texts": dict(self.texts),
+            "labels": {name: labels.names for name, labels in self.labels.items()},
+        })  # fmt: skip
         file = io.BytesIO()
         arrays: dict[str, Any] = {name: getattr(self, name) for name in _COLUMNS}
-        arrays |= {f"locator.{name}": column for name, column in self.locators.items()}
+        arrays |= {} if self.state_hash is None else {_HASH: self.state_hash}
+        arrays |= {f"{_LOCATOR}{name}": column for name, column in self.locators.items()}
+        arrays |= {f"{_LABEL}{name}": labels.number for name, labels in self.labels.items()}
         np.savez(file, text=np.frombuffer(text.encode(), np.uint8), **arrays)
         return file.getvalue()
 
     @classmethod
     def from_bytes(cls, data: bytes) -> EpisodeTable:
-        """Read what `to_bytes` returned.
+        """Read what `to_bytes` returned; of before there were hashes and labels (latent caches), it has none.
 
         Raises:
             NotATableError: It is something else, or damaged.
@@ -140,13 +157,19 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             return cls(
                 **{name: arrays[name] for name in _COLUMNS},
                 problems=tuple(Problem(**problem) for problem in text["problems"]),
-                locators={name.removeprefix("locator."): a for name, a in arrays.items() if name not in _COLUMNS},
+                locators={name.removeprefix(_LOCATOR): a for name, a in arrays.items() if name.startswith(_LOCATOR)},
                 texts=text["texts"],
+                state_hash=arrays.get(_HASH),
+                labels={
+                    name: Labels(tuple(names), arrays[f"{_LABEL}{name}"])
+                    for name, names in text.get("labels", {}).items()
+                },
             )
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
             raise NotATableError(str(error)) from None
 
 
+_HASH = "state_hash"
 _COLUMNS = ("num_steps", "success", "id_ends", "id_bytes", "id_hash", "id_rank")
 
 

@@ -79,19 +79,24 @@ class ClipOrder:
         return int.from_bytes(digest, "big") % count
 
 
-def split_of(episode_id: str, config: DataConfig) -> Split:
-    """Return where an episode belongs: a hash of its identity, as a number in [0, 1), against the shares."""
-    number = identity_hash(episode_id) / 2**64
+def split_of(name: str, config: DataConfig) -> Split:
+    """Return where an episode belongs: a hash of its identity, as a number in [0, 1), against the shares.
+
+    Args:
+        name: Its identity; with `data.split_by`, the name of its group.
+        config: The shares.
+    """
+    number = identity_hash(name) / 2**64
     if number < config.test_share:
         return "test"
     return "validation" if number < config.test_share + config.validation_share else "train"
 
 
 def in_split(
-    id_hash: UInt64[np.ndarray, " episodes"], config: DataConfig, split: Split
+    split_hash: UInt64[np.ndarray, " episodes"], config: DataConfig, split: Split
 ) -> Bool[np.ndarray, " episodes"]:
-    """Return which episodes belong to a split: `split_of` for all at once."""
-    number = id_hash.astype(np.float64) / 2**64
+    """Return which episodes belong to a split: `split_of` for all at once, from the hashes of the names."""
+    number = split_hash.astype(np.float64) / 2**64
     held_out = config.test_share + config.validation_share
     low, high = {"test": (0.0, config.test_share), "validation": (config.test_share, held_out)}.get(
         split, (held_out, 2.0)
@@ -105,6 +110,7 @@ def windows_of(
     starts: Starts,
     config: DataConfig,
     split: Split,
+    split_hash: UInt64[np.ndarray, " episodes"],
 ) -> Windows:
     """Return the windows of a split.
 
@@ -114,14 +120,16 @@ def windows_of(
         starts: What `clip_starts` returned for all of these.
         config: Shares of the splits, and what to do with short episodes.
         split: Which split.
+        split_hash: What decides the split of each episode.
 
     Raises:
         InputError: The split has no episodes, or only short ones, or none with a clip's length of kept steps, or
             `data.short_episodes` forbids short ones.
     """
-    members = taking_part & in_split(table.id_hash, config, split)
+    members = taking_part & in_split(split_hash, config, split)
     if not members.any():
-        raise _empty_split(int(taking_part.sum()), config, split)
+        groups = None if config.split_by is None else len(np.unique(split_hash[taking_part]))
+        raise _empty_split(int(taking_part.sum()), groups, config, split)
     short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
     short = short[np.argsort(table.id_rank[short])]
     if len(short) and (config.short_episodes == "error" or len(short) == members.sum()):
@@ -192,16 +200,19 @@ def _warn_of_short(path: str, split: Split, clip_steps: int, members: int, short
     )  # fmt: skip
 
 
-def _empty_split(episodes: int, config: DataConfig, split: Split) -> InputError:
+def _empty_split(episodes: int, groups: int | None, config: DataConfig, split: Split) -> InputError:
     shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
     fix = (
         "Lower data.validation_share or data.test_share"
         if split == "train"
         else f"Raise data.{split}_share: a hash of its identity draws an episode, so few episodes need a large share"
+        if groups is None
+        else f"Raise data.{split}_share: a hash of its name draws a group, so few groups need a large share"
     )
+    together = "" if groups is None else f" in {groups} groups (data.split_by)"
     return InputError(
         where=f"data.path: {config.path}",
-        found=f"no {split} episodes among {episodes} ({shares})",
+        found=f"no {split} episodes among {episodes}{together} ({shares})",
         needed="one or more",
         fix=fix,
     )

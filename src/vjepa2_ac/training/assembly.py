@@ -16,6 +16,7 @@ from torch import nn
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset, open_dataset
+from vjepa2_ac.data.duplicates import find_duplicates
 from vjepa2_ac.data.loader import training_loader, validation_batches
 from vjepa2_ac.data.prefetch import Batches
 from vjepa2_ac.data.streams import Copies, copies_for
@@ -134,6 +135,8 @@ def assemble(
         require_learned(config.model)
     with accelerator.local_main_process_first():  # the others find the index of the first one on this machine
         dataset = open_dataset(config.data, progress=looked_through)
+    if (duplicates := find_duplicates(dataset)).episodes:
+        note(f"Warning: {duplicates}.")
     check_heads(config, dataset)
     world_model, calibration = None, None
     if config.data.stride == "auto":

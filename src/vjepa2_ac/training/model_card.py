@@ -94,7 +94,8 @@ def _data(config: Config, facts: AdapterFacts) -> str:
             "clips": f"{data.frames} frames, one every {data.stride} control steps (the stride)",
             "crop": data.crop,
             **_states(config, facts),
-            "held out": f"{data.validation_share:.0%} of the episodes for validation, {data.test_share:.0%} for test",
+            "held out": f"{data.validation_share:.0%} of the episodes for validation, {data.test_share:.0%} for test"
+            + ("" if data.split_by is None else f", those of one `{data.split_by}` together"),
         },
     )
 

@@ -60,6 +60,20 @@ class DroidMetadata:
         return value if isinstance(value, bool) else None
 
     @property
+    def labels(self) -> dict[str, str | None]:
+        """What the episode belongs to, as far as it is told: scene, building, operator, task."""
+        return {
+            "scene": self._short("scene_id"),
+            "building": self._short("building"),
+            "operator": self._short("user_id") or self._short("user"),
+            "task": self.language,
+        }
+
+    def _short(self, key: str) -> str | None:
+        value = self.values.get(key)
+        return str(value) if isinstance(value, str | int) and not isinstance(value, bool) else None
+
+    @property
     def language(self) -> str | None:
         """The task in words, where it is told."""
         value = self.values.get("current_task")

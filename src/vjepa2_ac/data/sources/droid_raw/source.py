@@ -14,6 +14,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import as_error, as_problem
 from vjepa2_ac.data.index import kept_or_built, key_of
+from vjepa2_ac.data.labels import labels_of
 from vjepa2_ac.data.lines import line_of, pack_lines
 from vjepa2_ac.data.sources.droid_raw.folders import (
     TRAJECTORY,
@@ -29,6 +30,7 @@ from vjepa2_ac.data.sources.droid_raw.trajectory import Trajectory, parse_trajec
 from vjepa2_ac.data.sources.episode_files import EpisodeFiles
 from vjepa2_ac.data.sources.folders import in_parallel
 from vjepa2_ac.data.sources.states import require_plausible
+from vjepa2_ac.data.state_hash import hash_of_states
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.data.video import count_frames, read_frames
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
@@ -48,6 +50,16 @@ class _Place:
     metadata: str
     version: str
     pictures: dict[str, int]  # how many each of the config's cameras has, by serial number
+
+
+@dataclass(frozen=True)
+class _Found:
+    """An episode that can be used."""
+
+    info: EpisodeInfo
+    place: _Place
+    state_hash: int
+    labels: dict[str, str | None]
 
 
 class RawDroidSource:
@@ -128,7 +140,7 @@ class RawDroidSource:
     def _scan_all(self, folders: list[str], progress: Progress | None) -> EpisodeTable:
         done = 0
 
-        def scan(folder: str) -> tuple[EpisodeInfo, _Place] | Problem:
+        def scan(folder: str) -> _Found | Problem:
             nonlocal done
             found = self._scan(folder)
             done += 1
@@ -136,25 +148,29 @@ class RawDroidSource:
                 progress(done, len(folders))
             return found
 
-        infos: dict[str, EpisodeInfo] = {}
-        places, problems = [], []
+        usable: dict[str, _Found] = {}
+        problems = []
         for found in in_parallel(scan, folders, self._config.connections if storage.is_url(self._root) else 1):
             if isinstance(found, Problem):
                 problems.append(found)
-            elif found[0].id in infos:
-                problems.append(_twice(found[0].id, self._path(found[1], TRAJECTORY)))
+            elif found.info.id in usable:
+                problems.append(_twice(found.info.id, self._path(found.place, TRAJECTORY)))
             else:
-                infos[found[0].id] = found[0]
-                places.append(json.dumps(vars(found[1])))
-        if not infos:
+                usable[found.info.id] = found
+        if not usable:
             raise as_error(problems[0])
         texts = {"control_rate_hz": str(self._config.droid_raw.control_rate_hz)}
-        logger.info("%s: %d episodes, %d that cannot be used", self._root, len(infos), len(problems))
+        logger.info("%s: %d episodes, %d that cannot be used", self._root, len(usable), len(problems))
         return EpisodeTable.of(
-            list(infos.values()), problems=problems, locators=pack_lines("place", places), texts=texts
+            [one.info for one in usable.values()],
+            problems=problems,
+            locators=pack_lines("place", [json.dumps(vars(one.place)) for one in usable.values()]),
+            texts=texts,
+            state_hashes=[one.state_hash for one in usable.values()],
+            labels=labels_of([one.labels for one in usable.values()]),
         )
 
-    def _scan(self, folder: str) -> tuple[EpisodeInfo, _Place] | Problem:
+    def _scan(self, folder: str) -> _Found | Problem:
         identity = identity_of(self._root, folder)
         listed = list_episode(self._root, folder)
         try:
@@ -162,13 +178,14 @@ class RawDroidSource:
             metadata = self._metadata(place)
             serials = tuple(metadata.serial(camera) for camera in self._config.cameras)
             place = replace(place, pictures=self._counted(place, listed, serials))
-            steps = len(self._trajectory(place, serials).states)
+            states = self._trajectory(place, serials).states
         except UnreachableError:
             raise  # the network's fault, not the episode's
         except InputError as error:
             return as_problem(error, identity)
         success = success_of(identity) if metadata.success is None else metadata.success
-        return EpisodeInfo(identity, steps, success), place
+        info = EpisodeInfo(identity, len(states), success)
+        return _Found(info, place, hash_of_states(states), metadata.labels)
 
     def _place_of(self, listed: EpisodeFolder, identity: str) -> _Place:
         if not listed.has_trajectory or listed.metadata is None:

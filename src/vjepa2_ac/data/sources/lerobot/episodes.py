@@ -12,6 +12,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.sources.lerobot.files import filled, list_by_template
 from vjepa2_ac.data.sources.lerobot.meta import DatasetInfo
 from vjepa2_ac.data.sources.lerobot.parquet import Opener, read_table
+from vjepa2_ac.data.state_hash import UNKNOWN, hash_of_bytes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
 
@@ -21,6 +22,7 @@ EPISODES_V30 = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parq
 _T = TypeVar("_T")
 
 _FIX = "Get the files in meta again"
+_STATISTICS = ("min", "max", "mean", "std")
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,20 @@ class EpisodeRow:
     file: int
     videos: Mapping[str, VideoPlace] = field(default_factory=dict)
     success: bool | None = None
+    state_hash: int = UNKNOWN
 
     @property
     def id(self) -> str:
         """Its identity."""
         return identity(self.index)
+
+
+@dataclass(frozen=True)
+class Told:
+    """Columns of which the tables' statistics tell something."""
+
+    states: tuple[str, ...]  # whether two episodes have the same states; none: their rows are read
+    success: str | None  # whether an episode succeeded
 
 
 def identity(index: int) -> str:
@@ -67,7 +78,7 @@ def tables_of_episodes(info: DatasetInfo, connections: int) -> dict[str, FileInf
 
 
 def read_episodes(
-    info: DatasetInfo, tables: Sequence[str], keys: Sequence[str], success: str | None, open_file: Opener
+    info: DatasetInfo, tables: Sequence[str], keys: Sequence[str], told: Told, open_file: Opener
 ) -> list[EpisodeRow]:
     """Return every episode, sorted by number.
 
@@ -75,7 +86,7 @@ def read_episodes(
         info: Of the data set.
         tables: The files that list the episodes, within the data set.
         keys: Videos whose places are wanted.
-        success: Column whose statistics tell whether an episode succeeded.
+        told: Columns of which statistics are wanted; of v2.1 none are read.
         open_file: Gives what to open for a path.
 
     Raises:
@@ -84,7 +95,7 @@ def read_episodes(
     """
     videos = [key for key in keys if info.features[key].dtype == "video"]
     if info.version == "v3.0":
-        rows = [row for table in tables for row in _rows_of_table(info, table, videos, success, open_file)]
+        rows = [row for table in tables for row in _rows_of_table(info, table, videos, told, open_file)]
     else:
         rows = list(_rows_of_lines(info, videos))
     rows.sort(key=lambda row: row.index)
@@ -139,22 +150,23 @@ def _of_line(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str]) -
 
 
 def _rows_of_table(
-    info: DatasetInfo, table: str, videos: Sequence[str], success: str | None, open_file: Opener
+    info: DatasetInfo, table: str, videos: Sequence[str], told: Told, open_file: Opener
 ) -> Iterator[EpisodeRow]:
     path = storage.join(info.root, table)
-    outcome = f"stats/{success}/max"
+    outcome = f"stats/{told.success}/max"
+    statistics = [f"stats/{name}/{kind}" for name in told.states for kind in _STATISTICS]
     prefixes = tuple(f"videos/{key}/" for key in videos)
-    own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome}
+    own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome, *statistics}
     columns = read_table(open_file(path), path, lambda name: name in own or name.startswith(prefixes))
     lengths = {len(column) for column in columns.values()}
     if len(lengths) > 1:
         raise _damaged(path, f"columns of {sorted(lengths)} rows")
     for number in range(max(lengths, default=0)):
         row = {name: column[number] for name, column in columns.items()}
-        yield _checked(f"{path}: row {number}", _of_row, row, videos, row.get(outcome))
+        yield _checked(f"{path}: row {number}", _of_row, row, videos, row.get(outcome), statistics)
 
 
-def _of_row(row: Mapping[str, Any], videos: Sequence[str], outcome: object) -> EpisodeRow:
+def _of_row(row: Mapping[str, Any], videos: Sequence[str], outcome: object, statistics: Sequence[str]) -> EpisodeRow:
     while isinstance(outcome, list) and outcome:
         outcome = outcome[0]
     return EpisodeRow(
@@ -165,7 +177,15 @@ def _of_row(row: Mapping[str, Any], videos: Sequence[str], outcome: object) -> E
         file=_count(row["data/file_index"]),
         videos={key: _place(row, f"videos/{key}") for key in videos},
         success=bool(outcome) if isinstance(outcome, bool | int | float) else None,
+        state_hash=_hash_of(row["length"], [row.get(name) for name in statistics]),
     )
+
+
+def _hash_of(length: object, statistics: Sequence[object]) -> int:
+    """Return what stands for an episode's states where its rows are not read: their statistics, all of them."""
+    if not statistics or any(one is None for one in statistics):
+        return UNKNOWN
+    return hash_of_bytes(json.dumps([length, *statistics], default=str).encode())
 
 
 def _place(row: Mapping[str, Any], name: str) -> VideoPlace:

@@ -11,15 +11,18 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.broken import as_problem
+from vjepa2_ac.data.labels import Labels
 from vjepa2_ac.data.sources.lerobot.episodes import EpisodeRow, VideoPlace, data_file, video_file
 from vjepa2_ac.data.sources.lerobot.meta import DatasetInfo
+from vjepa2_ac.data.sources.lerobot.rows import EpisodeContent
 from vjepa2_ac.data.sources.states import zero_steps
+from vjepa2_ac.data.state_hash import hash_of_states
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.episode import EpisodeInfo, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
 
-Check = Callable[[EpisodeRow], "bool | None"]  # reads an episode's rows; whether it succeeded
+Check = Callable[[EpisodeRow], EpisodeContent]  # reads an episode's rows
 
 
 def find_problems(
@@ -84,6 +87,8 @@ def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], tex
         raise problems[min(problems)]
     tasks = sorted({"; ".join(row.tasks) for row in usable})
     number = {task: place for place, task in enumerate(tasks)}
+    hashes = [row.state_hash for row in usable]
+    labels = Labels.of(["; ".join(row.tasks) for row in usable])
     locators: dict[str, np.ndarray] = {
         "index": np.array([row.index for row in usable], np.int64),
         "chunk": np.array([row.chunk for row in usable], np.int32),
@@ -100,6 +105,8 @@ def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], tex
         problems=[as_problem(problems[row.index], row.id) for row in rows if row.index in problems],
         locators=locators,
         texts={"tasks": json.dumps(tasks), **texts},
+        state_hashes=hashes if any(hashes) else None,
+        labels={"task": labels} if labels.is_said else {},
     )
 
 
@@ -124,12 +131,13 @@ def row_of(table: EpisodeTable, place: int) -> EpisodeRow:
 
 def _checked(row: EpisodeRow, check: Check) -> tuple[EpisodeRow, InputError | None]:
     try:
-        success = check(row)
+        content = check(row)
     except UnreachableError:  # says nothing of the episode
         raise
     except InputError as error:
         return row, error
-    return (row if success is None else replace(row, success=success)), None
+    success = row.success if content.success is None else content.success
+    return replace(row, success=success, state_hash=hash_of_states(content.states)), None
 
 
 def _require_usable(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> None:

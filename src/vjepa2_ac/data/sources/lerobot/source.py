@@ -15,7 +15,14 @@ from vjepa2_ac.data.disk_cache import fetched_data
 from vjepa2_ac.data.index import kept_or_built, key_of
 from vjepa2_ac.data.sources.episode_files import EpisodeFiles
 from vjepa2_ac.data.sources.kept_file import KeptFile
-from vjepa2_ac.data.sources.lerobot.episodes import EpisodeRow, data_file, read_episodes, tables_of_episodes, video_file
+from vjepa2_ac.data.sources.lerobot.episodes import (
+    EpisodeRow,
+    Told,
+    data_file,
+    read_episodes,
+    tables_of_episodes,
+    video_file,
+)
 from vjepa2_ac.data.sources.lerobot.files import fingerprint, list_by_template
 from vjepa2_ac.data.sources.lerobot.index import check_rows, find_problems, row_of, table_of
 from vjepa2_ac.data.sources.lerobot.kept import KeptRows
@@ -155,7 +162,8 @@ class LeRobotSource:
     ) -> EpisodeTable:
         info, fields = self._info, self._config.lerobot
         known = info.known_keys(fields)
-        rows = read_episodes(info, tables, known, fields.success, self._open)
+        told = Told(tuple(fields.state) if self._is_far else (), fields.success)
+        rows = read_episodes(info, tables, known, told, self._open)
         problems = find_problems(info, rows, files.keys(), keys)
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
         if not self._is_far or (self._config.outcome != "all" and outcome_unknown):
@@ -164,7 +172,7 @@ class LeRobotSource:
                 info,
                 rows,
                 problems,
-                lambda row: self._content(row).success,
+                self._content,
                 connections=self._connections,
                 progress=progress,
             )

@@ -16,6 +16,7 @@ and may hold
     actions            [steps, any], *commanded*: read with data.actions: recorded
     success            true or false
     language           the task in words
+    scene, building, operator, day   texts: what `data.split_by` may keep together
 
 Of a file that numpy.savez wrote, only the pictures that are asked for are read, and their checksum is not checked: it
 covers all of them. Of one that numpy.savez_compressed wrote, the pictures before must be unpacked, too: slow for long
@@ -40,6 +41,7 @@ from vjepa2_ac.data.sources.states import require_finite, require_plausible
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.errors import InputError
 
+LABELS = ("scene", "building", "operator", "day")
 FORMAT_HELP = "docs/data.md says what an episode holds"
 
 
@@ -54,6 +56,7 @@ class NpzEpisode:
     extrinsics: dict[str, Any]  # of each camera: [steps 6], or None
     joint_velocities: Float[np.ndarray, "steps joints"] | None
     commands: Float[np.ndarray, "steps action_dim"] | None
+    labels: dict[str, str | None]  # what the episode belongs to
 
     @property
     def widths(self) -> tuple[int, int | None]:
@@ -100,6 +103,7 @@ def read_episode(opened: str | KeptFile, path: str, cameras: Sequence[str], conf
             extrinsics=extrinsics,
             joint_velocities=arrays.numbers("joint_velocities", (steps, None)) if has_velocities else None,
             commands=arrays.numbers("actions", (steps, None)) if config.actions == "recorded" else None,
+            labels={name: arrays.text(name) for name in LABELS if arrays.is_text(name)},
         )
 
 
@@ -149,6 +153,13 @@ class _Arrays:
                 where=f"{self.path}: {name}", found=f"NaN or infinity{at}", needed="numbers", fix=FORMAT_HELP
             )
         return values
+
+    def is_text(self, name: str) -> bool:
+        """Return whether there is an array of this name that is one text; a camera may be called so, too."""
+        return name in self.file.names and (self.file.header(name).shape, self.file.header(name).dtype.kind) == (
+            (),
+            "U",
+        )
 
     def text(self, name: str) -> str:
         """Return a text."""

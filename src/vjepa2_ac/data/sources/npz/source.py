@@ -16,10 +16,12 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.broken import as_error, as_problem
 from vjepa2_ac.data.index import kept_or_built, key_of
+from vjepa2_ac.data.labels import labels_of
 from vjepa2_ac.data.sources.episode_files import EpisodeFiles
 from vjepa2_ac.data.sources.folders import in_parallel, walk, within
 from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.data.sources.npz.episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_pictures
+from vjepa2_ac.data.state_hash import hash_of_states
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
@@ -128,9 +130,15 @@ class NpzSource:
         problems += [
             self._other_widths(name, one.widths, widths) for name, one in found.items() if one.widths != widths
         ]
-        infos = [EpisodeInfo(name, len(one.states), one.success) for name, one in found.items() if one.widths == widths]
-        logger.info("%s: %d episodes, %d that cannot be used", self._root, len(infos), len(problems))
-        return EpisodeTable.of(infos, problems=problems, texts={"control_rate_hz": str(rate)})
+        usable = {name: one for name, one in found.items() if one.widths == widths}
+        logger.info("%s: %d episodes, %d that cannot be used", self._root, len(usable), len(problems))
+        return EpisodeTable.of(
+            [EpisodeInfo(name, len(one.states), one.success) for name, one in usable.items()],
+            problems=problems,
+            texts={"control_rate_hz": str(rate)},
+            state_hashes=[hash_of_states(one.states) for one in usable.values()],
+            labels=labels_of([{"task": one.language, **one.labels} for one in usable.values()]),
+        )
 
     def _scan(self, identity: str) -> NpzEpisode | Problem:
         try:

@@ -24,6 +24,7 @@ from vjepa2_ac.data.sources.rlds.fields import (
 from vjepa2_ac.data.sources.rlds.record import Record
 from vjepa2_ac.data.sources.rlds.shard_file import open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, RecordSpan, require_intact, span_at
+from vjepa2_ac.data.state_hash import UNKNOWN, hash_of_states
 from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import EpisodeInfo, Progress
 from vjepa2_ac.errors import InputError
@@ -38,6 +39,7 @@ class Row:
 
     info: EpisodeInfo
     span: RecordSpan
+    state_hash: int = UNKNOWN
 
 
 Found = Row | Problem
@@ -155,6 +157,7 @@ def table_of(shards: Sequence[Shard], found: Iterator[list[Found]]) -> EpisodeTa
             "offset": np.array([span.offset for span in spans], np.int64),
             "length": np.array([span.length for span in spans], np.int64),
         },
+        state_hashes=[row.state_hash for row in rows],
     )
 
 
@@ -171,11 +174,11 @@ def _examine(read: Read, span: RecordSpan, config: DataConfig, cameras: Sequence
         name = identity_of(record, config.fields)
         record.require([*features_of_steps(config), *cameras])
         steps = num_steps_of(record, config)
-        states_of(record, config, steps, f"{span} ({name})")
+        states = states_of(record, config, steps, f"{span} ({name})")
         commands_of(record, config, steps, f"{span} ({name})")
     except InputError as error:
         return as_problem(_damage_or(error, read, span), name)
-    return Row(info_of(name, steps), span)
+    return Row(info_of(name, steps), span, hash_of_states(states))
 
 
 def _damage_or(error: InputError, read: Read, span: RecordSpan) -> InputError:

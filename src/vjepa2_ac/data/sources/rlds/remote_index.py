@@ -1,10 +1,11 @@
 """Which episodes does an RLDS data set behind a URL hold? Found out with a few small reads for each.
 
 A read costs tens of milliseconds, so many shards are read at once, and of a record no more is read than names it and
-tells its steps: its states are checked when it is read. TFDS writes the features of a record in a hash's order, another
-one in every process: its names lie before, between or behind the pictures. Looked at are its head; its end, which comes
-with the head of the next record; then what lies between the pictures. That is one read a record where the names come
-first, three on the average of all orders. How many bytes one read takes is decided by a few records.
+tells its steps: its states are checked when it is read, and here only where it may be a copy (`lookalikes`). TFDS
+writes the features of a record in a hash's order, another one in every process: its names lie before, between or behind
+the pictures. Looked at are its head; its end, which comes with the head of the next record; then what lies between the
+pictures. That is one read a record where the names come first, three on the average of all orders. How many bytes one
+read takes is decided by a few records.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from vjepa2_ac.config import DataConfig, RldsFields
 from vjepa2_ac.data.broken import as_problem
@@ -34,6 +35,7 @@ from vjepa2_ac.data.sources.rlds.fields import (
     states_of,
 )
 from vjepa2_ac.data.sources.rlds.index import Found, Row, in_parallel, place_of, scan_shard, table_of
+from vjepa2_ac.data.sources.rlds.lookalikes import hashes_of_lookalikes
 from vjepa2_ac.data.sources.rlds.record import Record, not_an_example
 from vjepa2_ac.data.sources.rlds.remote_file import RemoteFile
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, RecordSpan, span_at
@@ -95,7 +97,9 @@ def index_remote(
     def scan(shard: Shard) -> list[Found]:
         return list(scan_shard(RemoteFile(shard, window=layout.window, kept=_PIECES), shard, examine))
 
-    return table_of(shards, in_parallel(scan, shards, max(threads, FEWEST_IN_FLIGHT), progress))
+    threads = max(threads, FEWEST_IN_FLIGHT)
+    table = table_of(shards, in_parallel(scan, shards, threads, progress))
+    return replace(table, state_hash=hashes_of_lookalikes(table, shards, config, threads=threads))
 
 
 def learn_layout(shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str]) -> Layout:

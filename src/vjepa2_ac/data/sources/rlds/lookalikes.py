@@ -1,0 +1,71 @@
+"""Which records behind a URL could be copies of one another? Only of those are the states read while indexing.
+
+The index of a record behind a URL reads no states: for DROID that would be several reads more of each of 95,658. A copy
+under another name differs in its name alone: it has as many steps, and a record as long but for its name. Few others
+do: records of some 15 MB, nearly all of it pictures, seldom agree to the byte. A copy whose pictures or texts were
+written anew has another length, and is not found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+from jaxtyping import Int64, UInt64
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.rlds.fields import states_of
+from vjepa2_ac.data.sources.rlds.record import Record
+from vjepa2_ac.data.sources.rlds.remote_file import RemoteFile
+from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan
+from vjepa2_ac.data.state_hash import UNKNOWN, hash_of_states
+from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
+
+_WINDOW = 1 << 16
+_LENGTH_BYTES = 5  # that grow with a name: of the text, its list, the feature, the entry of the map, and of them all
+
+
+def hashes_of_lookalikes(
+    table: EpisodeTable, shards: Sequence[Shard], config: DataConfig, *, threads: int
+) -> UInt64[np.ndarray, " episodes"]:
+    """Return the hash of the states of every record that could be a copy of another; of the others, `UNKNOWN`.
+
+    Raises:
+        UnreachableError: The network fails.
+    """
+
+    def look(index: int) -> int:
+        at = {name: int(column[index]) for name, column in table.locators.items()}
+        shard = shards[at["shard"]]
+        span = RecordSpan(path=shard.path, number=at["record"], offset=at["offset"], length=at["length"])
+        try:
+            record = Record(RemoteFile(shard, window=_WINDOW), span)
+            return hash_of_states(states_of(record, config, int(table.num_steps[index]), str(span)))
+        except UnreachableError:
+            raise  # says nothing of the record
+        except InputError:
+            return UNKNOWN  # said when the episode is read
+
+    found = np.full(len(table), UNKNOWN, np.uint64)
+    chosen = lookalikes(table, tolerance=_LENGTH_BYTES * max(1, len(config.fields.identity)))
+    with ThreadPoolExecutor(threads) as pool:
+        for index, value in zip(chosen.tolist(), pool.map(look, chosen.tolist()), strict=True):
+            found[index] = value
+    return found
+
+
+def lookalikes(table: EpisodeTable, *, tolerance: int) -> Int64[np.ndarray, " lookalikes"]:
+    """Return the episodes that have as many steps as another, and a record as long but for its name.
+
+    Args:
+        table: With the lengths of the records.
+        tolerance: Bytes by which the rest may differ, as the lengths of names take bytes, too.
+    """
+    rest = table.locators["length"] - np.diff(table.id_ends, prepend=0)
+    order = np.lexsort((rest, table.num_steps))
+    alike = (np.diff(table.num_steps[order]) == 0) & (np.diff(rest[order]) <= tolerance)
+    return np.asarray(order[np.append(alike, False) | np.append(False, alike)], np.int64)
