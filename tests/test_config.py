@@ -1,6 +1,9 @@
 """Every knob once; everything that is wrong at once."""
 
+import os
 import re
+import textwrap
+import threading
 from operator import attrgetter
 from pathlib import Path
 
@@ -197,3 +200,48 @@ def test_a_pattern_is_given_as_a_table(tmp_path: Path) -> None:
     assert changed_keys(plain, config)
     with pytest.raises(InputError, match=r"adapter\.rank_pattern.*greater than or equal to 1"):
         load_config(path, ["adapter.rank_pattern={fc1: 0}"])
+
+
+def test_sections_that_others_are_merged_into_are_read(tmp_path: Path) -> None:
+    text = """
+    run_dir: runs/x
+    data: {path: d}
+    model: {base: b.pt}
+    validation: &measure
+      every: 7
+      clips: 9
+    training:
+      <<: {steps: 500, warmup_steps: 10}
+      warmup_steps: 20
+    """
+    config = load_config(write(tmp_path, textwrap.dedent(text)))
+    assert (config.training.steps, config.training.warmup_steps, config.validation.clips) == (500, 20, 9)
+
+
+@pytest.mark.parametrize(
+    "name", ["1e-4", "010", "1:30", "2024-01-01", "089", "on", "null", "0x1F", "1_0", "=", "é #: ü"]
+)
+def test_text_that_looks_like_a_number_stays_text_when_written_and_read(tmp_path: Path, name: str) -> None:
+    config = parse_config(MINIMAL | {"run_dir": name, "data": {"path": "d", "exclude": [name]}}, where="")
+    assert load_config(write(tmp_path, config_as_yaml(config))) == config
+
+
+def test_a_template_that_was_not_filled_in_is_named_with_its_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"config\.yaml: line 2, column 11.*Fill in the template"):
+        load_config(write(tmp_path, "seed: 1\nrun_dir: {{ RUN }}\n"))
+
+
+def test_a_config_is_of_bounded_size_and_may_come_through_a_pipe(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="more than 4,194,304 bytes"):
+        load_config(write(tmp_path, "#" * (5 << 20)))
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=pipe.write_text, args=(yaml.safe_dump(MINIMAL),))
+    writer.start()
+    assert load_config(pipe) == parse_config(MINIMAL, where="")
+    writer.join()
+
+
+def test_values_of_the_command_line_that_lie_too_deep_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="too deep"):
+        load_config(write(tmp_path, yaml.safe_dump(MINIMAL)), [".".join("a" * 5_000) + "=1"])

@@ -30,7 +30,7 @@ def complaints(*overrides: str, values: dict[str, Any] | None = None) -> list[st
             ["data.frames: ", "nothing to train on", "precision fp32 needs"],
         ),
         (["training.betas=[2, 0.9]", "data.join_actions=sum"], ["training.betas.0: ", "join_actions belongs"]),
-        (["data.stride=fast", "training.steps=3"], ["data.stride.", "data.stride.", "exceed steps 3"]),
+        (["data.stride=fast", "training.steps=3"], ["data.stride: ", "exceed steps 3"]),
         (["adapter=null", "training.steps=3"], ["adapter: ", "exceed steps 3"]),
         (["model.random.image_size=50", "model.random.patch_size=0"], ["patch_size: ", "give either base"]),
     ],
@@ -59,6 +59,7 @@ def test_what_is_lacking_does_not_hide_anything_either() -> None:
         ["data.num_frames=32", "training.rollout_steps=20"],
         ["data.source=droid_row", "data.camera=ext1"],
         ["data.fields.cameras=1", "data.camera=third_eye"],
+        ["data.fields.cameras={a: 1}"],
         ["data.stride=0", "data.states=vector", "data.actions=recorded"],
         ["model.random.encoder.width=no", "model.random.encoder.heads=352", "model.base=null", "adapter.kind=none"],
     ],
@@ -102,3 +103,41 @@ def test_other_names_are_those_of_keys_and_of_none_themselves() -> None:
 
 def test_a_config_that_is_right_is_read() -> None:
     assert parse_config(MINIMAL, where="here").run_dir == "runs/x"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "line"),
+    [
+        ("data.stride=fast", "data.stride: Input should be a valid integer, or 'auto' (found 'fast')"),
+        ("data.stride=0", "data.stride: Input should be greater than or equal to 1, or 'auto' (found 0)"),
+        ("data.camera=1.5", "data.camera: Input should be a valid string, or a list (found 1.5)"),
+        ("data.camera=[a, 1.5]", "data.camera.1: Input should be a valid string (found 1.5)"),
+        ("adapter.targets=q", "adapter.targets: Input should be a list (found 'q')"),
+        ("training.betas=[0.5]", "training.betas: List should have at least 2 items"),
+        ("training.betas=[0.1, 0.2, 0.3]", "training.betas: List should have at most 2 items, not 3"),
+        ("adapter.rank_pattern=3", "adapter.rank_pattern: Input should be a mapping of keys to values (found 3)"),
+    ],
+)
+def test_what_is_wrong_is_said_once_without_the_inner_names_of_pydantic(wrong: str, line: str) -> None:
+    (found,) = complaints(wrong)
+    assert found.startswith(line)
+    for inner in (
+        "function-before",
+        "constrained",
+        "literal[",
+        "tuple[",
+        "array",
+        "object",
+        "dict",
+        "after validation",
+    ):
+        assert inner not in found
+
+
+def test_a_flood_of_mistakes_is_told_in_part() -> None:
+    found = complaints(
+        values=MINIMAL | {"x" * 1_000_000 + str(n): n for n in range(3)} | {f"k{n}": n for n in range(5000)}
+    )
+    assert len(found) == 31
+    assert max(map(len, found)) < 500
+    assert "and more" in found[-1]

@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, printable
 
 
 @pytest.mark.parametrize(
@@ -27,3 +27,17 @@ def test_an_error_of_a_loader_worker_arrives_as_it_was() -> None:
     error = InputError(where="a", found="b", needed="c", fix="d")
     other = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
     assert (type(other), str(other), other.fix) == (InputError, str(error), "d")
+
+
+def test_a_terminal_shows_what_is_quoted_and_does_not_obey_it() -> None:
+    error = InputError(where="run\x1b[2J", found="key '\x1b]0;title\x07' and \u202e\udc80\u2028", fix="One\nTwo")
+    assert str(error) == "run\\x1b[2J: key '\\x1b]0;title\\x07' and \\u202e\\udc80\\u2028. One\nTwo."
+    assert str(error).encode()  # a lone surrogate could not be written
+    assert printable("å 日本\u3000ö\n") == "å 日本\u3000ö\n"
+
+
+def test_what_is_quoted_does_not_flood_the_terminal() -> None:
+    error = InputError(where="w", found="begin" + "x" * 1_000_000 + "end", fix="Way out")
+    assert len(str(error)) < 10_000
+    assert "begin" in str(error)
+    assert str(error).endswith("end. Way out.")

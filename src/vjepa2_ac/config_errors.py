@@ -6,13 +6,17 @@ import difflib
 import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.structured import message_of
 
 _ROUNDS = 20  # more than there are rules about several values
+_MOST_LINES = 30
+_LONGEST_KEY = 80
 
 # What people bring along from other programs, by the key that it has here.
 _ALSO_CALLED = {
@@ -53,10 +57,13 @@ def wrong_values(values: Mapping[str, Any], error: ValidationError) -> list[str]
     Rules about several values are only looked at when each value by itself is right. What is wrong is therefore taken
     out, and the rest is looked at again; what a rule then says about something that was taken out does not count.
     """
-    left, found, taken = json.loads(json.dumps(values)), list(error.errors()), set[str]()
+    left, found, taken = json.loads(json.dumps(values)), error.errors(include_url=False)[:_MOST_LINES], set[str]()
     lines: list[str] = []
     for _ in range(_ROUNDS):
-        lines += [line for one in found if (line := _explain(one)) not in lines and not _is_about(one, taken)]
+        told = _told_once([one for one in found if not _is_about(one, taken)])
+        lines += [line for line in told if line not in lines]
+        if len(lines) >= _MOST_LINES:
+            return [*lines[:_MOST_LINES], "and more, which are not looked at before these are right"]
         before = json.dumps(left)
         for one in found:
             taken |= _take_out(left, one)
@@ -67,7 +74,7 @@ def wrong_values(values: Mapping[str, Any], error: ValidationError) -> list[str]
             Config.model_validate_json(json.dumps(left))
             break
         except ValidationError as again:
-            found = list(again.errors())
+            found = again.errors(include_url=False)[:_MOST_LINES]
     return lines
 
 
@@ -81,18 +88,49 @@ def all_keys(section: type[BaseModel] = Config, prefix: str = "") -> list[str]:
     return keys
 
 
+def _told_once(details: Sequence[Any]) -> list[str]:
+    """Return a line for each value that is wrong: what may be of several kinds is told once, not for each kind."""
+    kinds: dict[tuple[Any, ...], list[Any]] = {}
+    for detail in details:
+        kinds.setdefault(_union_of(detail["loc"]) or (*detail["loc"], detail["msg"]), []).append(detail)
+    lines = []
+    for together in kinds.values():
+        deepest = max(len(detail["loc"]) for detail in together)  # of a kind that fits at least from outside
+        line, *others = [_explain(detail) for detail in together if len(detail["loc"]) == deepest]
+        also = [other.split("Input should be ", 1)[-1].split(" (found ", 1)[0] for other in others]
+        message, found, rest = line.partition(" (found ")
+        lines.append(", or ".join([message, *also]) + found + rest)
+    return lines
+
+
 def _explain(detail: Any) -> str:
-    path = ".".join(str(part) for part in detail["loc"])
+    path = ".".join(_places(detail["loc"]))
     if detail["type"] == "extra_forbidden":
         meant = _meant(detail["loc"])
         hint = f"did you mean {meant}?" if meant else f"known here: {', '.join(_keys_at(detail['loc'][:-1]))}"
         return f"{path}: unknown key; {hint}"
+    if detail["type"] == "missing" and isinstance(detail["loc"][-1], int):
+        return f"{'.'.join(_places(detail['loc'][:-1]))}: List should have at least {detail['loc'][-1] + 1} items"
     if detail["type"] == "missing":
         return f"{path}: missing; it has no default"
-    message = str(detail["msg"]).removeprefix("Value error, ")
-    found = detail.get("input")
-    shown = "" if isinstance(found, dict) else f" (found {found!r})"
-    return f"{path}: {message}{shown}" if path else message
+    return f"{path}: {message_of(detail)}" if path else message_of(detail)
+
+
+def _places(location: Sequence[Any]) -> list[str]:
+    """Return the keys and numbers of items that lead to a value; pydantic's names for kinds of values are no keys."""
+    union = _union_of(location)
+    kept = location if union is None else (*union, *location[len(union) + 1 :])
+    return [part if len(part := str(one)) <= _LONGEST_KEY else f"{part[:_LONGEST_KEY]}…" for one in kept]
+
+
+def _union_of(location: Sequence[Any]) -> tuple[Any, ...] | None:
+    """Return the place of the knob that a location lies in, if that may be of several kinds."""
+    for depth in range(1, len(location)):
+        section = _section_at(location[: depth - 1])
+        knob = None if section is None else section.model_fields.get(str(location[depth - 1]))
+        if knob is not None and len([kind for kind in get_args(knob.annotation) if kind is not NoneType]) > 1:
+            return tuple(location[:depth]) if get_origin(knob.annotation) in {Union, UnionType} else None
+    return None
 
 
 def _meant(location: Sequence[Any]) -> str | None:
@@ -112,6 +150,8 @@ def _is_about(detail: Any, names: Iterable[str]) -> bool:
 def _take_out(values: dict[str, Any], detail: Any) -> set[str]:
     """Take what is wrong out of the values; return the names of what is no longer as it was meant."""
     location, names = [str(part) for part in detail["loc"]], set[str]()
+    if detail["type"] == "missing" and isinstance(detail["loc"][-1], int):
+        return _delete(values, location[:-1], whole=False)
     if detail["type"] == "missing":
         return {location[-1]}
     if detail["type"] in {"value_error", "assertion_error"} and _section_at(location) is not None:
@@ -135,6 +175,8 @@ def _delete(values: dict[str, Any], path: Sequence[str], *, whole: bool) -> set[
             if whole and (depth < len(path) - 1 or (not depth and _section_at(path) is not None)):
                 return set()
             del inside[key]
+            if not inside and depth and _section_at(path[:depth]) is None:  # an empty list of cameras is no camera
+                return {key, *_delete(values, path[:depth], whole=False)}
             return {key}
         inside = inside[key]
     return set()

@@ -9,12 +9,15 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
+import yaml  # to write: `structured` reads
 from pydantic import ValidationError
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_errors import wrong_values
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import parse_yaml, require_shallow
+
+_MOST_BYTES = 4 << 20  # of a config: data.exclude may name thousands of episodes
 
 
 def load_config(path: str | Path, overrides: Iterable[str] = ()) -> Config:
@@ -41,6 +44,7 @@ def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
     Raises:
         InputError: Names every key that is wrong, all at once.
     """
+    require_shallow(dict(values), where=where)
     try:
         return Config.model_validate_json(json.dumps(values))
     except ValidationError as error:
@@ -52,7 +56,7 @@ def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
             + "\n",
             fix="`vjepa2-ac config schema` lists every key with its range",
         ) from None
-    except (TypeError, ValueError) as error:  # a YAML date, NaN, ...
+    except (TypeError, ValueError) as error:  # of values that are not from a file
         raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
 
 
@@ -68,7 +72,7 @@ def config_as_flat_dict(config: Config) -> dict[str, Any]:
 
 def config_as_yaml(config: Config) -> str:
     """Return the resolved config as YAML that `load_config` reads back to an equal config."""
-    return str(yaml.safe_dump(config_as_dict(config), sort_keys=False))
+    return str(yaml.dump(config_as_dict(config), Dumper=_Dumper, sort_keys=False))
 
 
 def config_schema() -> dict[str, Any]:
@@ -82,46 +86,31 @@ def changed_keys(old: Config, new: Config) -> list[str]:
     return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
 
 
-class _StrictLoader(yaml.SafeLoader):
-    """Safe YAML that refuses a key given twice, and reads 1e-4 as the number it is (YAML 1.1 says text)."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if key in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"key {key!r} is given twice", key_node.start_mark)
-            seen.add(key)
-        return dict(super().construct_mapping(node, deep))
-
-    def construct_scientific(self, node: yaml.ScalarNode) -> float:
-        return float(str(self.construct_scalar(node)))
+class _Dumper(yaml.SafeDumper):
+    """Puts text in quotes that would be read as another thing."""
 
 
-_StrictLoader.add_constructor("!scientific", _StrictLoader.construct_scientific)
-_StrictLoader.add_implicit_resolver("!scientific", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789"))
+_Dumper.add_implicit_resolver("!number", re.compile(r"^[-+]?[\d_]*\.?[\d_]*[eE][-+]?\d+$"), list("-+.0123456789"))
 
 
 def _read_yaml(path: Path) -> dict[str, Any]:
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open("rb") as file:  # which may be a pipe
+            data = file.read(_MOST_BYTES + 1)
+        text = data.decode()
     except FileNotFoundError:
         raise InputError(
             where=str(path), found="no such file", needed="a config", fix="See configs/ for examples"
         ) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
-    values = _parse_yaml(text, where=str(path))
+    if len(data) > _MOST_BYTES:
+        raise InputError(where=str(path), found=f"more than {_MOST_BYTES:,} bytes", needed="a config")
+    values = parse_yaml(text, where=str(path))
     if not isinstance(values, dict):
-        raise InputError(where=str(path), found=f"a {type(values).__name__}", needed="a mapping of keys to values")
+        found = "nothing" if values is None else f"a {type(values).__name__}"
+        raise InputError(where=str(path), found=found, needed="a mapping of keys to values")
     return values
-
-
-def _parse_yaml(text: str, *, where: str) -> Any:
-    try:
-        return yaml.load(text, Loader=_StrictLoader)  # noqa: S506 - a SafeLoader
-    except yaml.YAMLError as error:
-        raise InputError(where=where, found=f"not YAML: {error}") from None
 
 
 def _overridden(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
@@ -131,7 +120,7 @@ def _overridden(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, A
             raise InputError(
                 where="command line", found=f"{override!r}", needed="an override such as training.steps=100"
             )
-        _set(values, key.split("."), _parse_yaml(text, where=f"command line: {key}"), override)
+        _set(values, key.split("."), parse_yaml(text, where=f"command line: {key}"), override)
     return values
 
 

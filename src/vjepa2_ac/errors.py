@@ -1,10 +1,16 @@
 """What does the user read when something they gave cannot be used?"""
 
+import unicodedata
+
+_MOST_CHARACTERS = 8_000  # of a part of a message: what is quoted in it may be of any length
+_CONTROL = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})  # terminals obey some of these; lone surrogates cannot be written
+
 
 class InputError(Exception):
     """Something the user gave cannot be used: where it is, what was found, what was needed, and the way out.
 
-    The command line prints the message without a traceback and exits with status 2.
+    The command line prints the message without a traceback and exits with status 2. What is quoted in it may come from
+    anybody: control characters are written out, and a part is cut where it is endless.
 
     Args:
         where: A config key, file, episode or command: what the user can go and look at.
@@ -15,8 +21,9 @@ class InputError(Exception):
 
     def __init__(self, *, where: str, found: str, needed: str = "", fix: str = "") -> None:
         self.where, self.found, self.needed, self.fix = where, found, needed, fix
-        sentences = [found, f"needed: {needed}" if needed else "", fix]
-        super().__init__(f"{where}: " + "".join(_sentence(text) for text in sentences if text).rstrip())
+        sentences = [_short(found), f"needed: {_short(needed)}" if needed else "", _short(fix)]
+        text = f"{_short(where)}: " + "".join(_sentence(text) for text in sentences if text).rstrip()
+        super().__init__(printable(text))
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
         """Survive the trip from a loader worker to the main process."""
@@ -32,3 +39,26 @@ def _sentence(text: str) -> str:
     if text.endswith("\n"):
         return text
     return text + (" " if text.endswith((".", "?", "!")) else ". ")
+
+
+def printable(text: str) -> str:
+    r"""Return a text that a terminal shows and does not obey: control characters are written out, as \x1b.
+
+    Ends of lines stay.
+    """
+    if text.isprintable():
+        return text
+    return "".join(_written_out(character) for character in text)
+
+
+def _written_out(character: str) -> str:
+    if character == "\n" or unicodedata.category(character) not in _CONTROL:
+        return character
+    return character.encode("unicode_escape").decode()
+
+
+def _short(text: str) -> str:
+    if len(text) <= _MOST_CHARACTERS:
+        return text
+    half = _MOST_CHARACTERS // 2
+    return f"{text[:half]} … {text[-half:]}"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -101,8 +102,8 @@ def list_files(folder: str | Path) -> list[FileInfo]:
     if is_url(folder):
         return [FileInfo(file.name, file.size, file.version) for file in _remote_entries(folder) if file.is_file]
     files = [path for path in Path(folder).iterdir() if path.is_file()] if Path(folder).is_dir() else []
-    stats = {path.name: path.stat() for path in files}
-    return [FileInfo(name, stat.st_size, str(stat.st_mtime_ns)) for name, stat in sorted(stats.items())]
+    found = {path.name: path.stat() for path in files}
+    return [FileInfo(name, one.st_size, str(one.st_mtime_ns)) for name, one in sorted(found.items())]
 
 
 def list_names(folder: str | Path) -> list[str]:
@@ -150,6 +151,26 @@ def read_bytes(path: str | Path) -> bytes:
     if is_url(path):
         return remote.read_range(str(path), 0, remote.file_size(str(path)))
     return Path(path).read_bytes()
+
+
+def read_bounded(path: str | Path, most_bytes: int) -> bytes:
+    """Return a whole file that is small, whoever wrote it: no more than so many bytes are ever read.
+
+    Raises:
+        InputError: It is larger, or no file but something that may never end, such as a pipe.
+        OSError: There is no such file, or it cannot be read.
+    """
+    if is_url(path):
+        size = remote.file_size(str(path))
+        data = remote.read_range(str(path), 0, min(size, most_bytes + 1))
+    else:
+        if not (stat.S_ISREG(mode := Path(path).stat().st_mode) or stat.S_ISDIR(mode)):
+            raise InputError(where=str(path), found="a pipe or a device", needed="a file")
+        with Path(path).open("rb") as file:
+            data = file.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise InputError(where=str(path), found=f"more than {most_bytes:,} bytes", needed="a file that small")
+    return data
 
 
 def read_range(path: str | Path, start: int, length: int) -> bytes:

@@ -1,0 +1,37 @@
+"""How deep may values lie within one another? So deep that no function that goes through them runs out of stack."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from vjepa2_ac.errors import InputError
+
+MOST_DEPTH = 64
+
+
+def require_shallow(value: Any, *, where: str, fix: str = "") -> None:
+    """Refuse mappings and lists that lie deeper than `MOST_DEPTH` within one another.
+
+    Raises:
+        InputError: They do.
+    """
+    level = [value]
+    for _ in range(MOST_DEPTH):
+        level = [inner for outer in level for inner in _inside(outer)]
+        if not level:
+            return
+    raise too_deep(where, fix)
+
+
+def too_deep(where: str, fix: str = "") -> InputError:
+    """Return the error of values that lie too deep within one another."""
+    needed = f"at most {MOST_DEPTH} mappings and lists within one another"
+    return InputError(where=where, found="values that lie too deep within one another", needed=needed, fix=fix)
+
+
+def _inside(value: Any) -> Iterable[Any]:
+    """Return the mappings and lists in a value."""
+    if isinstance(value, dict):
+        return [inner for inner in value.values() if isinstance(inner, dict | list)]
+    return [inner for inner in value if isinstance(inner, dict | list)] if isinstance(value, list) else ()

@@ -1,0 +1,39 @@
+"""Which regular expressions of a file are used? Those that are done soon, whatever the text."""
+
+from __future__ import annotations
+
+import re
+
+from vjepa2_ac.errors import InputError
+
+_MOST_CHARACTERS = 100
+_MOST_GROUPS = 2
+_MOST_REPEATS = 2  # the time grows with the text's length to this power
+_ESCAPED = re.compile(r"\\.", re.DOTALL)
+_SET = re.compile(r"\[\^?\]?[^\]]*\]")
+_REPEAT = re.compile(r"[*+?{]")
+_REPEATED_GROUP = re.compile(r"\)[*+?{]")
+_NOT_PLAIN = re.compile(r"\(\?|\\\d")  # look-around, names, flags; references back
+
+NEEDED = (
+    f"at most {_MOST_CHARACTERS} characters, {_MOST_GROUPS} groups, and {_MOST_REPEATS} of * + ? {{}}, none of them"
+    " behind a group"
+)
+
+
+def require_quick(pattern: str, *, where: str) -> None:
+    """Refuse a regular expression that may take for ever: of a search that goes back, the time is a power of choices.
+
+    Raises:
+        InputError: It repeats a group, chooses or repeats too often, or refers back to itself; or it is none at all.
+    """
+    plain = _SET.sub("x", _ESCAPED.sub("x", pattern))  # there, signs are themselves
+    too_long = len(pattern) > _MOST_CHARACTERS or len(_REPEAT.findall(plain)) > _MOST_REPEATS
+    nested = _REPEATED_GROUP.search(plain) or _NOT_PLAIN.search(pattern) or plain.count("(") > _MOST_GROUPS
+    if too_long or nested:
+        found = f"{pattern[:_MOST_CHARACTERS]!r}, a pattern that may take for ever"
+        raise InputError(where=where, found=found, needed=NEEDED)
+    try:
+        re.compile(pattern)
+    except (re.error, OverflowError, RecursionError) as error:
+        raise InputError(where=where, found=f"{pattern!r}, no regular expression ({error})") from None

@@ -1,0 +1,34 @@
+"""What is wrong with a value, said without the inner names of pydantic, which checks it?"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+_MOST_SHOWN = 120  # characters of a value
+_NAMES = (  # pydantic speaks of JSON, the user reads YAML as often
+    (re.compile(r"^Value error, "), ""),
+    (re.compile(r"\ba valid array\b"), "a list"),
+    (re.compile(r"\ba valid dictionary\b|\ban object\b|\bof type dict\b"), "a mapping of keys to values"),
+    (re.compile(r"^Tuple\b"), "List"),
+    (re.compile(r" after validation\b"), ""),
+    (re.compile(r"^JSON input should be", re.IGNORECASE), "Input should be"),
+)
+
+
+def message_of(detail: Any) -> str:
+    """Return what pydantic says of one value, in the words of this program, with what was found.
+
+    Args:
+        detail: One of `ValidationError.errors()`.
+    """
+    message, found = str(detail["msg"]), detail.get("input")
+    for inner, ours in _NAMES:
+        message = inner.sub(ours, message)
+    return message if isinstance(found, dict) else f"{message} (found {shown(found)})"
+
+
+def shown(value: object) -> str:
+    """Return a value as it would be written in Python, cut where it is long."""
+    text = repr(value)
+    return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}…"
