@@ -188,7 +188,9 @@ def _open_index(config: DataConfig) -> tuple[int, float, float, float]:
     opened = time.perf_counter() - start
     everyone = np.ones(len(table), bool)
     kept = KeptSteps.whole(table, everyone)
-    order = ClipOrder(windows_of(table, everyone, clip_starts(table, kept, config), config, "train"), seed=0)
+    order = ClipOrder(
+        windows_of(table, everyone, clip_starts(table, kept, config), config, "train", table.id_hash), seed=0
+    )
     order.window(123_456)
     taken, memory = time.perf_counter() - start, (process.memory_info().rss - before) / 1e6
     return len(order.windows), opened, taken, memory

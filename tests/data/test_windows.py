@@ -35,7 +35,7 @@ def windows_of(infos: list[EpisodeInfo], config: DataConfig, split: Split) -> Wi
     table = EpisodeTable.of(infos)
     taking_part = included(table, config)
     starts = clip_starts(table, KeptSteps.whole(table, taking_part), config)
-    return windows_of_starts(table, taking_part, starts, config, split)
+    return windows_of_starts(table, taking_part, starts, config, split, table.id_hash)
 
 
 ALL_TRAIN = {"validation_share": 0.0, "test_share": 0.0}
