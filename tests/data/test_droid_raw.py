@@ -203,7 +203,7 @@ BROKEN = {
     "cut trajectory": (cut("trajectory.h5", 0.5), "trajectory.h5: .*HDF5"),
     "empty trajectory": (cut("trajectory.h5", 0.0), "trajectory.h5: 0 bytes"),
     "cut metadata": (cut("*.json", 0.5), "not JSON"),
-    "metadata of another kind": (lambda folder: next(folder.glob("*.json")).write_text("[]"), "JSON object"),
+    "metadata of another kind": (lambda folder: next(folder.glob("*.json")).write_text("[]"), "a JSON list"),
     "no such camera": (lambda folder: next(folder.glob("*.json")).write_text("{}"), "left_mp4_path"),
     "cut video": (cut(MP4, 0.5), f"{LEFT}.mp4"),
     "empty video": (cut(MP4, 0.0), f"{LEFT}.mp4"),

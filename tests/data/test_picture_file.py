@@ -1,6 +1,9 @@
 """A picture in a file becomes its RGB pixels, or the user reads what is in the file."""
 
 import io
+import struct
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +12,7 @@ import simplejpeg
 from PIL import Image
 
 from vjepa2_ac.data.picture_file import decode_picture, read_picture
+from vjepa2_ac.data.picture_size import require_bounded
 from vjepa2_ac.errors import InputError
 
 PIXELS = np.random.default_rng(0).integers(0, 256, (20, 30, 3), dtype=np.uint8)
@@ -53,6 +57,50 @@ def test_what_is_no_picture_is_refused(data: bytes, complaint: str, tmp_path: Pa
     (tmp_path / "goal.png").write_bytes(data)
     with pytest.raises(InputError, match=rf"goal\.png.*{complaint}"):
         read_picture(tmp_path / "goal.png")
+
+
+def claimed_png(height: int, width: int) -> bytes:
+    """Return a PNG of a few hundred bytes that says to be of a size."""
+    data = png(Image.fromarray(PIXELS))
+    header = data[12:16] + struct.pack(">II", width, height) + data[24:29]
+    return data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:]
+
+
+def claimed_jpeg(height: int, width: int) -> bytes:
+    """Return a JPEG likewise."""
+    data = simplejpeg.encode_jpeg(PIXELS)
+    place = data.index(b"\xff\xc0") + 5
+    return data[:place] + struct.pack(">HH", height, width) + data[place + 4 :]
+
+
+@pytest.mark.parametrize("claimed", [claimed_png, claimed_jpeg])
+@pytest.mark.parametrize("size", [(65_500, 65_500), (10_001, 10_000), (1, 65_500 * 1_530)])
+def test_a_picture_that_claims_to_be_huge_is_refused_before_anything_is_made(
+    claimed: Callable[[int, int], bytes], size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if claimed is claimed_jpeg and max(size) > 65_535:
+        pytest.skip("a JPEG cannot say so")
+    monkeypatch.setattr(simplejpeg, "decode_jpeg", None)
+    monkeypatch.setattr(Image.Image, "convert", None)
+    with pytest.raises(InputError, match=f"goal: a picture of {size[0]} x {size[1]} pixels.*100 megapixels"):
+        decode_picture(claimed(*size), "goal")
+
+
+def test_a_jpeg_that_goes_over_its_pixels_again_and_again_is_refused() -> None:
+    data = claimed_jpeg(10_000, 10_000)
+    assert len(data) < 3_000
+    with pytest.raises(InputError, match="in 501 scans"):
+        decode_picture(data[:-2] + b"\xff\xda" * 500 + data[-2:], "goal")
+    progressive = io.BytesIO()
+    Image.fromarray(PIXELS).save(progressive, format="JPEG", progressive=True)
+    assert progressive.getvalue().count(b"\xff\xda") > 5
+    assert decode_picture(progressive.getvalue(), "goal").shape == PIXELS.shape
+
+
+def test_pictures_that_are_too_many_of_their_size_are_not_decoded_together() -> None:
+    require_bounded(720, 1280, "clip", count=256)
+    with pytest.raises(InputError, match="clip: 64 pictures of 10000 x 10000 pixels at once"):
+        require_bounded(10_000, 10_000, "clip", count=64)
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:

@@ -368,8 +368,9 @@ def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "cannot be read"),
-        ("[]", "another kind"),
+        ("{", "not JSON"),
+        ("[" * 20_000, "too deep"),
+        ("[]", "a JSON list"),
         ('{"name": "a"}', "not a description"),
         ('{"name": "a", "splits": []}', "no episodes"),
         ('{"name": "a", "splits": [{"name": "train", "shardLengths": ["x"]}]}', "not a description"),

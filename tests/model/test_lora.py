@@ -477,7 +477,7 @@ def truncate(folder: Path) -> None:
     ("spoil", "message"),
     [
         (lambda folder: (folder / "vjepa2_ac.json").unlink(), r"vjepa2_ac\.json: no such file"),
-        (lambda folder: (folder / "vjepa2_ac.json").write_text("[]"), "not the card of an adapter"),
+        (lambda folder: (folder / "vjepa2_ac.json").write_text("[]"), r"vjepa2_ac\.json: a JSON list"),
         (lambda folder: (folder / "adapter_model.safetensors").unlink(), r"adapter_model\.safetensors: no such file"),
         (lambda folder: (folder / "adapter_config.json").unlink(), r"adapter_config\.json: cannot be read"),
         (truncate, "not a whole safetensors file"),

@@ -2,6 +2,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -152,7 +153,7 @@ def remove_predictor(folder: Path) -> None:
     ("spoil", "message"),
     [
         (shutil.rmtree, "config.json: no such file. needed: a folder written by"),
-        (break_config, "config.json: cannot be read"),
+        (break_config, "config.json: not JSON"),
         (break_format, "config.json: not the config of a world model"),
         (break_sizes, r"model.safetensors: 16 tensors do not fit \(missing: blocks.2.attn.k.bias"),
         (truncate_encoder, "encoder.safetensors: not a whole safetensors file"),
@@ -182,3 +183,31 @@ def test_a_model_whose_encoder_is_set_aside_predicts_as_before_and_knows_which_o
     for needs_it in (lambda: model.encode(inputs.frames), lambda: model.save_pretrained(tmp_path / "model")):
         with pytest.raises(ValueError, match="set aside"):
             needs_it()
+
+
+@pytest.mark.parametrize(
+    ("sizes", "complaint"),
+    [
+        ({"predictor": {"depth": 10**9}}, "sizes.predictor.depth: Input should be less than or equal to 512"),
+        ({"encoder": {"width": 2**62, "heads": 1}}, "sizes.encoder.width: "),
+        ({"encoder": {"width": 16_384, "depth": 512, "heads": 128}}, "weights, more than"),
+        ({"image_size": 8_192, "patch_size": 8_192}, "weights, more than"),
+        ({"image_size": 8_192, "patch_size": 1}, "tokens a frame, more than 65,536"),
+        ({"encoder": {"mlp_ratio": 1e-9}}, "leaves nothing of encoder.width"),
+        ({"encoder": {"mlp_ratio": "4"}}, "sizes.encoder.mlp_ratio: Input should be a valid number"),
+        ({"predictor": []}, "sizes.predictor: Input should be a mapping"),
+        ({"predictor": {"state_dim": 10**6}}, "sizes.predictor.state_dim: "),
+        (None, "sizes: Input should be"),
+    ],
+)
+def test_a_folder_that_claims_absurd_sizes_is_refused_before_anything_is_made(
+    model: WorldModel, tmp_path: Path, sizes: dict[str, Any] | None, complaint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model.save_pretrained(tmp_path)
+    card = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(card | {"sizes": sizes}))
+    monkeypatch.setattr(WorldModel, "empty", None)
+    with pytest.raises(InputError) as caught:
+        WorldModel.from_pretrained(tmp_path)
+    assert complaint in str(caught.value)
+    assert caught.value.where == str(tmp_path / "config.json")

@@ -8,43 +8,53 @@ from pydantic import Field, model_validator
 
 from vjepa2_ac.config.section import PositiveInt, Section, Share
 
+# Far beyond every model of the kind (released: width 1408, depth 40, 1.3 billion weights): a file may claim anything.
+Width = Annotated[int, Field(ge=1, le=16_384)]
+Depth = Annotated[int, Field(ge=1, le=512)]
+Heads = Annotated[int, Field(ge=1, le=1_024)]
+Ratio = Annotated[float, Field(gt=0.0, le=64.0)]
+VectorWidth = Annotated[int, Field(ge=1, le=4_096)]
+_MOST_TOKENS = 65_536  # of a frame
+_MOST_WEIGHTS = 10**10  # 40 GB in float32
+_MOST_PATTERNS = 64  # that decide about layers by their names
+
 
 class EncoderSizes(Section):
     """Sizes of the frozen video encoder; the defaults are ViT-g/16's."""
 
-    width: PositiveInt = 1408
+    width: Width = 1408
     """Width of a latent."""
-    depth: PositiveInt = 40
+    depth: Depth = 40
     """Transformer blocks."""
-    heads: PositiveInt = 22
+    heads: Heads = 22
     """Attention heads; width / heads is the size of a head."""
-    mlp_ratio: Annotated[float, Field(gt=0.0)] = 48 / 11
+    mlp_ratio: Ratio = 48 / 11
     """Hidden width of the MLP over the width."""
 
 
 class PredictorSizes(Section):
     """Sizes of the action-conditioned predictor; the defaults are the released ones."""
 
-    width: PositiveInt = 1024
+    width: Width = 1024
     """Width of a token."""
-    depth: PositiveInt = 24
+    depth: Depth = 24
     """Transformer blocks."""
-    heads: PositiveInt = 16
+    heads: Heads = 16
     """Attention heads."""
-    mlp_ratio: Annotated[float, Field(gt=0.0)] = 4.0
+    mlp_ratio: Ratio = 4.0
     """Hidden width of the MLP over the width."""
     use_extrinsics: bool = False
     """Whether the camera pose is one more input token per time step."""
-    action_dim: PositiveInt = 7
-    """Numbers of an action. Where the data's are others, its encoder is replaced by a fresh one."""
-    state_dim: PositiveInt = 7
-    """Numbers of a state, likewise."""
+    action_dim: VectorWidth = 7
+    """VectorWidth of an action. Where the data's are others, its encoder is replaced by a fresh one."""
+    state_dim: VectorWidth = 7
+    """VectorWidth of a state, likewise."""
 
 
 class ModelSizes(Section):
     """Sizes of a world model. The defaults are V-JEPA 2-AC ViT-g/16 at 256 px."""
 
-    image_size: PositiveInt = 256
+    image_size: Annotated[int, Field(ge=1, le=8_192)] = 256
     """Height and width of a frame in pixels; a multiple of patch_size."""
     patch_size: PositiveInt = 16
     """Height and width of a patch in pixels."""
@@ -64,6 +74,26 @@ class ModelSizes(Section):
                 raise ValueError(
                     f"{name}: heads of width / heads = {part.width // part.heads} do not fit 3D RoPE (even, at least 6)"
                 )
+            if not int(part.width * part.mlp_ratio):
+                raise ValueError(f"{name}.mlp_ratio {part.mlp_ratio} leaves nothing of {name}.width {part.width}")
+        return self
+
+    @model_validator(mode="after")
+    def _sizes_are_of_this_world(self) -> ModelSizes:
+        tokens = (self.image_size // self.patch_size) ** 2
+        if tokens > _MOST_TOKENS:
+            raise ValueError(
+                f"image_size {self.image_size} and patch_size {self.patch_size} make {tokens:,} tokens a frame, more"
+                f" than {_MOST_TOKENS:,}"
+            )
+        parts = (self.encoder, self.predictor)
+        weights = sum(part.depth * part.width**2 * (4 + 2 * part.mlp_ratio) for part in parts)
+        weights += 6 * self.patch_size**2 * self.encoder.width  # of patches: 3 colours, 2 frames
+        if weights > _MOST_WEIGHTS:
+            raise ValueError(
+                f"encoder and predictor of these widths and depths have {weights:.2g} weights, more than"
+                f" {_MOST_WEIGHTS:.0e}"
+            )
         return self
 
 
@@ -98,14 +128,14 @@ class AdapterConfig(Section):
     """lora: low-rank adapter (PEFT). none: every weight of the predictor is trained."""
     rank: Annotated[int, Field(ge=1, le=1024)] = 16
     """Rank of the update of each target."""
-    alpha: Annotated[float, Field(gt=0.0)] = 32.0
+    alpha: Annotated[float, Field(gt=0.0, le=1e6)] = 32.0
     """Scale of the update: alpha / sqrt(rank) with rsLoRA, alpha / rank without."""
     rslora: bool = True
     """Rank-stabilised scale (arXiv 2312.03732)."""
     dropout: Share = 0.0
     """Dropout before the adapter's first matrix, in training only. The released recipe has none, nor what was measured
     here; it costs an eighth of a step on a GPU (predicted) and keeps a mask and a copy of each layer's input."""
-    targets: tuple[str, ...] = ("q", "k", "v", "o", "fc1", "fc2")
+    targets: Annotated[tuple[str, ...], Field(max_length=_MOST_PATTERNS)] = ("q", "k", "v", "o", "fc1", "fc2")
     """Linear layers of the predictor that get an adapter, by the last part of their name; besides the defaults:
     predictor_embed, predictor_proj, action_encoder, state_encoder. Or sets: attention (q, k, v, o), mlp (fc1, fc2),
     all (every linear layer)."""
@@ -116,8 +146,8 @@ class AdapterConfig(Section):
     init: Literal["default", "gaussian", "pissa"] = "default"
     """Where an adapter starts. default, gaussian: first matrix random, second zero. pissa: at the largest singular
     values of the weights (arXiv 2404.02948). PEFT's other ways need data, or change what the base predicts."""
-    rank_pattern: dict[str, Annotated[int, Field(ge=1, le=1024)]] = {}
+    rank_pattern: Annotated[dict[str, Annotated[int, Field(ge=1, le=1024)]], Field(max_length=_MOST_PATTERNS)] = {}
     """Other ranks for some targets: {fc1: 32, blocks.0.attn.q: 4}, by the end of a layer's name or a regular
     expression for it; the first that matches counts."""
-    alpha_pattern: dict[str, Annotated[float, Field(gt=0.0)]] = {}
+    alpha_pattern: Annotated[dict[str, Annotated[float, Field(gt=0.0, le=1e6)]], Field(max_length=_MOST_PATTERNS)] = {}
     """Other alphas for some targets, in the same way."""

@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import logging
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from jaxtyping import Int32
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.arrays import read_arrays
 from vjepa2_ac.data.broken import as_error, as_problem
 from vjepa2_ac.data.idle import kept_ranges
 from vjepa2_ac.data.index import kept_or_made, key_of
@@ -23,9 +23,11 @@ from vjepa2_ac.data.table import EpisodeTable, NotATableError, Problem
 from vjepa2_ac.episode import EpisodeSource, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
+from vjepa2_ac.structured import json_object, record_of, shown
 
 logger = logging.getLogger(__name__)
 
+_MOST_BYTES = 1 << 28  # of a published list
 _ALL_BROKEN = 10  # as many broken episodes at the start, and no other, are no accident
 
 Found = list[tuple[int, int]] | Problem
@@ -66,13 +68,36 @@ class FoundRanges:
             NotATableError: It is something else, or damaged.
         """
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as file:
-                text = json.loads(file["text"].tobytes())
-                columns = (file["episode"], file["start"], file["end"])
-            problems = tuple((int(place), Problem(**problem)) for place, problem in text["problems"])
-            return cls(*columns, problems, int(text["listed"]))
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            arrays = read_arrays(data)
+            columns = (arrays["episode"], arrays["start"], arrays["end"])
+            text = record_of(_Text, json_object(arrays["text"].tobytes(), where="text"), where="text")
+        except (InputError, KeyError) as error:
             raise NotATableError(str(error)) from None
+        if any(column.dtype != np.int32 or column.shape != (len(columns[0]),) for column in columns):
+            raise NotATableError("columns that do not fit together")
+        return cls(*columns, text.problems, text.listed)
+
+    def require_of(self, table: EpisodeTable) -> None:
+        """Refuse ranges that are not of the episodes of a table.
+
+        Raises:
+            NotATableError: They are not.
+        """
+        places = [place for place, _ in self.problems]
+        known = len(table) > self.episode.max(initial=-1) and len(table) > max(places, default=-1)
+        if not known or self.episode.min(initial=0) < 0 or min(places, default=0) < 0:
+            raise NotATableError(f"ranges of other episodes than these {len(table)}")
+        within = (self.start >= 0) & (self.start <= self.end) & (self.end <= table.num_steps[self.episode])
+        if not within.all() or (np.diff(self.episode) < 0).any():
+            raise NotATableError("ranges that are not in their episodes, or not in their order")
+
+
+@dataclass(frozen=True)
+class _Text:
+    """What of the ranges is no numbers."""
+
+    problems: tuple[tuple[int, Problem], ...]
+    listed: int
 
 
 def find_ranges(
@@ -154,15 +179,11 @@ def _published(path: str, table: EpisodeTable) -> FoundRanges:
 
 def _read_list(path: str) -> dict[str, object]:
     needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
+    where = f"data.idle.ranges: {path}"
     try:
-        content = json.loads(storage.read_bytes(path))
+        return json_object(storage.read_bounded(path, _MOST_BYTES), where=where, needed=needed)
     except OSError as error:
-        raise InputError(where=f"data.idle.ranges: {path}", found=f"cannot be read ({error})", needed=needed) from None
-    except ValueError as error:
-        raise InputError(where=f"data.idle.ranges: {path}", found=f"not JSON ({error})", needed=needed) from None
-    if not isinstance(content, dict):
-        raise InputError(where=f"data.idle.ranges: {path}", found=f"a JSON {type(content).__name__}", needed=needed)
-    return content
+        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed) from None
 
 
 def _checked(ranges: object, name: str, steps: int, path: str) -> list[tuple[int, int]]:
@@ -175,7 +196,7 @@ def _checked(ranges: object, name: str, steps: int, path: str) -> list[tuple[int
     if not whole or edges != sorted(edges) or any(start == end for start, end in pairs):
         raise InputError(
             where=f"data.idle.ranges: {path}: {name}",
-            found=str(ranges)[:200],
+            found=shown(ranges),
             needed="pairs [start, end) of steps that do not overlap",
         )
     if edges and not 0 <= edges[0] <= edges[-1] <= steps:

@@ -7,6 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 
+class NotLinesError(ValueError):
+    """Columns are not what `pack_lines` returned."""
+
+
 def pack_lines(name: str, lines: Sequence[str]) -> dict[str, np.ndarray]:
     """Return columns that hold these texts under a name."""
     encoded = [line.encode() for line in lines]
@@ -14,8 +18,20 @@ def pack_lines(name: str, lines: Sequence[str]) -> dict[str, np.ndarray]:
     return {f"{name}_ends": ends, f"{name}_bytes": np.frombuffer(b"".join(encoded), np.uint8)}
 
 
+def require_lines(ends: np.ndarray, data: np.ndarray | None) -> None:
+    """Refuse columns that `pack_lines` cannot have made.
+
+    Raises:
+        NotLinesError: The ends do not lie within the bytes, in their order.
+    """
+    fits = data is not None and data.dtype == np.uint8 and ends.dtype == np.int64
+    edges = np.concatenate([[0], ends, [0 if data is None else len(data)]])
+    if not fits or (np.diff(edges) < 0).any() or edges[-2] != edges[-1]:
+        raise NotLinesError("no lines")
+
+
 def line_of(name: str, columns: Mapping[str, np.ndarray], index: int) -> str:
     """Return one of the texts that `pack_lines` packed."""
     ends = columns[f"{name}_ends"]
     start = int(ends[index - 1]) if index else 0
-    return columns[f"{name}_bytes"][start : int(ends[index])].tobytes().decode()
+    return columns[f"{name}_bytes"][start : int(ends[index])].tobytes().decode(errors="replace")

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import io
+import struct
+import zlib
 from pathlib import Path
 
 import numpy as np
 import simplejpeg
 from jaxtyping import UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
 
+from vjepa2_ac.data.picture_size import require_bounded, require_few_scans
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import read_bytes, unreadable
 
@@ -34,25 +38,27 @@ def decode_picture(picture: bytes, where: str) -> UInt8[np.ndarray, "height widt
     """Return the RGB pixels of PNG or JPEG bytes; transparency is left out.
 
     Raises:
-        InputError: They are neither, damaged, or of more than 8 bits a channel.
+        InputError: They are neither, damaged, too large, or of more than 8 bits a channel.
     """
     try:
         if picture.startswith(_JPEG):
-            return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB"))
-        with Image.open(io.BytesIO(picture), formats=["PNG"]) as image:
+            return _jpeg(picture, where)
+        with PngImageFile(io.BytesIO(picture)) as image:  # which reads the header only
+            require_bounded(image.height, image.width, where)
             return _as_rgb(image)
-    except UnidentifiedImageError:  # its words name an object in memory
-        raise InputError(
-            where=where,
-            found=f"{len(picture)} bytes that are no picture, starting with {picture[:4]!r}",
-            needed="a picture: PNG or JPEG",
-        ) from None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except (OSError, ValueError, SyntaxError, struct.error, zlib.error, EOFError, IndexError) as error:
         raise InputError(
             where=where,
             found=f"{len(picture)} bytes that are no picture, starting with {picture[:4]!r} ({error})",
             needed="PNG or JPEG",
         ) from None
+
+
+def _jpeg(picture: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    height, width, _, _ = simplejpeg.decode_jpeg_header(picture)
+    require_bounded(height, width, where)
+    require_few_scans(picture, height, width, where)
+    return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB"))
 
 
 def _as_rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:

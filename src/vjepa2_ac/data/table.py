@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, overload
@@ -16,9 +15,12 @@ from typing import Any, overload
 import numpy as np
 from jaxtyping import Int8, Int32, Int64, UInt8, UInt64
 
+from vjepa2_ac.data.arrays import read_arrays
 from vjepa2_ac.data.labels import Labels
-from vjepa2_ac.data.lines import line_of, pack_lines
+from vjepa2_ac.data.lines import NotLinesError, line_of, pack_lines, require_lines
 from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import json_object, record_of
 
 FORMAT = 2  # of `to_bytes`: with another number an index is built again
 
@@ -151,26 +153,87 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             NotATableError: It is something else, or damaged.
         """
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-            text = json.loads(arrays.pop("text").tobytes())
-            return cls(
-                **{name: arrays[name] for name in _COLUMNS},
-                problems=tuple(Problem(**problem) for problem in text["problems"]),
-                locators={name.removeprefix(_LOCATOR): a for name, a in arrays.items() if name.startswith(_LOCATOR)},
-                texts=text["texts"],
-                state_hash=arrays.get(_HASH),
-                labels={
-                    name: Labels(tuple(names), arrays[f"{_LABEL}{name}"])
-                    for name, names in text.get("labels", {}).items()
-                },
-            )
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+            arrays = read_arrays(data)
+            text = record_of(_Text, json_object(arrays.pop("text").tobytes(), where="text"), where="text")
+        except (InputError, KeyError) as error:
             raise NotATableError(str(error)) from None
+        locators = {name.removeprefix(_LOCATOR): one for name, one in arrays.items() if name.startswith(_LOCATOR)}
+        _require_columns(arrays, locators)
+        columns = {name: arrays[name] for name in _COLUMNS}
+        return cls(
+            **columns,
+            problems=text.problems,
+            locators=locators,
+            texts=text.texts,
+            state_hash=_column(arrays, _HASH, np.uint64) if _HASH in arrays else None,
+            labels={name: _labels(arrays, name, names) for name, names in text.labels.items()},
+        )
+
+
+@dataclass(frozen=True)
+class _Text:
+    """What of a table is no numbers."""
+
+    problems: tuple[Problem, ...]
+    texts: Mapping[str, str]
+    labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 _HASH = "state_hash"
-_COLUMNS = ("num_steps", "success", "id_ends", "id_bytes", "id_hash", "id_rank")
+_COLUMNS = {
+    "num_steps": np.int32,
+    "success": np.int8,
+    "id_ends": np.int64,
+    "id_bytes": np.uint8,
+    "id_hash": np.uint64,
+    "id_rank": np.int32,
+}
+
+
+def _require_columns(arrays: Mapping[str, np.ndarray], locators: Mapping[str, np.ndarray]) -> None:
+    """Refuse columns that contradict each other: places of episodes would lead anywhere.
+
+    Raises:
+        NotATableError: They do.
+    """
+    for name, kind in _COLUMNS.items():
+        if name not in arrays or arrays[name].dtype != kind or arrays[name].ndim != 1:
+            raise NotATableError(f"no column {name} of {np.dtype(kind)}")
+    episodes = len(arrays["num_steps"])
+    whole = {name: arrays[name] for name in _COLUMNS} | {f"locator {name}": one for name, one in locators.items()}
+    for name, column in whole.items():
+        if column.ndim != 1 or column.dtype.kind not in "iuf" or (len(column) != episodes and not _is_packed(name)):
+            raise NotATableError(f"the column {name} is {column.dtype} of shape {column.shape}, of {episodes} episodes")
+    for packed in [name.removesuffix("_ends") for name in whole if name.endswith("_ends")]:
+        try:
+            require_lines(whole[f"{packed}_ends"], whole.get(f"{packed}_bytes"))
+        except NotLinesError:
+            raise NotATableError(f"the texts of {packed} do not fit together") from None
+    if (arrays["num_steps"] < 0).any():
+        raise NotATableError("an episode of less than no steps")
+
+
+def _column(arrays: Mapping[str, np.ndarray], name: str, kind: type[np.generic]) -> np.ndarray:
+    """Return a column that not every table has: one value for each episode.
+
+    Raises:
+        NotATableError: It is missing, or of another type or length.
+    """
+    column, episodes = arrays.get(name), len(arrays["num_steps"])
+    if column is None or column.dtype != kind or column.shape != (episodes,):
+        raise NotATableError(f"no column {name} of {np.dtype(kind)} for {episodes} episodes")
+    return column
+
+
+def _labels(arrays: Mapping[str, np.ndarray], name: str, names: tuple[str, ...]) -> Labels:
+    try:
+        return Labels(names, _column(arrays, f"{_LABEL}{name}", np.int32))
+    except ValueError as error:
+        raise NotATableError(str(error)) from None
+
+
+def _is_packed(name: str) -> bool:
+    return name.endswith("_bytes")
 
 
 def identity_hash(identity: str) -> int:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vjepa2_ac import storage
+from vjepa2_ac.data.picture_size import MOST_PIXELS, require_bounded
 from vjepa2_ac.data.video_parts import QuietFile, Wanted
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
@@ -29,7 +30,10 @@ if TYPE_CHECKING:
     from av.video.stream import VideoStream
 
 _DEMUXER = "mp4"  # by name: libav would otherwise follow play lists to other files
-_STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}  # an error rather than a guessed picture
+_STRICT = {
+    "err_detect": "crccheck+bitstream+buffer+explode",  # an error rather than a guessed picture
+    "max_pixels": str(MOST_PIXELS),
+}
 _START = -(1 << 40)  # before every picture
 _FIX = "Copy the file again, or leave the episode out"
 
@@ -194,6 +198,7 @@ class _Video:
 
     def decode(self, targets: list[int], clock: Clock | None) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
         """Return the pictures shown at these ascending times; with a clock, the first within half a step of each."""
+        require_bounded(self.stream.height or 1, self.stream.width or 1, self.where, count=len(targets))
         wanted = Wanted(targets, 0 if clock is None else max(0, int(0.49 / clock.rate_hz / self._unit_s)))
         while (target := wanted.first) is not None:
             before = len(wanted.frames)
@@ -252,6 +257,7 @@ class _Video:
             if frame.is_corrupt:
                 time = f"{target * self._unit_s:.3f} s"
                 raise InputError(where=self.where, found=f"a damaged picture at {time}", needed="a whole MP4", fix=_FIX)
+            require_bounded(frame.height, frame.width, self.where, count=wanted.count)
             picture = self.converter.reformat(frame, format="rgb24", threads=1)
             wanted.frames[target] = np.asarray(picture.to_ndarray())
 

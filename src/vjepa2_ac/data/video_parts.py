@@ -20,6 +20,11 @@ class Wanted:
         self.frames: dict[int, Any] = {}
 
     @property
+    def count(self) -> int:
+        """How many pictures are wanted."""
+        return len(self._targets)
+
+    @property
     def first(self) -> int | None:
         """The first time whose picture is missing."""
         return next((target for target in self._targets if target not in self.frames), None)

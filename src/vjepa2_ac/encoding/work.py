@@ -19,6 +19,7 @@ from vjepa2_ac.data.sources.latents.writer import CacheWriter
 from vjepa2_ac.encoding.ahead import Wanted
 from vjepa2_ac.encoding.room import Room, picture_bytes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import read_json_object, record_of
 
 _BROKEN, _KEY = "broken", "key.json"
 
@@ -119,10 +120,10 @@ def _require_empty(folder: Path) -> None:
 def _begun(path: Path) -> CacheKey | None:
     """Return the key of a cache that was begun."""
     try:
-        return CacheKey(json.loads(path.read_text(encoding="utf-8")))
+        return CacheKey(read_json_object(path, fix="Delete this folder"))
     except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", fix="Delete this folder") from None
 
 
@@ -140,8 +141,17 @@ def forget_broken(folder: Path, episode: int) -> None:
 
 def broken_in(folder: Path) -> Mapping[str, str]:
     """Return the episodes that were noted, by whatever process, and why."""
-    notes = [json.loads(path.read_text(encoding="utf-8")) for path in sorted((folder / _BROKEN).glob("*.json"))]
-    return {note["name"]: note["reason"] for note in notes}
+    paths = sorted((folder / _BROKEN).glob("*.json"))
+    notes = [record_of(_Note, read_json_object(path), where=str(path), fix="Delete this file") for path in paths]
+    return {note.name: note.reason for note in notes}
+
+
+@dataclass(frozen=True)
+class _Note:
+    """An episode that cannot be read, and why."""
+
+    name: str
+    reason: str
 
 
 def _note_of(folder: Path, episode: int) -> Path:

@@ -45,8 +45,10 @@ from vjepa2_ac.evaluation.result import (
 )
 from vjepa2_ac.evaluation.verdict import uses_actions, verdict
 from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.structured import read_json_object, shown
 
 METRICS_FILE = "metrics.json"
+_MOST_BYTES = 1 << 28  # landscapes are long
 FORMAT = 1  # goes up when a reader of the file would have to change
 
 _NUMBERS = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null|true|false),?\s+)+)\]")  # a list of plain values, over lines
@@ -68,16 +70,17 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     path = folder / METRICS_FILE
     fix = f"Write it with `vjepa2-ac evaluate {folder}`"
     try:
-        figures = json.loads(path.read_text(encoding="utf-8"))
+        figures = read_json_object(path, most_bytes=_MOST_BYTES, fix=fix)
     except FileNotFoundError:
         raise InputError(
             where=str(folder), found=f"no {METRICS_FILE}" if folder.is_dir() else "no such folder", fix=fix
         ) from None
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", fix=fix) from None
-    if not isinstance(figures, dict) or figures.get("format") != FORMAT:
-        found = figures.get("format") if isinstance(figures, dict) else None
-        raise InputError(where=str(path), found=f"format {found}", needed=f"format {FORMAT}", fix=fix)
+    if figures.get("format") != FORMAT:
+        raise InputError(
+            where=str(path), found=f"format {shown(figures.get('format'))}", needed=f"format {FORMAT}", fix=fix
+        )
     return figures
 
 

@@ -10,6 +10,7 @@ from torch import nn
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import require_quick
 
 ATTENTION = ("q", "k", "v", "o")
 MLP = ("fc1", "fc2")
@@ -37,6 +38,11 @@ def lora_arguments(predictor: nn.Module, config: AdapterConfig, unused: tuple[st
     _check_patterns("alpha_pattern", config.alpha_pattern, adapted)
     if config.init == "pissa":
         _check_ranks(config, adapted)
+    return peft_arguments(config, targets)
+
+
+def peft_arguments(config: AdapterConfig, targets: Iterable[str]) -> dict[str, Any]:
+    """Return the arguments of PEFT's LoraConfig for layers of these names; whether they fit is not looked at."""
     return {
         "r": config.rank,
         "lora_alpha": config.alpha,
@@ -80,11 +86,8 @@ def chosen_targets(config: AdapterConfig, linear: set[str]) -> tuple[str, ...]:
 
 def _check_patterns(knob: str, patterns: Mapping[str, object], adapted: Iterable[str]) -> None:
     for pattern in patterns:
-        try:
-            matched = any(_matches(pattern, name) for name in adapted)
-        except re.error as error:
-            raise InputError(where=f"adapter.{knob}", found=f"{pattern!r}, no regular expression ({error})") from None
-        if not matched:
+        require_quick(pattern, where=f"adapter.{knob}")
+        if not any(_matches(pattern, name) for name in adapted):
             raise InputError(
                 where=f"adapter.{knob}",
                 found=f"{pattern!r} matches no layer that gets an adapter",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from torch import nn
 from vjepa2_ac import storage
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import message_of, read_json_object
 
 FORMAT = "vjepa2-ac world model 1"
 CONFIG, ENCODER, PREDICTOR = "config.json", "encoder.safetensors", "predictor/model.safetensors"
@@ -55,17 +58,18 @@ def read_sizes(folder: Path) -> ModelSizes:
     needed = "a folder written by `vjepa2-ac export` or WorldModel.save_pretrained"
     fix = "Of a run, `vjepa2-ac export RUN FOLDER` makes one"
     try:
-        card = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
+        card = read_json_object(folder / CONFIG, needed=needed, fix=fix)
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
-    except (OSError, ValueError) as error:
+    except OSError as error:
         raise InputError(where=where, found=f"cannot be read ({error})", needed=needed, fix=fix) from None
-    if not isinstance(card, dict) or card.get("format") != FORMAT:
+    if card.get("format") != FORMAT:
         raise InputError(where=where, found="not the config of a world model", needed=needed, fix=fix)
     try:
-        return ModelSizes.model_validate_json(json.dumps(card["sizes"]))
-    except (KeyError, ValidationError) as error:
-        raise InputError(where=where, found=f"sizes that cannot be used ({error})", needed=needed, fix=fix) from None
+        return ModelSizes.model_validate_json(json.dumps(card.get("sizes")))
+    except ValidationError as error:
+        said = [f"{'.'.join(map(str, ('sizes', *one['loc'])))}: {message_of(one)}" for one in error.errors()[:4]]
+        raise InputError(where=where, found="; ".join(said), needed=needed, fix=fix) from None
 
 
 def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -> None:
@@ -75,26 +79,36 @@ def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -
         InputError: The file is missing or damaged, or its tensors are not those of the module.
     """
     needed = {name: tuple(value.shape) for name, value in module.state_dict().items()}
-    try:
-        with safe_open(path, framework="pt") as file:
-            found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
-            check_tensors(found, needed, where=str(path))
-            weights = {name: _cast(file.get_tensor(name), dtype) for name in needed}
-    except FileNotFoundError:
-        raise InputError(
-            where=str(path),
-            found="no such file",
-            needed="the weights of a world model",
-            fix="Copy or write the folder again",
-        ) from None
-    except (SafetensorError, OSError) as error:
-        raise InputError(
-            where=str(path), found=f"not a whole safetensors file ({error})", fix="Copy or write it again"
-        ) from None
+    with opened_safetensors(path, needed="the weights of a world model") as file:
+        check_tensors(shapes_of(file), needed, where=str(path))
+        weights = {name: _cast(file.get_tensor(name), dtype) for name in needed}
     frozen = {name: value.requires_grad for name, value in module.named_parameters()}
     module.load_state_dict(weights, strict=True, assign=True)
     for name, value in module.named_parameters():
         value.requires_grad_(frozen[name])
+
+
+@contextmanager
+def opened_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
+    """Open a safetensors file; its header is checked against its size, and its tensors are mapped, not read.
+
+    Raises:
+        InputError: The file is missing, cut off, or none of its kind.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            yield file
+    except FileNotFoundError:
+        fix = "Copy or write the folder again"
+        raise InputError(where=str(path), found="no such file", needed=needed, fix=fix) from None
+    except (SafetensorError, OSError, TypeError) as error:  # the last of a type that torch does not have
+        found = f"not a whole safetensors file ({error})"
+        raise InputError(where=str(path), found=found, fix="Copy or write it again") from None
+
+
+def shapes_of(file: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the tensors in an open safetensors file."""
+    return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
 
 
 def check_tensors(found: dict[str, tuple[int, ...]], needed: dict[str, tuple[int, ...]], *, where: str) -> None:

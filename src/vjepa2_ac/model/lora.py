@@ -17,7 +17,8 @@ from torch import Tensor, nn
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter_layers import lora_arguments
+from vjepa2_ac.model.adapter_file import ADAPTER_FILE, read_adapter_file
+from vjepa2_ac.model.adapter_layers import lora_arguments, peft_arguments
 from vjepa2_ac.model.adapter_start import (
     draw_first_matrices,
     measure_magnitudes,
@@ -256,7 +257,7 @@ def _set_trainable(model: WorldModel, trainable: bool) -> None:
 
 
 def _load_lora(model: WorldModel, folder: Path) -> None:
-    config = _read_lora_config(folder)
+    config = _read_lora_config(folder, model)
     if model.adaptation is None:
         _wrap(model, config)
     else:
@@ -267,12 +268,16 @@ def _load_lora(model: WorldModel, folder: Path) -> None:
     set_peft_model_state_dict(model.predictor, weights)
 
 
-def _read_lora_config(folder: Path) -> Any:
+def _read_lora_config(folder: Path, model: WorldModel) -> Any:
+    """Return what an adapter was made with, as PEFT takes it; on a base it is seen to fit."""
+    knobs = read_adapter_file(folder, LoraConfig().to_dict())
+    if model.adaptation is not None:
+        return LoraConfig(**peft_arguments(knobs, knobs.targets))
     try:
-        return LoraConfig.from_pretrained(str(folder))
-    except (OSError, ValueError, TypeError) as error:
+        return LoraConfig(**lora_arguments(model.predictor, knobs, unused=_unused(model)))
+    except InputError as error:
         raise InputError(
-            where=str(folder / "adapter_config.json"), found=f"cannot be read ({error})", needed="a LoRA of PEFT"
+            where=f"{folder / ADAPTER_FILE}: {error.where}", found=error.found, needed=error.needed, fix=error.fix
         ) from None
 
 

@@ -4,22 +4,45 @@ from __future__ import annotations
 
 import errno
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
+from pydantic import Field
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 
+from vjepa2_ac.config.model import VectorWidth
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.folder import check_tensors
+from vjepa2_ac.model.folder import check_tensors, opened_safetensors, shapes_of
 from vjepa2_ac.model.world_model import Adaptation, WorldModel
+from vjepa2_ac.structured import read_json_object, record_of
 
 CARD = "vjepa2_ac.json"
 LORA_WEIGHTS = "adapter_model.safetensors"  # PEFT's name
 FULL_WEIGHTS = "predictor.safetensors"
 PRINCIPAL_PARTS = "pissa_start.safetensors"  # what an adapter of init pissa started from, and the base then lacks
+
+
+@dataclass(frozen=True)
+class _Heads:
+    """Fresh heads: the widths of states and actions, and what they were drawn from."""
+
+    state_dim: VectorWidth
+    action_dim: VectorWidth
+    seed: Annotated[int, Field(ge=0, lt=2**63)]
+
+
+@dataclass(frozen=True)
+class _Card:
+    """What was trained, and on which base."""
+
+    kind: Literal["lora", "none"]
+    base_predictor: str
+    encoder: str
+    fresh_heads: _Heads | None = None
 
 
 def write_trained(
@@ -54,14 +77,14 @@ def read_kind(folder: Path, model: WorldModel) -> str:
     """
     card = _read_card(folder)
     _check_base(model, card, where=str(folder / CARD))
-    if model.adaptation is not None and model.adaptation.kind != card["kind"]:
+    if model.adaptation is not None and model.adaptation.kind != card.kind:
         raise InputError(
             where=str(folder),
-            found=f"an adapter of kind {card['kind']}",
+            found=f"an adapter of kind {card.kind}",
             needed=f"one of kind {model.adaptation.kind}, as the model has",
             fix="Set adapter.kind to the one it was trained with",
         )
-    return str(card["kind"])
+    return card.kind
 
 
 def read_fresh_heads(folder: Path) -> tuple[Widths, int] | None:
@@ -70,21 +93,8 @@ def read_fresh_heads(folder: Path) -> tuple[Widths, int] | None:
     Raises:
         InputError: The folder is of another kind, or damaged.
     """
-    card = _read_card(folder)
-    if "fresh_heads" not in card:
-        return None
-    try:
-        said = card["fresh_heads"]
-        state, action, seed = (int(said[key]) for key in ("state_dim", "action_dim", "seed"))
-    except (KeyError, TypeError, ValueError):
-        state = action = seed = 0
-    if min(state, action) < 1:
-        raise InputError(
-            where=str(folder / CARD),
-            found=f"fresh_heads that cannot be used: {card['fresh_heads']!r}"[:200],
-            needed="state_dim, action_dim and seed, as they were written",
-        )
-    return Widths(state, action), seed
+    heads = _read_card(folder).fresh_heads
+    return None if heads is None else (Widths(heads.state_dim, heads.action_dim), heads.seed)
 
 
 def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -93,15 +103,10 @@ def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
     Raises:
         InputError: The file is missing or damaged, or holds other tensors.
     """
-    try:
-        weights = dict(load_file(path))
-    except FileNotFoundError:
-        raise InputError(where=str(path), found="no such file", needed="the weights of an adapter") from None
-    except (SafetensorError, OSError) as error:
-        raise InputError(where=str(path), found=f"not a whole safetensors file ({error})") from None
-    found, needed = ({name: tuple(value.shape) for name, value in some.items()} for some in (weights, like))
-    check_tensors(found, needed, where=str(path))
-    return weights
+    needed = {name: tuple(value.shape) for name, value in like.items()}
+    with opened_safetensors(path, needed="the weights of an adapter") as file:
+        check_tensors(shapes_of(file), needed, where=str(path))
+        return {name: file.get_tensor(name).clone() for name in needed}  # the file may be replaced meanwhile
 
 
 def _save(weights: dict[str, Tensor], path: Path) -> None:
@@ -111,30 +116,28 @@ def _save(weights: dict[str, Tensor], path: Path) -> None:
         raise OSError(errno.EIO, str(error), str(path)) from None
 
 
-def _read_card(folder: Path) -> dict[str, Any]:
-    needed = "a folder written by save_trained"
+def _read_card(folder: Path) -> _Card:
+    path, needed = folder / CARD, "the card of an adapter, as save_trained writes it"
     try:
-        card = json.loads((folder / CARD).read_text(encoding="utf-8"))
+        card = read_json_object(path, needed=needed)
     except FileNotFoundError:
-        raise InputError(where=str(folder / CARD), found="no such file", needed=needed) from None
-    except (OSError, ValueError) as error:
-        raise InputError(where=str(folder / CARD), found=f"cannot be read ({error})", needed=needed) from None
-    if not isinstance(card, dict) or card.get("kind") not in ("lora", "none"):
-        raise InputError(where=str(folder / CARD), found="not the card of an adapter", needed=needed)
-    return card
+        raise InputError(where=str(path), found="no such file", needed=needed) from None
+    except OSError as error:
+        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=needed) from None
+    return record_of(_Card, card, where=str(path), needed=needed)
 
 
-def _check_base(model: WorldModel, card: dict[str, Any], *, where: str) -> None:
+def _check_base(model: WorldModel, card: _Card, *, where: str) -> None:
     own = model.adaptation.base if model.adaptation else model.predictor_fingerprint()
     encoder = model.adaptation.encoder if model.adaptation else model.encoder_fingerprint()
     for part, found, needed in (
-        ("predictor", own, card.get("base_predictor")),
-        ("encoder", encoder, card.get("encoder")),
+        ("predictor", own, card.base_predictor),
+        ("encoder", encoder, card.encoder),
     ):
         if found != needed:
             raise InputError(
                 where=where,
-                found=f"an adapter trained on another {part} ({str(needed)[:12]})",
+                found=f"an adapter trained on another {part} ({needed[:12]})",
                 needed=f"one trained on this model's {part} ({found[:12]})",
                 fix="Set model.base to the model it was trained on",
             )

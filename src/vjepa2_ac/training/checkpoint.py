@@ -16,10 +16,15 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
 
 from vjepa2_ac.config import CheckpointConfig
+from vjepa2_ac.config.section import PositiveInt
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import sync
+from vjepa2_ac.structured import read_json_object, record_of
 from vjepa2_ac.training.manifest import broken_seal, seal
 
 logger = logging.getLogger(__name__)
@@ -28,24 +33,28 @@ STATE = "state.json"
 ADAPTER = "adapter"  # a folder: what `model.lora.save_trained` writes
 OPTIMIZER = "optimizer.pt"
 _NAME = re.compile(r"step-(\d{8})$")
+_NEEDED = "where a run stood, as this program wrote it"
+_FIX = "Delete this checkpoint, to use an older one"
+
+Count = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 @dataclass(frozen=True)
 class RunState:
     """Where a run stands. Data order, learning rate and random numbers are functions of the step."""
 
-    step: int  # optimizer steps done
+    step: Count  # optimizer steps done
     run_id: str = ""  # a random name that stays with the run for good, wherever it goes on
-    clips_done: int = 0  # place in the row of clips of the whole run
-    clips_per_step: int | None = None  # of all processes together
-    clips_asked: int | None = None  # of one process, by the config: batch_size * accumulation
-    processes: int = 1
+    clips_done: Count = 0  # place in the row of clips of the whole run
+    clips_per_step: PositiveInt | None = None  # of all processes together
+    clips_asked: PositiveInt | None = None  # of one process, by the config: batch_size * accumulation
+    processes: PositiveInt = 1
     broken: Mapping[str, str] = field(default_factory=dict)  # episodes that clips could not be read from, and why
-    windows: int | None = None  # clips of an epoch: with another number, their order is another
-    best_step: int | None = None  # the validation that went best, where checkpoint.keep_best is set
-    best_error: float | None = None
+    windows: Count | None = None  # clips of an epoch: with another number, their order is another
+    best_step: Count | None = None  # the validation that went best, where checkpoint.keep_best is set
+    best_error: Annotated[float, Field(allow_inf_nan=False)] | None = None
     measured_on: Mapping[str, str] | None = None  # what validation errors are of, see `training.best`
-    loss_scale: Mapping[str, float] | None = None  # of fp16: state of the gradient scaler
+    loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
 
     def measured(self, error: float) -> RunState:
         """Return the state after a validation at its step: another one only where that went better than any before."""
@@ -152,11 +161,20 @@ def read_state(checkpoint: Path) -> RunState:
 
 
 def written_state(checkpoint: Path) -> RunState:
-    """Return where the run stood, as it was written, whatever became of the best checkpoint since."""
-    values = json.loads((checkpoint / STATE).read_text())
+    """Return where the run stood, as it was written, whatever became of the best checkpoint since.
+
+    Raises:
+        InputError: The file is missing or damaged, or of an older version of this program.
+    """
+    path = checkpoint / STATE
+    try:
+        values = read_json_object(path, needed=_NEEDED, fix=_FIX, allow_nan=True)  # a loss scale may be infinite
+    except OSError as error:
+        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED, fix=_FIX) from None
     if "clips_done" not in values:  # or the run would begin the row of clips again
-        raise ValueError(f"{STATE} is of an older version of this program, without clips_done")
-    return RunState(**values)
+        found = "of an older version of this program, without clips_done"
+        raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX)
+    return record_of(RunState, values, where=str(path), needed=_NEEDED, fix=_FIX)
 
 
 def _listed(folder: Path) -> list[Path]:

@@ -55,10 +55,7 @@ def choose_checkpoint(run: Path, by: str = NEWEST) -> Chosen:
 
 
 def _best_step(newest: Path) -> int:
-    try:
-        step = written_state(newest).best_step
-    except (OSError, ValueError, TypeError) as error:
-        raise InputError(where=str(newest), found=f"not the state of a run ({error})") from None
+    step = written_state(newest).best_step
     if step is None:
         found = (
             "no best checkpoint: checkpoint.keep_best was off, there was no validation yet, what it measures was"

@@ -11,10 +11,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import read_bounded, write_atomically
+from vjepa2_ac.structured import json_object
 from vjepa2_ac.training.trackers import Trackers
 
 logger = logging.getLogger(__name__)
+
+_MOST_BYTES = 1 << 28
 
 
 class Journal:
@@ -57,15 +61,19 @@ class Journal:
 
 
 def read_journal(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a metrics.jsonl; a last line that a killed process left by halves is passed over."""
+    """Yield the rows of a metrics.jsonl; a last line that a killed process left by halves is passed over.
+
+    Raises:
+        InputError: The file is too large to be one.
+    """
     if not path.exists():
         return
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in read_bounded(path, _MOST_BYTES).decode(errors="replace").splitlines():
         try:
-            row = json.loads(line)
-        except ValueError:
-            row = None
-        if isinstance(row, dict) and isinstance(row.get("step"), int):
+            row = json_object(line, where=str(path), allow_nan=True)
+        except InputError:
+            row = {}
+        if type(row.get("step")) is int and isinstance(row.get("kind"), str):
             yield row
         else:
             logger.warning("%s: a line is not a row of figures, or was left by halves; it is dropped", path)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Set
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
-from vjepa2_ac.storage import sha256_of_file, sync
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import read_bounded, sha256_of_file, sync
+from vjepa2_ac.structured import MOST_BYTES as _MOST_BYTES
+from vjepa2_ac.structured import json_object, shown
 
 MANIFEST = "manifest.json"
 
@@ -38,7 +41,7 @@ def broken_seal(folder: Path, needed: Set[str]) -> str | None:
         needed: Files that the manifest must name.
     """
     try:
-        files = json.loads((folder / MANIFEST).read_text())["files"]
+        files = named_files(read_bounded(folder / MANIFEST, _MOST_BYTES))
         if absent := needed - files.keys():
             return f"{MANIFEST} does not name {', '.join(sorted(absent))}"
         for name, digest in files.items():
@@ -48,6 +51,24 @@ def broken_seal(folder: Path, needed: Set[str]) -> str | None:
                 return f"{name} is missing"
             if sha256_of_file(folder / name) != digest:
                 return f"{name} is damaged (its SHA-256 is not the manifest's)"
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except InputError as error:
+        return f"no readable {MANIFEST} ({error.found})"
+    except OSError as error:
         return f"no readable {MANIFEST} ({error})"
     return None
+
+
+def named_files(manifest: bytes) -> dict[str, str]:
+    """Return the files that a manifest names, in the folder that it lies in, with the SHA-256 of each.
+
+    Raises:
+        InputError: It is not one, or names a file elsewhere.
+    """
+    files = json_object(manifest, where=MANIFEST).get("files")
+    if not isinstance(files, dict) or not all(isinstance(digest, str) for digest in files.values()):
+        raise InputError(where=MANIFEST, found=f"files {shown(files)}", needed="the SHA-256 of each file, by its name")
+    for name in files:
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts or not path.parts or str(path) != name:
+            raise InputError(where=MANIFEST, found=f"it names {name}, which is outside", needed="files beside it")
+    return files

@@ -18,6 +18,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import platform
+import re
 import secrets
 import sys
 import tempfile
@@ -27,13 +28,16 @@ from pathlib import Path
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import changed_keys, config_as_dict, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.storage import read_bounded, write_atomically
+from vjepa2_ac.structured import read_json_list, shown
 from vjepa2_ac.training.run_lock import LOCK
 
 CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
 RUN_ID = "run_id"
 CHECKPOINTS = "checkpoints"
+_ID = re.compile(r"[\w.-]{0,128}")
+_MOST_BYTES_OF_ID = 1_000
 NOT_FINITE = "not_finite"  # each process writes its own, on the disk that it sees
 
 # Settings that may change between two starts of one run. They do not change what is computed, but for those by which a
@@ -110,9 +114,18 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
 
 
 def run_id(folder: Path) -> str:
-    """Return the name that a run got at its first start; a new one where there is none."""
+    """Return the name that a run got at its first start; a new one where there is none.
+
+    Raises:
+        InputError: It cannot be a name: it becomes part of those that trackers give.
+    """
     path = folder / RUN_ID
-    return path.read_text().strip() if path.is_file() else secrets.token_hex(8)
+    if not path.is_file():
+        return secrets.token_hex(8)
+    name = read_bounded(path, _MOST_BYTES_OF_ID).decode(errors="replace").strip()
+    if not _ID.fullmatch(name):
+        raise InputError(where=str(path), found=shown(name), needed="the name of a run, letters and digits")
+    return name
 
 
 def config_changes(config: Config) -> list[str]:
@@ -165,10 +178,9 @@ def _is_without_config(path: Path) -> bool:
 
 def _earlier_starts(path: Path) -> list[object]:
     try:
-        starts = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_json_list(path)
+    except (OSError, InputError):
         return []
-    return starts if isinstance(starts, list) else []
 
 
 def _setting(config: Config, dotted_key: str) -> str:

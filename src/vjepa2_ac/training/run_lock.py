@@ -19,10 +19,12 @@ from typing import TextIO
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import user_can_write
+from vjepa2_ac.structured import json_object
 
 logger = logging.getLogger(__name__)
 
 LOCK = ".lock"
+_MOST_CHARACTERS = 10_000
 
 _TAKEN = frozenset({errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES})
 
@@ -94,9 +96,9 @@ def _holder(file: TextIO) -> str:
     """Return who signed the lock, in words."""
     try:
         file.seek(0)
-        who = json.load(file)
+        who = json_object(file.read(_MOST_CHARACTERS), where=LOCK)
         return f"process {who['process']} on {who['host']}, since {who['since']}"
-    except (OSError, ValueError, TypeError, KeyError):  # it is signing just now
+    except (OSError, ValueError, KeyError, InputError):  # it is signing just now
         return "another process"
 
 

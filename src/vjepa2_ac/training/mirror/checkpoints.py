@@ -8,16 +8,18 @@ are not sent again.
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
-from vjepa2_ac.storage import download, file_sizes, join, read_bytes, remove, remove_folder, upload
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.remote import UnreachableError
+from vjepa2_ac.storage import download, file_sizes, join, read_bounded, remove, remove_folder, upload
+from vjepa2_ac.structured import MOST_BYTES, read_json_object
 from vjepa2_ac.training.checkpoint import STATE, damage
-from vjepa2_ac.training.manifest import MANIFEST
+from vjepa2_ac.training.manifest import MANIFEST, named_files
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 
 SENDING = ".sending.json"
@@ -60,10 +62,12 @@ class RemoteCheckpoints:
     def run_id(self, name: str) -> str | None:
         """Return the run that a checkpoint is of; None where it does not tell."""
         try:
-            state = json.loads(read_bytes(self._path(name, STATE)))
-        except (FileNotFoundError, ValueError):
+            state = read_json_object(self._path(name, STATE), allow_nan=True)
+        except UnreachableError:
+            raise
+        except (FileNotFoundError, InputError):
             return None
-        return str(state.get("run_id", "")) if isinstance(state, dict) else None
+        return str(state.get("run_id", ""))
 
     def send(self, checkpoint: Path, files: Mapping[str, int], before_each: Callable[[], None]) -> None:
         """Bring a whole checkpoint of this machine there, as far as it is not there yet.
@@ -74,7 +78,7 @@ class RemoteCheckpoints:
             before_each: Called before each file; whatever it raises ends the sending.
         """
         name, manifest = checkpoint.name, (checkpoint / MANIFEST).read_bytes()
-        sizes = {path: (checkpoint / path).stat().st_size for path in _files_of(manifest)}
+        sizes = {path: (checkpoint / path).stat().st_size for path in named_files(manifest)}
         there = self._of_this(name, files, manifest)
         missing = [path for path, size in sizes.items() if there.get(path) != size]
         if missing and MANIFEST in there:  # somebody took a file away
@@ -99,20 +103,22 @@ class RemoteCheckpoints:
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         try:
-            manifest = read_bytes(self._path(name, MANIFEST))
-            for path in _files_of(manifest):
+            manifest = read_bounded(self._path(name, MANIFEST), MOST_BYTES)
+            for path in named_files(manifest):
                 download(self._path(name, path), folder / path)
+        except UnreachableError:
+            raise
         except FileNotFoundError as error:
             return f"a file is missing ({error})"
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            return f"no readable {MANIFEST} ({error})"
+        except InputError as error:
+            return f"no readable {MANIFEST} ({error.found})"
         (folder / MANIFEST).write_bytes(manifest)
         return damage(folder)
 
     def _of_this(self, name: str, files: Mapping[str, int], manifest: bytes) -> Mapping[str, int]:
         """Return what is there of this very checkpoint; of another by this name nothing is left."""
         claim = next((claim for claim in (MANIFEST, SENDING) if claim in files), None)
-        if claim is not None and read_bytes(self._path(name, claim)) == manifest:
+        if claim is not None and read_bounded(self._path(name, claim), MOST_BYTES) == manifest:
             return files
         if files:
             self.remove(name)
@@ -120,17 +126,3 @@ class RemoteCheckpoints:
 
     def _path(self, *names: str) -> str:
         return join(self.place, "/".join((CHECKPOINTS, *names)))
-
-
-def _files_of(manifest: bytes) -> list[str]:
-    """Return the files that a manifest names.
-
-    Raises:
-        ValueError: It is not one, or names a file elsewhere.
-    """
-    names = list(json.loads(manifest)["files"])
-    for name in names:
-        path = PurePosixPath(name)
-        if path.is_absolute() or ".." in path.parts or not path.parts:
-            raise ValueError(f"it names {name}")
-    return names

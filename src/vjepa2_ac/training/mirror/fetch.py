@@ -7,7 +7,6 @@ way begins again.
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 import tempfile
@@ -18,7 +17,7 @@ from pathlib import Path
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import download, join, sync, write_atomically
-from vjepa2_ac.training.checkpoint import STATE, checkpoint_name
+from vjepa2_ac.training.checkpoint import checkpoint_name, written_state
 from vjepa2_ac.training.mirror.checkpoints import RemoteCheckpoints
 from vjepa2_ac.training.mirror.update import SMALL_FILES
 from vjepa2_ac.training.run_folder import CHECKPOINTS, check_run_folder
@@ -110,7 +109,7 @@ def _fetch(remote: RemoteCheckpoints, name: str, folder: Path) -> Path | None:
 
 def _fetch_best(remote: RemoteCheckpoints, newest: Path, folder: Path) -> None:
     """Download the best checkpoint, if the newest names one that is there and is not on this machine."""
-    step = json.loads((newest / STATE).read_text()).get("best_step")
+    step = written_state(newest).best_step
     if step is None or newest.name == f"{FETCHING}{checkpoint_name(step)}":
         return
     best = folder / CHECKPOINTS / checkpoint_name(step)

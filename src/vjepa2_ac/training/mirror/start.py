@@ -6,7 +6,6 @@ error.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,7 +15,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import RefusedError, UnreachableError, quietly
 from vjepa2_ac.storage import is_url, place, try_writing
-from vjepa2_ac.training.checkpoint import STATE, checkpoint_name, newest_checkpoint
+from vjepa2_ac.training.checkpoint import checkpoint_name, newest_checkpoint, written_state
 from vjepa2_ac.training.mirror.checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.training.mirror.fetch import fetch_newest
 from vjepa2_ac.training.mirror.mirror import Mirror, reason_of
@@ -158,8 +157,8 @@ def _where_this_machine_stands(run_dir: Path) -> tuple[int | None, str | None]:
         return None, None
     if checkpoint is None:
         return None, None
-    state = json.loads((checkpoint / STATE).read_text())
-    return state["step"], state.get("run_id", "")
+    state = written_state(checkpoint)
+    return state.step, state.run_id
 
 
 def _warn(text: str) -> None:

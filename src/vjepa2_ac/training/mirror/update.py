@@ -8,14 +8,13 @@ so that training may remove it meanwhile.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 from collections.abc import Callable, Collection
 from pathlib import Path
 
 from vjepa2_ac.storage import join, upload
-from vjepa2_ac.training.checkpoint import STATE, checkpoint_name, damage
+from vjepa2_ac.training.checkpoint import checkpoint_name, damage, written_state
 from vjepa2_ac.training.mirror.checkpoints import Listing, RemoteCheckpoints, complete, is_checkpoint_name
 from vjepa2_ac.training.run_folder import CHECKPOINTS, CONFIG, ENVIRONMENT, RUN_ID
 from vjepa2_ac.training.stride import CALIBRATION
@@ -139,7 +138,7 @@ class RemoteUpdate:
 
 
 def _best_of(checkpoint: Path) -> str | None:
-    step = json.loads((checkpoint / STATE).read_text()).get("best_step")
+    step = written_state(checkpoint).best_step
     return None if step is None else checkpoint_name(step)
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
 
 from vjepa2_ac.config.data import RAW_CAMERAS
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import json_object
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,7 @@ class DroidMetadata:
         Raises:
             InputError: It is not a JSON object.
         """
-        try:
-            values = json.loads(data)
-        except (ValueError, RecursionError) as error:
-            raise InputError(where=where, found=f"not JSON ({error})", needed="the metadata of an episode") from None
-        if not isinstance(values, dict):
-            raise InputError(where=where, found=f"JSON of type {type(values).__name__}", needed="a JSON object")
-        return cls(values, where)
+        return cls(json_object(data, where=where, needed="the metadata of an episode", allow_nan=True), where)
 
     def serial(self, camera: str) -> str:
         """Return the serial number of a camera: left, right, wrist, ext1, ext2, or a serial number itself.

@@ -36,6 +36,7 @@ from vjepa2_ac.data.video import count_frames, read_frames
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
+from vjepa2_ac.structured import json_object
 
 logger = logging.getLogger(__name__)
 
@@ -97,7 +98,7 @@ class RawDroidSource:
             OSError: Data behind a URL cannot be read.
         """
         table = self.infos()
-        info, place = table[index], _Place(**json.loads(line_of("place", table.locators, index)))
+        info, place = table[index], _Place(**json_object(line_of("place", table.locators, index), where="the index"))
         metadata = self._metadata(place)
         serial = metadata.serial(camera or self._config.cameras[0])
         trajectory = self._trajectory(place, (serial,))

@@ -16,20 +16,25 @@ import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 from urllib.parse import quote
+
+from pydantic import Field
 
 from vjepa2_ac.data.idle_search import FoundRanges
 from vjepa2_ac.data.sources.latents.key import CacheKey
 from vjepa2_ac.data.sources.latents.record import Layout
 from vjepa2_ac.data.table import EpisodeTable, NotATableError
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import read_bounded
+from vjepa2_ac.structured import read_json_object, record_of
 
 T = TypeVar("T")
 
 FORMAT = "vjepa2-ac latent cache 1"
 MANIFEST, EPISODES, KEPT = "cache.json", "episodes.npz", "kept.npz"
 
+_MOST_BYTES = 1 << 30
 _AGAIN = (
     "Delete cache.json and run `vjepa2-ac encode` again, with the config that it was made with; or copy the cache again"
 )
@@ -41,9 +46,9 @@ class Manifest:
 
     key: Mapping[str, Any]  # the parts of its `CacheKey`
     digest: str
-    tokens: int  # of a frame
-    dim: int
-    control_rate_hz: float
+    tokens: Annotated[int, Field(ge=1, le=65_536)]  # of a frame
+    dim: Annotated[int, Field(ge=1, le=16_384)]
+    control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
     episodes: int  # of the data set
     encoded: int  # of them, for each camera at least
     frames: int  # of all cameras
@@ -103,19 +108,19 @@ def read_manifest(folder: Path) -> Manifest:
     """
     where = str(folder / MANIFEST)
     try:
-        content = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        if content.pop("format") != FORMAT:
-            raise InputError(where=where, found="another format", needed=FORMAT, fix=_AGAIN)
-        manifest = Manifest(**content)
-        damaged = manifest.cache_key.digest != manifest.digest
+        content = read_json_object(folder / MANIFEST, most_bytes=_MOST_BYTES, allow_nan=True, fix=_AGAIN)
     except (FileNotFoundError, NotADirectoryError):
         found = "an unfinished latent cache" if (folder / "episodes").is_dir() else "no latent cache"
         found = found if folder.is_dir() else f"no such folder, seen from {Path.cwd()}"
         fix = "Run `vjepa2-ac encode`, which goes on where it was stopped"
         raise InputError(where=str(folder), found=found, needed=f"a folder with {MANIFEST}", fix=fix) from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except OSError as error:
         raise InputError(where=where, found=f"cannot be read ({error})", fix=_AGAIN) from None
-    if damaged:
+    if content.pop("format", None) != FORMAT:
+        raise InputError(where=where, found="another format", needed=FORMAT, fix=_AGAIN)
+    manifest = record_of(Manifest, content, where=where, needed="what a latent cache says of itself", fix=_AGAIN)
+    manifest.cache_key.require_whole(where=where, fix=_AGAIN)
+    if manifest.cache_key.digest != manifest.digest:
         raise InputError(where=where, found="damaged: its key is not what its digest says", fix=_AGAIN)
     return manifest
 
@@ -127,13 +132,23 @@ def read_episodes(folder: Path, manifest: Manifest) -> tuple[EpisodeTable, Found
         InputError: One of the files is missing or damaged.
     """
     table = _read(folder, manifest, EPISODES, EpisodeTable.from_bytes)
-    return table, _read(folder, manifest, KEPT, FoundRanges.from_bytes) if KEPT in manifest.checksums else None
+    for place, camera in enumerate(manifest.cameras):
+        if size_column(place) not in table.locators:
+            raise InputError(where=str(folder / EPISODES), found=f"no sizes of the files of {camera}", fix=_AGAIN)
+    if KEPT not in manifest.checksums:
+        return table, None
+    kept = _read(folder, manifest, KEPT, FoundRanges.from_bytes)
+    try:
+        kept.require_of(table)
+    except NotATableError as error:
+        raise InputError(where=str(folder / KEPT), found=str(error), fix=_AGAIN) from None
+    return table, kept
 
 
 def _read(folder: Path, manifest: Manifest, name: str, from_bytes: Callable[[bytes], T]) -> T:
     path = folder / name
     try:
-        data = path.read_bytes()
+        data = read_bounded(path, _MOST_BYTES)
         found = from_bytes(data)
     except (OSError, NotATableError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", fix=_AGAIN) from None

@@ -10,8 +10,10 @@ from typing import Any
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.idle_search import fingerprint_of
-from vjepa2_ac.data.sources.latents.precision import CacheType
+from vjepa2_ac.data.sources.latents.precision import DTYPES, CacheType
 from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import shown
 
 NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: raise it when one of them changes
 
@@ -65,6 +67,20 @@ class CacheKey:
         """The type in which latents are kept."""
         kind: CacheType = self.parts["data.cache_dtype"]
         return kind
+
+    def require_whole(self, *, where: str, fix: str) -> None:
+        """Refuse a key from a file that lacks what a cache is read by.
+
+        Raises:
+            InputError: It does.
+        """
+        cameras, kind = self.parts.get("data.camera"), self.parts.get("data.cache_dtype")
+        named = isinstance(cameras, list) and cameras and all(isinstance(camera, str) for camera in cameras)
+        if not named or not isinstance(kind, str) or kind not in DTYPES:
+            found = f"a key with data.camera {shown(cameras)} and data.cache_dtype {shown(kind)}"
+            raise InputError(
+                where=where, found=found, needed=f"names of cameras, and one of {', '.join(DTYPES)}", fix=fix
+            )
 
     def differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
         """Return what is other here than wanted, as "data.stride: 8, not 4"; of these names, or of all."""

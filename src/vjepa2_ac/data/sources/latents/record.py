@@ -34,6 +34,7 @@ from vjepa2_ac.data.sources.latents.precision import DTYPES, CacheType
 from vjepa2_ac.data.sources.rlds.jpeg import decode_jpegs, encode_jpeg
 from vjepa2_ac.episode import Episode, StoredLatents
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import json_object, shown
 
 FORMAT = "vjepa2-ac latents 1"
 
@@ -137,25 +138,31 @@ class Record:
             self._file: Any = safe_open(self.path, framework="pt").__enter__()  # type: ignore[no-untyped-call] # mapped until nobody has it any more
             self.about: Mapping[str, str] = self._file.metadata() or {}
             self._names = frozenset(self._file.keys())
+            if unknown := self._names - _BY_FRAME - _SMALL.keys():
+                raise _damaged(self.path, f"the unknown tensors {shown(sorted(unknown))}")
             tensors = {name: self._file.get_tensor(name) for name in self._names - _BY_FRAME}
         if self.about.get("format") != FORMAT:
-            raise _damaged(self.path, f"the format {self.about.get('format')}", f"{FORMAT}")
+            raise _damaged(self.path, f"the format {shown(self.about.get('format'))}", FORMAT)
         if self.about.get("crc") != str(_crc_of_rest(self.about, tensors)):
             raise _damaged(self.path, "damaged: its CRC is wrong")
-        if self.about["key"] != layout.key:
+        if self.about.get("key") != layout.key:
             raise _damaged(self.path, "a file of another cache", "a file that was made with this one's cache.json")
+        _require_fitting(self.path, tensors)
         self._arrays = {name: np.array(tensor.numpy()) for name, tensor in tensors.items()}
         self.frame_steps: Int[np.ndarray, " frames"] = self._arrays["frame_steps"]
+        self.id, self.camera, self.metadata = self._told()
         self._require_shapes(layout)
 
     def __getitem__(self, name: str) -> Any:
         """Return states, or commands, extrinsics or joint_velocities; None where there are none."""
         return self._arrays.get(name)
 
-    @property
-    def metadata(self) -> dict[str, str]:
-        """The language instruction and the like."""
-        return dict(json.loads(self.about["metadata"]))
+    def _told(self) -> tuple[str, str, dict[str, str]]:
+        """Return identity and camera, and the language instruction and the like."""
+        if absent := [name for name in ("id", "camera", "metadata") if name not in self.about]:
+            raise _damaged(self.path, f"no {absent[0]} in its header")
+        metadata = json_object(self.about["metadata"], where=f"{self.path}: metadata", fix=_FIX)
+        return self.about["id"], self.about["camera"], {name: str(text) for name, text in metadata.items()}
 
     def places_of(self, steps: Sequence[int]) -> list[int]:
         """Return which frames were taken at these control steps.
@@ -167,7 +174,7 @@ class Record:
         for place, step in zip(places.tolist(), steps, strict=True):
             if place == len(self.frame_steps) or self.frame_steps[place] != step:
                 raise InputError(
-                    where=f"{self.path} ({self.about['id']})",
+                    where=f"{self.path} ({self.id})",
                     found=f"no frame of control step {step}",
                     needed=f"one; there are {len(self.frame_steps)}, of every step that a clip needed",
                     fix="Encode with the same data.stride, data.frames, data.start_every and data.idle as are used now",
@@ -223,8 +230,38 @@ class Record:
             found = {name: self._file.get_slice(name) for name in names}
             types = {name: slice_.get_dtype() for name, slice_ in found.items()}
             shapes = {name: list(slice_.get_shape()) for name, slice_ in found.items()}
+            pictures = self._file.get_slice("pictures").get_shape()
         if shapes != names or types["latents"] != _SAFETENSORS_NAMES[layout.kind]:
             raise _damaged(self.path, f"{types} {shapes}", f"latents of {_SAFETENSORS_NAMES[layout.kind]}, {names}")
+        if "scales" in names and types["scales"] != "F32":
+            raise _damaged(self.path, f"scales of {types['scales']}", "F32")
+        if pictures != [max(self._arrays["picture_ends"], default=0)]:
+            raise _damaged(self.path, f"pictures of {pictures} bytes", "as many as picture_ends says")
+
+
+_NUMBERS = (torch.float32, torch.float64)
+_SMALL: dict[str, tuple[int, tuple[torch.dtype, ...]]] = {  # axes and types
+    "states": (2, _NUMBERS),
+    **dict.fromkeys(_OPTIONAL, (2, _NUMBERS)),
+    "frame_steps": (1, (torch.int32,)),
+    **dict.fromkeys(("frame_crc", "picture_ends", "picture_crc"), (1, (torch.int64,))),
+}
+
+
+def _require_fitting(path: str, tensors: Mapping[str, Tensor]) -> None:
+    """Refuse what contradicts itself, whatever its CRC says: anybody can write one."""
+    if absent := _SMALL.keys() - set(_OPTIONAL) - tensors.keys():
+        raise _damaged(path, f"no {', '.join(sorted(absent))}")
+    frames, steps = (len(tensors[name]) if tensors[name].ndim else -1 for name in ("frame_steps", "states"))
+    for name, tensor in tensors.items():
+        axes, types = _SMALL[name]
+        rows = steps if axes == 2 else frames
+        if tensor.ndim != axes or tensor.dtype not in types or len(tensor) != rows:
+            raise _damaged(path, f"{name} of {tensor.dtype} and shape {list(tensor.shape)}", f"{rows} rows")
+    within = torch.cat([torch.tensor([-1]), tensors["frame_steps"], torch.tensor([steps])])
+    ends = torch.cat([torch.tensor([0]), tensors["picture_ends"]])
+    if (within.diff() <= 0).any() or (ends.diff() < 0).any():
+        raise _damaged(path, f"frames that are not in the order of the {steps} steps, or pictures that overlap")
 
 
 _SAFETENSORS_NAMES: dict[CacheType, str] = {"bf16": "BF16", "fp32": "F32", "int8": "I8"}

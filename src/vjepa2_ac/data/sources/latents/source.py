@@ -221,7 +221,7 @@ class _PictureReader:
 
 
 def _require_as_indexed(record: Record, info: EpisodeInfo, camera: str) -> None:
-    found = record.about["id"], record.about["camera"], len(record["states"])
+    found = record.id, record.camera, len(record["states"])
     if found != (info.id, camera, info.num_steps):
         raise InputError(
             where=record.path,

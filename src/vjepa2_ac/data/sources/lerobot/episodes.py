@@ -15,12 +15,14 @@ from vjepa2_ac.data.sources.lerobot.parquet import Opener, read_table
 from vjepa2_ac.data.state_hash import UNKNOWN, hash_of_bytes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
+from vjepa2_ac.structured import json_object
 
 EPISODES_V21 = "meta/episodes.jsonl"
 EPISODES_V30 = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 
 _T = TypeVar("_T")
 
+_MOST_BYTES = 1 << 28  # of meta/episodes.jsonl
 _FIX = "Get the files in meta again"
 _STATISTICS = ("min", "max", "mean", "std")
 
@@ -123,7 +125,7 @@ def video_file(info: DatasetInfo, place: VideoPlace, key: str) -> str:
 def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[EpisodeRow]:
     where = storage.join(info.root, EPISODES_V21)
     try:
-        lines = storage.read_bytes(where).decode().splitlines()
+        lines = storage.read_bounded(where, _MOST_BYTES).decode().splitlines()
     except FileNotFoundError:
         raise InputError(where=where, found="no such file", needed="one line for each episode", fix=_FIX) from None
     except UnicodeDecodeError as error:
@@ -132,7 +134,7 @@ def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[Episode
         if not line.strip():
             continue
         with_line = f"{where}: line {number + 1}"
-        row = _checked(with_line, json.loads, line)
+        row = json_object(line, where=with_line, needed="an episode", fix=_FIX, allow_nan=True)
         yield _checked(with_line, _of_line, info, row, videos)
 
 

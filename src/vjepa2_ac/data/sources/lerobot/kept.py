@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Shaped
 
+from vjepa2_ac.data.arrays import read_arrays
 from vjepa2_ac.data.disk_cache import DiskCache
+from vjepa2_ac.errors import InputError
 
 Columns = Mapping[str, Shaped[np.ndarray, "rows _"]]
 
@@ -33,9 +34,8 @@ class KeptRows:
         if data is None:
             return None
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as file:
-                return {name: file[name] for name in file.files}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return read_arrays(data)
+        except InputError:
             return None
 
     def write(self, path: str, episode: int, columns: Columns) -> None:

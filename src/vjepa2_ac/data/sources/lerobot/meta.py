@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import math
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig, LeRobotFields
 from vjepa2_ac.data.sources.lerobot.files import require_template
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import read_json_object
 
 INFO = "meta/info.json"
 VERSIONS = ("v2.1", "v3.0")
@@ -119,7 +119,7 @@ def read_info(root: str) -> DatasetInfo:
     """
     where = storage.join(root, INFO)
     try:
-        data = storage.read_bytes(where)
+        content = read_json_object(where, needed="a description of a data set", fix=_FIX, allow_nan=True)
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(
             where="data.path",
@@ -130,7 +130,6 @@ def read_info(root: str) -> DatasetInfo:
     except OSError as error:
         raise storage.unreadable(where, error) from None
     try:
-        content = dict(json.loads(data))
         _require_version(where, content.get("codebase_version"))
         return _parsed(root, where, content)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:

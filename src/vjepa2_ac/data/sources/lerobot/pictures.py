@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac.data import video
 from vjepa2_ac.data.picture_file import decode_picture
+from vjepa2_ac.data.picture_size import require_bounded
 from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.data.sources.lerobot.parquet import Opener
 from vjepa2_ac.errors import InputError
@@ -61,7 +62,10 @@ class StoredPictures:
             ValueError: No steps, or a step outside the episode.
         """
         _require_within(steps, self.num_steps, self.where)
-        frames = [decode_picture(self._pictures[step], f"{self.where}: step {step}") for step in steps]
+        first = decode_picture(self._pictures[steps[0]], f"{self.where}: step {steps[0]}")
+        require_bounded(first.shape[0], first.shape[1], f"{self.where}: step {steps[0]}", count=len(steps))
+        others = [decode_picture(self._pictures[step], f"{self.where}: step {step}") for step in steps[1:]]
+        frames = [first, *others]
         for step, frame in zip(steps, frames, strict=True):
             if frame.shape != frames[0].shape:
                 raise InputError(

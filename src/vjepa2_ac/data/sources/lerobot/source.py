@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 from dataclasses import replace
@@ -35,6 +34,7 @@ from vjepa2_ac.data.video import Clock
 from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
+from vjepa2_ac.structured import json_list
 
 logger = logging.getLogger(__name__)
 
@@ -106,7 +106,7 @@ class LeRobotSource:
 
     @cached_property
     def _tasks(self) -> list[str]:
-        return list(json.loads(self.infos().texts["tasks"]))
+        return json_list(self.infos().texts["tasks"], where="the tasks of the index")
 
     @cached_property
     def _parquet(self) -> ParquetRows:

@@ -35,6 +35,7 @@ from jaxtyping import Float, Float64
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.picture_size import require_bounded
 from vjepa2_ac.data.sources.kept_file import KeptFile
 from vjepa2_ac.data.sources.npz.file import NpzFile
 from vjepa2_ac.data.sources.states import require_finite, require_plausible
@@ -123,15 +124,24 @@ def opened_npz(opened: str | KeptFile, path: str) -> Iterator[NpzFile]:
         raise storage.unreadable(path, error) from None
 
 
-def require_pictures(file: NpzFile, camera: str, steps: int, path: str) -> None:
+def require_pictures(file: NpzFile, camera: str, steps: int, path: str, *, count: int = 1) -> None:
     """Refuse what cannot be the pictures of a camera, without reading them.
 
+    Args:
+        file: The episode's.
+        camera: The name of the array.
+        steps: Of the episode.
+        path: The file's, for messages.
+        count: How many are to be read together.
+
     Raises:
-        InputError: There is no such array, or it is not [steps, height, width, 3] of uint8.
+        InputError: There is no such array, or it is not [steps, height, width, 3] of uint8; they are too large.
     """
     _require_array(file, camera, (steps, None, None, 3), "u", "pictures (steps, height, width, 3)", path)
-    if file.header(camera).dtype != np.uint8:
-        found = f"pictures of {file.header(camera).dtype}"
+    header = file.header(camera)
+    require_bounded(header.shape[1], header.shape[2], f"{path}: {camera}", count=count)
+    if header.dtype != np.uint8:
+        found = f"pictures of {header.dtype}"
         raise InputError(where=f"{path}: {camera}", found=found, needed="uint8, 0 to 255", fix=FORMAT_HELP)
 
 

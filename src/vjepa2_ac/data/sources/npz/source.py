@@ -188,5 +188,5 @@ class _PictureReader:
         if not steps or min(steps) < 0 or max(steps) >= self.steps:
             raise ValueError(f"{self.path}: steps {list(steps)} of {self.steps}")
         with opened_npz(self.opened(), self.path) as file:
-            require_pictures(file, self.camera, self.steps, self.path)
+            require_pictures(file, self.camera, self.steps, self.path, count=len(set(steps)))
             return np.asarray(file.rows(self.camera, steps))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan, index_records
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import read_json_object
 
 _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
@@ -75,7 +75,7 @@ def index_shards(shards: list[Shard]) -> list[RecordSpan]:
 
 def _read_info(folder: str, where: str) -> dict[str, Any]:
     try:
-        info = json.loads(storage.read_bytes(where))
+        return read_json_object(where, needed="a description as TFDS writes it", allow_nan=True)
     except FileNotFoundError:
         raise InputError(
             where="data.path",
@@ -85,11 +85,6 @@ def _read_info(folder: str, where: str) -> dict[str, Any]:
         ) from None
     except OSError as error:
         raise storage.unreadable(where, error) from None
-    except ValueError as error:
-        raise InputError(where=where, found=f"cannot be read ({error})", needed="JSON as TFDS writes it") from None
-    if not isinstance(info, dict):
-        raise InputError(where=where, found="JSON of another kind", needed="a description as TFDS writes it")
-    return info
 
 
 def _nothing_in(folder: str) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 import simplejpeg
 from jaxtyping import UInt8
 
+from vjepa2_ac.data.picture_size import require_bounded, require_few_scans
 from vjepa2_ac.errors import InputError
 
 
@@ -22,9 +23,10 @@ def decode_jpegs(
         where: File, episode and camera, for messages.
 
     Raises:
-        InputError: A picture is not a JPEG, or differs in size from the first one.
+        InputError: A picture is not a JPEG, is too large, or differs in size from the first one.
     """
     height, width = _size_of(pictures[0], steps[0], where)
+    require_bounded(height, width, f"{where}: step {steps[0]}", count=len(pictures))
     frames = np.empty((len(pictures), height, width, 3), np.uint8)  # decoded in place: half the time of stacking
     for frame, picture, step in zip(frames, pictures, steps, strict=True):
         size = _size_of(picture, step, where)
@@ -34,6 +36,7 @@ def decode_jpegs(
                 found=f"a picture of {size[0]}x{size[1]}",
                 needed=f"{height}x{width} as at step {steps[0]}",
             )
+        require_few_scans(picture, height, width, f"{where}: step {step}")
         try:
             simplejpeg.decode_jpeg(picture, colorspace="RGB", fastdct=True, buffer=frame)
         except ValueError as error:

@@ -27,6 +27,7 @@ from vjepa2_ac.data.sources.rlds.shard_file import unreadable
 from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan
 from vjepa2_ac.episode import StepRanges
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.structured import json_object
 
 _HOP_WINDOW = 1 << 16
 _TEXT_BYTES = 512  # of a feature with one text for every step, of which the first is read
@@ -112,7 +113,7 @@ class RemoteEpisode:
     def _located(self, file: RemoteFile) -> dict[str, Located]:
         kept = self._cache.places.read(self._key)
         if kept is not None:
-            return {name: Located(*place) for name, place in json.loads(kept).items()}
+            return {name: Located(*place) for name, place in json_object(kept, where=self._key).items()}
         located = Record(file, self._span).located
         self._cache.places.write(self._key, json.dumps(located).encode())
         return located
