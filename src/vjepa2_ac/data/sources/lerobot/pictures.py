@@ -63,7 +63,8 @@ class StoredPictures:
         """
         _require_within(steps, self.num_steps, self.where)
         first = decode_picture(self._pictures[steps[0]], f"{self.where}: step {steps[0]}")
-        require_bounded(*first.shape[:2], f"{self.where}: step {steps[0]}", count=len(steps))
+        height, width = first.shape[:2]
+        require_bounded(height, width, f"{self.where}: step {steps[0]}", count=len(steps))
         others = [decode_picture(self._pictures[step], f"{self.where}: step {step}") for step in steps[1:]]
         frames = [first, *others]
         for step, frame in zip(steps, frames, strict=True):

@@ -135,7 +135,8 @@ def require_pictures(file: NpzFile, camera: str, steps: int, path: str, *, count
     """
     _require_array(file, camera, (steps, None, None, 3), "u", "pictures (steps, height, width, 3)", path)
     header = file.header(camera)
-    require_bounded(*header.shape[1:3], f"{path}: {camera}", count=count)
+    height, width = header.shape[1:3]
+    require_bounded(height, width, f"{path}: {camera}", count=count)
     if header.dtype != np.uint8:
         found = f"pictures of {header.dtype}"
         raise InputError(where=f"{path}: {camera}", found=found, needed="uint8, 0 to 255", fix=FORMAT_HELP)
