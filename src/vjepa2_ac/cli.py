@@ -15,10 +15,10 @@ from vjepa2_ac.cli_data import add_data
 from vjepa2_ac.cli_doctor import add_doctor
 from vjepa2_ac.cli_encode import add_encode
 from vjepa2_ac.cli_evaluate import add_checkpoint, add_evaluate
-from vjepa2_ac.cli_parts import Commands, Handler, command
+from vjepa2_ac.cli_parts import Commands, Handler, command, say_places_elsewhere
 from vjepa2_ac.cli_plan import add_plan
 from vjepa2_ac.cli_simulate import add_simulate
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, printable
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -41,11 +41,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except OSError as error:  # a full disk, a path that is no path: the message names it
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {printable(str(error))}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
+
+
+class _Printable(logging.Formatter):
+    """Writes out the control characters of names that come from anybody."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the line."""
+        return printable(super().format(record))
 
 
 def _show_our_warnings() -> None:
@@ -53,7 +61,7 @@ def _show_our_warnings() -> None:
     ours = logging.getLogger("vjepa2_ac")
     if not ours.handlers:
         handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("warning: %(message)s"))
+        handler.setFormatter(_Printable("warning: %(message)s"))
         ours.addHandler(handler)
     for library in ("bitsandbytes", "torchao", "torch.utils._pytree"):  # kernels for other devices; torchao's own past
         logging.getLogger(library).setLevel(logging.ERROR)
@@ -113,6 +121,8 @@ def _train(options: argparse.Namespace) -> int:
         raise InputError(
             where=options.config, found="a folder", needed="a config file", fix="To go on with a run, add --resume"
         )
+    if options.resume:
+        say_places_elsewhere(options.config)
     config = read_run_config(path) if options.resume else load_config(path, options.overrides)
     reporter = ConsoleReporter()
     speaks = os.environ.get("RANK", "0") == "0"  # one of several processes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vjepa2_ac.cli_parts import Commands, command, count, number_between, whole_number
+from vjepa2_ac.cli_parts import Commands, command, count, number_between, say_places_elsewhere, whole_number
 
 
 def add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -111,6 +111,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     data = load_config(options.data, []) if options.data else None
     several, evaluations = len(options.subjects) > 1, []
     for subject in options.subjects:
+        say_places_elsewhere(subject)
         out = options.out / Path(subject).name if options.out and several else options.out
         asked = Asked(
             split=options.split,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Callable
+from pathlib import Path
 
 Commands = argparse._SubParsersAction
 Handler = Callable[[argparse.Namespace], int | None]
@@ -17,6 +19,17 @@ def command(
     parser = commands.add_parser(name, help=text, description=text)
     parser.set_defaults(handler=handler)
     return parser
+
+
+def say_places_elsewhere(subject: str) -> None:
+    """Say which addresses the config of a run names, before any of them is contacted; nothing of a model."""
+    from vjepa2_ac.console import console
+    from vjepa2_ac.errors import printable
+    from vjepa2_ac.training.run_folder import CONFIG, places_elsewhere, read_run_config
+
+    if (Path(subject) / CONFIG).is_file() and os.environ.get("RANK", "0") == "0":  # one of several processes
+        for place in places_elsewhere(read_run_config(Path(subject))):
+            console.print(printable(f"{subject} names a place elsewhere: {place}"), markup=False)
 
 
 def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli_evaluate import add_checkpoint
-from vjepa2_ac.cli_parts import Commands, command, whole_number
+from vjepa2_ac.cli_parts import Commands, command, say_places_elsewhere, whole_number
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -85,6 +85,7 @@ def _plan(options: argparse.Namespace) -> int:
     question, extrinsics = _question(options), _extrinsics(options)
     with user_can_write(options.out):
         options.out.mkdir(parents=True, exist_ok=True)
+    say_places_elsewhere(options.subject)
     steering = load_to_plan(
         options.subject, checkpoint=options.checkpoint, config=options.config, overrides=options.overrides
     )

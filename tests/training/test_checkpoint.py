@@ -152,7 +152,7 @@ def test_a_state_without_a_best_is_read_and_one_without_its_place_in_the_data_is
     (path / "state.json").write_text('{"step": 20, "clips_done": 80, "windows": 7}')
     assert read_state(path) == RunState(20, clips_done=80, windows=7)
     (path / "state.json").write_text('{"step": 20, "windows": 7}')
-    with pytest.raises(ValueError, match="older version"):
+    with pytest.raises(InputError, match="older version"):
         read_state(path)
 
 

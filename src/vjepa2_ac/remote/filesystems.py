@@ -12,6 +12,11 @@ from vjepa2_ac.errors import InputError
 GOOGLE = frozenset({"gs", "gcs"})
 
 _LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
+_KNOWN = "a folder of this machine, or gs://, hf://, s3://"
+_NO_PLACES = frozenset({  # they lead to files of any other kind, some by templates that are executed
+    "async_wrapper", "asyncwrapper", "blockcache", "cached", "dask", "data", "dir", "filecache", "generic",
+    "libarchive", "reference", "simplecache", "tar", "zip",
+})  # fmt: skip
 _EMULATOR = "STORAGE_EMULATOR_HOST"
 _MACHINE = Path("/sys/class/dmi/id/product_name")
 _PIECE_BYTES = 16 << 20  # of an upload; it is read while reads of others wait
@@ -138,9 +143,7 @@ def _filesystem(url: str, *, writing: bool = False) -> Any:
             options["access"] = "read_write" if writing else "read_only"
         key = (os.getpid(), protocol, repr(sorted(options.items())), os.environ.get(_EMULATOR))
         if key not in _filesystems:
-            _filesystems[key] = (
-                _google(kind, options) if protocol == "gs" else kind(**options, skip_instance_cache=True)
-            )
+            _filesystems[key] = _google(kind, options) if protocol == "gs" else _plain(kind, options, url)
         return _filesystems[key]
 
 
@@ -155,14 +158,22 @@ def _kind(url: str, protocol: str) -> Any:
     os.environ.setdefault("GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT", "false")
     import fsspec
 
+    if protocol in _NO_PLACES:
+        raise InputError(where=url, found=f"{protocol}://, which is no place but a way to another", needed=_KNOWN)
     try:
         return fsspec.get_filesystem_class(protocol)
     except ImportError as error:
         fix = 'Install it: pip install -c constraints.txt -e ".[gcs]"' if protocol == "gs" else str(error)
         raise InputError(where=url, found=f"the library for {protocol}:// is not installed", fix=fix) from None
     except ValueError:
-        known = "a folder of this machine, or gs://, hf://, s3://"
-        raise InputError(where=url, found=f"nothing reads {protocol}://", needed=known) from None
+        raise InputError(where=url, found=f"nothing reads {protocol}://", needed=_KNOWN) from None
+
+
+def _plain(kind: Any, options: dict[str, Any], url: str) -> Any:
+    try:
+        return kind(**options, skip_instance_cache=True)
+    except TypeError as error:  # it wants more than an address
+        raise InputError(where=url, found=f"an address alone does not do ({error})", needed=_KNOWN) from None
 
 
 def _google(kind: Any, options: dict[str, Any]) -> Any:

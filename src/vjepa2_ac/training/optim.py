@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -66,12 +66,29 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
         ValueError: The state is of another kind of optimizer, or of other parameters.
     """
     first = "exp_avg" if isinstance(optimizer, torch.optim.AdamW) else "state1"  # PyTorch's and bitsandbytes' names
+    known = (
+        isinstance(state, dict) and isinstance(state.get("state"), dict) and isinstance(state.get("param_groups"), list)
+    )
+    if not known or not all(isinstance(moments, dict) for moments in state["state"].values()):
+        raise ValueError("it is not the state of an optimizer")
     if any(first not in moments for moments in state["state"].values()):
         raise ValueError("its moments are of another training.optimizer")
+    _require_shapes(optimizer, state["state"], first)
     own = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
     groups = [group | settings for group, settings in zip(state["param_groups"], own, strict=False)]
     left = state["param_groups"][len(own) :]  # which PyTorch refuses
     optimizer.load_state_dict({**state, "param_groups": groups + left})
+
+
+def _require_shapes(optimizer: torch.optim.Optimizer, moments: Mapping[Any, Any], first: str) -> None:
+    """Refuse moments of other shapes than their parameters': nothing else would, before the first step."""
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    for place, of_one in moments.items():
+        if type(place) is not int or not 0 <= place < len(parameters):
+            raise ValueError(f"moments of a parameter {place!r}, of {len(parameters)}")
+        shape = getattr(of_one[first], "shape", None)
+        if isinstance(optimizer, torch.optim.AdamW) and shape != parameters[place].shape:
+            raise ValueError(f"moments of shape {shape} for a parameter of shape {tuple(parameters[place].shape)}")
 
 
 def learning_rate_at(step: int, training: TrainingConfig) -> float:

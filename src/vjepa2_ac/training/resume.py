@@ -18,6 +18,7 @@ from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.checkpoint import (
     ADAPTER,
     OPTIMIZER,
+    STATE,
     RunState,
     checkpoint_name,
     damage,
@@ -107,9 +108,20 @@ def refuse_if_overtaken(folder: Path, state: RunState) -> None:
 
 
 def take_up_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
-    """Let losses be scaled as they were when the checkpoint was written."""
-    if state.loss_scale is not None and scaler.is_enabled():
-        scaler.load_state_dict(dict(state.loss_scale))
+    """Let losses be scaled as they were when the checkpoint was written.
+
+    Raises:
+        InputError: What was written is no such scale.
+    """
+    if state.loss_scale is None or not scaler.is_enabled():
+        return
+    known = scaler.state_dict().keys()
+    if state.loss_scale.keys() != known:
+        found, needed = f"{STATE} with loss_scale of {sorted(state.loss_scale)}", f"{sorted(known)}"
+        raise InputError(
+            where="--resume", found=found, needed=needed, fix="Delete this checkpoint, to use an older one"
+        )
+    scaler.load_state_dict(dict(state.loss_scale))
 
 
 def say_what_is_new(dataset: Dataset, state: RunState, note: Callable[[str], None]) -> None:

@@ -26,9 +26,9 @@ import time
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config_file import changed_keys, config_as_dict, config_as_yaml, load_config
+from vjepa2_ac.config_file import changed_keys, config_as_dict, config_as_flat_dict, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import read_bounded, write_atomically
+from vjepa2_ac.storage import is_url, read_bounded, write_atomically
 from vjepa2_ac.structured import read_json_list, shown
 from vjepa2_ac.training.run_lock import LOCK
 
@@ -151,6 +151,15 @@ def read_run_config(folder: Path) -> Config:
             needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
         )
     return load_config(folder / CONFIG, [f"run_dir={json.dumps(str(folder))}"])
+
+
+def places_elsewhere(config: Config) -> list[str]:
+    """Return a line for each place away from this machine that a config names: its knob, and its address.
+
+    A run's config may come from anybody: whoever goes on with it should know where it leads.
+    """
+    named = [f"{key}: {value}" for key, value in config_as_flat_dict(config).items() if is_url(str(value))]
+    return [*named, "tracking.wandb: online"] if config.tracking.wandb == "online" else named
 
 
 def start_folders(folder: Path) -> list[Path]:

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import pickle
 import re
+import zipfile
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import torch
 
 from vjepa2_ac.errors import InputError
+
+_DAMAGE = (
+    OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError, AttributeError, IndexError, AssertionError,
+    OverflowError, MemoryError, NotImplementedError, zipfile.BadZipFile,
+)  # fmt: skip
 
 
 def write_torch(value: object, file: BinaryIO) -> None:
@@ -32,16 +38,28 @@ def read_torch(path: Path) -> Any:
     Raises:
         InputError: The file cannot be read, or holds more than tensors and plain values.
     """
+    needed = "a file that this program wrote"
     try:
+        _require_as_written(path)
         return torch.load(path, weights_only=True, map_location="cpu")
     except pickle.UnpicklingError as error:
         name = re.search(r"GLOBAL (\S+)", str(error))
         found = f"more than tensors and plain values{f' ({name[1]})' if name else ''}: such a file can run foreign code"
-        raise InputError(where=str(path), found=found, needed="a file that this program wrote") from None
-    except (OSError, EOFError, RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            where=str(path), found=f"cannot be read ({_first_line(error)})", needed="a file that this program wrote"
-        ) from None
+        raise InputError(where=str(path), found=found, needed=needed) from None
+    except _DAMAGE as error:
+        raise InputError(where=str(path), found=f"cannot be read ({_first_line(error)})", needed=needed) from None
+
+
+def _require_as_written(path: Path) -> None:
+    """Refuse other forms that torch reads, too: of those, a small file may take any memory.
+
+    Raises:
+        OSError: The file cannot be read.
+        ValueError: It is no archive, or its parts are compressed.
+    """
+    with zipfile.ZipFile(path) as archive:
+        if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+            raise ValueError("its parts are compressed")
 
 
 def _first_line(error: Exception) -> str:

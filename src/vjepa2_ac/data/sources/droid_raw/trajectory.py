@@ -104,11 +104,24 @@ class _Reader:
             raise InputError(where=f"{self.where}: {name}", found=f"no such array; there are {there}", fix=_FIX)
         return found
 
+    def _here(self, name: str) -> Any:
+        """Return what is in this very file under a name, or None: a link may lead to any other on this machine."""
+        found: Any = self.file
+        for part in name.split("/"):
+            if not hasattr(found, "keys") or part not in found.keys():  # noqa: SIM118 - `in` would follow a link
+                return None
+            kind = type(found.get(part, getlink=True)).__name__
+            found = found[part] if kind == "HardLink" else None
+            if found is None or getattr(found, "is_virtual", False) or getattr(found, "external", None):
+                needed, where = "the numbers themselves", f"{self.where}: {name}"
+                raise InputError(where=where, found="a link to somewhere else", needed=needed, fix=_FIX)
+        return found
+
     def optional(self, name: str, width: int, steps: int | None) -> Float64[np.ndarray, "steps width"] | None:
         """Return an array likewise, or None where there is none of this name."""
-        if name not in self.file:
+        data = self._here(name)
+        if data is None:
             return None
-        data = self.file[name]
         shape, kind = tuple(getattr(data, "shape", None) or ()), getattr(getattr(data, "dtype", None), "kind", "?")
         rows = shape[0] if shape else 0
         as_asked = shape == (rows, width) or (width == 1 and shape == (rows,))

@@ -82,4 +82,5 @@ def _names(template: str) -> list[str]:
 
 def _fits(name: str, part: str) -> bool:
     pieces = re.split(r"\{\w+(?::0\dd)?\}", part)
-    return re.fullmatch(r"\d+".join(re.escape(piece) for piece in pieces), name) is not None
+    # Possessive: a template of many places would else be tried in every way that there is.
+    return re.fullmatch(r"\d++".join(re.escape(piece) for piece in pieces), name) is not None
