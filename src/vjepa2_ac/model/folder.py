@@ -15,6 +15,7 @@ from torch import nn
 from vjepa2_ac import storage
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.finite import require_finite
 
 FORMAT = "vjepa2-ac world model 1"
 CONFIG, ENCODER, PREDICTOR = "config.json", "encoder.safetensors", "predictor/model.safetensors"
@@ -72,7 +73,7 @@ def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -
     """Fill a module (which may be on the meta device) from a file, every name and shape matched.
 
     Raises:
-        InputError: The file is missing or damaged, or its tensors are not those of the module.
+        InputError: The file is missing or damaged, its tensors are not those of the module, or one is not finite.
     """
     needed = {name: tuple(value.shape) for name, value in module.state_dict().items()}
     try:
@@ -91,6 +92,7 @@ def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -
         raise InputError(
             where=str(path), found=f"not a whole safetensors file ({error})", fix="Copy or write it again"
         ) from None
+    require_finite(weights, where=str(path), fix="Copy or write the folder again")
     frozen = {name: value.requires_grad for name, value in module.named_parameters()}
     module.load_state_dict(weights, strict=True, assign=True)
     for name, value in module.named_parameters():

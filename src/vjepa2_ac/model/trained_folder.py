@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.model.folder import check_tensors
 from vjepa2_ac.model.world_model import Adaptation, WorldModel
 
@@ -91,7 +92,7 @@ def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
     """Read weights that have the names and shapes of others.
 
     Raises:
-        InputError: The file is missing or damaged, or holds other tensors.
+        InputError: The file is missing or damaged, or holds other tensors, or NaN or infinity.
     """
     try:
         weights = dict(load_file(path))
@@ -101,6 +102,7 @@ def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
         raise InputError(where=str(path), found=f"not a whole safetensors file ({error})") from None
     found, needed = ({name: tuple(value.shape) for name, value in some.items()} for some in (weights, like))
     check_tensors(found, needed, where=str(path))
+    require_finite(weights, where=str(path), fix="Use an older checkpoint, or train it again")
     return weights
 
 
