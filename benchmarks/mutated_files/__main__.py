@@ -71,7 +71,7 @@ def _options() -> argparse.Namespace:
 
 def _names() -> list[str]:
     code = "import sys; sys.path[:0] = sys.argv[1:]; import readers; print('\\n'.join(readers.READERS))"
-    run = subprocess.run(
+    run = subprocess.run(  # noqa: S603 - this Python, this folder
         [sys.executable, "-W", "ignore", "-c", code, str(Path(__file__).parent), str(ROOT / "tests")],
         check=True, capture_output=True, text=True, env=_environment(),
     )  # fmt: skip
@@ -98,7 +98,7 @@ def _count(name: str, options: argparse.Namespace) -> list[tuple[int, str, str]]
 def _outcomes(name: str, first: int, end: int, options: argparse.Namespace) -> Iterator[tuple[int, str, str]]:
     command = [sys.executable, "-W", "ignore", __file__, "--worker", name, "--first", str(first)]
     command += ["--mutations", str(end - first), "--memory-gb", str(options.memory_gb)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=_environment()) as worker:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=_environment()) as worker:  # noqa: S603
         number = first
         ready = _line(worker, seconds=600.0)
         if ready is None:

@@ -15,10 +15,10 @@ from vjepa2_ac.cli_data import add_data
 from vjepa2_ac.cli_doctor import add_doctor
 from vjepa2_ac.cli_encode import add_encode
 from vjepa2_ac.cli_evaluate import add_checkpoint, add_evaluate
-from vjepa2_ac.cli_parts import Commands, Handler, command, say_places_elsewhere
+from vjepa2_ac.cli_parts import Commands, Handler, command, parsed, say_places_elsewhere
 from vjepa2_ac.cli_plan import add_plan
 from vjepa2_ac.cli_simulate import add_simulate
-from vjepa2_ac.errors import InputError, printable
+from vjepa2_ac.errors import InputError, in_words, is_out_of_memory, printable
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,21 +27,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     0 done, 1 a check failed, 2 something given cannot be used, 75 a training run was asked to stop and can go on,
     130 broken off.
     """
-    parser = _parser()
-    options, rest = parser.parse_known_args(arguments)
-    if rest and (not hasattr(options, "overrides") or any(word.startswith("-") for word in rest)):
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
-    if rest:  # argparse gives up on `key=value` behind an option
-        options.overrides += rest
+    options = parsed(_parser(), arguments)
     _show_our_warnings()
     handler: Handler = options.handler
     try:
+        _require_working_directory()
         return handler(options) or 0
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
+    except (InputError, OSError, MemoryError) as error:  # a full disk, a path that is no path: the message names it
+        print(f"error: {in_words(error)}", file=sys.stderr)
         return 2
-    except OSError as error:  # a full disk, a path that is no path: the message names it
-        print(f"error: {printable(str(error))}", file=sys.stderr)
+    except RuntimeError as error:
+        if not is_out_of_memory(error):
+            raise
+        print(f"error: {in_words(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
@@ -54,6 +52,18 @@ class _Printable(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Return the line."""
         return printable(super().format(record))
+
+
+def _require_working_directory() -> None:
+    """See that there is one: relative paths need it, and libraries of PyTorch end the process without."""
+    try:
+        Path.cwd()
+    except OSError:
+        raise InputError(
+            where="working directory",
+            found="it is gone: it was deleted, or its disk went away",
+            fix="Change to a folder that is there, with `cd`",
+        ) from None
 
 
 def _show_our_warnings() -> None:
@@ -176,6 +186,8 @@ def _add_config(commands: Commands[argparse.ArgumentParser]) -> None:
 def _config(options: argparse.Namespace) -> None:
     from vjepa2_ac.config_file import config_as_yaml, config_schema, load_config
 
+    if options.what == "schema" and options.config is not None:
+        raise InputError(where="command line", found=f"config schema {options.config}", needed="config schema")
     if options.what == "schema":
         print(json.dumps(config_schema(), indent=2))
     elif options.config is None:

@@ -5,7 +5,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vjepa2_ac.cli_parts import Commands, command, count, number_between, say_places_elsewhere, whole_number
+from vjepa2_ac.cli_parts import (
+    Commands,
+    SubjectsAndOverrides,
+    command,
+    count,
+    number_between,
+    require_overrides,
+    say_places_elsewhere,
+    whole_number,
+)
+from vjepa2_ac.errors import InputError
 
 
 def add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -35,6 +45,7 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
         "subjects",
         metavar="RUN_OR_MODEL",
         nargs="+",
+        action=SubjectsAndOverrides,
         help="folder of a run, or (with --data) what model.base takes; several: their spread, too",
     )
     parser.add_argument(
@@ -83,8 +94,9 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
         metavar="planning.key=value",
         nargs="*",
         help="plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score;"
-        " settings of the plan of one step, such as planning.samples=200, in place of the config's",
+        " settings of the plan of one step, such as planning.samples=200, in place of the config's, here or anywhere",
     )
+    parser.set_defaults(overrides=[])
     planning.add_argument(
         "--planning-clips", metavar="N", type=count, default=32, help="clips to plan from, one frame of each (32)"
     )
@@ -98,6 +110,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.evaluation.verdict import spread, verdict
     from vjepa2_ac.training.evaluation import Asked, evaluate_subject
 
+    _require_planning(options)
     probes = Probes(
         sensitivity_clips=options.sensitivity_clips,
         samples=options.samples,
@@ -122,7 +135,7 @@ def _evaluate(options: argparse.Namespace) -> None:
             out=out,
             probes=probes,
             calibrate=options.calibrate,
-            planning=tuple(options.planning or ()),
+            planning=(*(options.planning or ()), *options.overrides),
         )
         with Stages() as stages:
             measured = evaluate_subject(subject, asked, stage=stages)
@@ -135,6 +148,18 @@ def _evaluate(options: argparse.Namespace) -> None:
             console.print(f"  {path}")
     if several:
         console.print(spread(evaluations))
+
+
+def _require_planning(options: argparse.Namespace) -> None:
+    """Refuse settings of plans where none are asked for: they would do nothing."""
+    require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
+    if options.overrides and options.planning is None:
+        raise InputError(
+            where="command line",
+            found=f"{' '.join(options.overrides)}, and no plans are asked for",
+            needed="--planning beside settings of planning; what else a config says is not changed by evaluate",
+            fix="Add --planning",
+        )
 
 
 def _add_compare(commands: Commands[argparse.ArgumentParser]) -> None:

@@ -5,11 +5,19 @@ from __future__ import annotations
 import argparse
 import math
 import os
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
+
+from vjepa2_ac.errors import InputError, printable
 
 Commands = argparse._SubParsersAction
 Handler = Callable[[argparse.Namespace], int | None]
+
+_MOST = 10**9
+_OPTION = re.compile(r"-(?![\d.])")  # but a negative number is a value
+_OVERRIDE = re.compile(r"[a-z_]+(\.\w+)+=")
 
 
 def command(
@@ -24,7 +32,6 @@ def command(
 def say_places_elsewhere(subject: str) -> None:
     """Say which addresses the config of a run names, before any of them is contacted; nothing of a model."""
     from vjepa2_ac.console import console
-    from vjepa2_ac.errors import printable
     from vjepa2_ac.training.run_folder import CONFIG, places_elsewhere, read_run_config
 
     if (Path(subject) / CONFIG).is_file() and os.environ.get("RANK", "0") == "0":  # one of several processes
@@ -32,8 +39,53 @@ def say_places_elsewhere(subject: str) -> None:
             console.print(printable(f"{subject} names a place elsewhere: {place}"), markup=False)
 
 
+def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Parse a command line; `key=value` may stand anywhere behind a command that takes it.
+
+    argparse gives up on such words behind an option, and takes them for what it was not told of.
+    """
+    options, rest = parser.parse_known_args(arguments)
+    unknown = [word for word in rest if _OPTION.match(word)]
+    if rest and (unknown or not hasattr(options, "overrides")):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:
+        options.overrides = [*options.overrides, *rest]
+    return options
+
+
+class SubjectsAndOverrides(argparse.Action):
+    """Takes names of runs or models, one or more, and among them the `key=value` that no folder is called."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, _option: str | None = None
+    ) -> None:
+        """Put each where it belongs."""
+        overrides = [word for word in values if _OVERRIDE.match(word) and not Path(word).exists()]
+        subjects = [word for word in values if word not in overrides]
+        if not subjects:
+            parser.error(f"the following arguments are required: {self.metavar}")
+        setattr(namespace, self.dest, subjects)
+        namespace.overrides = [*namespace.overrides, *overrides]
+
+
+def require_overrides(words: Sequence[str], *, fix: str = "") -> None:
+    """Refuse words that are no `key=value`, before anything is read.
+
+    Raises:
+        InputError: There is one.
+    """
+    others = [word for word in words if "=" not in word]
+    if others:
+        raise InputError(
+            where="command line",
+            found=f"{' '.join(others)!r}",
+            needed="key=value, such as training.steps=100",
+            fix=fix,
+        )
+
+
 def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
-    """Return what reads an option that is a whole number from `least` to `most`."""
+    """Return what reads an option that is a whole number from `least` to `most`; None: as many as anybody can need."""
     meant = f"a whole number from {least}" + ("" if most is None else f" to {most}")
 
     def read(text: str) -> int:
@@ -41,6 +93,8 @@ def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
             number = int(text)
         except ValueError:
             raise argparse.ArgumentTypeError(f"{text!r} is not {meant}") from None
+        if most is None and number > _MOST:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {meant} to {_MOST}")
         if number < least or (most is not None and number > most):
             raise argparse.ArgumentTypeError(f"{text!r} is not {meant}")
         return number

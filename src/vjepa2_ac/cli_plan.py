@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli_evaluate import add_checkpoint
-from vjepa2_ac.cli_parts import Commands, command, say_places_elsewhere, whole_number
+from vjepa2_ac.cli_parts import Commands, command, require_overrides, say_places_elsewhere, whole_number
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -82,6 +82,7 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.storage import user_can_write
     from vjepa2_ac.training.planning import load_to_plan
 
+    require_overrides(options.overrides, fix="Numbers of --state or --extrinsics go in one word: --state 0.4,0,0.3,...")
     question, extrinsics = _question(options), _extrinsics(options)
     with user_can_write(options.out):
         options.out.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,7 @@
-"""What does the user read when something they gave cannot be used?"""
+"""What does the user read when something they gave cannot be used, or the machine cannot give what is needed?"""
 
+import errno
+import resource
 import unicodedata
 
 _MOST_CHARACTERS = 8_000  # of a part of a message: what is quoted in it may be of any length
@@ -62,3 +64,27 @@ def _short(text: str) -> str:
         return text
     half = _MOST_CHARACTERS // 2
     return f"{text[:half]} … {text[-half:]}"
+
+
+def in_words(error: BaseException) -> str:
+    """Return what to tell of an error: of files and memory that the system does not give, with the way out."""
+    if isinstance(error, OSError) and error.errno in {errno.EMFILE, errno.ENFILE}:
+        return str(too_few_files(str(error.filename or "")))
+    if is_out_of_memory(error):
+        return f"this machine's memory is not enough ({str(error).splitlines()[0] if str(error) else 'MemoryError'})"
+    return printable(str(error))
+
+
+def too_few_files(where: str = "") -> InputError:
+    """Return the error of a process that may not open as many files as it needs."""
+    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+    return InputError(
+        where=where or "ulimit -n",
+        found=f"too many open files: this process may have {limit} of them at once (ulimit -n)",
+        fix="Raise that where it is started, as with `ulimit -n 4096`, or lower data.workers and data.connections",
+    )
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Tell whether the machine's memory, not the GPU's, was not enough: PyTorch has no error of its own for that."""
+    return isinstance(error, MemoryError) or "DefaultCPUAllocator: can't allocate memory" in str(error)

@@ -3,10 +3,12 @@
 from pathlib import Path
 
 import pytest
+from safetensors.torch import load_file, save_file
 
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model import load
+from vjepa2_ac.model.folder import ENCODER, PREDICTOR
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel
 
@@ -73,3 +75,15 @@ def test_a_model_without_its_weights_names_the_file_and_the_way_out(model: World
     (tmp_path / "model" / "encoder.safetensors").unlink()
     with pytest.raises(InputError, match=r"encoder\.safetensors: no such file.*write the folder again"):
         load_with(tmp_path / "model", model.sizes)
+
+
+@pytest.mark.parametrize("part", [ENCODER, PREDICTOR])
+@pytest.mark.parametrize("value", [float("nan"), float("-inf")])
+def test_a_weight_that_is_not_finite_is_named(model: WorldModel, tmp_path: Path, part: str, value: float) -> None:
+    model.save_pretrained(tmp_path)
+    weights = load_file(tmp_path / part)
+    name = sorted(weights)[-1]
+    weights[name].flatten()[-1] = value
+    save_file(weights, tmp_path / part)
+    with pytest.raises(InputError, match=rf"{part}: {name} holds NaN or infinity"):
+        load_with(tmp_path, ModelSizes())

@@ -1,13 +1,16 @@
 """The official code's own figures, for both reference checkpoints; and what a checkpoint must be."""
 
+import io
 import json
+import os
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from paths import GOLDEN
@@ -216,11 +219,63 @@ def test_sizes_that_contradict_the_tensors_are_refused(sizes: ModelSizes, messag
         load_official(GOLDEN / "model" / "tiny.pt", sizes)
 
 
-def test_a_truncated_a_foreign_and_a_missing_file_are_refused(tmp_path: Path) -> None:
+def test_a_truncated_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     whole = (GOLDEN / "model" / "tiny.pt").read_bytes()
-    for name, content in (("cut.pt", whole[: len(whole) // 2]), ("text.pt", b"hello"), ("empty.pt", b"")):
-        (tmp_path / name).write_bytes(content)
-        with pytest.raises(InputError, match=rf"{name}: 0.00 GB that torch cannot read .* 11.7 GB"):
-            load_official(tmp_path / name, TINY_SIZES)
+    (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"cut\.pt: 0.00 GB that torch cannot read .*truncated.* 11.7 GB"):
+        load_official(tmp_path / "cut.pt", TINY_SIZES)
     with pytest.raises(InputError, match=r"none\.pt: no such file"):
         load_official(tmp_path / "none.pt", TINY_SIZES)
+
+
+class Hostile:
+    """Runs a command of the system where it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, ("it-was-executed",)
+
+
+def in_the_old_format(value: object) -> bytes:
+    file = io.BytesIO()
+    torch.save(value, file, _use_new_zipfile_serialization=False)
+    return file.getvalue()
+
+
+def in_the_new_format(value: object) -> bytes:
+    file = io.BytesIO()
+    torch.save(value, file)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.yaml", b"run_dir: runs/a\nmodel: {base: b.pt}\n", "a YAML file, such as a config"),
+        ("a.pt", b"hello", "a text file"),
+        ("a.pt", b"", "an empty file"),
+        ("a.pt", b"version https://git-lfs.github.com/spec/v1\noid", "a pointer of Git LFS"),
+        ("a.pt", b"<!DOCTYPE html><html>not found</html>", "a web page"),
+        ("a.pt", save({"weight": torch.zeros(1)}), "a safetensors file"),
+        ("a.pt", pickle.dumps({"encoder": Hostile()}), r"would call posix\.mkdir: it was refused.*run foreign code"),
+        ("a.pt", in_the_new_format({"encoder": Hostile()}), r"would call posix\.mkdir: it was refused"),
+        ("a.pt", in_the_old_format({"encoder": Hostile()}), r"would call posix\.mkdir: it was refused"),
+        ("a.pt", in_the_old_format({"encoder": {"weight": torch.zeros(1)}}), "a file of an old version of torch"),
+    ],
+)
+def test_a_file_that_is_no_checkpoint_is_called_what_it_is_and_never_executed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_bytes(content)
+    with pytest.raises(InputError, match=said) as caught:
+        load_official(name, TINY_SIZES)
+    assert "truncated" not in str(caught.value)
+    assert not Path("it-was-executed").exists()
+
+
+def test_a_weight_that_is_not_finite_is_named(rewritten) -> None:
+    def spoil(whole: Whole) -> None:
+        whole["predictor"]["module.predictor_blocks.1.mlp.fc1.weight"][2, 1] = float("nan")
+
+    with pytest.raises(InputError, match=r"changed\.pt: predictor: blocks\.1\.mlp\.fc1\.weight holds NaN or infinity"):
+        load_official(rewritten(spoil), TINY_SIZES)

@@ -11,7 +11,7 @@ import peft
 import pytest
 import torch
 import yaml
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from paths import GOLDEN
@@ -114,6 +114,51 @@ def test_merged_is_a_folder_that_predicts_as_the_run_does(trained, tmp_path: Pat
     run = trained()
     assert export_run(run, tmp_path / "merged") == Exported(tmp_path / "merged", "step-00000002 (the newest)")
     assert_predicts_as(WorldModel.from_pretrained(tmp_path / "merged"), run)
+
+
+def rewrite_adapter(run: Path, **changes: object) -> None:
+    """Change the newest checkpoint's adapter_config.json, and write its manifest anew."""
+    checkpoint = load_run(run).checkpoint
+    path = checkpoint / "adapter" / "adapter_config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+    seal(checkpoint)
+
+
+def poison(path: Path) -> str:
+    """Put one NaN into a file of tensors; return the name of the tensor."""
+    tensors = load_file(path)
+    name = sorted(tensors)[-1]
+    tensors[name].flatten()[-1] = float("nan")
+    save_file(tensors, path)
+    return name
+
+
+@pytest.mark.parametrize("form", ["merged", "official", "hub"])
+@pytest.mark.parametrize(
+    ("alpha", "said"), [(float("nan"), "lora_alpha"), (float("inf"), "lora_alpha"), (1e300, r"attn\.\w\.weight")]
+)
+def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(
+    trained, tmp_path: Path, form: Any, alpha: float, said: str
+) -> None:
+    run = trained()
+    rewrite_adapter(run, lora_alpha=alpha)
+    with pytest.raises(InputError, match=said):
+        export_run(run, tmp_path / "out", form)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "file"),
+    [("lora", "adapter_model.safetensors"), ("lora", "pissa_start.safetensors"), ("none", "predictor.safetensors")],
+)
+def test_a_trained_weight_that_is_not_finite_is_named(trained, tmp_path: Path, kind: str, file: str) -> None:
+    run = trained(adapter__kind=kind, **({"adapter__init": "pissa"} if file.startswith("pissa") else {}))
+    checkpoint = load_run(run).checkpoint
+    name = poison(checkpoint / "adapter" / file)
+    seal(checkpoint)
+    with pytest.raises(InputError, match=rf"{file}: {re.escape(name)} holds NaN or infinity"):
+        export_run(run, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_merging_into_a_bfloat16_base_keeps_its_type(trained, tmp_path: Path) -> None:

@@ -56,7 +56,7 @@ def test_rows_are_on_the_disk_before_the_checkpoint_after_them(make_config, repo
         real(handle)
 
     monkeypatch.setattr(os, "fsync", fsync)
-    folder = train(make_config(training__steps=2, checkpoint__every=1), reporter)
+    folder = train(make_config(training__steps=2, training__learning_rate=1e-9, checkpoint__every=1), reporter)
     states = [place for place, name in enumerate(flushed) if name == "state.json"]
     sizes = [row["step"] for row in read_journal(folder / "metrics.jsonl")]
     assert sizes == [0, 1, 2, 2], "a validation, a step, a step and its validation"

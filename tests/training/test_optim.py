@@ -206,3 +206,16 @@ def test_an_8_bit_optimizer_without_its_library_names_the_way_out(monkeypatch: p
     monkeypatch.setitem(sys.modules, "bitsandbytes.optim", None)
     with pytest.raises(InputError, match=r"bitsandbytes is not installed.*\.\[8bit\]"):
         make_optimizer(torch.nn.Linear(2, 2), TrainingConfig(optimizer="adamw_8bit"))
+
+
+@pytest.mark.parametrize("name", ["exp_avg", "exp_avg_sq"])
+def test_moments_that_are_not_finite_are_not_taken_up(name: str) -> None:
+    layer = torch.nn.Linear(2, 3)
+    optimizer = make_optimizer(layer, TrainingConfig())
+    layer(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    state = optimizer.state_dict()
+    load_moments(optimizer, state)
+    state["state"][0][name][1, 1] = float("inf")
+    with pytest.raises(ValueError, match=f"{name} of parameter 0 holds NaN or infinity"):
+        load_moments(optimizer, state)

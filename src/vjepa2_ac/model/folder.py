@@ -17,6 +17,7 @@ from torch import nn
 from vjepa2_ac import storage
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.structured import message_of, read_json_object
 
 FORMAT = "vjepa2-ac world model 1"
@@ -76,12 +77,13 @@ def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -
     """Fill a module (which may be on the meta device) from a file, every name and shape matched.
 
     Raises:
-        InputError: The file is missing or damaged, or its tensors are not those of the module.
+        InputError: The file is missing or damaged, its tensors are not those of the module, or one is not finite.
     """
     needed = {name: tuple(value.shape) for name, value in module.state_dict().items()}
     with opened_safetensors(path, needed="the weights of a world model") as file:
         check_tensors(shapes_of(file), needed, where=str(path))
         weights = {name: _cast(file.get_tensor(name), dtype) for name in needed}
+    require_finite(weights, where=str(path), fix="Copy or write the folder again")
     frozen = {name: value.requires_grad for name, value in module.named_parameters()}
     module.load_state_dict(weights, strict=True, assign=True)
     for name, value in module.named_parameters():

@@ -6,6 +6,7 @@ PEFT's home, beside the layer in `model.lora_linear`. How the base comes back, a
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -262,6 +263,7 @@ def _load_lora(model: WorldModel, folder: Path) -> None:
         _wrap(model, config)
     else:
         _check_same_adapter(_lora_config(model), config, where=str(folder))
+    _check_scales(model, where=str(folder / "adapter_config.json"))
     weights = read_weights(folder / LORA_WEIGHTS, _lora_weights(model))
     if config.init_lora_weights == "pissa":
         _start_from_principal_parts(model, _read_principal_parts(model, folder))
@@ -279,6 +281,14 @@ def _read_lora_config(folder: Path, model: WorldModel) -> Any:
         raise InputError(
             where=f"{folder / ADAPTER_FILE}: {error.where}", found=error.found, needed=error.needed, fix=error.fix
         ) from None
+
+
+def _check_scales(model: WorldModel, *, where: str) -> None:
+    for name, layer in lora_layers(model).items():
+        scale, alpha = layer.scaling["default"], layer.lora_alpha["default"]
+        if not math.isfinite(scale):
+            found = f"lora_alpha {alpha} for {name}, a scale of {scale}"
+            raise InputError(where=where, found=found, needed="a finite scale")
 
 
 def _check_same_adapter(own: Any, other: Any, *, where: str) -> None:

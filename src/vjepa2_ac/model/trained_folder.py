@@ -16,6 +16,7 @@ from torch import Tensor
 from vjepa2_ac.config.model import VectorWidth
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.model.folder import check_tensors, opened_safetensors, shapes_of
 from vjepa2_ac.model.world_model import Adaptation, WorldModel
 from vjepa2_ac.structured import read_json_object, record_of
@@ -101,12 +102,14 @@ def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
     """Read weights that have the names and shapes of others.
 
     Raises:
-        InputError: The file is missing or damaged, or holds other tensors.
+        InputError: The file is missing or damaged, or holds other tensors, or NaN or infinity.
     """
     needed = {name: tuple(value.shape) for name, value in like.items()}
     with opened_safetensors(path, needed="the weights of an adapter") as file:
         check_tensors(shapes_of(file), needed, where=str(path))
-        return {name: file.get_tensor(name).clone() for name in needed}  # the file may be replaced meanwhile
+        weights = {name: file.get_tensor(name).clone() for name in needed}  # the file may be replaced meanwhile
+    require_finite(weights, where=str(path), fix="Use an older checkpoint, or train it again")
+    return weights
 
 
 def _save(weights: dict[str, Tensor], path: Path) -> None:

@@ -16,7 +16,9 @@ from torch import Tensor, nn
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.model.folder import check_sizes, check_tensors
+from vjepa2_ac.model.foreign_file import foreign_kind
 from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.layers import mlp_ratio_of
 from vjepa2_ac.model.world_model import WorldModel
@@ -46,7 +48,7 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
         dtype: Type of the weights in memory.
 
     Raises:
-        InputError: The file is missing, truncated, of another kind, or contradicts the sizes.
+        InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
     """
     path = Path(path)
     parts = {part: _shapes(weights) for part, weights in _open(path).items()}
@@ -107,13 +109,7 @@ def _open(path: Path) -> dict[str, dict[str, Tensor]]:
     try:
         whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, OSError) as error:
-        size, reason = path.stat().st_size / 1e9, str(error).splitlines()[0][:120]
-        raise InputError(
-            where=str(path),
-            found=f"{size:.2f} GB that torch cannot read ({reason}): truncated, or of another kind",
-            needed=f"{_NEEDED}, 11.7 GB",
-            fix=_FIX,
-        ) from None
+        raise InputError(where=str(path), found=_foreign(path, error), needed=f"{_NEEDED}, 11.7 GB", fix=_FIX) from None
     if not isinstance(whole, dict):
         raise InputError(where=str(path), found=f"a {type(whole).__name__}", needed=_NEEDED, fix=_FIX)
     encoder = whole.get("encoder", whole.get("target_encoder"))
@@ -123,6 +119,13 @@ def _open(path: Path) -> dict[str, dict[str, Tensor]]:
             found = f"no weights under {part!r} (keys: {', '.join(map(str, list(whole)[:8]))})"
             raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX)
     return {part: _without_prefixes(weights) for part, weights in parts.items() if weights is not None}
+
+
+def _foreign(path: Path, error: Exception) -> str:
+    if (kind := foreign_kind(path, error)) is not None:
+        return kind
+    size, reason = path.stat().st_size / 1e9, str(error).splitlines()[0][:120]
+    return f"{size:.2f} GB that torch cannot read ({reason}): truncated, or of another kind"
 
 
 def _without_prefixes(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -187,9 +190,9 @@ def _fill(network: nn.Module, path: Path, part: str, dtype: torch.dtype) -> None
     _check(_shapes(_open(path)[part]), _shapes(needed), part, where=str(path))
     for names in _groups(needed):
         mapped = _open(path)[part]
-        network.load_state_dict(
-            {name: _take(mapped, name, part).to(dtype, copy=True) for name in names}, strict=False, assign=True
-        )
+        group = {name: _take(mapped, name, part).to(dtype, copy=True) for name in names}
+        require_finite(group, where=f"{path}: {part}", fix=_FIX)
+        network.load_state_dict(group, strict=False, assign=True)
         del mapped
     network.requires_grad_(False)
 

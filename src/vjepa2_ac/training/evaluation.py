@@ -40,6 +40,7 @@ from vjepa2_ac.storage import user_can_write
 from vjepa2_ac.training.assembly import make_accelerator
 from vjepa2_ac.training.cached import with_latents_if_there
 from vjepa2_ac.training.chosen import NEWEST, choose_checkpoint
+from vjepa2_ac.training.divergence import warnings_of
 from vjepa2_ac.training.journal import read_journal
 from vjepa2_ac.training.run_folder import read_run_config
 from vjepa2_ac.training.runs import TrainedRun, is_run, load_run
@@ -133,9 +134,14 @@ def evaluate_subject(
         evaluation,
         training=training_curves(Path(subject)) if run else (),
         calibration=calibration,
-        notes=(*notes, *evaluation.notes),
+        notes=(*notes, *(_warnings(Path(subject)) if run else ()), *evaluation.notes),
     )
     return Evaluated(evaluation, run.chosen if run else "", _written(evaluation, folder))
+
+
+def _warnings(folder: Path) -> list[str]:
+    """Return what training warned of, as sentences."""
+    return [f"In training, {text}." for text in warnings_of(folder / "metrics.jsonl")]
 
 
 def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:

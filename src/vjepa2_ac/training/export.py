@@ -17,6 +17,7 @@ from vjepa2_ac.episode import POSE_WIDTHS, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.metrics_file import METRICS_FILE, read_metrics
 from vjepa2_ac.model.adapter_end import merge_adapter
+from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.lora import trainable_report
 from vjepa2_ac.model.trained_folder import LORA_WEIGHTS
@@ -59,8 +60,8 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
 
     Raises:
         InputError: As `load_run`; the destination is occupied or cannot be written; official: the model is of another
-            width than Meta's code; hub: the run has no adapter, or
-            its `metrics.json` is damaged.
+            width than Meta's code; hub: the run has no adapter, or its `metrics.json` is damaged; or a weight of the
+            merged model is not finite, whatever the form.
     """
     _check_free(destination)
     config = read_run_config(folder)
@@ -73,7 +74,7 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
     run = load_run(folder, checkpoint)
     if form == "official":
         _check_widths(folder, widths_of_model(run.world_model.sizes))
-    merge_adapter(run.world_model)
+    _merge(run)
     if form == "merged":
         run.world_model.save_pretrained(destination)
         return Exported(destination, run.chosen)
@@ -81,6 +82,16 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
     with user_can_write(path), atomic_writer(path) as file:
         write_torch(to_official(run.world_model), file)
     return Exported(path, run.chosen)
+
+
+def _merge(run: TrainedRun) -> None:
+    """Make what was trained part of the model, and see that every weight is then a finite number."""
+    merge_adapter(run.world_model)
+    require_finite(
+        run.world_model.predictor.state_dict(),
+        where=f"{run.checkpoint}, merged into its base",
+        fix="Check lora_alpha in its adapter_config.json, or export another checkpoint: --checkpoint best",
+    )
 
 
 def _check_free(destination: Path) -> None:
@@ -121,6 +132,7 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dic
         card = model_card(run.config, _facts(run, folder, evaluation, plot))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _damaged(folder, f"figures that cannot be used ({error!r})") from None
+    _merge(run)  # nothing of the merged model is written, but an adapter that spoils it is of no use
     with folder_writer(destination, _PEFT_CONFIG) as fresh:
         for path in (*sorted(adapter.iterdir()), *([plot] if plot else [])):
             shutil.copyfile(path, fresh / path.name)

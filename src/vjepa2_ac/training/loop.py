@@ -26,6 +26,7 @@ from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, pred
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, make_accelerator, save_checkpoint
 from vjepa2_ac.training.checkpoint import CheckpointClock
+from vjepa2_ac.training.divergence import WatchedJournal
 from vjepa2_ac.training.embodiment import NOT_ASKED
 from vjepa2_ac.training.health import Throughput, TimedBatches
 from vjepa2_ac.training.journal import Journal
@@ -147,7 +148,7 @@ def _train(
         open_run_folder(config, run.state.run_id, allow_config_change=allow_config_change)
     if run.calibration is not None and writes:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
-    with _open_journal(run, folder) as journal:
+    with _open_journal(run, folder, reporter) as journal:
         if first is not None:
             journal.write("validation", 0, validation_figures(first))
         with remote.mirror(run.state.run_id) if remote else NoMirror() as mirror:
@@ -156,12 +157,12 @@ def _train(
     return folder
 
 
-def _open_journal(run: Run, folder: Path) -> Journal | QuietJournal:
+def _open_journal(run: Run, folder: Path, reporter: Reporter) -> Journal | QuietJournal:
     if not run.accelerator.is_main_process:
         return QuietJournal()
     done = run.state.step
     trackers = open_trackers(run.config, folder, run_id=run.state.run_id, first_step=done)
-    return Journal(folder, first_step=done, trackers=trackers)
+    return WatchedJournal(folder, config=run.config, note=reporter.note, first_step=done, trackers=trackers)
 
 
 def _loop(

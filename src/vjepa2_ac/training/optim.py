@@ -7,10 +7,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.finite import first_not_finite
 
 
 def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, object]]:
@@ -63,7 +64,7 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
     So does whether it is fused, by which PyTorch decides where the counts of steps have to be.
 
     Raises:
-        ValueError: The state is of another kind of optimizer, or of other parameters.
+        ValueError: The state is of another kind of optimizer, or of other parameters, or not finite.
     """
     first = "exp_avg" if isinstance(optimizer, torch.optim.AdamW) else "state1"  # PyTorch's and bitsandbytes' names
     known = (
@@ -74,6 +75,10 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
     if any(first not in moments for moments in state["state"].values()):
         raise ValueError("its moments are of another training.optimizer")
     _require_shapes(optimizer, state["state"], first)
+    for number, moments in state["state"].items():
+        tensors = {name: value for name, value in moments.items() if isinstance(value, Tensor)}
+        if (name := first_not_finite(tensors)) is not None:
+            raise ValueError(f"{name} of parameter {number} holds NaN or infinity")
     own = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
     groups = [group | settings for group, settings in zip(state["param_groups"], own, strict=False)]
     left = state["param_groups"][len(own) :]  # which PyTorch refuses
