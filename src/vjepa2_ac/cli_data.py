@@ -8,9 +8,13 @@ import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli_parts import Commands, Handler, command, count, whole_number
 from vjepa2_ac.errors import InputError
+
+if TYPE_CHECKING:
+    from vjepa2_ac.config import Config
 
 
 def add_data(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -39,7 +43,15 @@ def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
         "Open the data, load some clips as training would, and look at every number. Exit status 0: all is well or"
         " only warnings, 1: training would learn nothing or not begin, 2: something cannot be used.",
     )  # fmt: skip
-    parser.add_argument("--limit", metavar="N", type=count, default=32, help="clips to load (32)")
+    parser.add_argument(
+        "--limit", metavar="N", type=count, default=32, help="clips to load (32); to probe, twice as many"
+    )
+    parser.add_argument(
+        "--model",
+        metavar="RUN_OR_MODEL",
+        help="probe the data with a model that knows robots (a run, or what model.base takes): does it predict better"
+        " where pictures are shifted, mirrored, reversed, BGR, or the gripper is inverted?",
+    )
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -60,7 +72,24 @@ def _check(options: argparse.Namespace) -> int:
         for finding in findings:
             print_finding(finding)
             wrong += finding.level == "error"
+    if options.model is not None:
+        _probe(config, options.model, clips=2 * options.limit)
     return 1 if wrong else 0
+
+
+def _probe(config: Config, model: str, *, clips: int) -> None:
+    from vjepa2_ac.console import console
+    from vjepa2_ac.console_data import print_finding, probe_table
+    from vjepa2_ac.data.check import at_some_stride
+    from vjepa2_ac.data.dataset import open_dataset
+    from vjepa2_ac.data.finding import Finding
+    from vjepa2_ac.training.probe import probe_config
+
+    dataset = at_some_stride(open_dataset(config.data))
+    with _progress("probing") as progress:
+        probe = probe_config(config, dataset, model=model, clips=clips, progress=progress)
+    console.print(probe_table(probe))
+    print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
 
 
 def _add_index(commands: Commands[argparse.ArgumentParser]) -> None:

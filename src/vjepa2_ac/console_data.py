@@ -11,6 +11,7 @@ from vjepa2_ac.data.index import Watch
 from vjepa2_ac.data.inspection import PERCENTILES, Inspection
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.evaluation.calibration import Calibration
+from vjepa2_ac.evaluation.variants import VariantProbe, rows_of
 
 _LEVELS = {"ok": "[green]ok[/]     ", "warning": "[yellow]warning[/]", "error": "[red]error[/]  "}
 
@@ -106,6 +107,16 @@ def _change_table(inspection: Inspection) -> Table:
     for one in inspection.changes:
         cell = " / ".join(f"{value:.1f}" for value in one.percentiles(PERCENTILES)) or "no step fits"
         table.add_row(str(one.stride), f"{one.seconds:.2f}", cell)
+    return table
+
+
+def probe_table(probe: VariantProbe) -> Table:
+    """Return the table of `data check --model`."""
+    table = Table(title="One-step error / persistence of the data, read otherwise", title_justify="left")
+    for name in ("variant", "error / persistence", "difference"):
+        table.add_column(name, justify="left" if name == "variant" else "right", no_wrap=True)
+    for row in rows_of(probe):
+        table.add_row(*row)
     return table
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.check_excerpts import excerpt_findings
 from vjepa2_ac.data.check_vectors import has_moved, vector_findings
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.duplicates import find_duplicates
@@ -73,6 +74,7 @@ def check_data(
         yield Finding("ok", "stride", f"auto; looked at here at the smallest candidate, {dataset.config.stride}")
     yield from _what_takes_part(dataset)
     yield from _read(dataset, seed=seed, batch_size=batch_size, clips=clips, clock=clock)
+    yield from excerpt_findings(dataset)
 
 
 def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:

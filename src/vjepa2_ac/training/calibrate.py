@@ -46,7 +46,7 @@ def calibrate_config(
     """
     accelerator = make_accelerator(config)
     dataset = open_dataset(config.data, progress=indexing)
-    world_model = _load(config, model)
+    world_model = load_named(config, model)
     require_widths(world_model, dataset.widths, where=model or f"model.base: {config.model.base}")
     require_same_encoder(world_model, dataset, config)
     world_model.to(accelerator.device)
@@ -55,7 +55,12 @@ def calibrate_config(
     )
 
 
-def _load(config: Config, model: str | None) -> WorldModel:
+def load_named(config: Config, model: str | None) -> WorldModel:
+    """Return the model of a run's folder, or of what `model.base` takes; None: the config's own.
+
+    Raises:
+        InputError: There is none, it cannot be read, or it is drawn at random.
+    """
     if model is not None and (Path(model) / CONFIG).is_file():
         return load_run(Path(model)).world_model
     chosen = config.model if model is None else config.model.model_copy(update={"base": model, "random": None})
