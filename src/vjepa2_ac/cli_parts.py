@@ -5,9 +5,22 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable
+from pathlib import Path
+from typing import NoReturn
+
+from vjepa2_ac import places
+from vjepa2_ac.output import printable
 
 Commands = argparse._SubParsersAction
 Handler = Callable[[argparse.Namespace], int | None]
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose messages cannot move a terminal's cursor, whatever was given."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print what is wrong, and end with status 2."""
+        super().error(printable(message))
 
 
 def command(
@@ -17,6 +30,21 @@ def command(
     parser = commands.add_parser(name, help=text, description=text)
     parser.set_defaults(handler=handler)
     return parser
+
+
+def as_path(text: str) -> Path:
+    """Read an option that is a path of this machine; `~` is the user's home, also behind `--out=`."""
+    return Path(as_local(text))
+
+
+def as_local(text: str) -> str:
+    """Read a path of this machine, and keep it as it was written."""
+    return _meant(places.on_this_machine, text)
+
+
+def as_model(text: str) -> str:
+    """Read what names a run or a model: a path of this machine, or a model that comes with the package."""
+    return _meant(places.of_a_model, text)
 
 
 def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
@@ -51,3 +79,10 @@ def number_between(least: float, most: float, unit: str) -> Callable[[str], floa
 
 
 count = whole_number(1)  # a number of things
+
+
+def _meant(read: Callable[[str], str], text: str) -> str:
+    try:
+        return read(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} {error}") from None

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from vjepa2_ac.config.section import OFF, PositiveInt, Section, Share
+from vjepa2_ac.config.section import OFF, Local, Place, PositiveInt, Section, Share
+from vjepa2_ac.places import is_url
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 
@@ -15,15 +15,6 @@ RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
 _STRIDES_AT_15_HZ = (4, 8, 15)
-
-
-def _place(path: str) -> str:
-    if not path.strip():
-        raise ValueError("empty; name a folder, or a URL")
-    return os.path.expanduser(path).rstrip("/") or "/"  # noqa: PTH111 - a URL is no Path
-
-
-Place = Annotated[str, AfterValidator(_place)]  # on this machine, where ~ is the user's home, or a URL
 
 
 class RldsFields(Section):
@@ -164,7 +155,7 @@ class AugmentConfig(Section):
 class DiskCacheConfig(Section):
     """What is kept on this machine of data that lies elsewhere, and of what was found out about it."""
 
-    dir: str | None = None
+    dir: Local | None = None
     """Folder; null: $VJEPA2_AC_CACHE, or vjepa2-ac in the user's cache folder."""
     limit_gb: Annotated[float, Field(ge=0.0)] = 50.0
     """Pictures beyond this size go, least recently used first; 0: none are kept. Indexes do not count."""
@@ -235,7 +226,7 @@ class DataConfig(Section):
     that are not there yet are encoded before the first step. require: refuse to start where they are not there."""
     cache_dtype: Literal["bf16", "fp32", "int8"] = "bf16"
     """Type that latents are kept in: bf16; fp32, which takes twice as much room; int8 with a scale per token, half."""
-    cache_dir: str | None = None
+    cache_dir: Local | None = None
     """Folder for latent caches, one folder in it for each; null: `latents` in the folder of `disk_cache`."""
     check_crc: Literal["once", "always", "never"] = "once"
     """When the CRC-32C of a local TFRecord's data is checked: the first time that it is read on this machine, every
@@ -262,7 +253,7 @@ class DataConfig(Section):
                 )
         if self.source == "latents" and isinstance(self.stride, str):
             raise ValueError("stride auto: a latent cache has one stride; give its number")
-        if self.source == "latents" and (self.cache != "off" or "://" in self.path):
+        if self.source == "latents" and (self.cache != "off" or is_url(self.path)):
             raise ValueError("source latents is itself a cache, in a folder on this machine: set cache: off")
         if self.augment.is_on and (self.source == "latents" or self.cache != "off"):
             raise ValueError("augment changes pictures, and latents that are cached are of unchanged ones: choose one")

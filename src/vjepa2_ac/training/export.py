@@ -21,7 +21,7 @@ from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.lora import trainable_report
 from vjepa2_ac.model.trained_folder import LORA_WEIGHTS
 from vjepa2_ac.model.weights import to_official
-from vjepa2_ac.storage import atomic_writer, folder_writer, user_can_write, write_atomically
+from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, user_can_write, write_atomically
 from vjepa2_ac.training.checkpoint import ADAPTER, read_state
 from vjepa2_ac.training.chosen import NEWEST
 from vjepa2_ac.training.evaluation import PLOT
@@ -86,7 +86,7 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
 def _check_free(destination: Path) -> None:
     """See that nothing is at a destination, and that it can be written. Changes nothing."""
     with user_can_write(destination):
-        if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
+        if destination.exists() and not (destination.is_dir() and is_empty(destination)):
             raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
         existing = next(path for path in (destination, *destination.absolute().parents) if path.exists())
         with tempfile.TemporaryFile(dir=existing):

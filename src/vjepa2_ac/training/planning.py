@@ -20,6 +20,7 @@ from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel, fingerprint
+from vjepa2_ac.places import literal
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.training.chosen import NEWEST
 from vjepa2_ac.training.device import is_on_cpu
@@ -131,7 +132,7 @@ def _run_config(subject: str, config: str | Path | None, overrides: Sequence[str
             needed="one config",
             fix="Change single settings behind the run's name, such as planning.horizon=2",
         )
-    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(subject)}"])
+    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(literal(Path(subject)))}"])
 
 
 def _model_config(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
