@@ -18,6 +18,8 @@ from pathlib import Path
 
 import psutil
 
+from vjepa2_ac import output
+
 KILLED = -signal.SIGKILL
 
 
@@ -30,9 +32,14 @@ class Nursery:
             env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
         )  # fmt: skip
 
-    def start(self, *arguments: str, folder: Path, die_at: int | None = None) -> Child:
-        """Start a command; it kills itself when it is about to do its `die_at`-th change to the files in a folder."""
-        self._say({"arguments": arguments, "folder": str(folder), "die_at": die_at})
+    def start(
+        self, *arguments: str, folder: Path, die_at: int | None = None, out: str = os.devnull, err: str | None = None
+    ) -> Child:
+        """Start a command; it kills itself when it is about to do its `die_at`-th change to the files in a folder.
+
+        Its standard output is the file `out`; its standard error the file `err`, else that of this process.
+        """
+        self._say({"arguments": arguments, "folder": str(folder), "die_at": die_at, "out": out, "err": err})
         return Child(int(self._answer()), self)
 
     def status_of_last(self) -> int:
@@ -125,9 +132,11 @@ def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
     try:
         os.setsid()  # its workers are in its session, and known by it when it is dead
         signal.alarm(300)  # no test waits for ever
-        nothing = os.open(os.devnull, os.O_RDWR)
-        os.dup2(nothing, 0)
-        os.dup2(nothing, 1)
+        output.LAST_S = 0.5
+        os.dup2(os.open(os.devnull, os.O_RDWR), 0)
+        os.dup2(os.open(wish["out"], os.O_WRONLY | os.O_NOCTTY), 1)
+        if wish["err"] is not None:
+            os.dup2(os.open(wish["err"], os.O_WRONLY | os.O_NOCTTY), 2)
         if wish["die_at"] is not None:
             _die_at(wish["die_at"], wish["folder"])
         status = main(wish["arguments"])

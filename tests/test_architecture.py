@@ -13,9 +13,10 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 
 # A room imports only rooms of a lower rank; rooms of one rank do not know each other.
 RANK = {
-    "__init__": 0, "errors": 0, "remote": 0.5, "config": 1, "structured": 1.2, "config_errors": 1.4, "config_file": 1.5,
-    "episode": 1, "geometry": 1, "storage": 1, "data": 2, "model": 2, "latents": 3, "encoding": 3.5, "planning": 4,
-    "evaluation": 5, "training": 6, "simulation": 7,
+    "__init__": 0, "errors": 0, "output": 0, "ending": 0, "places": 0, "remote": 0.5,
+    "config": 1, "structured": 1.2, "config_errors": 1.4, "config_file": 1.5, "episode": 1, "geometry": 1,
+    "storage": 1, "data": 2, "model": 2, "latents": 3, "encoding": 3.5, "planning": 4, "evaluation": 5,
+    "training": 6, "simulation": 7,
     "console": 8, "console_data": 8.2, "console_doctor": 8.2, "cli_parts": 8.4, "cli_data": 8.5, "cli_doctor": 8.5,
     "cli_encode": 8.5, "console_evaluation": 8.2, "cli_evaluate": 8.7, "console_planning": 8.2, "cli_plan": 8.8,
     "console_simulation": 8.2, "cli_simulate": 8.8, "cli": 9,

@@ -30,6 +30,8 @@ def complaints(*overrides: str, values: dict[str, Any] | None = None) -> list[st
             ["data.frames: ", "nothing to train on", "precision fp32 needs"],
         ),
         (["training.betas=[2, 0.9]", "data.join_actions=sum"], ["training.betas.0: ", "join_actions belongs"]),
+        (["data.stride=100000000000", "training.batch_size=100000000000"], ["data.stride", "training.batch_size: "]),
+        (["data.fields.state=[]", "data.fields.cameras={}"], ["data.fields.state: ", "data.fields.cameras: "]),
         (["data.stride=fast", "training.steps=3"], ["data.stride: ", "exceed steps 3"]),
         (["adapter=null", "training.steps=3"], ["adapter: ", "exceed steps 3"]),
         (["model.random.image_size=50", "model.random.patch_size=0"], ["patch_size: ", "give either base"]),

@@ -41,3 +41,16 @@ def test_what_is_quoted_does_not_flood_the_terminal() -> None:
     assert len(str(error)) < 10_000
     assert "begin" in str(error)
     assert str(error).endswith("end. Way out.")
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("run[lr=0.01] :smile: Grüße\n\tx", "run[lr=0.01] :smile: Grüße\n\tx"),
+        ("a\x1b[31mred\x1b]0;title\x07b", r"a\x1b[31mred\x1b]0;title\x07b"),
+        ("a\rb\x08c\x7f\x9b2J", r"a\rb\x08c\x7f\x9b2J"),
+        ("evil\u202etxt.exe\u2028", r"evil\u202etxt.exe\u2028"),
+    ],
+)
+def test_a_name_has_no_say_over_a_terminal(text: str, shown: str) -> None:
+    assert printable(text) == shown

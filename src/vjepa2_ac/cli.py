@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from vjepa2_ac import __version__
+from vjepa2_ac import __version__, output
 from vjepa2_ac.cli_data import add_data
 from vjepa2_ac.cli_doctor import add_doctor
 from vjepa2_ac.cli_encode import add_encode
 from vjepa2_ac.cli_evaluate import add_checkpoint, add_evaluate
-from vjepa2_ac.cli_parts import Commands, Handler, command, parsed, say_places_elsewhere
+from vjepa2_ac.cli_parts import Commands, Handler, Parser, as_local, as_path, command, parsed, say_places_elsewhere
 from vjepa2_ac.cli_plan import add_plan
 from vjepa2_ac.cli_simulate import add_simulate
+from vjepa2_ac.ending import tidy_end
 from vjepa2_ac.errors import InputError, in_words, is_out_of_memory, printable
 
 
@@ -25,33 +27,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return its status.
 
     0 done, 1 a check failed, 2 something given cannot be used, 75 a training run was asked to stop and can go on,
-    130 broken off.
+    130 broken off. A reader who leaves, as `head` does, changes nothing; text for which there is no room on its disk is
+    an error, but where it only tells of work.
     """
+    with output.own_streams() as streams, _our_warnings(), tidy_end():
+        status = _run(arguments)
+        if lost := streams.what_was_lost():
+            _complain(lost)
+            return status or 2
+        return status
+
+
+def _run(arguments: Sequence[str] | None) -> int:
     options = parsed(_parser(), arguments)
-    _show_our_warnings()
     handler: Handler = options.handler
     try:
         _require_working_directory()
         return handler(options) or 0
     except (InputError, OSError, MemoryError) as error:  # a full disk, a path that is no path: the message names it
-        print(f"error: {in_words(error)}", file=sys.stderr)
+        _complain(in_words(error))
         return 2
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise
-        print(f"error: {in_words(error)}", file=sys.stderr)
+        _complain(in_words(error))
         return 2
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
-
-
-class _Printable(logging.Formatter):
-    """Writes out the control characters of names that come from anybody."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        """Return the line."""
-        return printable(super().format(record))
 
 
 def _require_working_directory() -> None:
@@ -66,19 +69,31 @@ def _require_working_directory() -> None:
         ) from None
 
 
-def _show_our_warnings() -> None:
-    """Print warnings of this program; those of libraries are theirs to show."""
-    ours = logging.getLogger("vjepa2_ac")
-    if not ours.handlers:
-        handler = logging.StreamHandler()
-        handler.setFormatter(_Printable("warning: %(message)s"))
-        ours.addHandler(handler)
+def _complain(error: str) -> None:
+    print(printable(f"error: {error}"), file=sys.stderr)
+
+
+class _Warning(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(f"warning: {super().format(record)}")
+
+
+@contextlib.contextmanager
+def _our_warnings() -> Iterator[None]:
+    """Print warnings of this program, as long as the context lasts; those of libraries are theirs to show."""
+    ours, handler = logging.getLogger("vjepa2_ac"), logging.StreamHandler()
+    handler.setFormatter(_Warning())
+    ours.addHandler(handler)
     for library in ("bitsandbytes", "torchao", "torch.utils._pytree"):  # kernels for other devices; torchao's own past
         logging.getLogger(library).setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        ours.removeHandler(handler)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser: argparse.ArgumentParser = Parser(
         prog="vjepa2-ac", description="Fine-tune V-JEPA 2-AC with LoRA, and know whether it helped."
     )
     parser.add_argument("--version", action="version", version=__version__)
@@ -101,10 +116,12 @@ def _add_train(commands: Commands[argparse.ArgumentParser]) -> None:
         commands,
         "train",
         _train,
-        "Train an adapter (or the whole predictor) as a config says. SIGTERM, SIGINT or SIGUSR1: finish the step, write"
-        " a checkpoint, end with status 75; the same command goes on from there. A second signal: end at once.",
+        "Train an adapter (or the whole predictor) as a config says. SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step,"
+        " write a checkpoint, end with status 75; the same command goes on from there. A second signal: end at once.",
     )
-    parser.add_argument("config", metavar="CONFIG", help="a YAML config, or with --resume the folder of a run")
+    parser.add_argument(
+        "config", metavar="CONFIG", type=as_local, help="a YAML config, or with --resume the folder of a run"
+    )
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as training.learning_rate=3e-4")
     parser.add_argument("--resume", action="store_true", help="go on with the run in the folder CONFIG")
     parser.add_argument(
@@ -134,13 +151,14 @@ def _train(options: argparse.Namespace) -> int:
     if options.resume:
         say_places_elsewhere(options.config)
     config = read_run_config(path) if options.resume else load_config(path, options.overrides)
+    output.never_wait()
     reporter = ConsoleReporter()
     speaks = os.environ.get("RANK", "0") == "0"  # one of several processes
     try:
         folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
     except StoppedError as stopped:
         if speaks:
-            print(stopped, file=sys.stderr)
+            print(printable(str(stopped)), file=sys.stderr)
         return EXIT_STATUS
     finally:
         reporter.close()
@@ -153,8 +171,10 @@ def _add_export(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = command(
         commands, "export", _export, "Write a run's model, adapter merged in, or its adapter, for others to use."
     )
-    parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a run")
-    parser.add_argument("folder", metavar="FOLDER", type=Path, help="where to, new or empty; official: or a .pt file")
+    parser.add_argument("run", metavar="RUN", type=as_path, help="the folder of a run")
+    parser.add_argument(
+        "folder", metavar="FOLDER", type=as_path, help="where to, new or empty; official: or a .pt file"
+    )
     parser.add_argument(
         "--to",
         choices=["merged", "official", "hub"],
@@ -179,7 +199,7 @@ def _export(options: argparse.Namespace) -> None:
 def _add_config(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = command(commands, "config", _config, "Print the JSON schema of configs, or one config with every default.")
     parser.add_argument("what", choices=["schema", "show"])
-    parser.add_argument("config", metavar="CONFIG", nargs="?", help="for show: a YAML config")
+    parser.add_argument("config", metavar="CONFIG", type=as_local, nargs="?", help="for show: a YAML config")
     parser.add_argument("overrides", nargs="*", metavar="key=value")
 
 
@@ -202,7 +222,7 @@ def _add_download(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = command(
         commands, "download", _download, "Fetch the official checkpoint (11.7 GB); goes on where it stopped."
     )
-    parser.add_argument("path", metavar="PATH", type=Path, nargs="?", default=Path("checkpoints/vjepa2-ac-vitg.pt"))
+    parser.add_argument("path", metavar="PATH", type=as_path, nargs="?", default=Path("checkpoints/vjepa2-ac-vitg.pt"))
     parser.add_argument("--url", default=None, help="another address than Meta's")
 
 

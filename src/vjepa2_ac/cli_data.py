@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vjepa2_ac.cli_parts import Commands, Handler, command, count, whole_number
+from vjepa2_ac.cli_parts import Commands, Handler, as_local, as_model, as_path, command, count, whole_number
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ def _command(
     commands: Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
 ) -> argparse.ArgumentParser:
     parser = command(commands, name, handler, text)
-    parser.add_argument("config", metavar="CONFIG", help="a YAML config")
+    parser.add_argument("config", metavar="CONFIG", type=as_local, help="a YAML config")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as data.camera=wrist_left")
     return parser
 
@@ -49,6 +49,7 @@ def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--model",
         metavar="RUN_OR_MODEL",
+        type=as_model,
         help="probe the data with a model that knows robots (a run, or what model.base takes): does it predict better"
         " where pictures are shifted, mirrored, reversed, BGR, or the gripper is inverted?",
     )
@@ -111,14 +112,14 @@ def _index(options: argparse.Namespace) -> None:
     with _progress("looking through the data set") as progress, watched(rebuild=options.rebuild) as watch:
         dataset = open_dataset(config, progress=progress)
     for line in index_lines(dataset.table, watch, time.perf_counter() - started):
-        console.print(line, markup=False)
+        console.print(line)
 
 
 def _add_inspect(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = _command(
         commands, "inspect", _inspect, "Say what is in a data set, and picture it: text, inspect.json, a contact sheet."
     )
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("inspection"), help="where to (inspection)")
+    parser.add_argument("--out", metavar="DIR", type=as_path, default=Path("inspection"), help="where to (inspection)")
     parser.add_argument(
         "--episodes", "--limit", metavar="N", type=count, default=100, help="episodes whose motion is looked at (100)"
     )
@@ -144,15 +145,15 @@ def _inspect(options: argparse.Namespace) -> None:
     with _progress("reading states") as progress:
         inspection = inspect_dataset(dataset, episodes=options.episodes, progress=progress)
     for line in inspection_lines(inspection):
-        console.print(line, markup=False)
+        console.print(line)
     console.print(motion_table(inspection))
     if inspection.is_pose:
-        console.print(f"For comparison: {RELEASED}.", markup=False)
+        console.print(f"For comparison: {RELEASED}.")
     write_atomically(options.out / "inspect.json", json.dumps(inspection.as_dict(), indent=1).encode())
     path = options.out / "contact_sheet.png"
     with _progress("reading pictures") as progress:
         picture = picture_data_set(dataset, inspection, path, rows=options.rows, progress=progress)
-    console.print(f"  {picture}\n  {options.out / 'inspect.json'}", markup=False)
+    console.print(f"  {picture}\n  {options.out / 'inspect.json'}")
 
 
 def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -160,11 +161,13 @@ def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
         commands, "calibrate", _calibrate,
         "Let a model say how many control steps its model step is: its error over persistence at each stride.",
     )  # fmt: skip
-    parser.add_argument("--model", metavar="MODEL", help="another than model.base: a .pt, a folder, or a run")
+    parser.add_argument(
+        "--model", metavar="MODEL", type=as_model, help="another than model.base: a .pt, a folder, or a run"
+    )
     parser.add_argument("--split", choices=["train", "validation", "test"], default="validation", help="(validation)")
     parser.add_argument("--limit", metavar="N", type=count, default=64, help="clips at each stride (64)")
     parser.add_argument("--frames", metavar="N", type=whole_number(2, 256), help="of a clip (the config's, 8 at most)")
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path("inspection"), help="where to (inspection)")
+    parser.add_argument("--out", metavar="DIR", type=as_path, default=Path("inspection"), help="where to (inspection)")
 
 
 def _calibrate(options: argparse.Namespace) -> None:
@@ -187,10 +190,10 @@ def _calibrate(options: argparse.Namespace) -> None:
             measuring=measuring,
         )
     console.print(calibration_table(calibration))
-    console.print(calibration.verdict(), markup=False)
+    console.print(calibration.verdict())
     path = options.out / "calibration.json"
     write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
-    console.print(f"  {path}", markup=False)
+    console.print(f"  {path}")
 
 
 @contextlib.contextmanager

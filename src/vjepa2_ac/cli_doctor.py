@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from vjepa2_ac.cli_parts import Commands, command
+from vjepa2_ac.cli_parts import Commands, as_local, command
 
 
 def add_doctor(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -14,7 +14,7 @@ def add_doctor(commands: Commands[argparse.ArgumentParser]) -> None:
         " 1: it does not, 2: something cannot be used."
     )
     parser = command(commands, "doctor", _doctor, text)
-    parser.add_argument("config", metavar="CONFIG", help="a YAML config")
+    parser.add_argument("config", metavar="CONFIG", type=as_local, help="a YAML config")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as training.batch_size=4")
 
 
@@ -36,9 +36,9 @@ def _doctor(options: argparse.Namespace) -> int:
         gpu, available = device.name, device.total_memory
     estimate = estimate_memory(config, sizes)
     for line in memory_lines(config, estimate):
-        console.print(line, markup=False)
+        console.print(line)
     needed = estimate.total(checkpointing=estimate.checkpointing)
     knobs = ways_to_fit(config, sizes, available)
-    console.print(verdict(needed, available, gpu, knobs), markup=False)
-    console.print(f"The data are looked at by: vjepa2-ac data check {options.config}", markup=False)
+    console.print(verdict(needed, available, gpu, knobs))
+    console.print(f"The data are looked at by: vjepa2-ac data check {options.config}")
     return 0 if needed <= available else 1

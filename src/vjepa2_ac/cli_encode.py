@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
 
-from vjepa2_ac.cli_parts import Commands
+from vjepa2_ac import output
+from vjepa2_ac.cli_parts import Commands, as_local, as_path
 
 
 def add_encode(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -18,12 +18,12 @@ def add_encode(commands: Commands[argparse.ArgumentParser]) -> None:
     )
     parser = commands.add_parser("encode", help=text.split(".", maxsplit=1)[0] + ".", description=text)
     parser.set_defaults(handler=_encode)
-    parser.add_argument("config", metavar="CONFIG", help="a YAML config")
+    parser.add_argument("config", metavar="CONFIG", type=as_local, help="a YAML config")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as data.cache_dtype=int8")
     parser.add_argument(
         "--out",
         metavar="FOLDER",
-        type=Path,
+        type=as_path,
         help="folder of the cache, for data.source: latents (default: where data.cache finds it)",
     )
 
@@ -34,12 +34,13 @@ def _encode(options: argparse.Namespace) -> None:
     from vjepa2_ac.training.encode import encode_config
 
     config = load_config(options.config, options.overrides)
+    output.never_wait()
     is_first = os.environ.get("RANK", "0") == "0"
     looking, bar = LateProgress("looking through the data set"), EncodingBar()
 
     def note(text: str) -> None:
         if is_first:
-            console.print(text, markup=False)
+            console.print(text)
 
     try:
         encoded = encode_config(
@@ -54,18 +55,16 @@ def _encode(options: argparse.Namespace) -> None:
         bar.close()
     manifest = encoded.manifest
     if manifest is None:
-        console.print(f"This process has done its share; others are still at work on {encoded.folder}", markup=False)
+        console.print(f"This process has done its share; others are still at work on {encoded.folder}")
         return
     for name, reason in manifest.broken.items():
-        console.print(f"left out: {name}: {reason}", markup=False)
+        console.print(f"left out: {name}: {reason}")
     console.print(
         f"{manifest.encoded:,} of {manifest.episodes:,} episodes, {manifest.frames:,} frames,"
         f" {manifest.bytes / 1e9:.3g} GB are in {encoded.folder}",
-        markup=False,
     )
     console.print(
         f"Train on them with data.source=latents data.path={encoded.folder}"
         if options.out
         else "Train on them with data.cache=auto",
-        markup=False,
     )

@@ -8,6 +8,9 @@ from pathlib import Path
 from vjepa2_ac.cli_parts import (
     Commands,
     SubjectsAndOverrides,
+    as_local,
+    as_model,
+    as_path,
     command,
     count,
     number_between,
@@ -49,15 +52,19 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
         help="folder of a run, or (with --data) what model.base takes; several: their spread, too",
     )
     parser.add_argument(
-        "--data", metavar="CONFIG", help="measure on the data of this config (and with its model.dtype, device, seed)"
+        "--data",
+        metavar="CONFIG",
+        type=as_local,
+        help="measure on the data of this config (and with its model.dtype, device, seed)",
     )
     parser.add_argument(
         "--against",
         metavar="base|RUN|MODEL",
+        type=as_model,
         nargs="+",
         help="what to compare with, on the same latents; default: the base of a run, nothing for a model",
     )
-    parser.add_argument("--out", metavar="FOLDER", type=Path, help="where figures go; default: the run's folder")
+    parser.add_argument("--out", metavar="FOLDER", type=as_path, help="where figures go; default: the run's folder")
     parser.add_argument("--split", choices=["test", "validation"], default="test", help="which held-out episodes")
     parser.add_argument("--clips", type=count, default=256, help="at most this many clips, spread over the episodes")
     add_checkpoint(parser)
@@ -169,8 +176,8 @@ def _add_compare(commands: Commands[argparse.ArgumentParser]) -> None:
         _compare,
         "Put runs side by side that `evaluate` has measured on the same clips: one table, one picture.",
     )
-    parser.add_argument("runs", metavar="RUN", type=Path, nargs="+", help="folders with a metrics.json, two or more")
-    parser.add_argument("--out", metavar="PNG", type=Path, default=Path("comparison.png"), help="the picture")
+    parser.add_argument("runs", metavar="RUN", type=as_path, nargs="+", help="folders with a metrics.json, two or more")
+    parser.add_argument("--out", metavar="PNG", type=as_path, default=Path("comparison.png"), help="the picture")
 
 
 def _compare(options: argparse.Namespace) -> None:

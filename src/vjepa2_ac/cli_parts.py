@@ -8,8 +8,9 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
+from vjepa2_ac import places
 from vjepa2_ac.errors import InputError, printable
 
 Commands = argparse._SubParsersAction
@@ -18,6 +19,14 @@ Handler = Callable[[argparse.Namespace], int | None]
 _MOST = 10**9
 _OPTION = re.compile(r"-(?![\d.])")  # but a negative number is a value
 _OVERRIDE = re.compile(r"[a-z_]+(\.\w+)+=")
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose messages cannot move a terminal's cursor, whatever was given."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print what is wrong, and end with status 2."""
+        super().error(printable(message))
 
 
 def command(
@@ -61,7 +70,10 @@ class SubjectsAndOverrides(argparse.Action):
     ) -> None:
         """Put each where it belongs."""
         overrides = [word for word in values if _OVERRIDE.match(word) and not Path(word).exists()]
-        subjects = [word for word in values if word not in overrides]
+        try:
+            subjects = [as_model(word) for word in values if word not in overrides]
+        except argparse.ArgumentTypeError as error:
+            raise argparse.ArgumentError(self, str(error)) from None
         if not subjects:
             parser.error(f"the following arguments are required: {self.metavar}")
         setattr(namespace, self.dest, subjects)
@@ -82,6 +94,21 @@ def require_overrides(words: Sequence[str], *, fix: str = "") -> None:
             needed="key=value, such as training.steps=100",
             fix=fix,
         )
+
+
+def as_path(text: str) -> Path:
+    """Read an option that is a path of this machine; `~` is the user's home, also behind `--out=`."""
+    return Path(as_local(text))
+
+
+def as_local(text: str) -> str:
+    """Read a path of this machine, and keep it as it was written."""
+    return _meant(places.on_this_machine, text)
+
+
+def as_model(text: str) -> str:
+    """Read what names a run or a model: a path of this machine, or a model that comes with the package."""
+    return _meant(places.of_a_model, text)
 
 
 def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
@@ -118,3 +145,10 @@ def number_between(least: float, most: float, unit: str) -> Callable[[str], floa
 
 
 count = whole_number(1)  # a number of things
+
+
+def _meant(read: Callable[[str], str], text: str) -> str:
+    try:
+        return read(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} {error}") from None

@@ -8,7 +8,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli_evaluate import add_checkpoint
-from vjepa2_ac.cli_parts import Commands, command, require_overrides, say_places_elsewhere, whole_number
+from vjepa2_ac.cli_parts import (
+    Commands,
+    as_local,
+    as_model,
+    as_path,
+    command,
+    require_overrides,
+    say_places_elsewhere,
+    whole_number,
+)
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,9 +36,13 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         " Status 1 where the model gives no finite energy.",
     )
     parser._negative_number_matcher = re.compile(r"^-[\d.]")  # "-0.3,0.1,..." is a value, not an option
-    parser.add_argument("subject", metavar="RUN_OR_MODEL", help="folder of a run, or what model.base takes")
+    parser.add_argument(
+        "subject", metavar="RUN_OR_MODEL", type=as_model, help="folder of a run, or what model.base takes"
+    )
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as planning.horizon=2")
-    parser.add_argument("--start", metavar="PICTURE", required=True, help="what the camera sees: PNG or JPEG")
+    parser.add_argument(
+        "--start", metavar="PICTURE", type=as_local, required=True, help="what the camera sees: PNG or JPEG"
+    )
     parser.add_argument(
         "--state",
         metavar="NUMBERS",
@@ -39,6 +52,7 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "--goal",
         metavar="PICTURE",
+        type=as_local,
         required=True,
         action="append",
         help="what it shall see; again for goals that follow one another",
@@ -49,7 +63,10 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         help="model steps of each goal but the last, as 2,1; default: equal shares of planning.horizon",
     )
     parser.add_argument(
-        "--mask", metavar="PICTURE", help="what of the picture counts: of the goal's size, black where it does not"
+        "--mask",
+        metavar="PICTURE",
+        type=as_local,
+        help="what of the picture counts: of the goal's size, black where it does not",
     )
     parser.add_argument(
         "--extrinsics",
@@ -57,7 +74,7 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         help="the camera in the robot base frame: x,y,z,roll,pitch,yaw; where the model uses it",
     )
     parser.add_argument(
-        "--config", metavar="CONFIG", help="for a model: the config whose planning, crop and dtype count"
+        "--config", metavar="CONFIG", type=as_local, help="for a model: the config whose planning, crop and dtype count"
     )
     add_checkpoint(parser)
     parser.add_argument("--seed", metavar="N", type=whole_number(0, 2**31 - 1), help="default: the config's")
@@ -68,7 +85,7 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         default=13,
         help="of an energy slice along each axis (13); below 3: no slices",
     )
-    parser.add_argument("--out", metavar="FOLDER", type=Path, default=Path("plan"), help="for both files (plan)")
+    parser.add_argument("--out", metavar="FOLDER", type=as_path, default=Path("plan"), help="for both files (plan)")
 
 
 def _plan(options: argparse.Namespace) -> int:
@@ -103,9 +120,9 @@ def _plan(options: argparse.Namespace) -> int:
             plot_plan(found, options.out / PLAN_PICTURE),
         ]
     console.print(plan_table(found))
-    console.print(in_words(found), markup=False)
+    console.print(in_words(found))
     for path in written:
-        console.print(f"  {path}", markup=False)
+        console.print(f"  {path}")
     return int(found.decision.why == "no finite energy")
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from vjepa2_ac import output, places
 from vjepa2_ac.cli_evaluate import add_checkpoint
-from vjepa2_ac.cli_parts import Commands, command, count, whole_number
+from vjepa2_ac.cli_parts import Commands, as_local, as_model, as_path, command, count, whole_number
 from vjepa2_ac.errors import InputError
 
 _RECORD = "record"
@@ -35,6 +36,7 @@ def add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "subject",
         metavar="RUN_OR_MODEL|record",
+        type=as_model,
         help="who steers: the folder of a run, or what model.base takes, such as builtin:sim-tiny; or: record",
     )
     parser.add_argument(
@@ -66,10 +68,15 @@ def add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
 
 def _add_steering(group: argparse._ArgumentGroup) -> None:
     add_checkpoint(group)
-    group.add_argument("--config", metavar="CONFIG", help="of a model: a config whose `planning` is heeded")
+    group.add_argument(
+        "--config", metavar="CONFIG", type=as_local, help="of a model: a config whose `planning` is heeded"
+    )
     group.add_argument("--films", metavar="N", type=whole_number(0), help="episodes in the video; 0: none (6)")
     group.add_argument(
-        "--out", metavar="FOLDER", type=Path, help="where figures and video go (closed_loop/TASK-DOMAIN, in the run's)"
+        "--out",
+        metavar="FOLDER",
+        type=as_path,
+        help="where figures and video go (closed_loop/TASK-DOMAIN, in the run's)",
     )
 
 
@@ -96,10 +103,17 @@ def _record(options: argparse.Namespace) -> int:
     if len(options.overrides) != 1:
         found = " ".join(options.overrides) or "no folder"
         raise InputError(where="simulate record", found=found, needed="one folder, where the data set goes")
+    try:
+        target = Path(places.on_this_machine(options.overrides[0]))
+    except ValueError as error:
+        raise InputError(
+            where="simulate record", found=f"{options.overrides[0]!r} {error}", needed="a folder of this machine"
+        ) from None
+    output.never_wait()
     bar = ProgressBar("recording", options.episodes)
     try:
         folder = record_dataset(
-            Path(options.overrides[0]),
+            target,
             domain=options.domain,
             episodes=options.episodes,
             steps=options.steps,
@@ -123,6 +137,7 @@ def _steer(options: argparse.Namespace) -> int:
     from vjepa2_ac.simulation.contest import Asked, hold_contest
     from vjepa2_ac.simulation.domains import named_domain
     from vjepa2_ac.simulation.scene import load_mujoco
+    from vjepa2_ac.training.own_files import refuse_links_out
     from vjepa2_ac.training.planning import load_to_plan
     from vjepa2_ac.training.runs import is_run
 
@@ -142,8 +157,11 @@ def _steer(options: argparse.Namespace) -> int:
     steering = load_to_plan(
         options.subject, checkpoint=options.checkpoint, config=options.config, overrides=options.overrides
     )
+    name = f"closed_loop/{asked.task}-{asked.domain}"
+    if options.out is None and is_run(options.subject):
+        refuse_links_out(Path(options.subject), [name])
     home = Path(options.subject) if is_run(options.subject) else Path()
-    folder = options.out or home / "closed_loop" / f"{asked.task}-{asked.domain}"
+    folder = options.out or home / name
     with Stages() as stages:
         contest, files = hold_contest(steering, asked, folder, stage=stages)
     if steering.checkpoint:

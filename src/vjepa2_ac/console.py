@@ -5,17 +5,46 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from datetime import timedelta
+from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Column
+from rich.text import Text
 
+from vjepa2_ac.errors import printable
 from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, ratios_by_horizon
 
 _MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
 _WIDE = 120  # columns that leave room for a long bar
 
-console = Console(highlight=False, soft_wrap=True)
+
+class PlainConsole(Console):
+    """Shows every text as it is: no brackets, colons or control characters of a name or path mean anything.
+
+    Whatever is to have a colour is a `rich.text.Text`.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, highlight=False, soft_wrap=True, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return what is printed of a text: of a line, a cell, a title."""
+        return super().render_str(printable(text), **options)
+
+
+class _Words(TextColumn):
+    """A column of a bar, of text that is shown as it is."""
+
+    def __init__(self, text_format: str, table_column: Column | None = None) -> None:
+        super().__init__(text_format, markup=False, table_column=table_column)
+
+    def render(self, task: Task) -> Text:
+        """Return what is shown of a task."""
+        return Text(printable(self.text_format.format(task=task)))
+
+
+console = PlainConsole()
 if not console.is_terminal:
     console.width = 120  # a log file has room
 
@@ -31,11 +60,11 @@ class ProgressBar:
         self._task: TaskID | None = None
         if console.is_terminal:
             self._bar = Progress(
-                TextColumn("{task.description}"),
+                _Words("{task.description}"),
                 BarColumn(bar_width=40 if console.width >= _WIDE else 6, table_column=Column(no_wrap=True)),
                 MofNCompleteColumn(table_column=Column(no_wrap=True)),
                 TimeRemainingColumn(table_column=Column(no_wrap=True)),
-                TextColumn("{task.fields[words]}", table_column=Column()),  # goes on below where it does not fit
+                _Words("{task.fields[words]}", table_column=Column()),  # goes on below where it does not fit
                 console=console,
             )
             self._task = self._bar.add_task(title, total=total, completed=done, words="")

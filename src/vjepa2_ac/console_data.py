@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from vjepa2_ac.console import console
 from vjepa2_ac.data.finding import Finding
@@ -13,12 +13,13 @@ from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.evaluation.calibration import Calibration
 from vjepa2_ac.evaluation.variants import VariantProbe, rows_of
 
-_LEVELS = {"ok": "[green]ok[/]     ", "warning": "[yellow]warning[/]", "error": "[red]error[/]  "}
+_COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
 
 
 def print_finding(finding: Finding) -> None:
     """Print one line of `data check`."""
-    console.print(f"{_LEVELS[finding.level]}  {escape(f'{finding.about:<16}{finding.text}')}")
+    level = Text(f"{finding.level:<7}", style=_COLOURS[finding.level])
+    console.print(level, console.render_str(f"{finding.about:<16}{finding.text}"), sep="  ")
 
 
 def index_lines(table: EpisodeTable, watch: Watch, seconds: float) -> list[str]:
@@ -136,6 +137,9 @@ def calibration_table(calibration: Calibration) -> Table:
             f"{one.stride}{mark}", f"{one.seconds_per_step:.2f}", str(one.ratio), f"{one.error:.4f}",
             f"{one.persistence:.4f}", moved, str(one.clips), str(one.episodes),
         )  # fmt: skip
-    for stride, reason in calibration.impossible.items():
-        table.add_row(str(stride), "", f"not possible: {escape(reason)}")
+    if calibration.impossible:
+        table.caption = "\n".join(
+            f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()
+        )
+        table.caption_justify = "left"
     return table

@@ -46,7 +46,7 @@ def _sentence(text: str) -> str:
 def printable(text: str) -> str:
     r"""Return a text that a terminal shows and does not obey: control characters are written out, as \x1b.
 
-    Ends of lines stay.
+    Ends of lines and tabs stay.
     """
     if text.isprintable():
         return text
@@ -54,7 +54,7 @@ def printable(text: str) -> str:
 
 
 def _written_out(character: str) -> str:
-    if character == "\n" or unicodedata.category(character) not in _CONTROL:
+    if character in "\n\t" or unicodedata.category(character) not in _CONTROL:
         return character
     return character.encode("unicode_escape").decode()
 

@@ -128,6 +128,11 @@ def test_a_file_that_changed_after_indexing_is_named(tmp_path: Path) -> None:
         plain.read(0)
 
 
+def test_states_may_lie_in_columns(tmp_path: Path) -> None:
+    write(tmp_path / "one.npz", states=np.asfortranarray(STATES))
+    np.testing.assert_array_equal(source(tmp_path).read(0).states, STATES)
+
+
 def cut(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-200])
 
@@ -151,7 +156,10 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "wide pictures": (lambda path: write(path, frames=FRAMES.astype(np.uint16)), "pictures of uint16"),
     "grey pictures": (lambda path: write(path, frames=FRAMES[..., 0]), "frames: shape"),
     "pickled pictures": (lambda path: write(path, frames=np.array([{}, []], object)), "frames: .*objects"),
-    "turned pictures": (lambda path: write(path, frames=np.asfortranarray(FRAMES)), "ascontiguousarray"),
+    "turned pictures": (
+        lambda path: write(path, frames=np.asfortranarray(FRAMES)),
+        r"frames: an array in Fortran order.*needed: C order.*ascontiguousarray",
+    ),
     "states of another width": (lambda path: write(path, states=STATES[:, :6]), r"states: shape \(20, 6\)"),
     "no steps": (lambda path: write(path, states=STATES[:0], frames=FRAMES[:0]), "no steps"),
     "not a number": (lambda path: write(path, states=NAN), "step 3"),

@@ -1,10 +1,11 @@
 """A tiny run on synthetic episodes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from killable import Nursery
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_as_dict, parse_config
@@ -53,6 +54,14 @@ def base_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("base") / "model"
     WorldModel.random(ModelSizes.model_validate(TINY), seed=3).save_pretrained(folder)
     return folder
+
+
+@pytest.fixture(scope="session")
+def nursery() -> Iterator[Nursery]:
+    """Starts real processes in no time."""
+    nursery = Nursery()
+    yield nursery
+    nursery.close()
 
 
 MakeConfig = Callable[..., Config]

@@ -128,13 +128,6 @@ def test_of_several_cameras_each_is_encoded(make_config: MakeConfig, tmp_path: P
 # ---- whatever happens --------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def nursery() -> Iterator[Nursery]:
-    nursery = Nursery()
-    yield nursery
-    nursery.close()
-
-
 def test_a_kill_costs_one_episode_at_most(
     nursery: Nursery, make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
 ) -> None:

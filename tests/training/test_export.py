@@ -101,6 +101,13 @@ def test_the_official_checkpoint_has_the_names_of_metas(trained, tmp_path: Path)
     assert all(torch.equal(value, found["target_encoder"][name]) for name, value in found["encoder"].items())
 
 
+@pytest.mark.parametrize(("name", "form"), [("x.bin", "official"), ("x.safetensors", "official"), ("x.pt", "merged")])
+def test_a_name_of_another_kind_of_file_makes_no_folder(tmp_path: Path, name: str, form: Any) -> None:
+    with pytest.raises(InputError, match=rf"{name}: the name of a \{Path(name).suffix} file"):
+        export_run(tmp_path / "run", tmp_path / name, form)
+    assert not (tmp_path / name).exists()
+
+
 def test_it_loads_as_the_base_of_another_run(trained, make_config, reporter, tmp_path: Path) -> None:
     run = trained()
     written = export_run(run, tmp_path / "base.pt", "official").path

@@ -1,10 +1,16 @@
 """Rows are appended, survive a kill, and are not written twice."""
 
+import errno
 import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
 
+import pytest
+
+from same_run import assert_same_run
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.training import loop
 from vjepa2_ac.training.journal import Journal, read_journal
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.trackers import Trackers
@@ -64,6 +70,99 @@ def test_rows_are_on_the_disk_before_the_checkpoint_after_them(make_config, repo
     ends = [len("".join(lines[:2])), len("".join(lines))]
     for place, end in zip(states, ends, strict=True):
         assert f"metrics.jsonl {end}" in flushed[:place]
+
+
+class FullDisk:
+    """Lets writes to metrics.jsonl fail, after some bytes of them, from a row on."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.is_full, self._write = False, os.write
+        monkeypatch.setattr(os, "write", self.write)
+
+    def write(self, handle: int, data: bytes) -> int:
+        if not self.is_full or Path(f"/proc/self/fd/{handle}").readlink().name != "metrics.jsonl":
+            return self._write(handle, data)
+        if bytes(data).startswith(b"{"):
+            return self._write(handle, bytes(data)[:7])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def full_from(disk: FullDisk, reporter, at: int):
+    stepped = reporter.stepped
+
+    def step_on(step: int, figures: dict) -> None:
+        stepped(step, figures)
+        disk.is_full = step >= at
+
+    reporter.stepped = step_on
+    return reporter
+
+
+def test_a_run_that_cannot_write_its_record_writes_its_checkpoint_and_says_of_which_file(
+    make_config, reporter, tmp_path, monkeypatch
+) -> None:
+    disk, quiet = FullDisk(monkeypatch), type(reporter)()
+    config = make_config(checkpoint__every=100, checkpoint__every_minutes=None, checkpoint__keep_best=False)
+    with pytest.raises(InputError, match=r"metrics\.jsonl: .*No space left on device.*The checkpoint of this step is"):
+        train(config, full_from(disk, reporter, 4))
+    assert reporter.steps[-1] == 4, "it ended at once"
+    disk.is_full = False
+    train(config, quiet)
+    assert quiet.steps == [5, 6], "no step was lost"
+    assert [row["step"] for row in read_journal(tmp_path / "run/metrics.jsonl") if row["kind"] == "train"] == [
+        1, 2, 3, 5, 6
+    ]  # fmt: skip
+
+
+def test_where_a_checkpoint_makes_room_the_run_goes_on_and_its_record_is_whole(
+    make_config, reporter, tmp_path, monkeypatch
+) -> None:
+    disk, save = FullDisk(monkeypatch), loop.save_checkpoint
+
+    def make_room(*arguments: object) -> None:
+        save(*arguments)
+        disk.is_full = False
+
+    train(make_config(run_dir=str(tmp_path / "whole")), type(reporter)())
+    monkeypatch.setattr(loop, "save_checkpoint", make_room)
+    train(make_config(), full_from(disk, reporter, 3))
+    assert_same_run(tmp_path / "whole", tmp_path / "run")
+
+
+def test_where_neither_record_nor_checkpoint_can_be_written_both_are_named(tmp_path: Path, monkeypatch) -> None:
+    disk = FullDisk(monkeypatch)
+
+    def no_checkpoint() -> None:
+        with journal.before_a_checkpoint():
+            raise InputError(where="step-00000001", found="it cannot be written")
+
+    with Journal(tmp_path, first_step=0) as journal:
+        with pytest.raises(InputError, match=r"^step-00000001: it cannot be written"):
+            no_checkpoint()
+        disk.is_full = True
+        journal.write("train", 1, {"loss": 0.5})
+        assert journal.is_behind
+        with pytest.raises(InputError, match=r"metrics\.jsonl: .*No space left.*step-00000001: it cannot be written"):
+            no_checkpoint()
+
+
+def test_a_flush_that_failed_is_not_taken_for_done_when_the_next_one_is(tmp_path: Path, monkeypatch) -> None:
+    """The system may have forgotten what it was to write."""
+    real, failures = os.fsync, [OSError(errno.EIO, "Input/output error")]
+
+    def fsync(handle: int) -> None:
+        if failures:
+            raise failures.pop()
+        real(handle)
+
+    def checkpoint() -> None:
+        with journal.before_a_checkpoint():
+            pass
+
+    with Journal(tmp_path, first_step=0) as journal:
+        monkeypatch.setattr(os, "fsync", fsync)
+        with pytest.raises(InputError, match="Input/output error"):
+            checkpoint()
 
 
 def test_what_json_cannot_hold_becomes_null(tmp_path: Path) -> None:

@@ -127,6 +127,13 @@ def test_a_signal_that_comes_twice_at_once_is_one() -> None:
         assert stop.reason == "SIGTERM"
 
 
+def test_a_terminal_that_goes_asks_to_stop_however_often_it_says_so() -> None:
+    with stop_on_signals(same_within_s=0.0) as stop:
+        for _ in range(3):
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert stop.reason == "SIGHUP"
+
+
 def test_signals_do_afterwards_what_they_did_before() -> None:
     def mine(number: int, frame: object) -> None: ...
 

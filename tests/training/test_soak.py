@@ -6,7 +6,6 @@ A few kills here; many with `make soak` (VJEPA2_AC_SOAK=20: so many kills of eac
 import logging
 import os
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,13 +24,6 @@ CHANGES = {
     "training__steps": 24, "validation__every": 4, "checkpoint__every": 2, "checkpoint__keep": 2,
     "checkpoint__every_minutes": None,
 }  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def nursery() -> Iterator[Nursery]:
-    nursery = Nursery()
-    yield nursery
-    nursery.close()
 
 
 class Killer:

@@ -14,6 +14,9 @@ import pytest
 from vjepa2_ac.config import Config, TrackingConfig
 from vjepa2_ac.config_file import parse_config
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.training import guest, loop
+from vjepa2_ac.training.journal import read_journal
+from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.trackers import Trackers, open_trackers, require_installed
 
 
@@ -71,6 +74,7 @@ def test_figures_come_by_name_and_lists_number_by_number() -> None:
     kept = Kept()
     trackers = Trackers({"one": lambda: kept})
     trackers.log("validation", 7, {"error": 0.5, "by_horizon": [1.0, 2.0], "nothing": float("nan"), "words": "no"})
+    trackers.close()
     assert kept.rows == [(7, {"validation/error": 0.5, "validation/by_horizon/1": 1.0, "validation/by_horizon/2": 2.0})]
 
 
@@ -111,6 +115,72 @@ def test_one_that_hangs_is_left_behind(caplog) -> None:
     never.set()
     assert len(slow.rows) == 1
     assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["stuck cannot be opened", "slow did not close"]
+
+
+def test_one_that_takes_minutes_holds_up_nothing_and_gets_all_in_the_end(caplog) -> None:
+    slow, goes_on = Kept(), threading.Event()
+    taken = slow.log
+
+    def log(figures: Mapping[str, float], step: int) -> None:
+        assert goes_on.wait(60)
+        taken(figures, step)
+
+    slow.log = log  # type: ignore[method-assign]
+    trackers = Trackers({"slow": lambda: slow}, opening_s=0.05, closing_s=60.0)
+    started = time.monotonic()
+    for step in range(100):
+        trackers.log("train", step, {"loss": 0.5})
+    time.sleep(0.1)
+    trackers.log("train", 100, {"loss": 0.5})
+    trackers.log("train", 101, {"loss": 0.5})
+    assert time.monotonic() - started < 30, "none was waited for"
+    assert warnings_in(caplog) == ["slow failed (no answer within 0.05 s); its figures wait"]
+    goes_on.set()
+    trackers.close()
+    assert [step for step, _ in slow.rows] == list(range(102))
+    assert slow.closed == 1
+
+
+def test_one_that_has_nothing_to_do_for_long_is_not_warned_of(caplog) -> None:
+    kept = Kept()
+    trackers = Trackers({"kept": lambda: kept}, opening_s=0.05)
+    trackers.log("train", 1, {"loss": 0.5})
+    while not kept.rows:
+        time.sleep(0.001)
+    time.sleep(0.1)
+    trackers.log("train", 2, {"loss": 0.5})
+    trackers.close()
+    assert warnings_in(caplog) == []
+
+
+def test_what_waits_for_a_tracker_is_bounded_and_the_rest_counted(caplog, monkeypatch) -> None:
+    monkeypatch.setattr(guest, "MOST_ROWS", 5)
+    never, slow = threading.Event(), Kept()
+
+    def opened() -> Kept:
+        never.wait(60)
+        return slow
+
+    trackers = Trackers({"slow": opened}, closing_s=60.0)
+    for step in range(12):
+        trackers.log("train", step, {"loss": 0.5})
+    never.set()
+    trackers.close()
+    assert [step for step, _ in slow.rows] == [0, 1, 2, 3, 4]
+    assert warnings_in(caplog) == ["slow was too slow for 7 rows, which are missing there"]
+
+
+def test_a_run_does_not_wait_for_a_tracker_that_never_opens(make_config, reporter, monkeypatch, caplog) -> None:
+    never = threading.Event()
+
+    def stuck(*_: object, **__: object) -> Trackers:
+        return Trackers({"stuck": lambda: never.wait()}, closing_s=0.05)  # type: ignore[dict-item, return-value]
+
+    monkeypatch.setattr(loop, "open_trackers", stuck)
+    folder = train(make_config(training__steps=2), reporter)
+    never.set()
+    assert [row["step"] for row in read_journal(folder / "metrics.jsonl") if row["kind"] == "train"] == [1, 2]
+    assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["stuck cannot be opened"]
 
 
 @pytest.mark.parametrize("library", ["wandb", "trackio"])

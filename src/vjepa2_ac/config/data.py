@@ -2,29 +2,21 @@
 
 from __future__ import annotations
 
-import os
 import re
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from vjepa2_ac.config.section import OFF, PositiveInt, Section, Share
+from vjepa2_ac.config.section import OFF, Local, Place, PositiveInt, Section, Share
+from vjepa2_ac.places import is_url
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 
 # A serial number is a name, also where YAML takes it for a number.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
+_Names = Annotated[tuple[str, ...], Field(min_length=1)]
 _STRIDES_AT_15_HZ = (4, 8, 15)
-
-
-def _place(path: str) -> str:
-    if not path.strip():
-        raise ValueError("empty; name a folder, or a URL")
-    return os.path.expanduser(path).rstrip("/") or "/"  # noqa: PTH111 - a URL is no Path
-
-
-Place = Annotated[str, AfterValidator(_place)]  # on this machine, where ~ is the user's home, or a URL
 
 
 def _split_by(text: str) -> str:
@@ -46,19 +38,19 @@ def _split_by(text: str) -> str:
 class RldsFields(Section):
     """Where an RLDS data set keeps what the model needs; the defaults are DROID's."""
 
-    state: tuple[str, ...] = (
+    state: _Names = (
         "steps/observation/cartesian_position",
         "steps/observation/gripper_position",
     )
     """Features that give, joined, the 7 numbers of the *measured* state (legend: episode.py); for `states: vector` any
     numbers."""
-    action: tuple[str, ...] = ("steps/action",)
+    action: _Names = ("steps/action",)
     """For `actions: recorded`: features that give, joined, the *commanded* action of each control step."""
     gripper: Literal["closedness", "openness"] = "closedness"
     """What the last number of the state is: 0 open .. 1 closed (DROID), or 0 closed .. 1 open (BridgeData)."""
-    identity: tuple[str, ...] = ("episode_metadata/recording_folderpath", "episode_metadata/file_path")
+    identity: _Names = ("episode_metadata/recording_folderpath", "episode_metadata/file_path")
     """Features that name an episode; the split into train, validation and test is a hash of them."""
-    cameras: dict[str, str] = {
+    cameras: Annotated[dict[str, str], Field(min_length=1)] = {
         "exterior_1_left": "steps/observation/exterior_image_1_left",
         "exterior_2_left": "steps/observation/exterior_image_2_left",
         "wrist_left": "steps/observation/wrist_image_left",
@@ -84,10 +76,10 @@ class RawDroidOptions(Section):
 class LeRobotFields(Section):
     """Where a LeRobot data set keeps what the model needs; the defaults are those of DROID's ports."""
 
-    state: tuple[str, ...] = ("observation.state.cartesian_position", "observation.state.gripper_position")
+    state: _Names = ("observation.state.cartesian_position", "observation.state.gripper_position")
     """Columns whose values, joined, hold position, rotation and gripper of the *measured* state; for `states: vector`
     any numbers."""
-    action: tuple[str, ...] = ("action",)
+    action: _Names = ("action",)
     """For `actions: recorded`: columns that give, joined, the *commanded* action of each control step."""
     select: tuple[Annotated[int, Field(ge=0)], ...] | None = None
     """Which of the joined numbers, in this order, are x, y, z, the rotation's 3 or 4, the gripper; for `states: vector`
@@ -98,7 +90,7 @@ class LeRobotFields(Section):
     """What the gripper's number is when it is open."""
     gripper_closed: float = 1.0
     """What the gripper's number is when it is closed; smaller than gripper_open where the sign is turned."""
-    cameras: dict[str, str] = {
+    cameras: Annotated[dict[str, str], Field(min_length=1)] = {
         "exterior_1_left": "observation.images.exterior_1_left",
         "exterior_2_left": "observation.images.exterior_2_left",
         "wrist_left": "observation.images.wrist_left",
@@ -181,7 +173,7 @@ class AugmentConfig(Section):
 class DiskCacheConfig(Section):
     """What is kept on this machine of data that lies elsewhere, and of what was found out about it."""
 
-    dir: str | None = None
+    dir: Local | None = None
     """Folder; null: $VJEPA2_AC_CACHE, or vjepa2-ac in the user's cache folder."""
     limit_gb: Annotated[float, Field(ge=0.0)] = 50.0
     """Pictures beyond this size go, least recently used first; 0: none are kept. Indexes do not count."""
@@ -256,7 +248,7 @@ class DataConfig(Section):
     that are not there yet are encoded before the first step. require: refuse to start where they are not there."""
     cache_dtype: Literal["bf16", "fp32", "int8"] = "bf16"
     """Type that latents are kept in: bf16; fp32, which takes twice as much room; int8 with a scale per token, half."""
-    cache_dir: str | None = None
+    cache_dir: Local | None = None
     """Folder for latent caches, one folder in it for each; null: `latents` in the folder of `disk_cache`."""
     check_crc: Literal["once", "always", "never"] = "once"
     """When the CRC-32C of a local TFRecord's data is checked: the first time that it is read on this machine, every
@@ -283,7 +275,7 @@ class DataConfig(Section):
                 )
         if self.source == "latents" and isinstance(self.stride, str):
             raise ValueError("stride auto: a latent cache has one stride; give its number")
-        if self.source == "latents" and (self.cache != "off" or "://" in self.path):
+        if self.source == "latents" and (self.cache != "off" or is_url(self.path)):
             raise ValueError("source latents is itself a cache, in a folder on this machine: set cache: off")
         if self.augment.is_on and (self.source == "latents" or self.cache != "off"):
             raise ValueError("augment changes pictures, and latents that are cached are of unchanged ones: choose one")

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from vjepa2_ac import places
 from vjepa2_ac.config.section import PositiveInt, Section, Share
 
 # Far beyond every model of the kind (released: width 1408, depth 40, 1.3 billion weights): a file may claim anything.
@@ -100,7 +101,7 @@ class ModelSizes(Section):
 class ModelConfig(Section):
     """Which world model to start from."""
 
-    base: str | None = None
+    base: Annotated[str, AfterValidator(places.of_a_model)] | None = None
     """The model to adapt: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny
     model of the demo, which comes with the package)."""
     random: ModelSizes | None = None

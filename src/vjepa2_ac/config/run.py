@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
+from vjepa2_ac import places
 from vjepa2_ac.config.data import DataConfig
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
@@ -13,11 +14,20 @@ from vjepa2_ac.config.section import Section
 from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
 
 
+def _run_folder(path: str) -> str:
+    try:
+        return places.on_this_machine(path)
+    except ValueError as error:
+        if not places.is_url(path):
+            raise
+        raise ValueError(f"{error}; to keep a copy there as the run goes, set checkpoint.remote to it") from None
+
+
 class Config(Section):
     """A complete run."""
 
-    run_dir: str
-    """Folder of the run: resolved config, checkpoints, metrics."""
+    run_dir: Annotated[str, AfterValidator(_run_folder)]
+    """Folder of the run, on this machine: resolved config, checkpoints, metrics. `checkpoint.remote` keeps a copy."""
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     """Decides the order of clips, fresh weights and dropout."""
     data: DataConfig

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-PositiveInt = Annotated[int, Field(ge=1)]
+from vjepa2_ac import places
+
+PositiveInt = Annotated[int, Field(ge=1, le=1_000_000_000)]  # more of anything no machine has room for
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 OFF = BeforeValidator(lambda value: "off" if value is False else value)  # YAML takes off for a truth value
+Place = Annotated[str, AfterValidator(places.anywhere)]  # on this machine, where ~ is the user's home, or a URL
+Local = Annotated[str, AfterValidator(places.on_this_machine)]  # likewise, but no URL
 
 
 class Section(BaseModel):

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from vjepa2_ac.config.section import OFF, PositiveInt, Section
+from vjepa2_ac.config.section import OFF, Place, PositiveInt, Section
 
 
 class TrainingConfig(Section):
@@ -114,7 +114,7 @@ class CheckpointConfig(Section):
     """How many of the newest checkpoints stay."""
     keep_best: bool = True
     """Write one after the validation that went best (rollout error over persistence at the last horizon); it stays."""
-    remote: Annotated[str, Field(min_length=1)] | None = None
+    remote: Place | None = None
     """Where the run is copied to as it goes: gs://bucket/folder, another URL of fsspec that can be written, or a folder
     (a mounted disk). A start with an empty run_dir goes on from there; null: nowhere. Same keep and best as here."""
     remote_every_minutes: Annotated[float, Field(ge=0.0)] = 30.0

@@ -14,14 +14,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
-from vjepa2_ac import storage
+from vjepa2_ac import places, storage
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.data.table import FORMAT, EpisodeTable, NotATableError
+from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+_CACHE = "VJEPA2_AC_CACHE"
 _VERSION = 3  # of what is kept: another number makes all of it be found out again
 _CRC_BYTES = 4
 
@@ -49,11 +51,18 @@ def watched(*, rebuild: bool = False) -> Iterator[Watch]:
 
 
 def cache_folder(config: DiskCacheConfig) -> Path:
-    """Return the folder for what is kept on this machine: the config's, $VJEPA2_AC_CACHE, or the user's."""
+    """Return the folder for what is kept on this machine: the config's, $VJEPA2_AC_CACHE, or the user's.
+
+    Raises:
+        InputError: The environment names none.
+    """
     if config.dir is not None:
-        return Path(config.dir).expanduser()
-    if named := os.environ.get("VJEPA2_AC_CACHE"):
-        return Path(named).expanduser()
+        return Path(config.dir)
+    if named := os.environ.get(_CACHE):
+        try:
+            return Path(places.on_this_machine(named))
+        except ValueError as error:
+            raise InputError(where=_CACHE, found=f"{named!r} {error}", needed="a folder of this machine") from None
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vjepa2-ac"
 
 

@@ -52,7 +52,7 @@ def key_for(dataset: Dataset, encoding: Encoding) -> CacheKey:
 def folder_of(config: DataConfig, key: CacheKey) -> Path:
     """Return the folder of a cache: in `data.cache_dir`, or with what else is kept on this machine."""
     parent = cache_folder(config.disk_cache) / "latents" if config.cache_dir is None else Path(config.cache_dir)
-    return parent.expanduser() / key.digest
+    return parent / key.digest
 
 
 def through_cache(dataset: Dataset, encoding: Encoding) -> Dataset:

@@ -23,7 +23,7 @@ import torch
 from torch.utils.data import DataLoader
 from torch.utils.data import Dataset as TorchDataset
 
-from vjepa2_ac import storage
+from vjepa2_ac import output, storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.augment import draw
 from vjepa2_ac.data.clips import Wish, clip_at, collate, no_clips, read_clip
@@ -263,7 +263,9 @@ def _start_servers_deaf() -> None:
     finish the step, and ends them.
     """
     for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the first one clears the mask
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGUSR1})
+        before = signal.pthread_sigmask(
+            signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGHUP}
+        )
         try:
             start()
         finally:
@@ -279,6 +281,7 @@ def _end_with_the_run(_worker: int) -> None:
     if run is None:
         raise ValueError("not in a worker")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which ends its workers
+    output.never_wait()  # a warning that nobody reads must not hold up the batch
 
     def watch() -> None:
         run.join()

@@ -37,10 +37,13 @@ def compare(folders: Sequence[Path]) -> Comparison:
     """Put runs side by side; each is compared with the first one, paired by clip.
 
     Raises:
-        InputError: Fewer than two, one was not evaluated, or they were measured on different clips.
+        InputError: Fewer than two, one is named twice or was not evaluated, or they were measured on different clips.
     """
     if len(folders) < 2:
         raise InputError(where="command line", found=f"{len(folders)} run", needed="two or more to compare")
+    for number, folder in enumerate(folders):
+        if folder.resolve() in [other.resolve() for other in folders[:number]]:
+            raise InputError(where=str(folder), found="a run that is named twice", needed="each run once")
     measured = {_name(folder, folders): read_metrics(folder) for folder in folders}
     try:
         return _compared(measured, dict(zip(measured, folders, strict=True)))

@@ -12,11 +12,11 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.folder import CONFIG, check_sizes, read_sizes
 from vjepa2_ac.model.weights import load_official
 from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.places import BUILTIN
 
 ASSETS = Path(str(importlib.resources.files("vjepa2_ac"))) / "assets"
 
-_BUILTIN = "builtin:"
-_TINY = f"{_BUILTIN}sim-tiny"
+_TINY = f"{BUILTIN}sim-tiny"
 
 
 def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
@@ -31,7 +31,7 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
         return WorldModel.random(config.random, seed, dtype, at_persistence=at_persistence)
     if config.base is None:
         raise ValueError("a ModelConfig has a base or random sizes")
-    path = _builtin(config.base) if config.base.startswith(_BUILTIN) else Path(config.base)
+    path = _builtin(config.base) if config.base.startswith(BUILTIN) else Path(config.base)
     if path.is_dir():
         check_sizes(read_sizes(path), config.sizes, where=f"model.base: {config.base}")
         return WorldModel.from_pretrained(path, dtype=dtype)
@@ -55,14 +55,14 @@ def base_sizes(config: ModelConfig) -> ModelSizes:
     """
     if config.random is not None or config.base is None:
         return config.random or config.sizes
-    path = _builtin(config.base) if config.base.startswith(_BUILTIN) else Path(config.base)
+    path = _builtin(config.base) if config.base.startswith(BUILTIN) else Path(config.base)
     return read_sizes(path) if path.is_dir() else config.sizes
 
 
 def _builtin(name: str) -> Path:
-    path = ASSETS / name.removeprefix(_BUILTIN)
+    path = ASSETS / name.removeprefix(BUILTIN)
     if not (path / CONFIG).is_file():
-        there = sorted(f"{_BUILTIN}{config.parent.name}" for config in ASSETS.glob(f"*/{CONFIG}"))
+        there = sorted(f"{BUILTIN}{config.parent.name}" for config in ASSETS.glob(f"*/{CONFIG}"))
         raise InputError(
             where=f"model.base: {name}",
             found=f"no model of that name in the package; it has {', '.join(there) or 'none'}",

@@ -1,5 +1,6 @@
 """How are files listed, read, written and hashed, on this machine and behind URLs?"""
 
+from vjepa2_ac.places import is_url
 from vjepa2_ac.storage.reading import (
     ByteReader,
     FileInfo,
@@ -9,7 +10,6 @@ from vjepa2_ac.storage.reading import (
     exists,
     file_size,
     file_version,
-    is_url,
     join,
     list_files,
     list_names,
@@ -22,7 +22,7 @@ from vjepa2_ac.storage.reading import (
     unreadable,
 )
 from vjepa2_ac.storage.transfer import download, file_sizes, place, remove, remove_folder, try_writing, upload
-from vjepa2_ac.storage.writing import atomic_writer, folder_writer, sync, user_can_write, write_atomically
+from vjepa2_ac.storage.writing import atomic_writer, folder_writer, is_empty, sync, user_can_write, write_atomically
 
 __all__ = [
     "ByteReader",
@@ -37,6 +37,7 @@ __all__ = [
     "file_sizes",
     "file_version",
     "folder_writer",
+    "is_empty",
     "is_url",
     "join",
     "list_files",

@@ -19,6 +19,7 @@ from typing import Protocol, runtime_checkable
 
 from vjepa2_ac import remote
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.places import is_url
 from vjepa2_ac.remote import UnreachableError
 
 _HASH_CHUNK_BYTES = 1 << 20
@@ -44,11 +45,6 @@ class ByteReader(Protocol):
     def close(self) -> None:
         """Give the file back."""
         ...
-
-
-def is_url(path: str | Path) -> bool:
-    """Return whether a path names a file behind fsspec (`gs://…`) rather than one on this machine."""
-    return "://" in str(path)
 
 
 def join(folder: str | Path, name: str) -> str:

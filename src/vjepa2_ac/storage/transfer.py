@@ -15,8 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from vjepa2_ac import remote
+from vjepa2_ac.places import is_url
 from vjepa2_ac.remote import RefusedError, UnreachableError
-from vjepa2_ac.storage.reading import is_url, join
+from vjepa2_ac.storage.reading import join
 from vjepa2_ac.storage.writing import atomic_writer
 
 _AWAY = frozenset(
@@ -28,7 +29,7 @@ _PIECE_BYTES = 32 << 20
 def place(path: str) -> str:
     """Return the one name of a folder: an absolute path, also for `file://`, or a URL; no slash behind it."""
     path = path.removeprefix("file://")
-    return path.rstrip("/") if is_url(path) else str(Path(path).expanduser().resolve())
+    return path.rstrip("/") if is_url(path) else str(Path(path).resolve())
 
 
 def upload(source: Path, target: str) -> None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import errno
 import os
-import secrets
 import shutil
 from collections.abc import Iterator, Set
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.partial import is_partial, partial_file, partial_folder
 
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 _UNWRITABLE = _FULL | {
@@ -28,20 +28,19 @@ def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    # Of this writer alone: others may be threads, or processes of the same number in another container.
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
-    try:
-        with temporary.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(target)
-    except BaseException as error:
-        with suppress(FileNotFoundError):
-            temporary.unlink()
-        if isinstance(error, OSError) and error.filename is None:  # a full disk does not say of what
-            error.filename = str(target)
-        raise
+    with partial_file(target) as (temporary, handle):
+        try:
+            with os.fdopen(handle, "wb", closefd=False) as file:
+                yield file
+                file.flush()
+                os.fsync(handle)
+            temporary.replace(target)
+        except BaseException as error:
+            with suppress(FileNotFoundError):
+                temporary.unlink()
+            if isinstance(error, OSError) and error.filename is None:  # a full disk does not say of what
+                error.filename = str(target)
+            raise
     sync(target.parent)
 
 
@@ -65,26 +64,31 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
     Raises:
         InputError: The folder cannot be made or written, or the disk is full.
     """
-    with user_can_write(folder):
-        target = Path(folder).resolve()
-        there = target.is_dir()
-        partial = (target if there else target.parent) / f".{target.name}.{os.getpid()}.partial"
-        if target.exists() and not there:
-            raise NotADirectoryError(errno.ENOTDIR, "it is a file")
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir(parents=True)
-    try:
-        with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's own
-            yield partial
+    with ExitStack() as while_writing:
         with user_can_write(folder):
-            if there:
-                _move_into(target, partial, manifest)
-            else:
-                partial.replace(target)
-            sync(target if there else target.parent)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+            target = Path(folder).resolve()
+            there = target.is_dir()
+            if target.exists() and not there:
+                raise NotADirectoryError(errno.ENOTDIR, "it is a file")
+            parent = target if there else target.parent
+            partial = while_writing.enter_context(partial_folder(parent, target.name))
+        try:
+            with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's own
+                yield partial
+            with user_can_write(folder):
+                if there:
+                    _move_into(target, partial, manifest)
+                else:
+                    partial.replace(target)
+                sync(target if there else target.parent)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+
+
+def is_empty(folder: Path) -> bool:
+    """Return whether a folder has nothing in it, but for what writers that were killed have left there."""
+    return all(map(is_partial, folder.iterdir()))
 
 
 @contextmanager

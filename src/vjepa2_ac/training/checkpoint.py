@@ -2,7 +2,7 @@
 
 A checkpoint is a folder `step-00001000` with `manifest.json`, which holds the SHA-256 of every other file. It is
 written under a temporary name and renamed, so a folder that carries the final name is whole or was damaged later;
-the manifest tells.
+the manifest tells. What is called otherwise, `step-00001000.bak` for one, is somebody's own and is left alone.
 """
 
 from __future__ import annotations
@@ -32,7 +32,10 @@ logger = logging.getLogger(__name__)
 STATE = "state.json"
 ADAPTER = "adapter"  # a folder: what `model.lora.save_trained` writes
 OPTIMIZER = "optimizer.pt"
-_NAME = re.compile(r"step-(\d{8})$")
+FETCHING = ".fetching-"  # a checkpoint that comes from elsewhere, see `training.mirror.fetch`
+
+_WRITING = ".writing-"
+_NAME = re.compile(r"step-([0-9]{8,})")
 _NEEDED = "where a run stood, as this program wrote it"
 _FIX = "Delete this checkpoint, to use an older one"
 
@@ -90,6 +93,27 @@ def checkpoint_name(step: int) -> str:
     return f"step-{step:08d}"
 
 
+def step_of(name: str) -> int | None:
+    """Return the step of a checkpoint by the name of its folder; None where checkpoints are called otherwise."""
+    found = _NAME.fullmatch(name)
+    return int(found[1]) if found and name == checkpoint_name(int(found[1])) else None
+
+
+def listed(folder: Path) -> list[Path]:
+    """Return the checkpoints in a folder by their steps, the newest last, whole or damaged; of no folder, none."""
+    there = folder.iterdir() if folder.is_dir() else ()
+    found = [path for path in there if step_of(path.name) is not None and path.is_dir()]
+    return sorted(found, key=lambda path: step_of(path.name) or 0)
+
+
+def remove_leavings(folder: Path) -> None:
+    """Remove what starts of this run that were killed left by halves. Nobody else may be at work there."""
+    for beginning in (_WRITING, FETCHING):
+        for path in folder.glob(f"{beginning}*"):
+            if step_of(path.name.removeprefix(beginning)) is not None:
+                shutil.rmtree(path, ignore_errors=True)
+
+
 def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path], None], *, keep: int) -> Path:
     """Write a checkpoint whole or not at all, then remove all but the newest `keep` and the best.
 
@@ -103,16 +127,17 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
         InputError: The folder cannot be written (full disk, no permission). Older checkpoints stay as they are.
     """
     final = folder / checkpoint_name(state.step)
-    temporary = folder / f".writing-{checkpoint_name(state.step)}"
+    temporary = folder / f"{_WRITING}{final.name}"
     try:
+        remove_leavings(folder)  # they need the room
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
         write_files(temporary)
         (temporary / STATE).write_text(json.dumps(asdict(state)))
         seal(temporary)
-        for stale in _listed(folder):  # damaged ones that were passed over; those steps are being done again
-            if stale.name >= final.name:
-                shutil.rmtree(stale)
+        for stale in listed(folder):  # damaged ones that were passed over; those steps are being done again
+            if (step_of(stale.name) or 0) >= state.step:
+                _remove(stale)
         temporary.rename(final)
         sync(folder)
         _prune(folder, keep, state.best_step)
@@ -132,7 +157,7 @@ def newest_checkpoint(folder: Path) -> Path | None:
     Raises:
         InputError: There are checkpoints, and every one is damaged.
     """
-    found = _listed(folder)
+    found = listed(folder)
     for path in reversed(found):
         problem = damage(path)
         if problem is None:
@@ -147,9 +172,14 @@ def newest_checkpoint(folder: Path) -> Path | None:
     return None
 
 
-def damage(checkpoint: Path) -> str | None:
-    """Return what is wrong with a checkpoint, or None when every file is what the manifest says."""
-    return broken_seal(checkpoint, needed={STATE})
+def damage(checkpoint: Path, name: str | None = None) -> str | None:
+    """Return what is wrong with a checkpoint, or None when every file is what the manifest says.
+
+    Args:
+        checkpoint: Its folder.
+        name: What it is called, where its folder is called otherwise.
+    """
+    return broken_seal(checkpoint, needed={STATE}) or _another_step(checkpoint, name or checkpoint.name)
 
 
 def read_state(checkpoint: Path) -> RunState:
@@ -177,14 +207,23 @@ def written_state(checkpoint: Path) -> RunState:
     return record_of(RunState, values, where=str(path), needed=_NEEDED, fix=_FIX)
 
 
-def _listed(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.glob("step-*") if path.is_dir() and _NAME.search(path.name))
+def _another_step(checkpoint: Path, name: str) -> str | None:
+    """Return that a checkpoint is the copy of another one, whose name says another step than its state does."""
+    try:
+        step = read_json_object(checkpoint / STATE, allow_nan=True).get("step")
+    except (OSError, InputError) as error:
+        return f"no readable {STATE} ({error})"
+    return None if step_of(name) in {None, step} else f"a copy of another one, of step {step}"
 
 
 def _prune(folder: Path, keep: int, best_step: int | None) -> None:
-    for path in folder.glob(".writing-*"):
-        shutil.rmtree(path, ignore_errors=True)
-    best = None if best_step is None else checkpoint_name(best_step)
-    for path in _listed(folder)[:-keep]:
-        if path.name != best:
-            shutil.rmtree(path)
+    for path in listed(folder)[:-keep]:
+        if step_of(path.name) != best_step:
+            _remove(path)
+
+
+def _remove(checkpoint: Path) -> None:
+    if checkpoint.is_symlink():
+        checkpoint.unlink()  # what it leads to is not this run's
+    else:
+        shutil.rmtree(checkpoint)

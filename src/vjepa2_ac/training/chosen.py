@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.training.checkpoint import checkpoint_name, damage, newest_checkpoint, written_state
+from vjepa2_ac.training.checkpoint import checkpoint_name, damage, listed, newest_checkpoint, step_of, written_state
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 
 NEWEST, BEST = "newest", "best"
@@ -72,6 +72,5 @@ def _number(by: str, folder: Path) -> int:
 
 
 def _not_there(folder: Path, found: str) -> InputError:
-    there = [path for path in sorted(folder.glob("step-*")) if damage(path) is None]
-    steps = ", ".join(str(int(path.name.removeprefix("step-"))) for path in there)
+    steps = ", ".join(str(step_of(path.name)) for path in listed(folder) if damage(path) is None)
     return InputError(where=str(folder), found=found, needed=f"newest, best or one of the steps {steps}")

@@ -109,7 +109,7 @@ def writer_for(config: Config, dataset: Dataset, model: WorldModel, out: Path | 
     """Return what writes the cache of a data set that is open, made with the encoder of this model."""
     encoding = encoding_of(model, config)
     key = key_for(dataset, encoding)
-    return CacheWriter(folder_of(config.data, key) if out is None else out.expanduser(), key, encoding)
+    return CacheWriter(folder_of(config.data, key) if out is None else out, key, encoding)
 
 
 def encoder_at_work(config: Config, model: WorldModel, device: torch.device) -> EncoderAtWork:

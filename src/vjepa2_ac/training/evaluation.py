@@ -36,13 +36,14 @@ from vjepa2_ac.latents import encode_batch, require_widths
 from vjepa2_ac.model.adapter_end import base_only, unadapted_copy
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.storage import user_can_write
 from vjepa2_ac.training.assembly import make_accelerator
 from vjepa2_ac.training.cached import with_latents_if_there
 from vjepa2_ac.training.chosen import NEWEST, choose_checkpoint
 from vjepa2_ac.training.divergence import warnings_of
 from vjepa2_ac.training.journal import read_journal
-from vjepa2_ac.training.run_folder import read_run_config
+from vjepa2_ac.training.run_folder import METRICS, read_run_config
 from vjepa2_ac.training.runs import TrainedRun, is_run, load_run
 from vjepa2_ac.training.start_folder import DATA, with_paths_from_start
 from vjepa2_ac.training.stride import calibrate_model
@@ -147,7 +148,7 @@ def _warnings(folder: Path) -> list[str]:
 def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
     """Return every figure of a run's metrics.jsonl that is one number, over optimizer steps."""
     points: dict[str, list[tuple[int, float]]] = {}
-    for row in read_journal(folder / "metrics.jsonl"):
+    for row in read_journal(folder / METRICS):
         for name, value in row.items():
             if name != "step" and isinstance(value, int | float):
                 points.setdefault(f"{row['kind']}/{name}", []).append((row["step"], float(value)))
@@ -275,7 +276,7 @@ def _like(world_model: WorldModel, other: str, config: Config, subject: str) -> 
     Raises:
         InputError: It has another encoder, or takes other states or actions.
     """
-    if not (other.startswith("builtin:") or Path(other).expanduser().exists()):
+    if not (other.startswith(BUILTIN) or Path(other).exists()):
         raise InputError(
             where=f"--against {other}",
             found="no such file or folder",

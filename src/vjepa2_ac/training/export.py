@@ -22,7 +22,7 @@ from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.lora import trainable_report
 from vjepa2_ac.model.trained_folder import LORA_WEIGHTS
 from vjepa2_ac.model.weights import to_official
-from vjepa2_ac.storage import atomic_writer, folder_writer, user_can_write, write_atomically
+from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, user_can_write, write_atomically
 from vjepa2_ac.training.checkpoint import ADAPTER, read_state
 from vjepa2_ac.training.chosen import NEWEST
 from vjepa2_ac.training.evaluation import PLOT
@@ -35,6 +35,7 @@ Form = Literal["merged", "official", "hub"]
 
 OFFICIAL_NAME = "vjepa2-ac.pt"  # in a folder; a destination that ends in .pt is the file itself
 CARD = "README.md"
+_OTHER_FILES = frozenset({".bin", ".ckpt", ".h5", ".onnx", ".pth", ".safetensors"})
 _PEFT_CONFIG = "adapter_config.json"
 
 
@@ -63,7 +64,7 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
             width than Meta's code; hub: the run has no adapter, or its `metrics.json` is damaged; or a weight of the
             merged model is not finite, whatever the form.
     """
-    _check_free(destination)
+    _check_free(destination, form)
     config = read_run_config(folder)
     if form == "hub":
         _check_adapter(folder, config)
@@ -94,10 +95,16 @@ def _merge(run: TrainedRun) -> None:
     )
 
 
-def _check_free(destination: Path) -> None:
+def _check_free(destination: Path, form: Form) -> None:
     """See that nothing is at a destination, and that it can be written. Changes nothing."""
+    if form == "official" and destination.suffix in _OTHER_FILES and not destination.is_dir():
+        needed = f"a file that ends in .pt, or a folder for {OFFICIAL_NAME}"
+        raise InputError(where=str(destination), found=f"the name of a {destination.suffix} file", needed=needed)
+    if form != "official" and destination.suffix in {*_OTHER_FILES, ".pt"} and not destination.is_dir():
+        found = f"the name of a {destination.suffix} file"
+        raise InputError(where=str(destination), found=found, needed=f"a folder, for --to {form}")
     with user_can_write(destination):
-        if destination.exists() and (not destination.is_dir() or any(destination.iterdir())):
+        if destination.exists() and not (destination.is_dir() and is_empty(destination)):
             raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
         existing = next(path for path in (destination, *destination.absolute().parents) if path.exists())
         with tempfile.TemporaryFile(dir=existing):

@@ -36,12 +36,12 @@ from vjepa2_ac.training.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.training.processes import from_first, largest, require_same
 from vjepa2_ac.training.quiet import QuietJournal, QuietReporter
 from vjepa2_ac.training.resume import refuse_if_overtaken
-from vjepa2_ac.training.run_folder import check_run_folder, config_changes, open_run_folder
+from vjepa2_ac.training.run_folder import CALIBRATION, check_run_folder, config_changes, open_run_folder
 from vjepa2_ac.training.run_lock import RunLock
 from vjepa2_ac.training.start_folder import require_start_folder
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.stopwatch import stopwatch_for
-from vjepa2_ac.training.stride import CALIBRATION, with_settled_stride
+from vjepa2_ac.training.stride import with_settled_stride
 from vjepa2_ac.training.trackers import open_trackers
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: the longest look ahead is what planning leans on
@@ -186,10 +186,11 @@ def _loop(
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             is_best = _validate_if_due(run, journal, reporter)
             # Agreed among all processes, and read once: a signal after this waits for the next step.
-            stopped_by, due = largest(run.accelerator, [stop.number, clock.is_due(step) or is_best or last])
+            is_due = clock.is_due(step) or is_best or last or journal.is_behind
+            stopped_by, due = largest(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
-                journal.sync()
-                save_checkpoint(run, folder)
+                with journal.before_a_checkpoint():
+                    save_checkpoint(run, folder)
                 clock.restart()
             mirror.tick()
             if stopped_by and not last:

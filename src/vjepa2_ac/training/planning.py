@@ -22,6 +22,7 @@ from vjepa2_ac.model.adapter_end import merge_adapter
 from vjepa2_ac.model.load import load_base
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.model.world_model import WorldModel, fingerprint
+from vjepa2_ac.places import literal
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.training.chosen import NEWEST
 from vjepa2_ac.training.device import has_bf16, is_on_cpu, require_type_of_weights
@@ -166,7 +167,7 @@ def _run_config(subject: str, config: str | Path | None, overrides: Sequence[str
             needed="one config",
             fix="Change single settings behind the run's name, such as planning.horizon=2",
         )
-    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(subject)}", _ANY_TYPE])
+    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(literal(Path(subject)))}", _ANY_TYPE])
 
 
 def _model_config(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:

@@ -1,8 +1,11 @@
-"""Was the run asked to stop? SIGTERM, SIGINT (Ctrl-C) and SIGUSR1 ask; the loop stops where it can go on from.
+"""Was the run asked to stop? SIGTERM, SIGINT (Ctrl-C), SIGUSR1 and SIGHUP ask; the loop stops where it can go on from.
 
 The first signal is noted: the loop finishes its optimizer step, and the validation that is due after it, writes a
 checkpoint and raises `StoppedError`. The command line then exits with `EXIT_STATUS`. A second signal means now: it does
 what it would do without this file, which ends the process; checkpoints are whole or absent, whenever that happens.
+
+SIGHUP says that the terminal is gone, which nobody means twice: shell and kernel send one each, and only the first
+counts. Who wants the run to outlive its terminal starts it with `nohup` or in tmux.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from pathlib import Path
 from types import FrameType
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
+HANG_UP = signal.SIGHUP
 EXIT_STATUS = 75  # sysexits.h, EX_TEMPFAIL: the same command goes on
 
 
@@ -56,7 +60,7 @@ class StopRequest:
         """Note a first signal; let a second one do what it does by default."""
         if self.reason is None:
             self.reason, self._came_at = signal.Signals(number).name, time.monotonic()
-        elif time.monotonic() - self._came_at >= self._same_within_s:
+        elif number != HANG_UP and time.monotonic() - self._came_at >= self._same_within_s:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
 
@@ -72,7 +76,7 @@ def stop_on_signals(*, same_within_s: float = 0.5) -> Iterator[StopRequest]:
     if threading.current_thread() is not threading.main_thread():
         yield request
         return
-    taken = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    taken = [number for number in (*SIGNALS, HANG_UP) if signal.getsignal(number) is not signal.SIG_IGN]
     before = {number: signal.signal(number, request.take) for number in taken}
     try:
         yield request

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from vjepa2_ac.evaluation.metrics import PredictionErrors
@@ -36,8 +37,12 @@ class QuietJournal:
     def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
         """Write nothing."""
 
-    def sync(self) -> None:
+    is_behind = False
+
+    @contextmanager
+    def before_a_checkpoint(self) -> Iterator[None]:
         """Do nothing."""
+        yield
 
     def __enter__(self) -> QuietJournal:
         """Return the journal."""

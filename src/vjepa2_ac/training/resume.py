@@ -20,10 +20,11 @@ from vjepa2_ac.training.checkpoint import (
     OPTIMIZER,
     STATE,
     RunState,
-    checkpoint_name,
     damage,
+    listed,
     newest_checkpoint,
     read_state,
+    step_of,
 )
 from vjepa2_ac.training.optim import load_moments
 from vjepa2_ac.training.processes import from_first, require_same, take_from_first
@@ -95,10 +96,10 @@ def refuse_if_overtaken(folder: Path, state: RunState) -> None:
     Raises:
         InputError: Somebody did.
     """
-    here = checkpoint_name(state.step)  # it and those before it were looked at when the run was taken up
-    further = [path for path in (folder / CHECKPOINTS).glob("step-*") if path.name > here and damage(path) is None]
-    if further:
-        newest = max(further)
+    # Those up to its own step were looked at when the run was taken up.
+    further = [path for path in listed(folder / CHECKPOINTS) if (step_of(path.name) or 0) > state.step]
+    newest = next((path for path in reversed(further) if damage(path) is None), None)
+    if newest is not None:
         raise InputError(
             where=str(newest),
             found=f"a checkpoint of step {read_state(newest).step}, which another start wrote while this one stood at"

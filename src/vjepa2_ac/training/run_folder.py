@@ -20,6 +20,7 @@ import json
 import platform
 import re
 import secrets
+import shutil
 import sys
 import tempfile
 import time
@@ -28,17 +29,29 @@ from pathlib import Path
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import changed_keys, config_as_dict, config_as_flat_dict, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import is_url, read_bounded, write_atomically
+from vjepa2_ac.places import is_url, literal
+from vjepa2_ac.storage import read_bounded, write_atomically
 from vjepa2_ac.structured import read_json_list, shown
+from vjepa2_ac.training.checkpoint import remove_leavings
+from vjepa2_ac.training.own_files import refuse_links_out
 from vjepa2_ac.training.run_lock import LOCK
 
 CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
 RUN_ID = "run_id"
+CALIBRATION = "calibration.json"  # of an auto stride
 CHECKPOINTS = "checkpoints"
+HELD = ".mirror"
+METRICS = "metrics.jsonl"
+TENSORBOARD, WANDB = "tensorboard", "wandb"
 _ID = re.compile(r"[\w.-]{0,128}")
 _MOST_BYTES_OF_ID = 1_000
 NOT_FINITE = "not_finite"  # each process writes its own, on the disk that it sees
+
+_OWN = (
+    *(LOCK, CONFIG, ENVIRONMENT, CALIBRATION, RUN_ID, METRICS),
+    *(CHECKPOINTS, HELD, TENSORBOARD, WANDB, NOT_FINITE),
+)
 
 # Settings that may change between two starts of one run. They do not change what is computed, but for those by which a
 # broken episode is left out: data.exclude changes the order of the clips that are still to come, data.broken_episodes
@@ -69,11 +82,13 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
         allow_config_change: A run of another config is to go on with this one.
 
     Raises:
-        InputError: The folder is a file, somebody else's, of another config, or not writable.
+        InputError: The folder is a file, somebody else's, of another config, or not writable; or what is to be written
+            into it is a link to elsewhere.
     """
     folder = Path(config.run_dir)
     if folder.exists() and not folder.is_dir():
         raise InputError(where=str(folder), found="a file", needed="a folder for the run", fix="Set another run_dir")
+    refuse_links_out(folder, [*_OWN, *(f"{NOT_FINITE}/{path.name}" for path in (folder / NOT_FINITE).glob("*"))])
     if (folder / CONFIG).exists():
         if not allow_config_change:
             _refuse_another_config(folder, config)
@@ -110,6 +125,8 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     write_atomically(path, json.dumps([*starts, start], indent=1).encode())
     write_atomically(folder / RUN_ID, run_name)
     (folder / CHECKPOINTS).mkdir(exist_ok=True)
+    remove_leavings(folder / CHECKPOINTS)
+    shutil.rmtree(folder / HELD, ignore_errors=True)  # links keep the room of checkpoints that are gone
     return folder
 
 
@@ -150,7 +167,7 @@ def read_run_config(folder: Path) -> Config:
             found="no config.yaml" if folder.is_dir() else "no such folder",
             needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
         )
-    return load_config(folder / CONFIG, [f"run_dir={json.dumps(str(folder))}"])
+    return load_config(folder / CONFIG, [f"run_dir={json.dumps(literal(folder))}"])
 
 
 def places_elsewhere(config: Config) -> list[str]:

@@ -1,7 +1,7 @@
 """Is another process training in this run's folder right now? Two would write over each other's checkpoints.
 
 The lock is on `RUN/.lock` and the kernel's (flock): it is gone when its process is, however that ended. The file stays,
-and says who was there last.
+and says who was there last. It is never opened through a link: what that leads to would be cut off.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from typing import TextIO
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import user_can_write
 from vjepa2_ac.structured import json_object
+from vjepa2_ac.training.own_files import refused_link
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +53,7 @@ class RunLock:
             return
         with user_can_write(self.path):
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self.path.open("a+", encoding="utf-8")
+            self._file = self._opened()
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -66,6 +67,12 @@ class RunLock:
             )  # fmt: skip
         with user_can_write(self.path):
             self._sign()
+
+    def _opened(self) -> TextIO:
+        if self.path.is_symlink():
+            raise refused_link(self.path)
+        handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        return os.fdopen(handle, "a+", encoding="utf-8")
 
     def release(self) -> None:
         """Let others have it."""

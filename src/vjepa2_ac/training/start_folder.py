@@ -9,6 +9,7 @@ from typing import Any
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import config_as_dict, config_as_flat_dict, parse_config
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.places import BUILTIN, is_url
 from vjepa2_ac.training.run_folder import start_folders
 
 DATA, BASE, RANGES = "data.path", "model.base", "data.idle.ranges"
@@ -74,9 +75,9 @@ def _seen_from_start(config: Config, run: Path) -> dict[str, str]:
 
 def _leads_nowhere(path: str | None) -> bool:
     """Return whether this is a relative path, and there is nothing at it."""
-    if path is None or "://" in path or path.startswith("builtin:"):
+    if path is None or is_url(path) or path.startswith(BUILTIN):
         return False
-    here = Path(path).expanduser()
+    here = Path(path)
     return not here.is_absolute() and not here.exists()
 
 

@@ -19,8 +19,6 @@ from vjepa2_ac.latents import encode_batch
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.run_folder import CONFIG, read_run_config
 
-CALIBRATION = "calibration.json"
-
 
 def with_settled_stride(config: Config) -> Config:
     """Return a config whose stride is a number where the run in its folder has chosen one: it is chosen once."""

@@ -1,32 +1,29 @@
 """Who draws curves of a run? TensorBoard, Weights & Biases and trackio, as the config asks.
 
-A tracker is a guest: one that cannot be opened, fails or hangs is left out with one warning, and training goes on. Only
-a library that is not installed is an error, before the first step. `metrics.jsonl` (`training.journal`) has all figures
-whatever becomes of trackers. A run that goes on, on whatever machine, goes on in the same W&B or trackio run.
+A tracker is a guest (`training.guest`): one that cannot be opened, fails or hangs is left out with one warning, and
+training goes on as if it were not there. Only a library that is not installed is an error, before the first step.
+`metrics.jsonl` (`training.journal`) has all figures whatever becomes of trackers. A run that goes on, on whatever
+machine, goes on in the same W&B or trackio run.
 """
 
 from __future__ import annotations
 
 import importlib.util
-import logging
 import math
 import os
-import queue
-import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol, TypeVar, cast, runtime_checkable
+from typing import Any
 
 from vjepa2_ac.config import Config, TrackingConfig
 from vjepa2_ac.config_file import config_as_flat_dict
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.training.guest import Guest, Opening
+from vjepa2_ac.training.run_folder import TENSORBOARD
 
-logger = logging.getLogger(__name__)
-
-_T = TypeVar("_T")
-
-OPENING_S = 60.0  # how long training waits for a tracker
-CLOSING_S = 30.0
+PATIENCE_S = 60.0  # after which it is said that a tracker does not answer
+CLOSING_S = 30.0  # how long the end of a run waits for all of them
 
 _INSTALL = {
     "wandb": 'Run pip install -c constraints.txt -e ".[wandb]"',
@@ -34,60 +31,35 @@ _INSTALL = {
 }
 
 
-@runtime_checkable
-class Tracker(Protocol):
-    """Takes figures; may raise anything."""
-
-    def log(self, figures: Mapping[str, float], step: int) -> None:
-        """Take the figures of a row, named kind/figure, and its optimizer step."""
-        ...
-
-    def close(self) -> None:
-        """Write what is left."""
-        ...
-
-
-Opening = Callable[[], Tracker]
-
-
 class Trackers:
     """Those trackers of a run that work.
 
     Args:
         openings: By the name that a person knows it by, what opens a tracker.
-        opening_s: Longer than this none is waited for.
-        closing_s: Likewise when it is closed.
+        opening_s: After which it is said that one does not answer; training does not wait for it.
+        closing_s: Longer than this none is waited for in the end, all together.
     """
 
     def __init__(
-        self, openings: Mapping[str, Opening], *, opening_s: float = OPENING_S, closing_s: float = CLOSING_S
+        self, openings: Mapping[str, Opening], *, opening_s: float = PATIENCE_S, closing_s: float = CLOSING_S
     ) -> None:
         self._closing_s = closing_s
-        self._working: dict[str, Tracker] = {}
-        for name, opening in openings.items():
-            try:
-                self._working[name] = _within(opening_s, opening)
-            except Exception as error:  # whatever it is: a tracker never stops training
-                logger.warning("%s cannot be opened (%s); going on without it", name, _words(error))
+        self._guests = [Guest(name, opening, patience_s=opening_s) for name, opening in openings.items()]
 
     def log(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
         """Hand on a row: its numbers; lists, such as errors by horizon, number by number from 1."""
         numbers = {f"{kind}/{key}": value for key, value in _numbers(figures).items()}
-        for name, tracker in list(self._working.items()):
-            try:
-                tracker.log(numbers, step)
-            except Exception as error:
-                logger.warning("%s failed (%s); going on without it", name, _words(error))
-                del self._working[name]
+        for guest in self._guests:
+            guest.log(numbers, step)
 
     def close(self) -> None:
         """Close all; a second call does nothing."""
-        while self._working:
-            name, tracker = self._working.popitem()
-            try:
-                _within(self._closing_s, tracker.close)
-            except Exception as error:
-                logger.warning("%s did not close (%s); its last figures may be missing there", name, _words(error))
+        guests, self._guests = self._guests, []
+        until_s = time.monotonic() + self._closing_s
+        for guest in guests:
+            guest.end()
+        for guest in guests:
+            guest.wait(max(0.0, until_s - time.monotonic()), self._closing_s)
 
 
 def require_installed(tracking: TrackingConfig) -> None:
@@ -119,7 +91,7 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
     tracking = config.tracking
     openings: dict[str, Opening] = {}
     if tracking.tensorboard:
-        openings["TensorBoard"] = lambda: _TensorBoard(folder / "tensorboard", first_step)
+        openings["TensorBoard"] = lambda: _TensorBoard(folder / TENSORBOARD, first_step)
     if tracking.wandb != "disabled":
         openings["Weights & Biases"] = lambda: _WeightsAndBiases(config, folder, run_id)
     if tracking.trackio:
@@ -190,38 +162,9 @@ class _Trackio:
         self._run.finish()
 
 
-def _within(seconds: float, call: Callable[[], _T]) -> _T:
-    """Return what a call returns, or raise what it raises, if it is done in time; else leave it behind.
-
-    Raises:
-        TimeoutError: It is not.
-    """
-    done: queue.SimpleQueue[tuple[_T | None, BaseException | None]] = queue.SimpleQueue()
-
-    def run() -> None:
-        try:
-            done.put((call(), None))
-        except BaseException as error:  # also what would end the program
-            done.put((None, error))
-
-    threading.Thread(target=run, daemon=True).start()
-    try:
-        value, error = done.get(timeout=seconds)
-    except queue.Empty:
-        raise TimeoutError(f"no answer within {seconds:g} s") from None
-    if error is not None:
-        raise error if isinstance(error, Exception) else RuntimeError(repr(error))
-    return cast(_T, value)
-
-
 def _numbers(figures: Mapping[str, Any]) -> dict[str, float]:
     numbers: dict[str, float] = {}
     for key, value in figures.items():
         values = {f"{key}/{n}": v for n, v in enumerate(value, start=1)} if isinstance(value, list) else {key: value}
         numbers |= {name: float(v) for name, v in values.items() if isinstance(v, int | float) and math.isfinite(v)}
     return numbers
-
-
-def _words(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

@@ -8,7 +8,6 @@ are not sent again.
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,26 +17,20 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
 from vjepa2_ac.storage import download, file_sizes, join, read_bounded, remove, remove_folder, upload
 from vjepa2_ac.structured import MOST_BYTES, read_json_object
-from vjepa2_ac.training.checkpoint import STATE, damage
+from vjepa2_ac.training.checkpoint import STATE, damage, step_of
 from vjepa2_ac.training.manifest import MANIFEST, named_files
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 
 SENDING = ".sending.json"
 
-_NAME = re.compile(r"step-\d{8}")
-
 Listing = Mapping[str, Mapping[str, int]]
 """Sizes of files by name, by name of the checkpoint."""
 
 
-def is_checkpoint_name(name: str) -> bool:
-    """Return whether a folder is called as checkpoints are."""
-    return _NAME.fullmatch(name) is not None
-
-
 def complete(listing: Listing) -> list[str]:
     """Return the names of the checkpoints that are all there, the newest first."""
-    return sorted((name for name, files in listing.items() if MANIFEST in files), reverse=True)
+    whole = [name for name, files in listing.items() if MANIFEST in files]
+    return sorted(whole, key=lambda name: step_of(name) or 0, reverse=True)
 
 
 @dataclass(frozen=True)
@@ -55,7 +48,7 @@ class RemoteCheckpoints:
         found: dict[str, dict[str, int]] = {}
         for path, size in file_sizes(join(self.place, CHECKPOINTS)).items():
             name, _, file = path.partition("/")
-            if is_checkpoint_name(name) and file:
+            if step_of(name) is not None and file:
                 found.setdefault(name, {})[file] = size
         return found
 
@@ -113,7 +106,7 @@ class RemoteCheckpoints:
         except InputError as error:
             return f"no readable {MANIFEST} ({error.found})"
         (folder / MANIFEST).write_bytes(manifest)
-        return damage(folder)
+        return damage(folder, name)
 
     def _of_this(self, name: str, files: Mapping[str, int], manifest: bytes) -> Mapping[str, int]:
         """Return what is there of this very checkpoint; of another by this name nothing is left."""

@@ -17,15 +17,13 @@ from pathlib import Path
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import download, join, sync, write_atomically
-from vjepa2_ac.training.checkpoint import checkpoint_name, written_state
+from vjepa2_ac.training.checkpoint import FETCHING, checkpoint_name, remove_leavings, written_state
 from vjepa2_ac.training.mirror.checkpoints import RemoteCheckpoints
 from vjepa2_ac.training.mirror.update import SMALL_FILES
 from vjepa2_ac.training.run_folder import CHECKPOINTS, check_run_folder
 from vjepa2_ac.training.stride import with_settled_stride
 
 logger = logging.getLogger(__name__)
-
-FETCHING = ".fetching-"
 
 
 def fetch_newest(
@@ -96,8 +94,7 @@ def _require_this_config(config: Config, fetched: Path, place: str, *, allow_con
 
 def _fetch(remote: RemoteCheckpoints, name: str, folder: Path) -> Path | None:
     """Download a checkpoint under a temporary name; None, and a warning, where it is damaged."""
-    for left_over in (folder / CHECKPOINTS).glob(f"{FETCHING}*"):
-        shutil.rmtree(left_over, ignore_errors=True)
+    remove_leavings(folder / CHECKPOINTS)
     fetched = folder / CHECKPOINTS / f"{FETCHING}{name}"
     problem = remote.fetch(name, fetched)
     if problem is None:

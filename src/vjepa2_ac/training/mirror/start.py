@@ -15,7 +15,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import RefusedError, UnreachableError, quietly
 from vjepa2_ac.storage import is_url, place, try_writing
-from vjepa2_ac.training.checkpoint import checkpoint_name, newest_checkpoint, written_state
+from vjepa2_ac.training.checkpoint import newest_checkpoint, step_of, written_state
 from vjepa2_ac.training.mirror.checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.training.mirror.fetch import fetch_newest
 from vjepa2_ac.training.mirror.mirror import Mirror, reason_of
@@ -77,7 +77,7 @@ def open_remote(
         return replace(remote, is_reachable=False)
     minutes = config.checkpoint.remote_every_minutes
     note(f"{remote.place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
-    further = [name for name in complete(listing) if step is None or name > checkpoint_name(step)]
+    further = [name for name in complete(listing) if step is None or (step_of(name) or 0) > step]
     if not further:
         return remote
     target = config if into is None else config.model_copy(update={"run_dir": str(into)})

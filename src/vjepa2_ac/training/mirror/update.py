@@ -14,13 +14,11 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from vjepa2_ac.storage import join, upload
-from vjepa2_ac.training.checkpoint import checkpoint_name, damage, written_state
-from vjepa2_ac.training.mirror.checkpoints import Listing, RemoteCheckpoints, complete, is_checkpoint_name
-from vjepa2_ac.training.run_folder import CHECKPOINTS, CONFIG, ENVIRONMENT, RUN_ID
-from vjepa2_ac.training.stride import CALIBRATION
+from vjepa2_ac.training.checkpoint import checkpoint_name, damage, listed, step_of, written_state
+from vjepa2_ac.training.mirror.checkpoints import Listing, RemoteCheckpoints, complete
+from vjepa2_ac.training.run_folder import CALIBRATION, CHECKPOINTS, CONFIG, ENVIRONMENT, HELD, METRICS, RUN_ID
 
-HELD = ".mirror"  # in the run's folder: links to what is being sent
-SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, RUN_ID, "metrics.jsonl")
+SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, RUN_ID, METRICS)
 
 GoOn = Callable[[], None]
 """Called before each file; raises to break off."""
@@ -125,15 +123,14 @@ class RemoteUpdate:
         whole = complete(listing)
         kept = {*whole[: self._keep], newest, best}
         for name in sorted(set(listing) - kept):
-            if name in whole or name < newest:
+            if name in whole or (step_of(name) or 0) < (step_of(newest) or 0):
                 go_on()
                 self._remote.remove(name)
 
     def _names_here(self) -> list[str]:
         """Return the checkpoints of this machine, the newest first."""
         with contextlib.suppress(FileNotFoundError):
-            names = [path.name for path in (self._folder / CHECKPOINTS).iterdir()]
-            return sorted(filter(is_checkpoint_name, names), reverse=True)
+            return [path.name for path in reversed(listed(self._folder / CHECKPOINTS))]
         return []
 
 

@@ -138,7 +138,7 @@ def require_pictures(file: NpzFile, camera: str, steps: int, path: str, *, count
         InputError: There is no such array, or it is not [steps, height, width, 3] of uint8; they are too large.
     """
     _require_array(file, camera, (steps, None, None, 3), "u", "pictures (steps, height, width, 3)", path)
-    header = file.header(camera)
+    header = file.header_of_rows(camera)
     require_bounded(header.shape[1], header.shape[2], f"{path}: {camera}", count=count)
     if header.dtype != np.uint8:
         found = f"pictures of {header.dtype}"

@@ -37,6 +37,7 @@ class ArrayHeader:
     shape: tuple[int, ...]
     dtype: np.dtype
     start: int
+    by_columns: bool = False  # in Fortran order
 
     @property
     def row_bytes(self) -> int:
@@ -64,7 +65,7 @@ class NpzFile:
         return tuple(self._members)
 
     def header(self, name: str) -> ArrayHeader:
-        """Return shape and type of an array, without its values; raises what is no plain array in rows."""
+        """Return shape and type of an array, without its values."""
         with self._damage_is_named(name), self._archive.open(self._members[name]) as member:
             version = np.lib.format.read_magic(member)
             if version not in {(1, 0), (2, 0)}:
@@ -74,11 +75,21 @@ class NpzFile:
             shape, by_columns, dtype = read(member)
             if dtype.hasobject:
                 raise ValueError("an array of Python objects, which would have to be executed")
-            if by_columns and len(shape) > 1:
-                raise ValueError("an array in Fortran order; numpy.ascontiguousarray gives it rows")
-            header = ArrayHeader(tuple(int(size) for size in shape), dtype, member.tell())
+            header = ArrayHeader(tuple(int(size) for size in shape), dtype, member.tell(), by_columns)
             self._require_fitting(self._members[name], header)
             return header
+
+    def header_of_rows(self, name: str) -> ArrayHeader:
+        """Return likewise what has to lie in rows, one behind the other."""
+        header = self.header(name)
+        if header.by_columns and len(header.shape) > 1:
+            raise InputError(
+                where=f"{self._where}: {name}",
+                found="an array in Fortran order, of which no rows can be read by themselves",
+                needed="C order",
+                fix="Write it with numpy.ascontiguousarray",
+            )
+        return header
 
     def array(self, name: str) -> Shaped[np.ndarray, ...]:
         """Return a whole array; its checksum is checked."""
@@ -87,7 +98,7 @@ class NpzFile:
             if prod(header.shape) * header.dtype.itemsize > _MOST_BYTES:
                 raise ValueError(f"shape {header.shape}, more than is ever read at once")
             values = member.read()[header.start :]
-            return np.frombuffer(values, header.dtype).reshape(header.shape)
+            return np.frombuffer(values, header.dtype).reshape(header.shape, order="F" if header.by_columns else "C")
 
     def rows(self, name: str, rows: Sequence[int]) -> Shaped[np.ndarray, "rows ..."]:
         """Return some rows of an array, in this order.
@@ -95,7 +106,7 @@ class NpzFile:
         Of an array that is stored as it is, only these rows are read, and no checksum is checked: it covers the whole
         array. One that is compressed is gone through up to the last of these rows; no others are kept.
         """
-        header = self.header(name)
+        header = self.header_of_rows(name)
         member = self._members[name]
         wanted = sorted(set(rows))
         stored = member.compress_type == zipfile.ZIP_STORED

@@ -89,7 +89,7 @@ def write_droid_rlds(
     """
     folder = Path(folder)
     with storage.user_can_write(folder):
-        in_use = folder.is_dir() and any(folder.iterdir())
+        in_use = folder.is_dir() and not storage.is_empty(folder)
     if in_use:
         raise InputError(
             where=str(folder), found="already there and not empty", fix="Delete it, or name another folder"

@@ -1,0 +1,226 @@
+"""How does a command talk to whoever reads it? Without ever failing for it, and where it is a run, without waiting.
+
+`own_streams` puts streams of ours in the place of standard output and standard error, for all that writes there: the
+console, warnings, libraries. What they cannot write is dropped: the reader has left (`| head`), the terminal is gone,
+the disk of a log is full. They never raise, so no text ends what it tells of.
+
+After `never_wait` text goes to a thread instead. A pipe that nobody reads, a terminal that was halted with Ctrl-S or a
+disk that stalls then holds up that thread alone; what does not fit into its queue is dropped, and counted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import io
+import os
+import select
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+MOST_BYTES = 1 << 20  # that wait for a reader
+LAST_S = 5.0  # how long the end of a run waits for a reader
+_LAST_WORDS_S = 1.0
+
+_LEFT = frozenset({errno.EPIPE, errno.ECONNRESET})  # the reader did not want any more
+_NAMES = {"stdout": "standard output", "stderr": "standard error"}
+
+
+class Writer:
+    """Writes bytes to a file descriptor, and never raises.
+
+    Args:
+        handle: The descriptor; it stays open.
+    """
+
+    def __init__(self, handle: int) -> None:
+        self.handle = handle
+        self.problem: OSError | None = None  # after which nothing is written any more
+        self.lines_dropped = 0  # because nobody read
+        self._is_terminal = os.isatty(handle)
+        self._process = os.getpid()
+        self._thread: threading.Thread | None = None
+        self._waiting: deque[bytes] = deque()
+        self._bytes, self._lines = 0, 0  # that wait, or are being written by the thread
+        self._changed = threading.Condition()
+
+    @property
+    def has_lost(self) -> bool:
+        """Whether somebody who would have read it did not get all of it: the disk of a file is full."""
+        return self.problem is not None and self.problem.errno not in _LEFT and not self._is_terminal
+
+    def write(self, data: bytes) -> None:
+        """Write, or hand to the thread where there is one; drop what there is no room for."""
+        if self._thread is None or os.getpid() != self._process:  # a forked process has no thread
+            self._write(data)
+            return
+        with self._changed:
+            if self._bytes and self._bytes + len(data) > MOST_BYTES:
+                self.lines_dropped += data.count(b"\n")
+                return
+            self._waiting.append(data)
+            self._count(data, 1)
+            self._changed.notify_all()
+
+    def never_wait(self) -> None:
+        """Let a thread do the writing from now on."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._serve, name="console", daemon=True)
+            self._thread.start()
+
+    def finish(self, within_s: float) -> None:
+        """Wait until what waits is written, but no longer than that: what is left then is dropped."""
+        with self._changed:
+            if not self._changed.wait_for(lambda: not self._bytes, within_s):
+                self.lines_dropped += self._lines
+
+    def _serve(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting)
+                data = b"".join(self._waiting)
+                self._waiting.clear()
+            self._write(data)
+            with self._changed:
+                self._count(data, -1)
+                self._changed.notify_all()
+
+    def _count(self, data: bytes, sign: int) -> None:
+        self._bytes += sign * len(data)
+        self._lines += sign * data.count(b"\n")
+
+    def _write(self, data: bytes) -> None:
+        left = memoryview(data)
+        while left and self.problem is None:
+            try:
+                left = left[os.write(self.handle, left) :]
+            except BlockingIOError:  # whoever shares this file has made it so
+                ready = select.poll()
+                ready.register(self.handle, select.POLLOUT)
+                ready.poll()
+            except OSError as error:
+                self.problem = error
+
+
+class _Raw(io.RawIOBase):
+    """What a text stream writes through."""
+
+    def __init__(self, writer: Writer, handle: int) -> None:
+        self._writer, self._handle = writer, handle
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any, /) -> int:
+        self._writer.write(bytes(data))
+        return len(data)
+
+    def fileno(self) -> int:
+        return self._handle
+
+    def isatty(self) -> bool:
+        return os.isatty(self._handle)
+
+
+class Streams:
+    """Standard output and standard error of this process, by the names that `sys` has for them."""
+
+    def __init__(self) -> None:
+        self.writers: dict[str, Writer] = {}
+        self._waits = True  # for readers
+        self._before: dict[str, Any] = {}
+        self._by_file: dict[tuple[int, int, int], Writer] = {}
+
+    def put_in_place(self) -> None:
+        """Let all that this process writes go through here; streams that were put in place before stay."""
+        for number, name in enumerate(_NAMES, start=1):
+            stream = getattr(sys, name)
+            if stream is None:  # it was closed when the process started
+                _occupy_closed_numbers()
+                self._replace(name, number, "utf-8")
+            elif stream is getattr(sys, f"__{name}__"):
+                with contextlib.suppress(OSError, ValueError):  # no file behind it, or none any more
+                    stream.flush()
+                    self._replace(name, stream.fileno(), stream.encoding)
+
+    def put_back(self) -> None:
+        """Let `sys` have its own again, in which nothing waits for the end of the process."""
+        for name, stream in self._before.items():
+            setattr(sys, name, stream)
+
+    def never_wait(self) -> None:
+        """Hold up nobody from now on."""
+        self._waits = False
+        for writer in self.writers.values():
+            writer.never_wait()
+
+    def finish(self) -> None:
+        """Give readers a last moment; of a run, tell in the one stream what is not to be seen in the other."""
+        until = time.monotonic() + LAST_S
+        for writer in self.writers.values():
+            writer.finish(max(0.0, until - time.monotonic()))
+        for name, writer in self.writers.items() if not self._waits else ():
+            for other in self.writers.values():
+                if other is not writer and (words := _what_is_missing(writer)):
+                    other.write(f"warning: {_NAMES[name]}: {words}\n".encode())
+                    other.finish(_LAST_WORDS_S)
+
+    def what_was_lost(self) -> str:
+        """Return what is wrong where a command that is there for its output could not write it; empty: nothing is."""
+        writer = self.writers.get("stdout")
+        return f"{_NAMES['stdout']}: {_what_is_missing(writer)}" if self._waits and writer and writer.has_lost else ""
+
+    def _replace(self, name: str, handle: int, encoding: str) -> None:
+        about = os.fstat(handle)
+        writer = self._by_file.setdefault((about.st_dev, about.st_ino, about.st_rdev), Writer(handle))
+        self.writers[name], self._before[name] = writer, getattr(sys, name)
+        raw: Any = _Raw(writer, handle)
+        setattr(sys, name, io.TextIOWrapper(raw, encoding=encoding, errors="backslashreplace", write_through=True))
+
+
+_streams: Streams | None = None
+
+
+@contextlib.contextmanager
+def own_streams() -> Iterator[Streams]:
+    """Let all that this process writes go through streams that never raise, as long as the context lasts.
+
+    Streams that are not the process's own, such as those of a test or a notebook, stay as they are.
+    """
+    global _streams
+    before, _streams = _streams, Streams()
+    _streams.put_in_place()
+    try:
+        yield _streams
+    finally:
+        _streams.finish()
+        _streams.put_back()
+        _streams = before
+
+
+def never_wait() -> None:
+    """Let no reader hold up this process from now on: it does work that is worth more than what it tells of it."""
+    global _streams
+    if _streams is None:  # a process that others started for a part of their work
+        _streams = Streams()
+        _streams.put_in_place()
+    _streams.never_wait()
+
+
+def _occupy_closed_numbers() -> None:
+    """Open nothing as 0, 1 and 2 where they are free: else the next file is, and what libraries say goes into it."""
+    while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(handle)
+
+
+def _what_is_missing(writer: Writer) -> str:
+    if writer.has_lost and writer.problem:
+        return f"cannot be written ({writer.problem.strerror}): not all that was said is there"
+    if writer.lines_dropped:
+        return f"{writer.lines_dropped} lines were left out, because nobody read them in time"
+    return ""

@@ -1,0 +1,65 @@
+"""Where does a path lead that somebody gave? One meaning for all of them: knobs, options and the environment.
+
+`~` is the user's home. Where only a folder of this machine will do, a URL is refused: taken for a path it would become
+a folder called `gs:`. What cannot be meant raises a ValueError, whose message goes on after the name of the knob.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+BUILTIN = "builtin:"  # models that come with the package
+
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # with one slash, too: what a Path makes of a URL
+
+
+def is_url(path: str | Path) -> bool:
+    """Return whether a path names a file behind fsspec (`gs://…`) rather than one on this machine."""
+    return "://" in str(path)
+
+
+def anywhere(path: str) -> str:
+    """Return a path of this machine, from the user's home where it begins with `~`, or a URL; no slash behind it.
+
+    Raises:
+        ValueError: It is empty, of nobody's home, no path, or neither a URL nor a path.
+    """
+    if is_url(path):
+        return path.rstrip("/")
+    if _SCHEME.match(path):
+        raise ValueError("looks like a URL, which has two slashes behind the colon")
+    return on_this_machine(path)
+
+
+def on_this_machine(path: str) -> str:
+    """Return a path of this machine, from the user's home where it begins with `~`; no slash behind it.
+
+    Raises:
+        ValueError: It is a URL, empty, of nobody's home, or no path.
+    """
+    if not path.strip():
+        raise ValueError("is empty")
+    if "\0" in path:
+        raise ValueError("has a zero byte in it")
+    if is_url(path) or _SCHEME.match(path):
+        raise ValueError("is a URL (or looks like one), and only a path of this machine will do")
+    expanded = os.path.expanduser(path)  # noqa: PTH111 - a Path would take a `./` away
+    if expanded.startswith("~"):
+        raise ValueError(f"names the home of a user who is not here; for a folder of that name write ./{path}")
+    return expanded.rstrip("/") or "/"
+
+
+def of_a_model(name: str) -> str:
+    """Return what names a model: one of the package as it is, any other as `on_this_machine` does.
+
+    Raises:
+        ValueError: As `on_this_machine`.
+    """
+    return name if name.startswith(BUILTIN) else on_this_machine(name)
+
+
+def literal(path: Path) -> str:
+    """Return a path such that it means the same when it is read as a knob: a folder may be called `~`."""
+    return f"./{path}" if str(path).startswith("~") else str(path)

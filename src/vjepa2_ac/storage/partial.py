@@ -1,0 +1,148 @@
+"""Under which name is something written until it is whole, and who removes it where its writer was killed?
+
+`.NAME.KERNEL-RANDOM.partial`, in the folder where it is to go. Its writer holds a lock on it (flock), which the kernel
+takes back when the writer is gone, however that went. Whoever next writes into that folder removes what nobody holds.
+
+Why a lock: numbers of processes are given again, and mean nothing in another container. But a lock may say nothing to
+another machine that has the same disk. KERNEL tells whose it is: a hash of what the kernel drew when it started, one
+for all containers on it. What another kernel's writer left, or nobody can lock, goes when it has not changed for a day.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import functools
+import hashlib
+import os
+import platform
+import re
+import secrets
+import shutil
+import stat
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+_OLD_S = 86_400.0
+_BOOT = Path("/proc/sys/kernel/random/boot_id")
+_NAME = re.compile(r"\..+\.(?:([0-9a-f]{8})-)?[0-9a-f]+\.partial")  # without KERNEL: of earlier versions
+_NAME_BYTES = 200  # of the 255 that a name may have
+_HELD = frozenset({errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES})
+
+_looked_at: set[Path] = set()
+
+
+@contextlib.contextmanager
+def partial_file(target: Path) -> Iterator[tuple[Path, int]]:
+    """Give a new empty file beside a target and its descriptor, which is closed in the end; the file stays.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+    _remove_abandoned_once(target.parent)
+    while True:
+        path = _new_name(target.parent, target.name)
+        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        if _locked(path, handle):
+            break
+    try:
+        yield path, handle
+    finally:
+        os.close(handle)
+
+
+@contextlib.contextmanager
+def partial_folder(parent: Path, name: str) -> Iterator[Path]:
+    """Give a new empty folder in another, for what is to be called `name`; it stays.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+    parent.mkdir(parents=True, exist_ok=True)
+    _remove_abandoned_once(parent)
+    while True:
+        path = _new_name(parent, name)
+        path.mkdir()
+        handle = os.open(path, os.O_RDONLY)
+        if _locked(path, handle):
+            break
+    try:
+        yield path
+    finally:
+        os.close(handle)
+
+
+def is_partial(path: Path) -> bool:
+    """Return whether this is the name of something that is being written, or was when its writer was killed."""
+    return _NAME.fullmatch(path.name) is not None
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove what writers that are gone left in a folder; what cannot be removed stays."""
+    with contextlib.suppress(OSError):
+        for path in [path for path in folder.iterdir() if is_partial(path)]:
+            with contextlib.suppress(OSError):
+                _remove_if_abandoned(path)
+
+
+def _remove_abandoned_once(folder: Path) -> None:
+    """Look at a folder the first time that this process writes there: it may hold thousands of files."""
+    place = folder.absolute()
+    if place not in _looked_at:
+        _looked_at.add(place)
+        remove_abandoned(folder)
+
+
+def _remove_if_abandoned(path: Path) -> None:
+    is_folder = stat.S_ISDIR(path.lstat().st_mode)
+    found = _NAME.fullmatch(path.name)
+    way = os.O_RDONLY if is_folder else os.O_RDWR  # some file systems lock only what is open for writing
+    handle = os.open(path, way | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        if found is not None and found[1] == _kernel():
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if error.errno in _HELD or not _is_old(path):
+                    return
+        elif not _is_old(path):
+            return
+        if is_folder:
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    finally:
+        os.close(handle)
+
+
+def _is_old(path: Path) -> bool:
+    newest = max(one.lstat().st_mtime for one in (path, *path.rglob("*")))
+    return time.time() - newest > _OLD_S
+
+
+def _locked(path: Path, handle: int) -> bool:
+    """Lock what was just made; return whether it is ours: whoever removes may have come between; then it is closed."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        ours = path.exists()
+    except OSError as error:  # most often a file system without locks
+        ours = error.errno not in _HELD
+    if not ours:
+        os.close(handle)
+    return ours
+
+
+def _new_name(folder: Path, name: str) -> Path:
+    short = name.encode(errors="surrogateescape")[:_NAME_BYTES].decode(errors="ignore")
+    return folder / f".{short}.{_kernel()}-{secrets.token_hex(4)}.partial"
+
+
+@functools.cache
+def _kernel() -> str:
+    try:
+        drawn = _BOOT.read_text(encoding="ascii")
+    except OSError:  # not Linux
+        drawn = platform.node()
+    return hashlib.blake2b(drawn.encode(), digest_size=4).hexdigest()

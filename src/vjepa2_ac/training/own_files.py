@@ -1,0 +1,56 @@
+"""Do the files of a run stay in its folder? What a link leads to elsewhere is not the run's to write, whoever made it.
+
+The folder itself may be a link, to another disk for one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from vjepa2_ac.errors import InputError
+
+
+def refuse_links_out(run: Path, names: Iterable[str]) -> None:
+    """See that nothing that is to be written leads out of a run's folder.
+
+    Args:
+        run: The run's folder.
+        names: Of files and folders in it; parts of a path may be links as well.
+
+    Raises:
+        InputError: One is a link, or is behind one, that does.
+    """
+    home = run.resolve()
+    for link in (link for name in names for link in _links(run, name)):
+        target = _target(link)
+        if target is None or not target.is_relative_to(home):
+            raise refused_link(link)
+
+
+def refused_link(link: Path) -> InputError:
+    """Return what to tell of a link in a run's folder that is not followed."""
+    target = _target(link)
+    return InputError(
+        where=str(link),
+        found="a link that leads nowhere" if target is None else f"a link that leads out of the run, to {target}",
+        needed="a file or folder of the run's own",
+        fix="Remove it. To have a run on another disk, make the run's folder itself the link, or set run_dir to that"
+        " disk",
+    )
+
+
+def _links(run: Path, name: str) -> Iterator[Path]:
+    """Yield what is a link of `a/b/c`: `a`, `a/b`, `a/b/c`."""
+    path = run
+    for part in Path(name).parts:
+        path /= part
+        if path.is_symlink():
+            yield path
+
+
+def _target(link: Path) -> Path | None:
+    try:
+        return link.resolve()
+    except (OSError, RuntimeError):  # a circle of links
+        return None
