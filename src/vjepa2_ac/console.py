@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from datetime import timedelta
 from typing import Any
 
-from rich.console import Console
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TaskID, TextColumn, TimeRemainingColumn
-from rich.table import Column
+from rich.table import Column, Table
 from rich.text import Text
 
 from vjepa2_ac.errors import printable
@@ -17,6 +18,8 @@ from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, rati
 
 _MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
 _WIDE = 120  # columns that leave room for a long bar
+_BESIDE_A_CELL = 3  # a line and two spaces
+_WHOLE = 16  # characters: a longer word of a table, such as a path, may be divided
 
 
 class PlainConsole(Console):
@@ -31,6 +34,33 @@ class PlainConsole(Console):
     def render_str(self, text: str, **options: Any) -> Text:
         """Return what is printed of a text: of a line, a cell, a title."""
         return super().render_str(printable(text), **options)
+
+
+class FigureTable(Table):
+    """A table whose figures and words stay whole: where the terminal is narrow, cells go on below at their spaces.
+
+    A cell may not squeeze the others, however long it is.
+    """
+
+    def __init__(self, title: str) -> None:
+        super().__init__(title=title, title_justify="left", caption_justify="left")
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Any]:
+        """Yield what is shown."""
+        room = options.max_width - len(self.columns) * _BESIDE_A_CELL - 1
+        for column, width in zip(self.columns, self._widths(room), strict=True):
+            column.width, column.overflow = width, "fold"
+        yield from super().__rich_console__(console, options)
+
+    def _widths(self, room: int) -> list[int]:
+        """Return how wide columns are: as wide as they like, or else the widest give way, down to whole words."""
+        texts = [[str(text) for text in (column.header, *column.cells)] for column in self.columns]
+        widths = [max(map(cell_len, of_column), default=1) for of_column in texts]
+        words = [[cell_len(word) for text in of_column for word in text.split()] for of_column in texts]
+        least = [max((size for size in sizes if size <= _WHOLE), default=1) for sizes in words]
+        while sum(widths) > room and (shrinking := [n for n, width in enumerate(widths) if width > least[n]]):
+            widths[max(shrinking, key=lambda n: widths[n])] -= 1
+        return widths
 
 
 class _Words(TextColumn):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 from rich.text import Text
 
-from vjepa2_ac.console import console
+from vjepa2_ac.console import FigureTable, console
 from vjepa2_ac.data.finding import Finding
 from vjepa2_ac.data.index import Watch
 from vjepa2_ac.data.inspection import PERCENTILES, Inspection
@@ -91,9 +91,9 @@ def motion_table(inspection: Inspection) -> Table:
     """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
     if not inspection.is_pose:
         return _change_table(inspection)
-    table = Table(title="Motion per model step: 10 / 50 / 90 / 99 %", title_justify="left")
+    table = FigureTable("Motion per model step: 10 / 50 / 90 / 99 %")
     for name in ("stride", "seconds", "moves by (cm)", "turns by (degrees)"):
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right")
     for one in inspection.motions:
         figures = (one.percentiles("moved_cm"), one.percentiles("turned_deg"))
         cells = (" / ".join(f"{value:.1f}" for value in values) or "no step fits" for values in figures)
@@ -102,9 +102,9 @@ def motion_table(inspection: Inspection) -> Table:
 
 
 def _change_table(inspection: Inspection) -> Table:
-    table = Table(title="Change per model step: 10 / 50 / 90 / 99 %", title_justify="left")
+    table = FigureTable("Change per model step: 10 / 50 / 90 / 99 %")
     for name in ("stride", "seconds", "the number that changes most (% of its range)"):
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right")
     for one in inspection.changes:
         cell = " / ".join(f"{value:.1f}" for value in one.percentiles(PERCENTILES)) or "no step fits"
         table.add_row(str(one.stride), f"{one.seconds:.2f}", cell)
@@ -113,9 +113,9 @@ def _change_table(inspection: Inspection) -> Table:
 
 def probe_table(probe: VariantProbe) -> Table:
     """Return the table of `data check --model`."""
-    table = Table(title="One-step error / persistence of the data, read otherwise", title_justify="left")
+    table = FigureTable("One-step error / persistence of the data, read otherwise")
     for name in ("variant", "error / persistence", "difference"):
-        table.add_column(name, justify="left" if name == "variant" else "right", no_wrap=True)
+        table.add_column(name, justify="left" if name == "variant" else "right")
     for row in rows_of(probe):
         table.add_row(*row)
     return table
@@ -123,23 +123,21 @@ def probe_table(probe: VariantProbe) -> Table:
 
 def calibration_table(calibration: Calibration) -> Table:
     """Return the table of `data calibrate`."""
-    table = Table(
-        title=f"One-step error / persistence on {calibration.split} episodes, {calibration.frames} frames a clip"
-        " (95 % interval over episodes)",
-        title_justify="left",
+    table = FigureTable(
+        f"One-step error / persistence on {calibration.split} episodes, {calibration.frames} frames a clip"
+        " (95 % interval over episodes)"
     )
-    for name in ("stride", "seconds", "error / persistence", "error", "persistence", "moves by", "clips", "episodes"):
-        table.add_column(name, justify="right", no_wrap=True)
+    for name in ("stride", "seconds", "error / persistence", "error", "persistence", "moves by", "clips (episodes)"):
+        table.add_column(name, justify="right")
     for one in calibration.tried:
         mark = " <" if one is calibration.best else ""
         moved = "" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
         table.add_row(
             f"{one.stride}{mark}", f"{one.seconds_per_step:.2f}", str(one.ratio), f"{one.error:.4f}",
-            f"{one.persistence:.4f}", moved, str(one.clips), str(one.episodes),
+            f"{one.persistence:.4f}", moved, f"{one.clips} ({one.episodes})",
         )  # fmt: skip
     if calibration.impossible:
         table.caption = "\n".join(
             f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()
         )
-        table.caption_justify = "left"
     return table

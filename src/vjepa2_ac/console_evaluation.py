@@ -9,7 +9,7 @@ from typing import Literal
 
 from rich.table import Table
 
-from vjepa2_ac.console import LateProgress
+from vjepa2_ac.console import FigureTable, LateProgress
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.bootstrap import Estimate
 from vjepa2_ac.evaluation.comparison import Comparison
@@ -63,8 +63,8 @@ def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 def comparison_table(comparison: Comparison) -> Table:
     """Return the table of `compare`, a row per run."""
-    table = Table(title=comparison.title, title_justify="left")
-    table.add_column("run", overflow="fold", min_width=8)
+    table = FigureTable(comparison.title)
+    table.add_column("run")
     for column in comparison.columns:
         table.add_column(column, justify="right")
     for name, cells in comparison.rows.items():
@@ -83,9 +83,9 @@ def _share(cell: Estimate | str) -> str:
 def _errors(evaluation: Evaluation) -> Table:
     sure = "95 % interval over episodes" if evaluation.clips.episodes > 1 else "one episode: no interval"
     table = _table(f"Latent error / persistence on held-out episodes ({sure})", "open loop, L1")
-    table.add_column("persistence", justify="right", no_wrap=True)
+    table.add_column("persistence", justify="right")
     for name in evaluation.models:
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right")
     models, seconds, last = list(evaluation.models), evaluation.about.seconds_per_step, evaluation.horizon
     columns = {name: over_persistence(evaluation, name, "rollout") for name in models}
     for h in range(1, last + 1):
@@ -110,9 +110,9 @@ def _errors(evaluation: Evaluation) -> Table:
 
 def _use_of_actions(evaluation: Evaluation) -> Table:
     table = _table("Use of the actions: one step from one frame", "")
-    table.add_column("ignoring them", justify="right", no_wrap=True)
+    table.add_column("ignoring them", justify="right")
     for name in evaluation.models:
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right")
     sensitivities = [model.sensitivity for model in evaluation.models.values()]
     if all(sensitivities):
         _sensitivity_rows(table, [one for one in sensitivities if one is not None])
@@ -152,7 +152,7 @@ def _plans(evaluation: Evaluation, study: PlanningStudy) -> Table:
     found = {"doing nothing": study.zero, "random": study.random, "within limits": study.within_limits}
     ways = {**found, **ways_of(evaluation)}
     for name in ways:
-        table.add_column(name, justify="right", no_wrap=True)
+        table.add_column(name, justify="right")
     figures = [figures_of(study, plans) for plans in ways.values()]
 
     def row(label: str, of: Callable[[PlanFigures], Estimate], digits: int = 1) -> None:
@@ -192,8 +192,8 @@ def _clips(number: int) -> str:
 
 
 def _table(title: str, first: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    table.add_column(first, no_wrap=True)
+    table = FigureTable(title)
+    table.add_column(first)
     return table
 
 

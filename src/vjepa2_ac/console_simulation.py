@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rich.table import Table
 
+from vjepa2_ac.console import FigureTable
 from vjepa2_ac.evaluation.bootstrap import Estimate
 from vjepa2_ac.simulation.closed_loop_result import ClosedLoopResult
 from vjepa2_ac.simulation.contest import Contest
@@ -15,12 +16,11 @@ _USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that
 def contest_table(contest: Contest) -> Table:
     """Return a row for each who did the task; the intervals are 95 %, over episodes."""
     asked, threshold = contest.asked, f"{100 * SUCCESS_M[contest.asked.task]:g} cm"
-    table = Table(
-        title=f"{asked.task} in domain {asked.domain}: {asked.episodes} problems of seed {asked.seed},"
+    table = FigureTable(
+        f"{asked.task} in domain {asked.domain}: {asked.episodes} problems of seed {asked.seed},"
         f" {contest.results[0].steps} steps of {contest.seconds_per_step:.2f} s (95 % interval over episodes)",
-        title_justify="left",
     )
-    table.add_column("", no_wrap=True)
+    table.add_column("")
     columns = (f"within {threshold} at the end", "once on the way", "left at the end, cm", "steps", "s per decision")
     for column in columns:
         table.add_column(column, justify="right")
