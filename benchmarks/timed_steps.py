@@ -46,7 +46,7 @@ from vjepa2_ac.training.step import training_step
 
 OFFICIAL = "official"
 OFFICIAL_FULL = "official_full"  # every weight of its predictor is trained
-COMPILED = "+compile"  # at the end of a way of ours
+COMPILED, GRAPH = "+compile", "+graph"  # at the end of a way of ours, in this order
 PRECISIONS = {"float32": "fp32", "bfloat16": "bf16"}
 _PAST_WARM_UP = 1001  # a step at which the learning rate is what it mostly is
 
@@ -70,15 +70,17 @@ class Started:
     problem: str | None
 
 
-def our_ways(attention: Sequence[str], *, compiled: bool) -> list[str]:
-    """Return ways of ours: kinds of attention, each once more with compiled blocks if that is asked for."""
-    return [*attention, *(way + COMPILED for way in attention if compiled)]
+def our_ways(attention: Sequence[str], *, compiled: bool, graphs: bool) -> list[str]:
+    """Return ways of ours: kinds of attention, each once more as a CUDA graph, compiled, and as both, as is asked."""
+    plain = [*attention, *(way + GRAPH for way in attention if graphs)]
+    both = [*(way + COMPILED for way in attention), *(way + COMPILED + GRAPH for way in attention if graphs)]
+    return plain + both if compiled else plain
 
 
 def take_way(model: WorldModel, way: str) -> None:
     """Let a model train in one of our ways."""
-    model.set_attention(way.removesuffix(COMPILED))  # type: ignore[arg-type]  # checked when it is used
-    model.set_compiled("with gradients" if way.endswith(COMPILED) else "never")
+    model.set_attention(way.split("+", maxsplit=1)[0])  # type: ignore[arg-type]  # checked when it is used
+    model.set_compiled("with gradients" if COMPILED in way else "never")
 
 
 def has_checkout(options: argparse.Namespace) -> bool:
@@ -172,7 +174,7 @@ class Bench:
         for parameter in self.model.parameters():
             if not parameter.requires_grad:
                 parameter.data = parameter.data.to(self.dtype)
-        run, batches = self.run(setting), itertools.repeat(self.batch(setting))
+        run, batches = self.run(setting, cuda_graph=way.endswith(GRAPH)), itertools.repeat(self.batch(setting))
         return partial(self._our_step, run, batches, None if setting.encoder else latents, way)
 
     def _our_step(self, run: Run, batches: Any, latents: LatentBatch | None, way: str) -> None:
@@ -238,9 +240,11 @@ class Bench:
             frames=max(self.options.frames), encoder="pixels" in self.options.source, device=self.device,
         )  # fmt: skip
 
-    def run(self, setting: Setting) -> Run:
+    def run(self, setting: Setting, *, cuda_graph: bool = False) -> Run:
         """Return the run that `training_step` works on."""
         config = self.config(setting)
+        training = config.training.model_copy(update={"cuda_graph": cuda_graph})
+        config = config.model_copy(update={"training": training})
         return Run(
             config=config,
             accelerator=self._accelerator(config),
@@ -267,9 +271,8 @@ class Bench:
         shape = (setting.batch, setting.frames, side, side, 3)
         frames = torch.randint(256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
         states, actions = _states_and_actions(setting)
-        return Batch(
-            frames, states, actions, None, ("a",) * setting.batch, (0,) * setting.batch
-        )  # as pinned memory would be: its way to the device is part of the step
+        batch = Batch(frames, states, actions, None, ("a",) * setting.batch, (0,) * setting.batch)
+        return batch.pin_memory() if self.device.type == "cuda" else batch  # its way to the device is part of the step
 
 
 def _states_and_actions(setting: Setting) -> tuple[Tensor, Tensor]:
