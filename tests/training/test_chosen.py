@@ -41,11 +41,16 @@ def test_the_newest_the_best_and_that_of_a_step_are_found(run: Path, by: str, wo
 
 @pytest.mark.parametrize(
     ("by", "found"),
-    [("15", "no checkpoint of step 15"), ("bset", "--checkpoint bset"), ("-10", "--checkpoint -10")],
+    [
+        ("15", "no checkpoint of step 15"),
+        ("bset", "--checkpoint bset"),
+        ("-10", "--checkpoint -10"),
+        ("9" * 5000, "--checkpoint 999"),
+    ],
 )
 def test_one_that_is_not_there_is_an_error_that_names_those_that_are(run: Path, by: str, found: str) -> None:
     with pytest.raises(
-        InputError, match=rf"checkpoints: {found}\. needed: newest, best or one of the steps 10, 20, 30"
+        InputError, match=rf"checkpoints: {found}.*\. needed: newest, best or one of the steps 10, 20, 30"
     ):
         choose_checkpoint(run, by)
 

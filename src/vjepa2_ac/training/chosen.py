@@ -10,6 +10,7 @@ from vjepa2_ac.training.checkpoint import checkpoint_name, damage, listed, newes
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 
 NEWEST, BEST = "newest", "best"
+_MOST_DIGITS = 18  # of a number of steps
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ def _best_step(newest: Path) -> int:
 
 
 def _number(by: str, folder: Path) -> int:
-    if not by.isdecimal():
+    if not by.isdecimal() or len(by) > _MOST_DIGITS:
         raise _not_there(folder, f"--checkpoint {by}")
     return int(by)
 
