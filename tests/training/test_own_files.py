@@ -1,5 +1,6 @@
 """A run writes into its own folder only, whatever a stranger has put there; and names of others are no checkpoints."""
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.training import run_folder
 from vjepa2_ac.training.checkpoint import RunState, listed, newest_checkpoint, remove_leavings, write_checkpoint
 from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.manifest import seal
 from vjepa2_ac.training.own_files import refuse_links_out
 from vjepa2_ac.training.run_folder import check_run_folder
 from vjepa2_ac.training.run_lock import RunLock
@@ -86,6 +88,16 @@ def test_a_copy_under_the_name_of_another_step_is_damaged_and_passed_over(
     shutil.copytree(twenty, tmp_path / "step-00000099")
     assert newest_checkpoint(tmp_path) == twenty
     assert "step-00000099: a copy of another one, of step 20; passed over" in caplog.text
+
+
+@pytest.mark.parametrize("step", [None, "20", {"a": 1}, [20], 20.0, True])
+def test_a_step_that_is_none_is_damage(tmp_path: Path, caplog: pytest.LogCaptureFixture, step: object) -> None:
+    ten, twenty = written(tmp_path, 10, 20)
+    (twenty / "state.json").write_text(json.dumps({"step": step, "clips_done": 20}))
+    (twenty / "manifest.json").unlink()
+    seal(twenty)
+    assert newest_checkpoint(tmp_path) == ten
+    assert "step-00000020: no readable state.json (step: " in caplog.text
 
 
 def test_checkpoints_beyond_eight_digits_are_the_newest(tmp_path: Path) -> None:

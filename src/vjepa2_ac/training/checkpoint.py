@@ -24,7 +24,7 @@ from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.config.section import PositiveInt
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import sync
-from vjepa2_ac.structured import read_json_object, record_of
+from vjepa2_ac.structured import read_json_object, record_of, shown
 from vjepa2_ac.training.manifest import broken_seal, seal
 
 logger = logging.getLogger(__name__)
@@ -213,6 +213,8 @@ def _another_step(checkpoint: Path, name: str) -> str | None:
         step = read_json_object(checkpoint / STATE, allow_nan=True).get("step")
     except (OSError, InputError) as error:
         return f"no readable {STATE} ({error})"
+    if type(step) is not int:
+        return f"no readable {STATE} (step: {shown(step)})"
     return None if step_of(name) in {None, step} else f"a copy of another one, of step {step}"
 
 
