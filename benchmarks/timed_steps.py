@@ -272,7 +272,8 @@ class Bench:
         frames = torch.randint(256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
         states, actions = _states_and_actions(setting)
         batch = Batch(frames, states, actions, None, ("a",) * setting.batch, (0,) * setting.batch)
-        return batch.pin_memory() if self.device.type == "cuda" else batch  # its way to the device is part of the step
+        # Its way to the device is part of the step. A device that is but imagined pins nothing.
+        return batch.pin_memory() if self.device.type == "cuda" and torch.cuda.is_available() else batch
 
 
 def _states_and_actions(setting: Setting) -> tuple[Tensor, Tensor]:

@@ -21,7 +21,9 @@ def optimizer_state(run: Path) -> dict:
 
 
 def figures(run: Path) -> list[dict]:
-    return [{k: v for k, v in row.items() if k not in TIMINGS} for row in read_journal(run / "metrics.jsonl")]
+    """Return the rows of numbers: a warning's words name knobs that two runs of the same weights may differ in."""
+    rows = [row for row in read_journal(run / "metrics.jsonl") if row["kind"] != "warning"]
+    return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
 
 
 def assert_same_run(one: Path, other: Path) -> None:

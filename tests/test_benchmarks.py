@@ -254,6 +254,7 @@ def test_a_way_as_a_graph_is_a_run_that_asks_for_one_and_its_clips_are_pinned_on
     bench.batch(setting)
     assert pinned == []
     bench.device = torch.device("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     bench.batch(setting)
     assert pinned == ["pinned"]
 

@@ -9,7 +9,7 @@ import pytest
 
 from vjepa2_ac import places
 from vjepa2_ac.cli import _parser, main
-from vjepa2_ac.cli_parts import as_local, as_model, as_path
+from vjepa2_ac.cli_parts import as_local, as_model, as_path, as_subject
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.config_errors import all_keys
 from vjepa2_ac.config_file import config_as_flat_dict, parse_config
@@ -106,7 +106,7 @@ def test_every_path_on_the_command_line_is_read_alike() -> None:
         is_path = words & set(str(action.metavar).replace("|", " ").split())
         if is_path and action.dest != "overrides":
             found += 1
-            assert action.type in {as_path, as_local, as_model}, f"{command}: {action.dest}"
+            assert action.type in {as_path, as_local, as_model, as_subject}, f"{command}: {action.dest}"
     assert found > 20
 
 

@@ -11,6 +11,7 @@ from vjepa2_ac.cli_parts import (
     as_local,
     as_model,
     as_path,
+    as_subject,
     command,
     count,
     number_between,
@@ -47,6 +48,7 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument(
         "subjects",
         metavar="RUN_OR_MODEL",
+        type=as_subject,
         nargs="+",
         action=SubjectsAndOverrides,
         help="folder of a run, or (with --data) what model.base takes; several: their spread, too",

@@ -56,7 +56,7 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> 
     options, rest = parser.parse_known_args(arguments)
     unknown = [word for word in rest if _OPTION.match(word)]
     if rest and (unknown or not hasattr(options, "overrides")):
-        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+        parser.error(f"unrecognized arguments: {' '.join(word for word in rest if not _OVERRIDE.match(word))}")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
@@ -69,15 +69,21 @@ class SubjectsAndOverrides(argparse.Action):
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, _option: str | None = None
     ) -> None:
         """Put each where it belongs."""
-        overrides = [word for word in values if _OVERRIDE.match(word) and not Path(word).exists()]
-        try:
-            subjects = [as_model(word) for word in values if word not in overrides]
-        except argparse.ArgumentTypeError as error:
-            raise argparse.ArgumentError(self, str(error)) from None
+        overrides = [word for word in values if _is_override(word)]
+        subjects = [word for word in values if word not in overrides]
         if not subjects:
             parser.error(f"the following arguments are required: {self.metavar}")
         setattr(namespace, self.dest, subjects)
         namespace.overrides = [*namespace.overrides, *overrides]
+
+
+def as_subject(text: str) -> str:
+    """Read likewise what names a run or a model, and leave a `key=value` for `SubjectsAndOverrides` as it is."""
+    return text if _is_override(text) else as_model(text)
+
+
+def _is_override(word: str) -> bool:
+    return _OVERRIDE.match(word) is not None and not Path(word).exists()
 
 
 def require_overrides(words: Sequence[str], *, fix: str = "") -> None:

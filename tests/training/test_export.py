@@ -142,7 +142,12 @@ def poison(path: Path) -> str:
 
 @pytest.mark.parametrize("form", ["merged", "official", "hub"])
 @pytest.mark.parametrize(
-    ("alpha", "said"), [(float("nan"), "lora_alpha"), (float("inf"), "lora_alpha"), (1e300, r"attn\.\w\.weight")]
+    ("alpha", "said"),
+    [
+        (float("nan"), r"adapter_config\.json: not JSON: NaN"),
+        (float("inf"), r"adapter_config\.json: not JSON: Infinity"),
+        (1e300, "lora_alpha: .*less than or equal"),
+    ],
 )
 def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(
     trained, tmp_path: Path, form: Any, alpha: float, said: str
@@ -319,7 +324,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_occupied_place_is_refused_before_work_begins(tmp_path: Path, form: Any) -> None:
     (tmp_path / "there.pt").write_text("precious")
     for place in (tmp_path, tmp_path / "there.pt"):
-        with pytest.raises(InputError, match="something is there already"):
+        with pytest.raises(InputError, match=r"something is there already|the name of a \.pt file"):
             export_run(tmp_path / "run", place, form)
     assert (tmp_path / "there.pt").read_text() == "precious"
 

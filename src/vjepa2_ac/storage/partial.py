@@ -35,8 +35,8 @@ _looked_at: set[Path] = set()
 
 
 @contextlib.contextmanager
-def partial_file(target: Path) -> Iterator[tuple[Path, int]]:
-    """Give a new empty file beside a target and its descriptor, which is closed in the end; the file stays.
+def partial_file(target: Path) -> Iterator[Path]:
+    """Give a new empty file beside a target, locked as long as the block lasts; it stays.
 
     Raises:
         OSError: It cannot be made.
@@ -48,7 +48,7 @@ def partial_file(target: Path) -> Iterator[tuple[Path, int]]:
         if _locked(path, handle):
             break
     try:
-        yield path, handle
+        yield path
     finally:
         os.close(handle)
 

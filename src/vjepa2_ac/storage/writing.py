@@ -28,12 +28,12 @@ def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    with partial_file(target) as (temporary, handle):
+    with partial_file(target) as temporary:
         try:
-            with os.fdopen(handle, "wb", closefd=False) as file:
+            with temporary.open("wb") as file:  # by its name, by which some libraries tell what it is
                 yield file
                 file.flush()
-                os.fsync(handle)
+                os.fsync(file.fileno())
             temporary.replace(target)
         except BaseException as error:
             with suppress(FileNotFoundError):
