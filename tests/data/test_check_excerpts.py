@@ -142,6 +142,12 @@ def test_of_few_or_short_or_still_episodes_nothing_is_claimed(how: str) -> None:
     assert found_in([(s[:1], f[:1]) for s, f in recorded()]) == []
 
 
+def test_episodes_may_be_of_any_length() -> None:
+    pairs = [(states[number:], frames[number:]) for number, (states, frames) in enumerate(recorded())]
+    assert not alarms_in(pairs)
+    assert [alarm.about for alarm in alarms_in(SPOILS["late"](pairs))] == ["agreement"]
+
+
 def test_more_blue_than_red_is_a_hint_and_no_alarm() -> None:
     swapped = [(states, frames[..., ::-1]) for states, frames in recorded()]
     (hint,) = [finding for finding in found_in(swapped) if finding.about == "colours"]

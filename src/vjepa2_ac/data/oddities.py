@@ -33,7 +33,7 @@ _FASTEST_M_S = 2.0  # Franka: 1.7
 _BLUER, _BLUER_SHARE, _BLUER_EPISODES = 10.0, 0.9, 8
 
 
-def motion_in(excerpts: Sequence[Excerpt], *, is_pose: bool) -> list[Float[np.ndarray, " changes"]]:
+def motion_in(excerpts: Sequence[Excerpt], *, is_pose: bool) -> list[Float[np.ndarray, " _"]]:
     """Return how far each episode moves at each step: the sum over its numbers, each in units of what it moves by."""
     changes = [_change_of_pose(one.states) if is_pose else np.diff(one.states, axis=0) for one in excerpts]
     scale = np.sqrt((np.concatenate(changes) ** 2).mean(axis=0))
@@ -65,7 +65,7 @@ def _far_change(excerpt: Excerpt) -> float:
     return float(np.abs(excerpt.grey[half:] - excerpt.grey[: len(excerpt.grey) - half]).mean()) if half else 0.0
 
 
-def repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " changes"]]) -> Iterator[Finding]:
+def repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]]) -> Iterator[Finding]:
     """Yield what only repeats: poses while pictures change, pictures while poses do, or single steps of both.
 
     Args:
@@ -96,7 +96,7 @@ def _share(mask: Bool[np.ndarray, " changes"], among: Bool[np.ndarray, " changes
     return float(mask[among].mean()) if among.any() else 0.0
 
 
-def _by_episode(mask: Bool[np.ndarray, " changes"], excerpts: Sequence[Excerpt]) -> list[Bool[np.ndarray, " of_one"]]:
+def _by_episode(mask: Bool[np.ndarray, " changes"], excerpts: Sequence[Excerpt]) -> list[Bool[np.ndarray, " _"]]:
     ends = np.cumsum([len(one.grey) - 1 for one in excerpts])
     return np.split(mask, ends[:-1])
 
