@@ -6,8 +6,9 @@ they are and with one thing changed at a time; what surely fits better is most l
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.loader import batches_of, validation_windows
 from vjepa2_ac.data.windows import Split, spread
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
-from vjepa2_ac.evaluation.bootstrap import Estimate, ratio
+from vjepa2_ac.evaluation.bootstrap import Estimate, ratio, ratio_difference
 from vjepa2_ac.evaluation.metrics import Predictor, distances
 from vjepa2_ac.evaluation.variants import ChangedSource, RememberingSource, Variant, variants_of
 
@@ -36,7 +37,7 @@ class TriedVariant:
     name: str
     mend: str
     ratio: Estimate  # one-step error over persistence
-    difference: Estimate  # of this to that of the data as they are, paired by clip; below 0: fits better
+    difference: Estimate  # of this to that of the data as they are, on the same clips; below 0: fits better
 
 
 @dataclass(frozen=True)
@@ -109,41 +110,38 @@ def probe_variants(
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": min(dataset.config.frames, FRAMES)}))
     windows, shifts = _with_room(dataset, candidates, clips)
     variants = variants_of(dataset.config, shifts)
-    errors: list[list[np.ndarray]] = []
-    persistence: list[np.ndarray] = []
+    measured: list[list[_Errors]] = []
     ids: list[str] = []
     for batch in batches_of(dataset, windows, batch_size=batch_size):
         latents = encode(batch)
         here = _of_batch(dataset, batch)
-        errors.append([_errors(model, latents), *(_under(one, model, encode, *here, latents) for one in variants)])
-        persistence.append(distances(latents.latents[:, :-1], latents.latents[:, 1:]).l1.mean(axis=1))
+        measured.append([_errors(model, latents), *(_under(one, model, encode, *here, latents) for one in variants)])
         ids += batch.episode_ids
         if progress is not None:
             progress(len(ids), len(windows))
-    measured = np.concatenate([np.array(of_batch) for of_batch in errors], axis=1)
-    return _compared(variants, measured, np.concatenate(persistence), ids)
-
-
-def _compared(
-    variants: Sequence[Variant],
-    errors: Float[np.ndarray, "variants_and_plain clips"],
-    persistence: Float[np.ndarray, " clips"],
-    ids: Sequence[str],
-) -> VariantProbe:
+    plain, *others = [
+        _Errors(*map(np.concatenate, zip(*of_one, strict=True))) for of_one in zip(*measured, strict=True)
+    ]
     tried = [
-        TriedVariant(
-            one.name, one.mend, ratio(error, persistence, ids), ratio(error - errors[0], persistence, ids)
-        )
-        for one, error in zip(variants, errors[1:], strict=True)
-    ]  # fmt: skip
-    return VariantProbe(ratio(errors[0], persistence, ids), tuple(tried), len(ids), len(set(ids)))
+        TriedVariant(variant.name, variant.mend, ratio(*one, ids), ratio_difference(one, plain, ids))
+        for variant, one in zip(variants, others, strict=True)
+    ]
+    return VariantProbe(ratio(*plain, ids), tuple(tried), len(ids), len(set(ids)))
+
+
+class _Errors(NamedTuple):
+    """Of each clip; persistence is another one where a variant changes the pictures."""
+
+    one_step: Float[np.ndarray, " clips"]
+    persistence: Float[np.ndarray, " clips"]
 
 
 @torch.no_grad()
-def _errors(model: Predictor, batch: LatentBatch) -> Float[np.ndarray, " clips"]:
+def _errors(model: Predictor, batch: LatentBatch) -> _Errors:
+    latents, truth = batch.latents[:, :-1], batch.latents[:, 1:]
     extrinsics = None if batch.extrinsics is None else batch.extrinsics[:, :-1]
-    predicted = model.predict(batch.latents[:, :-1], batch.actions, batch.states[:, :-1], extrinsics)
-    return np.asarray(distances(predicted, batch.latents[:, 1:]).l1.mean(axis=1))
+    predicted = model.predict(latents, batch.actions, batch.states[:, :-1], extrinsics)
+    return _Errors(distances(predicted, truth).l1.mean(axis=1), distances(latents, truth).l1.mean(axis=1))
 
 
 def _of_batch(dataset: Dataset, batch: Batch) -> tuple[Dataset, list[tuple[int, int]]]:
@@ -161,7 +159,7 @@ def _under(
     dataset: Dataset,
     windows: list[tuple[int, int]],
     plain: LatentBatch,
-) -> Float[np.ndarray, " clips"]:
+) -> _Errors:
     """Return the errors of the same clips under a variant; pictures are encoded again only where it changes them."""
     source = ChangedSource(dataset.source, variant)
     changed = next(iter(batches_of(replace(dataset, source=source), windows, batch_size=len(windows))))

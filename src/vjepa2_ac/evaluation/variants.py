@@ -47,12 +47,14 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
         found.append(Variant("the states backwards", "turn the order of the pictures", _backwards))
     if config.states == "pose":
         for axis, name in enumerate("xy"):
-            mend = f"negate {name}, with the rotation (as of a mirror); or flip the pictures"
+            mend = f"negate {name}, with the rotation (as of a mirror)"
             found.append(Variant(f"{name} negated", mend, partial(_with_mirrored_states, axis=axis)))
         found.append(Variant("the gripper inverted", _GRIPPER[config.source], _with_gripper_inverted))
     if config.source != "latents":
         mend = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
         found.append(Variant("red and blue exchanged", mend, _with_channels_exchanged, changes_pictures=True))
+        mend = "flip the pictures, left to right, where the data is written"
+        found.append(Variant("pictures mirrored", mend, _with_mirrored_pictures, changes_pictures=True))
     return found
 
 
@@ -140,7 +142,15 @@ def _with_gripper_inverted(episode: Episode) -> Episode:
 
 
 def _with_channels_exchanged(episode: Episode) -> Episode:
+    return _with_pictures(episode, lambda frames: frames[..., ::-1])
+
+
+def _with_mirrored_pictures(episode: Episode) -> Episode:
+    return _with_pictures(episode, lambda frames: frames[:, :, ::-1])
+
+
+def _with_pictures(episode: Episode, change: Callable[[np.ndarray], np.ndarray]) -> Episode:
     def read(steps: Sequence[int]) -> np.ndarray:
-        return np.ascontiguousarray(episode.read_frames(steps)[..., ::-1])
+        return np.ascontiguousarray(change(episode.read_frames(steps)))
 
     return replace(episode, read_frames=read)
