@@ -30,7 +30,7 @@ _FAR_LIKE_NEAR, _FEWEST_STEPS = 0.9, 8
 _SHAKING, _SHAKING_M = -0.2, 0.002
 _INSIDE_M, _DELTA_JUMPS = 0.05, 0.3
 _FASTEST_M_S = 2.0  # Franka: 1.7
-_BLUER, _BLUER_SHARE, _BLUER_EPISODES = 10.0, 0.9, 8
+_COLD, _COLD_SHARE, _COLD_EPISODES = -0.4, 0.9, 8
 
 
 def motion_in(excerpts: Sequence[Excerpt], *, is_pose: bool) -> list[Float[np.ndarray, " _"]]:
@@ -152,11 +152,11 @@ def too_fast(excerpts: Sequence[Excerpt], control_rate_hz: float) -> Finding | N
 
 
 def blue_hint(excerpts: Sequence[Excerpt]) -> Finding | None:
-    """Hint where nearly all episodes are more blue than red, which is rare among rooms, wood and skin, but no fault."""
-    bluer = np.array([one.colour[2] - one.colour[0] for one in excerpts])
-    if len(bluer) < _BLUER_EPISODES or (bluer > _BLUER).mean() < _BLUER_SHARE:
+    """Hint where in nearly all episodes colours are cold, which is rare among rooms, wood and skin, but no fault."""
+    warmth = np.array([one.warmth for one in excerpts])
+    if len(warmth) < _COLD_EPISODES or (warmth < _COLD).mean() < _COLD_SHARE:
         return None
     text = (
-        f"hint: {(bluer > _BLUER).sum()} of {len(bluer)} episodes are more blue than red, by {bluer.mean():.0f} of 255"
+        f"hint: what is strongly coloured is more blue than red in {(warmth < _COLD).sum()} of {len(warmth)} episodes"
     )
     return Finding("ok", "colours", f"{text}: look whether red and blue are exchanged (BGR), with `data inspect`")
