@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.data.excerpts import Excerpt, small_grey
+from vjepa2_ac.data.excerpts import Excerpt, small_grey, warmth_of
 
 STEPS, RATE_HZ = 48, 15.0
 ROWS, COLUMNS = 24, 32
@@ -34,14 +34,14 @@ def spot_frames(states: Float[np.ndarray, "steps 7"]) -> UInt8[np.ndarray, "step
     down, right = 12 - 12 * (states[:, 0] - 0.5), 16 + 12 * states[:, 1]
     distance = (rows - down[:, None, None]) ** 2 + (columns - right[:, None, None]) ** 2
     spot = 160 * np.exp(-distance / (8 + 40 * states[:, 2, None, None] ** 2))
-    return np.stack([70 + spot, 60 + spot, 40 + spot], axis=-1).clip(0, 255).astype(np.uint8)
+    return np.stack([70 + spot, 60 + spot, 20 + spot], axis=-1).clip(0, 255).astype(np.uint8)
 
 
 def spot_excerpt(
     name: int | str, states: Float[np.ndarray, "steps 7"], frames: UInt8[np.ndarray, "steps rows columns 3"]
 ) -> Excerpt:
     """Return these as the check looks at them."""
-    return Excerpt(str(name), states, small_grey(frames), frames.mean(axis=(0, 1, 2), dtype=np.float64))
+    return Excerpt(str(name), states, small_grey(frames), warmth_of(frames))
 
 
 def write_spots(folder: Path, episodes: list[tuple[np.ndarray, np.ndarray]]) -> Path:

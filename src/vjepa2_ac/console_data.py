@@ -11,7 +11,7 @@ from vjepa2_ac.data.index import Watch
 from vjepa2_ac.data.inspection import PERCENTILES, Inspection
 from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.evaluation.calibration import Calibration
-from vjepa2_ac.evaluation.variants import VariantProbe, rows_of
+from vjepa2_ac.evaluation.variant_probe import VariantProbe, rows_of
 
 _COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
 

@@ -15,7 +15,7 @@ from vjepa2_ac.data.broken import BrokenEpisodes
 from vjepa2_ac.data.check import check_data
 from vjepa2_ac.data.check_excerpts import excerpt_findings, signs_in
 from vjepa2_ac.data.dataset import Dataset, open_dataset
-from vjepa2_ac.data.excerpts import Excerpt, excerpts_of, small_grey
+from vjepa2_ac.data.excerpts import Excerpt, excerpts_of, small_grey, warmth_of
 from vjepa2_ac.data.finding import Finding
 from vjepa2_ac.data.kept import KeptSteps
 from vjepa2_ac.errors import InputError
@@ -142,12 +142,31 @@ def test_of_few_or_short_or_still_episodes_nothing_is_claimed(how: str) -> None:
     assert found_in([(s[:1], f[:1]) for s, f in recorded()]) == []
 
 
-def test_more_blue_than_red_is_a_hint_and_no_alarm() -> None:
+def test_episodes_may_be_of_any_length() -> None:
+    pairs = [(states[number:], frames[number:]) for number, (states, frames) in enumerate(recorded())]
+    assert not alarms_in(pairs)
+    assert [alarm.about for alarm in alarms_in(SPOILS["late"](pairs))] == ["agreement"]
+
+
+def test_cold_colours_are_a_hint_and_no_alarm() -> None:
     swapped = [(states, frames[..., ::-1]) for states, frames in recorded()]
     (hint,) = [finding for finding in found_in(swapped) if finding.about == "colours"]
     assert (hint.level, "BGR" in hint.text) == ("ok", True)
     assert not [finding for finding in found_in(recorded()) if finding.about == "colours"]
     assert not [finding for finding in found_in(swapped[:7]) if finding.about == "colours"]
+
+
+def test_warmth_is_that_of_strong_colours_only() -> None:
+    grey = np.full((2, 10, 10, 3), 100, np.uint8)
+    assert warmth_of(grey) == 0
+    one_blue = grey.copy()
+    one_blue[0, 0, 0] = (0, 0, 255)
+    assert warmth_of(one_blue) == 0  # a pixel is none
+    one_blue[:, 0] = (0, 0, 255)
+    assert warmth_of(one_blue) == -1
+    assert warmth_of(one_blue[..., ::-1]) == 1
+    one_blue[:, 1] = (50, 0, 0)
+    assert warmth_of(one_blue) == pytest.approx((50 - 255) / (50 + 255))
 
 
 def test_a_standing_robot_before_a_standing_camera_is_neither_stale_nor_copied() -> None:

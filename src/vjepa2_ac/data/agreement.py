@@ -45,7 +45,7 @@ class Agreement:
 
 
 def agreement_of(
-    excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " changes"]], *, least_lag: int = 2
+    excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]], *, least_lag: int = 2
 ) -> Agreement:
     """Compare the change of pictures with that of states.
 
@@ -104,7 +104,7 @@ def _judged(
     )
 
 
-def _ranks(rows: Sequence[Float[np.ndarray, " values"]]) -> Float[np.ndarray, "rows longest"]:
+def _ranks(rows: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, "rows longest"]:
     """Return the ranks of each row's values, from 0 to 1; NaN behind the shorter ones."""
     ranks = np.full((len(rows), max(map(len, rows))), np.nan)
     for place, row in enumerate(rows):

@@ -17,6 +17,7 @@ from vjepa2_ac.errors import InputError
 EPISODES = 24
 STEPS = 64
 _ROWS, _COLUMNS = 24, 32  # of a small picture: an arm is still some pixels wide, and a camera's noise is averaged out
+_STRONG, _STRONG_SHARE = 40, 0.01  # difference of red and blue, of 255; of the pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +27,7 @@ class Excerpt:
     name: str  # the episode's identity
     states: Float[np.ndarray, "steps state_dim"]
     grey: Float32[np.ndarray, "steps rows columns"]  # 0 to 255
-    colour: Float[np.ndarray, " 3"]  # mean of red, green, blue
+    warmth: float  # of what is strongly coloured: 1 all of it more red than blue, -1 more blue; 0 where nothing is
 
     @property
     def picture_change(self) -> Float[np.ndarray, " changes"]:
@@ -69,8 +70,15 @@ def _read(dataset: Dataset, index: int, steps: int) -> Excerpt:
         name=episode.info.id,
         states=np.asarray(episode.states[chosen.start : chosen.stop], np.float64),
         grey=small_grey(frames),
-        colour=frames.mean(axis=(0, 1, 2), dtype=np.float64),
+        warmth=warmth_of(frames[:: len(frames) - 1 or 1]),
     )
+
+
+def warmth_of(frames: UInt8[np.ndarray, "steps height width 3"]) -> float:
+    """Return how much more red than blue the strongly coloured pixels are, -1 to 1; 0 where there are few."""
+    warmer = frames[..., 0].astype(np.int16) - frames[..., 2]
+    strong = warmer[np.abs(warmer) > _STRONG]
+    return float(strong.sum() / np.abs(strong).sum()) if len(strong) > _STRONG_SHARE * warmer.size else 0.0
 
 
 def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.ndarray, "steps rows columns"]:

@@ -1,4 +1,4 @@
-"""Which reading of the data of a config does a model fit best? See `evaluation.variants`."""
+"""Which reading of the data of a config does a model fit best? See `evaluation.variant_probe`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.windows import Split
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.variants import VariantProbe, probe_variants
+from vjepa2_ac.evaluation.variant_probe import VariantProbe, probe_variants
 from vjepa2_ac.latents import encode_batch, require_same_encoder, require_widths
 from vjepa2_ac.training.assembly import make_accelerator
 from vjepa2_ac.training.calibrate import load_named
