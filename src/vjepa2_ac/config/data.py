@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from typing import Annotated, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from vjepa2_ac.config.section import OFF, Local, Place, PositiveInt, Section, Share
 from vjepa2_ac.places import is_url
