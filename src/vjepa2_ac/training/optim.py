@@ -42,6 +42,16 @@ def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.O
     return torch.optim.AdamW(groups, lr=training.learning_rate, betas=training.betas, fused=fused)
 
 
+def require_optimizer(training: TrainingConfig) -> None:
+    """See that the optimizer is there.
+
+    Raises:
+        InputError: It needs a library that is not installed.
+    """
+    if training.optimizer == "adamw_8bit":
+        _adamw_8bit()
+
+
 def _are_on_cuda(parameters: Iterable[nn.Parameter]) -> bool:
     return all(parameter.device.type == "cuda" for parameter in parameters)
 
