@@ -16,6 +16,13 @@ def trained_weights(run: Path) -> dict[str, torch.Tensor]:
     return load_file(newest_checkpoint(run / "checkpoints") / "adapter" / "adapter_model.safetensors")
 
 
+def all_weights(run: Path) -> dict[str, torch.Tensor]:
+    """Return what is trained of any kind of run, and where PiSSA began."""
+    folder = newest_checkpoint(run / "checkpoints") / "adapter"
+    files = sorted(folder.rglob("*.safetensors"))
+    return {f"{file.name} {name}": value for file in files for name, value in load_file(file).items()}
+
+
 def optimizer_state(run: Path) -> dict:
     return torch.load(newest_checkpoint(run / "checkpoints") / "optimizer.pt", weights_only=True)["state"]
 
@@ -26,11 +33,20 @@ def figures(run: Path) -> list[dict]:
     return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
 
 
+def numbers_in(state: dict, place: str = "") -> dict[str, torch.Tensor]:
+    """Return all numbers of nested dicts by their places: 8-bit moments are a dict in a dict."""
+    inner = [numbers_in(value, f"{place}{key}.") for key, value in state.items() if isinstance(value, dict)]
+    own = {f"{place}{key}": torch.as_tensor(value) for key, value in state.items() if not isinstance(value, dict)}
+    return {name: value for numbers in (own, *inner) for name, value in numbers.items()}
+
+
 def assert_same_run(one: Path, other: Path) -> None:
-    first, second = trained_weights(one), trained_weights(other)
-    assert first.keys() == second.keys()
-    assert all(torch.equal(first[key], second[key]) for key in first)
-    for key, moments in optimizer_state(one).items():
-        for name, value in moments.items():
-            assert torch.equal(value, optimizer_state(other)[key][name]), (key, name)
+    for first, second in (
+        (all_weights(one), all_weights(other)),
+        (numbers_in(optimizer_state(one)), numbers_in(optimizer_state(other))),
+    ):
+        assert first
+        assert first.keys() == second.keys()
+        for name, value in first.items():
+            assert torch.equal(value, second[name]), name
     assert figures(one) == figures(other)

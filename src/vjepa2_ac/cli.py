@@ -47,6 +47,12 @@ def _run(arguments: Sequence[str] | None) -> int:
     except (InputError, OSError, MemoryError) as error:  # a full disk, a path that is no path: the message names it
         _complain(in_words(error))
         return 2
+    except ModuleNotFoundError as error:  # one that every installation has: those of extras are errors of their own
+        library = (error.name or "vjepa2_ac").partition(".")[0]
+        if library == "vjepa2_ac":
+            raise
+        _complain(f"{library}: it is not installed. Run pip install -c constraints.txt -e .")
+        return 2
     except RuntimeError as error:
         if not is_out_of_memory(error):
             raise

@@ -10,16 +10,17 @@ from lerobot_sets import recorded, write_v21
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.dataset import Dataset, open_dataset
 from vjepa2_ac.data.loader import clip_at
+from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 
 
-def dataset_of(folder: Path) -> Dataset:
+def dataset_of(folder: Path, progress: Progress | None = None) -> Dataset:
     values = {
         "source": "lerobot", "path": str(folder), "frames": 3, "stride": 2, "validation_share": 0.0, "test_share": 0.0,
         "broken_episodes": "skip", "lerobot": {"cameras": {"wrist_left": "observation.images.wrist_left"}},
         "disk_cache": {"dir": str(folder.parent / "cache")},
     }  # fmt: skip
-    return open_dataset(DataConfig.model_validate_json(json.dumps(values)))
+    return open_dataset(DataConfig.model_validate_json(json.dumps(values)), progress=progress)
 
 
 def test_without_its_decoder_no_episode_is_offered_for_exclusion(
@@ -39,3 +40,14 @@ def test_without_its_reader_no_episode_is_called_broken(tmp_path: Path, monkeypa
     with pytest.raises(InputError, match="pyarrow, which reads LeRobot data sets, is not installed") as raised:
         dataset_of(folder)
     assert "broken" not in str(raised.value)
+
+
+def test_without_its_decoder_a_set_of_videos_is_not_looked_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or the states of a hundred thousand episodes would be read before the first picture is missed."""
+    folder, told = write_v21(tmp_path / "set", [recorded(0, 20)]), []
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match=r"PyAV, which decodes video, is not installed.*pip install"):
+        dataset_of(folder, lambda *done: told.append(done))
+    assert told == []

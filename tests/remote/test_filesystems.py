@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import filesystems
 
 
@@ -46,3 +47,16 @@ def test_an_emulator_is_shown_no_login(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_way_in_is_that_of_the_place() -> None:
     assert "hf auth login" in filesystems.way_in("hf://datasets/owner/name")
     assert filesystems.way_in("https://host/file") == "Check the login"
+
+
+@pytest.mark.parametrize(("url", "extra"), [("gs://bucket/set", "gcs"), ("hf://datasets/one/set", "lerobot")])
+def test_a_missing_library_is_named_with_the_extra_that_brings_it(
+    url: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def absent(protocol: str) -> None:
+        raise ImportError(f"Unable to load filesystem from EntryPoint(name={protocol!r})")
+
+    monkeypatch.setattr("fsspec.get_filesystem_class", absent)
+    monkeypatch.setattr(filesystems, "_filesystems", {})
+    with pytest.raises(InputError, match=rf'is not installed\. Install it: pip install .* "\.\[{extra}\]"'):
+        filesystems.ask(url, "info", 1.0)

@@ -52,6 +52,31 @@ def test_a_run_that_died_and_went_on_equals_the_one_that_did_not(make_config, re
     assert_same_run(tmp_path / "whole", tmp_path / "broken")
 
 
+KINDS = {
+    "dora": {"adapter__dora": True, "adapter__dropout": 0.2},
+    "pissa": {"adapter__init": "pissa"},
+    "whole predictor": {"adapter__kind": "none"},
+    "8 bit": {"training__optimizer": "adamw_8bit"},
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_of_any_kind_that_died_and_went_on_equals_the_one_that_did_not(
+    make_config, reporter, tmp_path, kind: str
+) -> None:
+    if kind == "8 bit":
+        pytest.importorskip("bitsandbytes")
+    changes = {"training__steps": 4, **KINDS[kind]}
+    train(make_config(run_dir=str(tmp_path / "whole"), **changes), reporter)
+    config = make_config(run_dir=str(tmp_path / "broken"), **changes)
+    with pytest.raises(KilledError):
+        train(config, dying_reporter(type(reporter)(), 3))
+    reporter.steps.clear()
+    train(config, reporter)
+    assert reporter.steps == [3, 4]
+    assert_same_run(tmp_path / "whole", tmp_path / "broken")
+
+
 def test_the_number_of_loader_workers_changes_nothing(make_config, reporter, tmp_path) -> None:
     train(make_config(run_dir=str(tmp_path / "none"), training__steps=2), reporter)
     train(make_config(run_dir=str(tmp_path / "two"), training__steps=2, data__workers=2), reporter)

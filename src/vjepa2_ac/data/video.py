@@ -266,6 +266,15 @@ class _Video:
         return float(self.stream.time_base or 1)
 
 
+def require_decoder(where: str) -> None:
+    """See that videos can be decoded, before anything is done with a set that has some.
+
+    Raises:
+        UnreachableError: PyAV is not installed.
+    """
+    _library(where)
+
+
 def _library(where: str) -> Any:
     try:
         import av

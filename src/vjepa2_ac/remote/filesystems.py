@@ -12,6 +12,7 @@ from vjepa2_ac.errors import InputError
 GOOGLE = frozenset({"gs", "gcs"})
 
 _LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
+_EXTRAS = {"gs": "gcs", "hf": "lerobot"}
 _KNOWN = "a folder of this machine, or gs://, hf://, s3://"
 _NO_PLACES = frozenset({  # they lead to files of any other kind, some by templates that are executed
     "async_wrapper", "asyncwrapper", "blockcache", "cached", "dask", "data", "dir", "filecache", "generic",
@@ -163,7 +164,8 @@ def _kind(url: str, protocol: str) -> Any:
     try:
         return fsspec.get_filesystem_class(protocol)
     except ImportError as error:
-        fix = 'Install it: pip install -c constraints.txt -e ".[gcs]"' if protocol == "gs" else str(error)
+        extra = _EXTRAS.get(protocol)
+        fix = f'Install it: pip install -c constraints.txt -e ".[{extra}]"' if extra else str(error)
         raise InputError(where=url, found=f"the library for {protocol}:// is not installed", fix=fix) from None
     except ValueError:
         raise InputError(where=url, found=f"nothing reads {protocol}://", needed=_KNOWN) from None

@@ -20,9 +20,10 @@ from vjepa2_ac.remote import RefusedError, UnreachableError
 from vjepa2_ac.storage.reading import join
 from vjepa2_ac.storage.writing import atomic_writer
 
-_AWAY = frozenset(
-    {errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC}
-)
+_AWAY = frozenset({
+    errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC,
+    errno.EDQUOT,
+})  # fmt: skip
 _PIECE_BYTES = 32 << 20
 
 

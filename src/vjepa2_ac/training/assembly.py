@@ -43,7 +43,6 @@ from vjepa2_ac.training.sharding import check_launch, share_if_asked, whole_mome
 from vjepa2_ac.training.shared_memory import say_if_shared_memory_is_small
 from vjepa2_ac.training.stride import choose_stride, require_learned, with_stride
 from vjepa2_ac.training.torch_file import write_torch
-from vjepa2_ac.training.trackers import require_installed
 
 LONGEST_WAIT = timedelta(hours=2)  # of a process for the others: one may look through a data set for the first time
 _CLIPS_TRIED = 8  # one is read; the others are for where data.broken_episodes passes over it
@@ -129,8 +128,6 @@ def assemble(
         InputError: Something cannot be used.
     """
     accelerator = accelerator or make_accelerator(config)
-    if accelerator.is_main_process:  # the only one that has trackers
-        require_installed(config.tracking)
     if config.data.stride == "auto":
         require_learned(config.model)
     with accelerator.local_main_process_first():  # the others find the index of the first one on this machine

@@ -35,6 +35,7 @@ from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.latents import encode_batch, require_widths
 from vjepa2_ac.model.adapter_end import base_only, unadapted_copy
 from vjepa2_ac.model.load import load_base
+from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.places import BUILTIN
 from vjepa2_ac.storage import user_can_write
@@ -96,6 +97,9 @@ def evaluate_subject(
     planning = _planning_of(config, asked)
     _check_writable(folder)
     accelerator = make_accelerator(config)
+    if asked.probes.planning_clips and planning.quantize != "off":
+        dtype = getattr(torch, config.model.dtype)
+        require_8_bits(planning.quantize, dtype, accelerator.device, where="planning.quantize")
     dataset = open_dataset(config.data, progress=stage("looking through the data") if stage else None)
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     run = load_run(Path(subject), asked.checkpoint) if is_run(subject) else None

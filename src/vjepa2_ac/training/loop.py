@@ -32,6 +32,7 @@ from vjepa2_ac.training.health import Throughput, TimedBatches
 from vjepa2_ac.training.journal import Journal
 from vjepa2_ac.training.mirror.mirror import Mirror, NoMirror
 from vjepa2_ac.training.mirror.start import Remote, open_remote
+from vjepa2_ac.training.optim import require_optimizer
 from vjepa2_ac.training.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.training.processes import from_first, largest, require_same
 from vjepa2_ac.training.quiet import QuietJournal, QuietReporter
@@ -42,7 +43,7 @@ from vjepa2_ac.training.start_folder import require_start_folder
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.stopwatch import stopwatch_for
 from vjepa2_ac.training.stride import with_settled_stride
-from vjepa2_ac.training.trackers import open_trackers
+from vjepa2_ac.training.trackers import open_trackers, require_installed
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: the longest look ahead is what planning leans on
 
@@ -94,6 +95,9 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
     """
     accelerator = make_accelerator(config)
     require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
+    require_optimizer(config.training)
+    if accelerator.is_main_process:  # the only one that has trackers
+        require_installed(config.tracking)
     remote = None
     with contextlib.ExitStack() as until_the_end:
         lock = until_the_end.enter_context(RunLock(Path(config.run_dir)))

@@ -42,6 +42,16 @@ def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.O
     return torch.optim.AdamW(groups, lr=training.learning_rate, betas=training.betas, fused=fused)
 
 
+def require_optimizer(training: TrainingConfig) -> None:
+    """See that the optimizer is there.
+
+    Raises:
+        InputError: It needs a library that is not installed.
+    """
+    if training.optimizer == "adamw_8bit":
+        _adamw_8bit()
+
+
 def _are_on_cuda(parameters: Iterable[nn.Parameter]) -> bool:
     return all(parameter.device.type == "cuda" for parameter in parameters)
 
@@ -72,10 +82,11 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
     )
     if not known or not all(isinstance(moments, dict) for moments in state["state"].values()):
         raise ValueError("it is not the state of an optimizer")
-    if any(first not in moments for moments in state["state"].values()):
+    flat = {number: _flat(moments) for number, moments in state["state"].items()}
+    if any(first not in moments for moments in flat.values()):
         raise ValueError("its moments are of another training.optimizer")
-    _require_shapes(optimizer, state["state"], first)
-    for number, moments in state["state"].items():
+    _require_shapes(optimizer, flat, first)
+    for number, moments in flat.items():
         tensors = {name: value for name, value in moments.items() if isinstance(value, Tensor)}
         if (name := first_not_finite(tensors)) is not None:
             raise ValueError(f"{name} of parameter {number} holds NaN or infinity")
@@ -83,6 +94,12 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
     groups = [group | settings for group, settings in zip(state["param_groups"], own, strict=False)]
     left = state["param_groups"][len(own) :]  # which PyTorch refuses
     optimizer.load_state_dict({**state, "param_groups": groups + left})
+
+
+def _flat(moments: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the moments of a parameter by their names: bitsandbytes puts its own into a dict among them."""
+    groups = [value for value in moments.values() if isinstance(value, Mapping)]
+    return {name: value for group in (moments, *groups) for name, value in group.items()}
 
 
 def _require_shapes(optimizer: torch.optim.Optimizer, moments: Mapping[Any, Any], first: str) -> None:

@@ -26,6 +26,7 @@ PATIENCE_S = 60.0  # after which it is said that a tracker does not answer
 CLOSING_S = 30.0  # how long the end of a run waits for all of them
 
 _INSTALL = {
+    "tensorboard": "Run pip install -c constraints.txt -e .",
     "wandb": 'Run pip install -c constraints.txt -e ".[wandb]"',
     "trackio": 'Run pip install -c constraints.txt -e ".[trackio]"',
 }
@@ -68,7 +69,11 @@ def require_installed(tracking: TrackingConfig) -> None:
     Raises:
         InputError: One that was asked for is not installed.
     """
-    asked = {"wandb": tracking.wandb != "disabled", "trackio": tracking.trackio}
+    asked = {
+        "tensorboard": tracking.tensorboard,
+        "wandb": tracking.wandb != "disabled",
+        "trackio": tracking.trackio,
+    }
     for library, is_asked in asked.items():
         if is_asked and importlib.util.find_spec(library) is None:
             off = "disabled" if library == "wandb" else "false"

@@ -70,7 +70,7 @@ def open_remote(
     checkpoints = RemoteCheckpoints(remote.place)
     try:
         with quietly():
-            listing = _look(checkpoints, run_id)
+            listing, owner = _look(checkpoints, run_id)
     except UnreachableError as error:
         stand = "without a checkpoint" if step is None else f"after step {step}"
         _warn(f"{reason_of(error)}. Training begins with what is on this machine, {stand}, and tries again later")
@@ -78,7 +78,8 @@ def open_remote(
     minutes = config.checkpoint.remote_every_minutes
     note(f"{remote.place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
     further = [name for name in complete(listing) if step is None or (step_of(name) or 0) > step]
-    if not further:
+    is_begun_there = step is None and owner is not None  # a machine was killed in its first upload, at the latest
+    if not further and not is_begun_there:
         return remote
     target = config if into is None else config.model_copy(update={"run_dir": str(into)})
     try:
@@ -88,14 +89,14 @@ def open_remote(
             raise
         _warn(f"{reason_of(error)}. Training goes on after step {step}, though {further[0]} is there")
         return remote
-    if damaged == further:
+    if further and damaged == further:
         _refuse_all_damaged(remote.place, damaged, step)
         return replace(remote, damaged=tuple(damaged))
     return replace(remote, config=target, damaged=tuple(damaged))
 
 
-def _look(checkpoints: RemoteCheckpoints, run_id: str | None) -> Listing:
-    """Return what is at the place, having written there and seen that it is ours.
+def _look(checkpoints: RemoteCheckpoints, run_id: str | None) -> tuple[Listing, str | None]:
+    """Return what is at the place and which run we are, as far as known; having written there and seen that it is ours.
 
     Raises:
         InputError: It cannot be written for good, or holds checkpoints of another run.
@@ -104,7 +105,7 @@ def _look(checkpoints: RemoteCheckpoints, run_id: str | None) -> Listing:
     try:
         try_writing(checkpoints.place)
         listing = checkpoints.listing()
-        _refuse_foreign(checkpoints, listing, run_id)
+        owner = _refuse_foreign(checkpoints, listing, run_id)
     except RefusedError as error:
         raise InputError(
             where="checkpoint.remote",
@@ -112,12 +113,12 @@ def _look(checkpoints: RemoteCheckpoints, run_id: str | None) -> Listing:
             needed="a place where files can be written and removed",
             fix=f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out",
         ) from error
-    return listing
+    return listing, owner
 
 
-def _refuse_foreign(checkpoints: RemoteCheckpoints, listing: Listing, run_id: str | None) -> None:
-    """Refuse checkpoints of another run than this machine's, or than each other's."""
-    for name in complete(listing):
+def _refuse_foreign(checkpoints: RemoteCheckpoints, listing: Listing, run_id: str | None) -> str | None:
+    """Refuse checkpoints, and halves of them, of another run than this machine's or each other's; return that run."""
+    for name in sorted(listing, reverse=True):
         owner = checkpoints.run_id(name)
         run_id = owner if run_id is None else run_id
         if owner is not None and owner != run_id:
@@ -127,6 +128,7 @@ def _refuse_foreign(checkpoints: RemoteCheckpoints, listing: Listing, run_id: st
                 needed="an empty place, or the one of this run",
                 fix="Set another checkpoint.remote; nothing was written there",
             )
+    return run_id
 
 
 def _refuse_own_folder(remote: str, run_dir: Path) -> None:

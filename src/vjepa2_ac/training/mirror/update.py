@@ -1,8 +1,8 @@
 """What is done to bring `checkpoint.remote` up to date, once?
 
-First whose it is: where another run's checkpoints lie, nothing is written. Then the run's small files, the newest
-checkpoint that is whole, the best one; and last, what is kept no longer goes. What is being sent is held by hard links,
-so that training may remove it meanwhile.
+First whose it is: where another run's checkpoints lie, nothing is written. Then halves of older checkpoints go, which
+take the room of what comes: the run's small files, the newest checkpoint that is whole, the best one. Last, what is
+kept no longer goes. What is being sent is held by hard links, so that training may remove it meanwhile.
 """
 
 from __future__ import annotations
@@ -67,6 +67,7 @@ class RemoteUpdate:
             return None
         best_name = _best_of(newest)
         best = self._hold(best_name) if best_name not in {None, newest.name} else None
+        self._remove_halves(listing, newest.name, best_name, go_on)
         self._send_small_files(go_on)
         for checkpoint in (newest, best):
             if checkpoint is not None:
@@ -117,15 +118,19 @@ class RemoteUpdate:
             return None
         return held if damage(held) is None else None
 
-    def _rotate(self, newest: str, best: str | None, go_on: GoOn) -> None:
-        """Remove what is not kept any more, and older ones that were left by halves; what is further on stays."""
-        listing = self._remote.listing()
-        whole = complete(listing)
-        kept = {*whole[: self._keep], newest, best}
-        for name in sorted(set(listing) - kept):
-            if name in whole or (step_of(name) or 0) < (step_of(newest) or 0):
+    def _remove_halves(self, listing: Listing, newest: str, best: str | None, go_on: GoOn) -> None:
+        """Remove older ones that were left by halves: a full place would never have room again; later ones stay."""
+        for name in sorted(set(listing) - {*complete(listing), newest, best}):
+            if (step_of(name) or 0) < (step_of(newest) or 0):
                 go_on()
                 self._remote.remove(name)
+
+    def _rotate(self, newest: str, best: str | None, go_on: GoOn) -> None:
+        """Remove what is not kept any more."""
+        whole = complete(self._remote.listing())
+        for name in sorted(set(whole) - {*whole[: self._keep], newest, best}):
+            go_on()
+            self._remote.remove(name)
 
     def _names_here(self) -> list[str]:
         """Return the checkpoints of this machine, the newest first."""

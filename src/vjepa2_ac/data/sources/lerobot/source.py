@@ -30,7 +30,7 @@ from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
 from vjepa2_ac.data.sources.lerobot.pictures import StoredPictures, VideoPictures
 from vjepa2_ac.data.sources.lerobot.rows import EpisodeContent, content_of, wanted_columns
 from vjepa2_ac.data.table import EpisodeTable
-from vjepa2_ac.data.video import Clock
+from vjepa2_ac.data.video import Clock, require_decoder
 from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import FileInfo
@@ -137,6 +137,8 @@ class LeRobotSource:
         info, config = self._info, self._config
         info.require_mapping(config)
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
+        if any(info.features[key].dtype == "video" for key in keys):
+            require_decoder(info.where)
         tables = tables_of_episodes(info, self._connections)
         files = list_by_template(info.root, info.data_path, connections=self._connections)
         for key in keys:

@@ -1,0 +1,65 @@
+"""What is not installed is said in one line, with the way out, before anything is opened, fetched or computed."""
+
+import sys
+
+import pytest
+
+from vjepa2_ac.cli import main
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate import Probes
+from vjepa2_ac.training.evaluation import Asked, evaluate_subject
+from vjepa2_ac.training.loop import train
+
+
+@pytest.mark.parametrize(
+    ("library", "knob", "value", "extra"),
+    [
+        ("bitsandbytes", "training__optimizer", "adamw_8bit", r"-e \"\.\[8bit\]\""),
+        ("wandb", "tracking__wandb", "offline", r"-e \"\.\[wandb\]\""),
+        ("trackio", "tracking__trackio", True, r"-e \"\.\[trackio\]\""),
+        ("tensorboard", "tracking__tensorboard", True, r"-e \."),
+    ],
+)
+def test_what_a_run_lacks_is_said_before_its_mirror_or_data_are_opened(
+    make_config, reporter, monkeypatch, library: str, knob: str, value: object, extra: str
+) -> None:
+    for name in (library, f"{library}.optim"):
+        monkeypatch.setitem(sys.modules, name, None)
+    config = make_config(data__path="nowhere", checkpoint__remote="nothing://reads/this", **{knob: value})
+    with pytest.raises(InputError, match=rf"{library} is not installed.*pip install -c constraints.txt {extra}"):
+        train(config, reporter)
+
+
+def test_an_evaluation_says_what_its_plans_lack_before_it_opens_the_data(
+    make_config, base_folder, monkeypatch, tmp_path
+) -> None:
+    monkeypatch.setitem(sys.modules, "torchao.quantization", None)
+    asked = Asked(
+        data=make_config(data__path="nowhere", data__frames=16, model__dtype="bfloat16", training__precision="bf16"),
+        probes=Probes(planning_clips=1), planning=("planning.quantize=int8",), out=tmp_path / "out",
+    )  # fmt: skip
+    with pytest.raises(InputError, match=r"torchao is not installed.*\[quantize\]"):
+        evaluate_subject(str(base_folder), asked)
+
+
+def needing(library: str):
+    def handler(_options: object) -> int:
+        __import__(library)
+        return 0
+
+    return handler
+
+
+def test_a_library_of_every_installation_that_is_gone_is_named_in_one_line(monkeypatch, capsys, tmp_path) -> None:
+    monkeypatch.setitem(sys.modules, "simplejpeg", None)
+    monkeypatch.setattr("vjepa2_ac.cli_data._check", needing("simplejpeg"))
+    assert main(["data", "check", str(tmp_path / "config.yaml")]) == 2
+    assert capsys.readouterr().err == (
+        "error: simplejpeg: it is not installed. Run pip install -c constraints.txt -e .\n"
+    )
+
+
+def test_a_part_of_this_program_that_is_gone_is_no_users_error(monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr("vjepa2_ac.cli_data._check", needing("vjepa2_ac.not_there"))
+    with pytest.raises(ModuleNotFoundError):
+        main(["data", "check", str(tmp_path / "config.yaml")])
