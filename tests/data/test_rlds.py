@@ -374,6 +374,16 @@ def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Pa
         ('{"name": "a"}', "not a description"),
         ('{"name": "a", "splits": []}', "no episodes"),
         ('{"name": "a", "splits": [{"name": "train", "shardLengths": ["x"]}]}', "not a description"),
+        ('{"name": "a", "splits": [{"name": "train", "shardLengths": [1e308]}]}', "not a description"),
+        (
+            '{"name": "a", "splits": [{"name": "train", "shardLengths": [9999999999]}]}',
+            "shard of 9,999,999,999 episodes",
+        ),
+        ('{"name": "a", "splits": [{"name": "train", "shardLengths": [-1]}]}', "not a description"),
+        (
+            '{"name": "a", "splits": [{"name": "t", "shardLengths": [2, 2], "filepathTemplate": "one.tfrecord"}]}',
+            "shards of one name",
+        ),
         ('{"name": "a", "fileFormat": "array_record", "splits": []}', "array_record"),
     ],
 )

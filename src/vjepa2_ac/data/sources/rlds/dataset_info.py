@@ -13,6 +13,7 @@ from vjepa2_ac.structured import read_json_object
 _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 _SHOWN = 5
+_MOST_EPISODES = 100_000  # of a shard; DROID's have some 50
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def _nothing_in(folder: str) -> str:
 
 
 def _shards_of(folder: str, dataset: str, split: dict[str, Any]) -> list[Shard]:
-    counts = [int(count) for count in split.get("shardLengths", [])]
+    counts = [_count(count) for count in split.get("shardLengths", [])]
     template = split.get("filepathTemplate") or _DEFAULT_TEMPLATE
     shards = []
     for number, count in enumerate(counts):
@@ -118,8 +119,20 @@ def _shards_of(folder: str, dataset: str, split: dict[str, Any]) -> list[Shard]:
     return shards
 
 
+def _count(value: object) -> int:
+    """Return how many episodes a shard has: TFDS writes a number, or its digits."""
+    count = int(str(value))
+    if not 0 <= count <= _MOST_EPISODES:
+        raise ValueError(f"a shard of {count:,} episodes")
+    return count
+
+
 def _as_listed(folder: str, shards: list[Shard]) -> list[Shard]:
     """Return the shards with size and version, from one look at the folder."""
+    if len({shard.path for shard in shards}) < len(shards):
+        raise InputError(
+            where=storage.join(folder, _INFO), found="shards of one name", needed="a filepathTemplate that numbers them"
+        )
     present = {file.name: file for file in storage.list_files(folder)}
     missing = [shard.name for shard in shards if shard.name not in present]
     if missing:
