@@ -14,6 +14,14 @@ from jaxtyping import Shaped
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.kept_file import KeptFile
+from vjepa2_ac.data.sources.lerobot.bounds import (
+    FIX,
+    MOST_PICTURE_BYTES,
+    MOST_TABLE_BYTES,
+    parts_of,
+    require_few,
+    require_sane,
+)
 from vjepa2_ac.data.sources.lerobot.kept import Columns, KeptRows
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import UnreachableError
@@ -28,8 +36,6 @@ EPISODE = "episode_index"
 
 _KEPT_BYTES = 64 << 20  # of decoded row groups, in a process
 _KEPT_FOOTERS = 256
-_ROWS_LIMIT = 50_000_000  # of one row group: beyond, the file is damaged (or would not fit into memory)
-_FIX = "Copy the file again, or leave its episodes out"
 
 
 @dataclass(frozen=True)
@@ -83,6 +89,7 @@ class ParquetRows:
                     chosen = _places_of(group, episode)
                     parts.append({name: column[chosen] for name, column in group.items()})
                     shared |= len(parts[-1][EPISODE]) < len(group[EPISODE])
+                    require_sane([sum(len(part[EPISODE]) for part in parts)], path)
         rows = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
         if self._kept is not None and shared:
             self._kept.write(path, episode, rows)
@@ -100,8 +107,8 @@ class ParquetRows:
             footer = self._footer(path, file)
             for number, (first, last) in enumerate(zip(footer.first, footer.last, strict=True)):
                 if (first is None or first <= episode) and (last is None or episode <= last):
-                    table = file.read_row_group(number, columns=[EPISODE, column], use_threads=False)
-                    found += _pictures_in(table, column, episode, path)
+                    for part in parts_of(file, path, [EPISODE, column], MOST_PICTURE_BYTES, row_groups=[number]):
+                        found += _pictures_in(part[column], part[EPISODE], episode, f"{path}: {column}")
         return found
 
     def _footer(self, path: str, file: parquet.ParquetFile) -> _Footer:
@@ -122,10 +129,11 @@ class ParquetRows:
                 self._groups.move_to_end((path, number))
                 return self._groups[path, number]
         present = [name for name in self._columns if name in file.schema_arrow.names]
+        require_few(file, number, present, path)
         table = file.read_row_group(number, columns=present, use_threads=False)
         group = {name: numbers_in(table.column(name), f"{path}: {name}") for name in present}
         if EPISODE not in group:
-            raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=_FIX)
+            raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=FIX)
         with self._lock:
             self._groups[path, number] = group
             while len(self._groups) > 1 and sum(map(_size_of, self._groups.values())) > _KEPT_BYTES:
@@ -141,10 +149,13 @@ def read_table(opened: str | KeptFile, path: str, wanted: Callable[[str], bool])
         OSError: A file far away cannot be read.
     """
     with _opened(opened, path) as file:
-        _require_sane(file, path)
+        _require_sane_groups(file, path)
         present = [name for name in file.schema_arrow.names if wanted(name)]
-        table = file.read(columns=present, use_threads=False)
-        return {name: table.column(name).to_pylist() for name in present if name in table.column_names}
+        values: dict[str, list[Any]] = {name: [] for name in present}
+        for part in parts_of(file, path, present, MOST_TABLE_BYTES):
+            for name in part:
+                values[name] += part[name]
+        return values
 
 
 def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows _"]:
@@ -185,15 +196,15 @@ def _opened(opened: str | KeptFile, path: str) -> Iterator[parquet.ParquetFile]:
         ) as file:
             yield file
     except FileNotFoundError:
-        raise InputError(where=path, found="no such file", needed="one, says the data set", fix=_FIX) from None
+        raise InputError(where=path, found="no such file", needed="one, says the data set", fix=FIX) from None
     except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError) as error:
         if isinstance(opened, KeptFile) and opened.failure is not None:
             raise opened.failure from None
         if isinstance(error, OSError) and error.errno is not None:  # of the system, not of the file's content
-            raise storage.unreadable(path, error, fix=_FIX) from None
+            raise storage.unreadable(path, error, fix=FIX) from None
         reason = str(error).strip().splitlines()[:1]
         raise InputError(
-            where=path, found=f"damaged: {' '.join(reason)[:200]}", needed="a whole Parquet file", fix=_FIX
+            where=path, found=f"damaged: {' '.join(reason)[:200]}", needed="a whole Parquet file", fix=FIX
         ) from None
 
 
@@ -205,10 +216,10 @@ def _places_of(group: Columns, episode: int) -> slice | Shaped[np.ndarray, " row
 
 
 def _footer_of(file: parquet.ParquetFile, path: str) -> _Footer:
-    _require_sane(file, path)
+    _require_sane_groups(file, path)
     metadata, schema = file.metadata, file.schema_arrow
     if EPISODE not in schema.names:
-        raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=_FIX)
+        raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=FIX)
     names = [metadata.schema.column(number).path for number in range(metadata.num_columns)]
     place = names.index(EPISODE)
     first: list[int | None] = []
@@ -221,23 +232,19 @@ def _footer_of(file: parquet.ParquetFile, path: str) -> _Footer:
     return _Footer(metadata, schema, first, last)
 
 
-def _require_sane(file: parquet.ParquetFile, path: str) -> None:
-    rows = [file.metadata.row_group(number).num_rows for number in range(file.metadata.num_row_groups)]
-    if any(not 0 <= count <= _ROWS_LIMIT for count in rows) or sum(rows) != file.metadata.num_rows:
-        raise InputError(
-            where=path, found=f"damaged: row groups of {rows[:5]} rows", needed="a whole Parquet file", fix=_FIX
-        )
+def _require_sane_groups(file: parquet.ParquetFile, path: str) -> None:
+    metadata = file.metadata
+    require_sane([metadata.row_group(n).num_rows for n in range(metadata.num_row_groups)], path, metadata.num_rows)
 
 
-def _pictures_in(table: pa.Table, column: str, episode: int, path: str) -> list[bytes]:
-    chosen = numbers_in(table.column(EPISODE), f"{path}: {EPISODE}")[:, 0] == episode
-    rows = table.column(column).to_pylist()
+def _pictures_in(rows: list[Any], episodes: list[Any], episode: int, where: str) -> list[bytes]:
     stored = [row.get("bytes") if isinstance(row, dict) else row for row in rows]
-    pictures = [picture for picture, keep in zip(stored, chosen, strict=True) if keep and isinstance(picture, bytes)]
-    if len(pictures) != chosen.sum():
+    chosen = [picture for picture, its in zip(stored, episodes, strict=True) if its == episode]
+    pictures = [picture for picture in chosen if isinstance(picture, bytes)]
+    if len(pictures) != len(chosen):
         raise InputError(
-            where=f"{path}: {column}",
-            found=f"pictures of type {table.column(column).type}, or names of files in their place",
+            where=where,
+            found="no pictures, or names of files in their place",
             needed="PNG or JPEG bytes in the column",
         )
     return pictures
@@ -245,7 +252,7 @@ def _pictures_in(table: pa.Table, column: str, episode: int, path: str) -> list[
 
 def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
     found = f"{gaps} rows without a value" if gaps else f"values of type {kind}"
-    return InputError(where=where, found=found, needed="numbers, as many in each row", fix=_FIX)
+    return InputError(where=where, found=found, needed="numbers, as many in each row", fix=FIX)
 
 
 def _size_of(columns: Columns) -> int:

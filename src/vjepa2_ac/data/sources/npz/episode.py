@@ -28,6 +28,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,8 @@ from vjepa2_ac.data.sources.states import require_finite, require_plausible
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.errors import InputError
 
+_MOST_NUMBERS = 1 << 25  # of an array besides pictures: 88 hours of 7 numbers at 15 Hz; 256 MB as float64
+_MOST_LETTERS = 1 << 16
 LABELS = ("scene", "building", "operator", "day")
 FORMAT_HELP = "docs/data.md says what an episode holds"
 
@@ -155,6 +158,7 @@ class _Arrays:
     def numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
         """Return finite numbers of a shape, None standing for any length."""
         self._require(name, shape, "biuf", "numbers")
+        self._require_small(name, prod(self.file.header(name).shape), _MOST_NUMBERS, "numbers")
         values = self.file.array(name).astype(np.float64)
         if not np.isfinite(values).all():
             step = np.argwhere(~np.isfinite(values))[0][:1].tolist()
@@ -174,6 +178,7 @@ class _Arrays:
     def text(self, name: str) -> str:
         """Return a text."""
         self._require(name, (), "U", "one text")
+        self._require_small(name, self.file.header(name).dtype.itemsize // 4, _MOST_LETTERS, "letters")
         return str(self.file.array(name))
 
     def extrinsics(self, camera: str, steps: int) -> Float64[np.ndarray, "steps 6"] | None:
@@ -184,6 +189,16 @@ class _Arrays:
                 values = self.numbers(name, (EXTRINSICS_DIM,) if one_pose else (steps, EXTRINSICS_DIM))
                 return np.broadcast_to(values, (steps, EXTRINSICS_DIM))
         return None
+
+    def _require_small(self, name: str, count: int, most: int, of_what: str) -> None:
+        """Refuse what claims to be far larger than any episode's, before it is unpacked: zeros pack a thousandfold."""
+        if count > most:
+            raise InputError(
+                where=f"{self.path}: {name}",
+                found=f"{count:,} {of_what}",
+                needed=f"at most {most:,} in an episode",
+                fix=FORMAT_HELP,
+            )
 
     def _require(self, name: str, shape: tuple[int | None, ...], kinds: str, meaning: str) -> None:
         _require_array(self.file, name, shape, kinds, meaning, self.path)

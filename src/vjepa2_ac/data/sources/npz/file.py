@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import struct
 import tokenize
 import zipfile
@@ -23,6 +24,8 @@ _LOCAL_HEADER_BYTES = 30
 _MOST_BYTES = 1 << 30  # of an array that is read whole
 _DEFLATE_LIMIT = 1040  # DEFLATE shortens a thousandfold at most: what claims more is damaged
 _CHUNK_BYTES = 1 << 20
+_MOST_HEADER_BYTES = 1 << 14  # numpy reads what a header claims, gigabytes, and refuses 10,000 bytes of it then
+_KINDS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # as numpy writes; others shorten without a bound
 _FIX = "Write the file again, with numpy.savez"
 _DAMAGE = (
     zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError, SyntaxError, EOFError, KeyError, ValueError,
@@ -67,15 +70,18 @@ class NpzFile:
     def header(self, name: str) -> ArrayHeader:
         """Return shape and type of an array, without its values."""
         with self._damage_is_named(name), self._archive.open(self._members[name]) as member:
-            version = np.lib.format.read_magic(member)
+            if self._members[name].compress_type not in _KINDS:
+                raise ValueError("packed in another way than numpy does")
+            head = self._head(member)
+            version = np.lib.format.read_magic(head)
             if version not in {(1, 0), (2, 0)}:
                 raise ValueError(f"version {version} of the format")
             first = version == (1, 0)
             read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-            shape, by_columns, dtype = read(member)
+            shape, by_columns, dtype = read(head)
             if dtype.hasobject:
                 raise ValueError("an array of Python objects, which would have to be executed")
-            header = ArrayHeader(tuple(int(size) for size in shape), dtype, member.tell(), by_columns)
+            header = ArrayHeader(tuple(int(size) for size in shape), dtype, head.tell(), by_columns)
             self._require_fitting(self._members[name], header)
             return header
 
@@ -114,6 +120,16 @@ class NpzFile:
             pieces = self._stored(member, header, wanted) if stored else self._unpacked(member, header, wanted)
             found = {row: np.frombuffer(piece, header.dtype) for row, piece in zip(wanted, pieces, strict=True)}
         return np.stack([found[row] for row in rows]).reshape(len(rows), *header.shape[1:])
+
+    @staticmethod
+    def _head(member: ByteReader) -> io.BytesIO:
+        """Read what numpy reads of an array's header, but not before its length is known to be one."""
+        start = member.read(np.lib.format.MAGIC_LEN)
+        size = member.read(2 if start[-2:] == b"\x01\x00" else 4)
+        length = int.from_bytes(size, "little")
+        if length > _MOST_HEADER_BYTES:
+            raise ValueError(f"a header of {length:,} bytes")
+        return io.BytesIO(start + size + member.read(length))
 
     def _stored(self, member: zipfile.ZipInfo, header: ArrayHeader, rows: list[int]) -> Iterator[bytes]:
         """Yield rows of an array that is not compressed, each from its place in the file."""

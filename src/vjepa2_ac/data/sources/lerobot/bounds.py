@@ -1,0 +1,84 @@
+"""How much of a Parquet file is ever unpacked? Equal values pack into next to nothing: some KB may claim any memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from vjepa2_ac.errors import InputError
+
+# All of this is far more than any data set has.
+MOST_ROWS = 5_000_000  # of one row group, or of one episode
+MOST_NUMBERS = 1 << 27  # of one column in a row group
+MOST_TABLE_BYTES = 1 << 28  # of a table of episodes or tasks
+MOST_PICTURE_BYTES = 1 << 32  # in one row group
+FIX = "Copy the file again, or leave its episodes out"
+
+_ROWS_AT_ONCE = 64  # where one value may be as large as a picture
+
+
+def parts_of(
+    file: Any, path: str, columns: Sequence[str], most_bytes: int, **which: list[int]
+) -> Iterator[dict[str, list[Any]]]:
+    """Yield some columns a few rows at a time, as Python's own values, as long as they are no larger than that in all.
+
+    What they take is counted in values: of equal ones the table holds one, and Python a copy for each.
+
+    Args:
+        file: An open Parquet file.
+        path: Its path, for messages.
+        columns: Which.
+        most_bytes: Of all values together.
+        which: Of which row groups, where not of all.
+
+    Raises:
+        InputError: They are larger.
+    """
+    total = 0
+    for part in file.iter_batches(_ROWS_AT_ONCE, columns=list(columns), use_threads=False, **which):
+        values = part.to_pydict()
+        total += _bytes_in(values)
+        if total > most_bytes:
+            raise InputError(
+                where=path, found=f"more than {most_bytes:,} bytes of {', '.join(columns)[:200]}",
+                needed="a table that fits into memory", fix=FIX,
+            )  # fmt: skip
+        yield values
+
+
+def _bytes_in(value: Any) -> int:
+    """Return about how many bytes nested lists and dicts of numbers, texts and pictures take."""
+    if isinstance(value, str | bytes):
+        return len(value)
+    if isinstance(value, dict):
+        return sum(map(_bytes_in, value.values()))
+    return sum(map(_bytes_in, value)) if isinstance(value, list) else 8
+
+
+def require_few(file: Any, number: int, columns: Sequence[str], path: str) -> None:
+    """Refuse a row group whose lists are longer than any robot's, before they are unpacked.
+
+    Raises:
+        InputError: It is one.
+    """
+    group = file.metadata.row_group(number)
+    for place in range(group.num_columns):
+        column = group.column(place)
+        is_read = any(f"{column.path_in_schema}.".startswith(f"{name}.") for name in columns)  # or a part of one
+        if is_read and column.num_values > MOST_NUMBERS:
+            raise InputError(
+                where=f"{path}: {column.path_in_schema}", found=f"{column.num_values:,} numbers in a row group",
+                needed=f"at most {MOST_NUMBERS:,}", fix=FIX,
+            )  # fmt: skip
+
+
+def require_sane(rows: Sequence[int], path: str, total: int | None = None) -> None:
+    """Refuse numbers of rows that no file has, or that are not those of all row groups together.
+
+    Raises:
+        InputError: They are so.
+    """
+    if any(not 0 <= count <= MOST_ROWS for count in rows) or (total is not None and sum(rows) != total):
+        raise InputError(
+            where=path, found=f"damaged: row groups of {list(rows[:5])} rows", needed="a whole Parquet file", fix=FIX
+        )

@@ -1,0 +1,78 @@
+"""Of a short Parquet file that claims to be long, no more is unpacked than a data set has; and it is named."""
+
+import tracemalloc
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet as pq
+
+from vjepa2_ac.data.sources.lerobot import bounds, parquet
+from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows, read_table
+from vjepa2_ac.errors import InputError
+
+_MB = 1 << 20
+STATE = "observation.state"
+
+
+def repeated(value: str | bytes, rows: int) -> pa.Array:
+    """Return a column that holds one value once, and says how often it stands there."""
+    return pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array([value]))
+
+
+def test_texts_that_repeat_without_end_are_refused_before_python_has_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "tasks.parquet"
+    lists = pa.ListArray.from_arrays(pa.array(np.arange(3001, dtype=np.int32)), repeated("x" * 100_000, 3000))
+    pq.write_table(pa.table({"tasks": lists, "length": np.arange(3000)}), path, compression="zstd")
+    assert path.stat().st_size < 100_000
+    monkeypatch.setattr(parquet, "MOST_TABLE_BYTES", 16 * _MB)
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"tasks.parquet: more than 16,777,216 bytes of tasks, length"):
+            read_table(str(path), str(path), lambda _: True)
+        assert tracemalloc.get_traced_memory()[1] < 40 * _MB
+    finally:
+        tracemalloc.stop()
+    assert read_table(str(path), str(path), lambda name: name == "length") == {"length": list(range(3000))}
+
+
+def rows_of(_: Path) -> ParquetRows:
+    return ParquetRows(lambda name: name, [STATE])
+
+
+def write(path: Path, rows: int, width: int = 7, row_group: int | None = None) -> Path:
+    states = pa.FixedSizeListArray.from_arrays(pa.array(np.zeros(rows * width, np.float32)), width)
+    pq.write_table(pa.table({"episode_index": np.zeros(rows, np.int64), STATE: states}), path, row_group_size=row_group)
+    return path
+
+
+def test_lists_without_end_are_refused_by_what_the_footer_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write(tmp_path / "rows.parquet", 10, width=70)
+    assert rows_of(path).rows(str(path), 0)[STATE].shape == (10, 70)
+    monkeypatch.setattr(bounds, "MOST_NUMBERS", 600)
+    with pytest.raises(InputError, match=r"observation\.state.*: 700 numbers in a row group\. needed: at most 600"):
+        rows_of(path).rows(str(path), 0)
+
+
+@pytest.mark.parametrize("row_group", [None, 30])
+def test_rows_without_end_are_refused_in_one_group_and_in_many(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, row_group: int | None
+) -> None:
+    path = write(tmp_path / "rows.parquet", 100, row_group=row_group)
+    assert len(rows_of(path).rows(str(path), 0)[STATE]) == 100
+    monkeypatch.setattr(bounds, "MOST_ROWS", 50)
+    with pytest.raises(InputError, match=r"damaged: row groups of \[(60|100)\] rows"):
+        rows_of(path).rows(str(path), 0)
+
+
+def test_pictures_that_repeat_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, picture = tmp_path / "rows.parquet", b"\xff\xd8" + bytes(99_998)
+    table = pa.table({"episode_index": np.repeat([0, 1], 50), "image": repeated(picture, 100)})
+    pq.write_table(table, path, compression="zstd")
+    assert rows_of(path).pictures(str(path), "image", 1) == [picture] * 50
+    monkeypatch.setattr(parquet, "MOST_PICTURE_BYTES", 5 * _MB)
+    with pytest.raises(InputError, match="more than 5,242,880 bytes of episode_index, image"):
+        rows_of(path).pictures(str(path), "image", 1)
