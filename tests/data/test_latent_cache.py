@@ -402,14 +402,21 @@ def test_vectors_and_recorded_commands_go_through_a_cache(tmp_path: Path) -> Non
         assert_same_clips(first_batches(original), first_batches(other))
 
 
-def test_poses_in_the_frame_of_the_camera_go_through_a_cache(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_fixed", [False, True])
+def test_poses_in_the_frame_of_the_camera_go_through_a_cache(tmp_path: Path, is_fixed: bool) -> None:
     folder = tmp_path / "poses"
     folder.mkdir()
     for number in range(8):
         states = synthetic_states(14, seed=number)
         camera = np.tile([0.5, 0.1 * number, 0.8, 0.3, -2.0, 1.0], (14, 1))
         frames = np.random.default_rng(number).integers(0, 256, (14, 20, 24, 3), dtype=np.uint8)
-        np.savez(folder / f"{number}.npz", states=states, frames=frames, fps_hz=15.0, extrinsics=camera)
+        np.savez(
+            folder / f"{number}.npz",
+            states=states,
+            frames=frames,
+            fps_hz=15.0,
+            extrinsics=camera[0] if is_fixed else camera,
+        )
     original, through = cached(folder, tmp_path, source="npz", pose_frame="camera")
     batches = first_batches(original)
     assert batches[0].extrinsics is not None

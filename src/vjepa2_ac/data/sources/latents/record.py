@@ -118,7 +118,7 @@ def _small_tensors(episode: Episode, steps: Sequence[int], jpegs: Sequence[bytes
         "picture_ends": np.cumsum([len(jpeg) for jpeg in jpegs], dtype=np.int64),
         "picture_crc": np.array([zlib.crc32(jpeg) for jpeg in jpegs], np.int64),
     }
-    return {name: torch.from_numpy(np.array(array)) for name, array in arrays.items() if array is not None}
+    return {name: torch.from_numpy(np.array(array, order="C")) for name, array in arrays.items() if array is not None}
 
 
 class Record:
