@@ -11,7 +11,7 @@ tells a blue world from exchanged channels, so there is a hint only.
     neighbours over far pictures    0.04 to 0.33              1.0 (noise)                          0.9
     autocorrelation of motion       0.67 to 0.97              -0.35 and less (2 cm of noise)       -0.2
     median distance from base       0.33 m to 0.60 m          0.02 m and less (deltas)             0.05 m
-    cold episodes, share            0; simulated arm: 1       1 (BridgeData in BGR)                0.9
+    cold episodes, share            0; arm of domain A: 1     1 (BridgeData in BGR)                0.9
 """
 
 from __future__ import annotations
