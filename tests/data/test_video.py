@@ -202,3 +202,14 @@ def test_pictures_that_are_moved_without_a_word_in_the_header_are_found_by_time(
             target.mux(packet)
     expected = whole[np.argsort(shown)]
     np.testing.assert_array_equal(read_frames(tmp_path / "moved.mp4", range(8), where="a"), expected)
+
+
+def test_a_clock_too_coarse_for_its_pictures_shows_none_twice(tmp_path: Path) -> None:
+    """Of a time scale of 0 libav makes whole seconds: all pictures of one would be taken for the same."""
+    path = write_mp4(tmp_path / "a.mp4", FRAMES)
+    data = bytearray(path.read_bytes())
+    scale = data.index(b"mdhd") + 16
+    data[scale : scale + 4] = bytes(4)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"times in units of 1 s for 15 pictures a second\. needed: a time for each"):
+        read_frames(path, [0, 5], where="a", clock=Clock(0.0, 15.0))

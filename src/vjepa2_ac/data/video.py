@@ -194,7 +194,11 @@ class _Video:
 
     def targets_by(self, clock: Clock, steps: Sequence[int]) -> list[int]:
         """Return the times that a clock gives to these steps."""
-        return [round((clock.start_s + step / clock.rate_hz) / self._unit_s) for step in steps]
+        times = {step: round((clock.start_s + step / clock.rate_hz) / self._unit_s) for step in steps}
+        if len(set(times.values())) < len(times):
+            found = f"times in units of {self._unit_s:g} s for {clock.rate_hz:g} pictures a second"
+            raise InputError(where=self.where, found=found, needed="a time for each", fix=_FIX)
+        return [times[step] for step in steps]
 
     def decode(self, targets: list[int], clock: Clock | None) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
         """Return the pictures shown at these ascending times; with a clock, the first within half a step of each."""
