@@ -16,6 +16,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 from safetensors import safe_open
+from safetensors.torch import save_file
 
 from latent_sets import NUMBERS, as_numbers, write_cache
 from memory_source import MemorySource
@@ -190,6 +191,15 @@ def test_a_file_of_another_cache_is_refused(tmp_path: Path) -> None:
     for other in (replace(layout, kind="bf16"), replace(layout, dim=DIM + 1)):
         with pytest.raises(InputError, match="needed: latents of"):
             Record(path, other)
+
+
+def test_pictures_of_another_type_are_damage(tmp_path: Path) -> None:
+    path, layout = written(tmp_path)
+    with safe_open(path, framework="pt") as file:
+        tensors, about = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
+    save_file(tensors | {"pictures": tensors["pictures"].to(torch.bfloat16)}, path, about)
+    with pytest.raises(InputError, match="values of BF16"):
+        Record(path, layout)
 
 
 def test_a_step_that_was_not_encoded_is_named(tmp_path: Path) -> None:

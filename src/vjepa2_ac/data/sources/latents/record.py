@@ -230,13 +230,15 @@ class Record:
             found = {name: self._file.get_slice(name) for name in names}
             types = {name: slice_.get_dtype() for name, slice_ in found.items()}
             shapes = {name: list(slice_.get_shape()) for name, slice_ in found.items()}
-            pictures = self._file.get_slice("pictures").get_shape()
+            pictures = self._file.get_slice("pictures")
+            bytes_of_pictures, type_of_pictures = pictures.get_shape(), pictures.get_dtype()
         if shapes != names or types["latents"] != _SAFETENSORS_NAMES[layout.kind]:
             raise _damaged(self.path, f"{types} {shapes}", f"latents of {_SAFETENSORS_NAMES[layout.kind]}, {names}")
         if "scales" in names and types["scales"] != "F32":
             raise _damaged(self.path, f"scales of {types['scales']}", "F32")
-        if pictures != [max(self._arrays["picture_ends"], default=0)]:
-            raise _damaged(self.path, f"pictures of {pictures} bytes", "as many as picture_ends says")
+        if type_of_pictures != "U8" or bytes_of_pictures != [max(self._arrays["picture_ends"], default=0)]:
+            found = f"pictures of {bytes_of_pictures} values of {type_of_pictures}"
+            raise _damaged(self.path, found, "as many bytes as picture_ends says")
 
 
 _NUMBERS = (torch.float32, torch.float64)
