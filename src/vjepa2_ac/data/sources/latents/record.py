@@ -237,8 +237,8 @@ class Record:
         if "scales" in names and types["scales"] != "F32":
             raise _damaged(self.path, f"scales of {types['scales']}", "F32")
         if type_of_pictures != "U8" or bytes_of_pictures != [max(self._arrays["picture_ends"], default=0)]:
-            found = f"pictures of {bytes_of_pictures} values of {type_of_pictures}"
-            raise _damaged(self.path, found, "as many bytes as picture_ends says")
+            said = f"pictures of {bytes_of_pictures} values of {type_of_pictures}"
+            raise _damaged(self.path, said, "as many bytes as picture_ends says")
 
 
 _NUMBERS = (torch.float32, torch.float64)
