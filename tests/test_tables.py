@@ -19,7 +19,7 @@ from vjepa2_ac.evaluation.bootstrap import Estimate
 from vjepa2_ac.evaluation.calibration import Calibration, TriedStride
 from vjepa2_ac.evaluation.comparison import Comparison
 from vjepa2_ac.evaluation.evaluate import Contender, Probes, evaluate
-from vjepa2_ac.evaluation.variants import TriedVariant, VariantProbe
+from vjepa2_ac.evaluation.variant_probe import TriedVariant, VariantProbe
 from vjepa2_ac.planning.one_plan import Answer
 from vjepa2_ac.simulation.closed_loop_result import ClosedLoopResult
 from vjepa2_ac.simulation.contest import Contest
