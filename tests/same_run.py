@@ -28,7 +28,9 @@ def optimizer_state(run: Path) -> dict:
 
 
 def figures(run: Path) -> list[dict]:
-    return [{k: v for k, v in row.items() if k not in TIMINGS} for row in read_journal(run / "metrics.jsonl")]
+    """Return all rows of numbers; what warnings advise depends on what a run keeps."""
+    rows = [row for row in read_journal(run / "metrics.jsonl") if row["kind"] != "warning"]
+    return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
 
 
 def numbers_in(state: dict, place: str = "") -> dict[str, torch.Tensor]:
