@@ -28,7 +28,7 @@ def optimizer_state(run: Path) -> dict:
 
 
 def figures(run: Path) -> list[dict]:
-    """Return the rows of numbers: a warning's words name knobs that two runs of the same weights may differ in."""
+    """Return all rows of numbers; what warnings advise depends on what a run keeps."""
     rows = [row for row in read_journal(run / "metrics.jsonl") if row["kind"] != "warning"]
     return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
 

@@ -30,7 +30,14 @@ from vjepa2_ac.model.lora_linear import CastMatrices
 from vjepa2_ac.model.world_model import WorldModel
 from vjepa2_ac.training.best import best_so_far, measured_on
 from vjepa2_ac.training.cached import with_latents
-from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, write_checkpoint
+from vjepa2_ac.training.checkpoint import (
+    ADAPTER,
+    OPTIMIZER,
+    RunState,
+    checkpoint_name,
+    newest_checkpoint,
+    write_checkpoint,
+)
 from vjepa2_ac.training.device import PRECISIONS, computing_device
 from vjepa2_ac.training.embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.loss import Objective
@@ -41,6 +48,7 @@ from vjepa2_ac.training.resume import micro_batches_of, say_what_is_new, take_up
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 from vjepa2_ac.training.sharding import check_launch, share_if_asked, whole_moments, whole_weights
 from vjepa2_ac.training.shared_memory import say_if_shared_memory_is_small
+from vjepa2_ac.training.stalled import said_if_stalled
 from vjepa2_ac.training.stride import choose_stride, require_learned, with_stride
 from vjepa2_ac.training.torch_file import write_torch
 
@@ -228,7 +236,8 @@ def save_checkpoint(run: Run, folder: Path) -> None:
         loss_scale=run.scaler.state_dict() if run.scaler.is_enabled() else None,
     )
     if writes:
-        write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
+        with said_if_stalled(folder / CHECKPOINTS / checkpoint_name(run.state.step)):
+            write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
 
 
 def _started(config: Config) -> Path | None:

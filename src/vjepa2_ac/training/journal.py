@@ -21,6 +21,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import read_bounded, user_can_write, write_atomically
 from vjepa2_ac.structured import json_object
 from vjepa2_ac.training.run_folder import METRICS
+from vjepa2_ac.training.stalled import said_if_stalled
 from vjepa2_ac.training.trackers import Trackers
 
 logger = logging.getLogger(__name__)
@@ -84,9 +85,12 @@ class Journal:
             raise _unwritable(self.path, error, "The checkpoint of this step is written")
 
     def _write(self) -> OSError | None:
+        if not self._waiting:
+            return None
         try:
-            while self._waiting:
-                self._waiting = self._waiting[os.write(self._handle, self._waiting) :]
+            with said_if_stalled(self.path):
+                while self._waiting:
+                    self._waiting = self._waiting[os.write(self._handle, self._waiting) :]
         except OSError as error:
             return error
         return None
@@ -95,7 +99,8 @@ class Journal:
         if error := self._write():
             return error
         try:
-            os.fsync(self._handle)
+            with said_if_stalled(self.path):
+                os.fsync(self._handle)
         except OSError as error:
             return error
         return None

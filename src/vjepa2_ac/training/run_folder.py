@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import os
 import platform
 import re
 import secrets
@@ -193,6 +194,8 @@ def environment() -> dict[str, object]:
         "command": sys.argv,
         "python": platform.python_version(),
         "machine": platform.platform(),
+        "host": platform.node(),
+        "process": os.getpid(),
         "packages": {name: importlib.metadata.version(name) for name in packages},
     }
 

@@ -18,7 +18,7 @@ from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.remote import RefusedError, UnreachableError, quietly
 from vjepa2_ac.training.mirror.checkpoints import RemoteCheckpoints
-from vjepa2_ac.training.mirror.update import ForeignRunError, RemoteUpdate
+from vjepa2_ac.training.mirror.update import ForeignRunError, OvertakenError, RemoteUpdate
 from vjepa2_ac.training.run_folder import CHECKPOINTS
 
 logger = logging.getLogger(__name__)
@@ -131,6 +131,13 @@ class Mirror:
             logger.warning(
                 "checkpoint.remote: %s holds a checkpoint of another run, %s. Nothing was written there, and nothing"
                 " will be: this run is on this machine alone. Name another place when you start it again",
+                self._place, error,
+            )  # fmt: skip
+        except OvertakenError as error:
+            self._is_off = True
+            logger.warning(
+                "checkpoint.remote: %s is kept by a later start of this run, %s. This one goes on here alone;"
+                " stop one of the two",
                 self._place, error,
             )  # fmt: skip
         except (InputError, OSError) as error:

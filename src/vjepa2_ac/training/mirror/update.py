@@ -13,7 +13,9 @@ import shutil
 from collections.abc import Callable, Collection
 from pathlib import Path
 
-from vjepa2_ac.storage import join, upload
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import join, read_bounded, upload
+from vjepa2_ac.structured import MOST_BYTES, json_list, shown
 from vjepa2_ac.training.checkpoint import checkpoint_name, damage, listed, step_of, written_state
 from vjepa2_ac.training.mirror.checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.training.run_folder import CALIBRATION, CHECKPOINTS, CONFIG, ENVIRONMENT, HELD, METRICS, RUN_ID
@@ -26,6 +28,10 @@ GoOn = Callable[[], None]
 
 class ForeignRunError(Exception):
     """Another run's checkpoints are there; the argument is the name of one."""
+
+
+class OvertakenError(Exception):
+    """A later start of the same run keeps the place; the argument says which."""
 
 
 class RemoteUpdate:
@@ -46,6 +52,7 @@ class RemoteUpdate:
         self._damaged = set(damaged)
         self._ours: set[str] = set()  # checkpoints there that are known to be of this run
         self._small: dict[str, tuple[int, int]] = {}  # sizes and times of the small files that were sent
+        self._starts: bytes | None = None  # the list of starts as it was sent: another one there is a later start's
         self.release()  # what a process that was killed held
 
     def __call__(self, go_on: GoOn) -> str | None:
@@ -53,11 +60,13 @@ class RemoteUpdate:
 
         Raises:
             ForeignRunError: The place is another run's.
+            OvertakenError: Another machine began to go on with this run, and keeps the place.
             UnreachableError: It cannot be reached.
             OSError: The run's folder cannot be read, or written for the links.
         """
         listing = self._remote.listing()
         self._require_ours(listing)
+        self._require_not_overtaken()
         for name in self._damaged & set(listing):
             self._remote.remove(name)
             listing = {other: files for other, files in listing.items() if other != name}
@@ -92,6 +101,19 @@ class RemoteUpdate:
             if owner is not None:
                 self._ours.add(name)
 
+    def _require_not_overtaken(self) -> None:
+        """Leave the place to whoever started last: two that send by turns would undo each other's."""
+        if self._starts is None:
+            return
+        path = join(self._remote.place, ENVIRONMENT)
+        try:
+            there = read_bounded(path, MOST_BYTES)
+        except FileNotFoundError:
+            self._small.pop(ENVIRONMENT, None)
+            return
+        if there != self._starts:
+            raise OvertakenError(_last_start(there, path))
+
     def _send_small_files(self, go_on: GoOn) -> None:
         """Send the files of the run's folder that have changed, as they are now: they may grow meanwhile."""
         for name in SMALL_FILES:
@@ -103,6 +125,8 @@ class RemoteUpdate:
                 go_on()
                 shutil.copyfile(source, copy)
                 upload(copy, join(self._remote.place, name))
+                if name == ENVIRONMENT:
+                    self._starts = copy.read_bytes()
                 self._small[name] = version
 
     def _hold_newest(self) -> Path | None:
@@ -142,6 +166,15 @@ class RemoteUpdate:
 def _best_of(checkpoint: Path) -> str | None:
     step = written_state(checkpoint).best_step
     return None if step is None else checkpoint_name(step)
+
+
+def _last_start(starts: bytes, where: str) -> str:
+    """Return where and when a run was started last, in words."""
+    try:
+        last = json_list(starts, where=where)[-1]
+        return f"on {shown(last['host'])}, at {shown(last['time'])}"
+    except (InputError, LookupError, TypeError):
+        return "elsewhere"
 
 
 def _link(source: str, target: str) -> None:

@@ -1,0 +1,44 @@
+"""What is said while training waits for a disk that does not answer? A network disk may do so for minutes.
+
+A checkpoint and the figures before it have to be on the disk before training goes on: nobody can spare it the wait. But
+a run that stands still and says nothing looks like one that hangs.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+logger = logging.getLogger(__name__)
+
+STALLED_S = 60.0
+
+
+@contextmanager
+def said_if_stalled(path: Path, *, after_s: float | None = None) -> Iterator[None]:
+    """Warn where the block, which writes a file, lasts longer than that; and, when it ends, how long it took.
+
+    Args:
+        path: What is written.
+        after_s: Seconds; None: a minute.
+    """
+    patience_s, begun_s, is_over = STALLED_S if after_s is None else after_s, time.monotonic(), threading.Lock()
+
+    def warn() -> None:
+        if is_over.acquire(blocking=False):
+            logger.warning("%s: the disk has not taken it for %g s; training waits for it", path, patience_s)
+
+    timer = threading.Timer(patience_s, warn)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        if not is_over.acquire(blocking=False):
+            timer.join()
+            logger.warning("%s: the disk took it after %.0f s; training goes on", path, time.monotonic() - begun_s)
