@@ -165,7 +165,7 @@ def test_moments_of_another_number_of_groups_are_refused() -> None:
     other = make_optimizer(without_bias, TrainingConfig())
     take_steps(without_bias, other, range(1))
     for one, another in ((optimizer, other), (other, optimizer)):
-        with pytest.raises(ValueError, match="different number of parameter groups|of a parameter 1, of 1"):
+        with pytest.raises(ValueError, match=r"different number of parameter groups|of a parameter 1, of 1"):
             load_moments(one, moments_of(another))
 
 
