@@ -83,6 +83,15 @@ def test_a_run_that_was_not_evaluated_is_named_with_the_way_out(tmp_path: Path) 
         compare([tmp_path / "one"])
 
 
+def test_figures_of_other_shapes_are_named(tmp_path: Path) -> None:
+    one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
+    figures = json.loads((other / METRICS_FILE).read_text())
+    figures["by_clip"]["persistence"] = 0.5
+    (other / METRICS_FILE).write_text(json.dumps(figures))
+    with pytest.raises(InputError, match="figures that cannot be used"):
+        compare([one, other])
+
+
 def test_damaged_figures_are_named(tmp_path: Path) -> None:
     one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
     figures = json.loads((other / METRICS_FILE).read_text())

@@ -219,6 +219,19 @@ def test_sizes_that_contradict_the_tensors_are_refused(sizes: ModelSizes, messag
         load_official(GOLDEN / "model" / "tiny.pt", sizes)
 
 
+@pytest.mark.parametrize("error", [IndexError("pop from empty list"), AttributeError("no dtype"), TypeError("dict")])
+def test_whatever_a_damaged_pickle_ends_in_names_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def load(*_: Any, **__: Any) -> None:
+        raise error
+
+    (tmp_path / "spoiled.pt").write_bytes(b"PK" * 99)
+    monkeypatch.setattr(torch, "load", load)
+    with pytest.raises(InputError, match=r"spoiled\.pt: "):
+        load_official(tmp_path / "spoiled.pt", TINY_SIZES)
+
+
 def test_a_truncated_and_a_missing_file_are_refused(tmp_path: Path) -> None:
     whole = (GOLDEN / "model" / "tiny.pt").read_bytes()
     (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])

@@ -47,7 +47,7 @@ def compare(folders: Sequence[Path]) -> Comparison:
     measured = {_name(folder, folders): read_metrics(folder) for folder in folders}
     try:
         return _compared(measured, dict(zip(measured, folders, strict=True)))
-    except (KeyError, TypeError, ValueError) as error:
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InputError(
             where=", ".join(str(folder / METRICS_FILE) for folder in folders),
             found=f"figures that cannot be used ({error!r})",

@@ -34,6 +34,10 @@ IGNORED = {
 _NEEDED = "a checkpoint of V-JEPA 2-AC as Meta publishes it (vjepa2-ac-vitg.pt)"
 _FIX = "`vjepa2-ac download` fetches it, and goes on with a part of it"
 _SPLIT = ("q", "k", "v")
+_DAMAGE = (  # what a pickle that is damaged ends in, beside what torch says of it
+    pickle.UnpicklingError, OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
+    AssertionError, ArithmeticError, MemoryError,
+)  # fmt: skip
 
 
 def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:
@@ -108,7 +112,7 @@ def _open(path: Path) -> dict[str, dict[str, Tensor]]:
         raise InputError(where=str(path), found="no such file", needed=_NEEDED, fix=_FIX)
     try:
         whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError, KeyError, OSError) as error:
+    except _DAMAGE as error:
         raise InputError(where=str(path), found=_foreign(path, error), needed=f"{_NEEDED}, 11.7 GB", fix=_FIX) from None
     if not isinstance(whole, dict):
         raise InputError(where=str(path), found=f"a {type(whole).__name__}", needed=_NEEDED, fix=_FIX)
