@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import select
 import pty
 import signal
 import time
@@ -61,7 +62,7 @@ def test_a_run_whose_reader_leaves_is_the_run_that_it_would_be(start: Start, pip
     err = tmp_path / "err"
     err.touch()
     child = start(out=path, err=str(err))
-    os.set_blocking(reader, True)
+    assert select.select([reader], [], [], 120)[0], "nothing was said"  # before there is a writer, reading would end
     assert os.read(reader, 10), "its first line, as `| head -1` would"
     os.dup2(os.open(os.devnull, os.O_RDONLY), reader)
     assert child.wait() == 0
@@ -92,8 +93,8 @@ def test_a_run_whose_terminal_is_gone_goes_on_and_stops_in_good_order_when_it_is
 ) -> None:
     ours, theirs = pty.openpty()
     child = start(out=os.ttyname(theirs), err=os.ttyname(theirs))
-    os.close(theirs)
     assert os.read(ours, 10)
+    os.close(theirs)  # not before the run has it
     os.close(ours)
     while not (tmp_path / "run" / "metrics.jsonl").exists():
         time.sleep(0.01)
