@@ -2,8 +2,8 @@
 
 import fcntl
 import os
-import select
 import pty
+import select
 import signal
 import time
 from collections.abc import Callable, Iterator
