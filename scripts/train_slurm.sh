@@ -19,7 +19,7 @@ set -euo pipefail
 
 readonly STOPPED=75 # the run was asked to stop, and can go on
 
-MASTER_ADDR="$(scontrol show hostnames "$SLURM_JOB_NODELIST" | head -n 1)"
+MASTER_ADDR="$(scontrol show hostnames "$SLURM_JOB_NODELIST" | sed -n 1p)"  # reads to the end: `head` would leave, and break the pipe
 MASTER_PORT="$((20000 + SLURM_JOB_ID % 20000))"
 WORLD_SIZE="$SLURM_NTASKS"
 export MASTER_ADDR MASTER_PORT WORLD_SIZE
