@@ -45,7 +45,7 @@ def say_places_elsewhere(subject: str) -> None:
 
     if (Path(subject) / CONFIG).is_file() and os.environ.get("RANK", "0") == "0":  # one of several processes
         for place in places_elsewhere(read_run_config(Path(subject))):
-            console.print(printable(f"{subject} names a place elsewhere: {place}"), markup=False)
+            console.print(f"{subject} names a place elsewhere: {place}")
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:

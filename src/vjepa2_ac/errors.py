@@ -72,7 +72,7 @@ def in_words(error: BaseException) -> str:
         return str(too_few_files(str(error.filename or "")))
     if is_out_of_memory(error):
         return f"this machine's memory is not enough ({str(error).splitlines()[0] if str(error) else 'MemoryError'})"
-    return printable(str(error))
+    return str(error)
 
 
 def too_few_files(where: str = "") -> InputError:

@@ -22,7 +22,7 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 _OLD_S = 86_400.0
@@ -41,16 +41,10 @@ def partial_file(target: Path) -> Iterator[Path]:
     Raises:
         OSError: It cannot be made.
     """
-    _remove_abandoned_once(target.parent)
-    while True:
-        path = _new_name(target.parent, target.name)
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        if _locked(path, handle):
-            break
-    try:
+    with _held(
+        target.parent, target.name, lambda path: os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+    ) as path:
         yield path
-    finally:
-        os.close(handle)
 
 
 @contextlib.contextmanager
@@ -61,11 +55,22 @@ def partial_folder(parent: Path, name: str) -> Iterator[Path]:
         OSError: It cannot be made.
     """
     parent.mkdir(parents=True, exist_ok=True)
+    with _held(parent, name, _open_new_folder) as path:
+        yield path
+
+
+def _open_new_folder(path: Path) -> int:
+    path.mkdir()
+    return os.open(path, os.O_RDONLY)
+
+
+@contextlib.contextmanager
+def _held(parent: Path, name: str, make: Callable[[Path], int]) -> Iterator[Path]:
+    """Make what does not exist yet, and hold a lock on it for as long as the block lasts."""
     _remove_abandoned_once(parent)
     while True:
         path = _new_name(parent, name)
-        path.mkdir()
-        handle = os.open(path, os.O_RDONLY)
+        handle = make(path)
         if _locked(path, handle):
             break
     try:

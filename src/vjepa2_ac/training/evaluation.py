@@ -146,7 +146,7 @@ def evaluate_subject(
 
 def _warnings(folder: Path) -> list[str]:
     """Return what training warned of, as sentences."""
-    return [f"In training, {text}." for text in warnings_of(folder / "metrics.jsonl")]
+    return [f"In training, {text}." for text in warnings_of(folder / METRICS)]
 
 
 def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:

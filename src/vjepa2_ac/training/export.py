@@ -17,6 +17,7 @@ from vjepa2_ac.episode import POSE_WIDTHS, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.metrics_file import METRICS_FILE, read_metrics
 from vjepa2_ac.model.adapter_end import merge_adapter
+from vjepa2_ac.model.adapter_file import ADAPTER_FILE
 from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.model.heads import widths_of_model
 from vjepa2_ac.model.lora import trainable_report
@@ -35,8 +36,7 @@ Form = Literal["merged", "official", "hub"]
 
 OFFICIAL_NAME = "vjepa2-ac.pt"  # in a folder; a destination that ends in .pt is the file itself
 CARD = "README.md"
-_OTHER_FILES = frozenset({".bin", ".ckpt", ".h5", ".onnx", ".pth", ".safetensors"})
-_PEFT_CONFIG = "adapter_config.json"
+_FILES = frozenset({".bin", ".ckpt", ".h5", ".onnx", ".pt", ".pth", ".safetensors"})  # no names of folders
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,11 @@ def _merge(run: TrainedRun) -> None:
 
 def _check_free(destination: Path, form: Form) -> None:
     """See that nothing is at a destination, and that it can be written. Changes nothing."""
-    if form == "official" and destination.suffix in _OTHER_FILES and not destination.is_dir():
-        needed = f"a file that ends in .pt, or a folder for {OFFICIAL_NAME}"
+    is_own = form == "official" and destination.suffix == ".pt"
+    if destination.suffix in _FILES and not is_own and not destination.is_dir():
+        file = f"a file that ends in .pt, or a folder for {OFFICIAL_NAME}"
+        needed = file if form == "official" else f"a folder, for --to {form}"
         raise InputError(where=str(destination), found=f"the name of a {destination.suffix} file", needed=needed)
-    if form != "official" and destination.suffix in {*_OTHER_FILES, ".pt"} and not destination.is_dir():
-        found = f"the name of a {destination.suffix} file"
-        raise InputError(where=str(destination), found=found, needed=f"a folder, for --to {form}")
     with user_can_write(destination):
         if destination.exists() and not (destination.is_dir() and is_empty(destination)):
             raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
@@ -140,7 +139,7 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dic
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise _damaged(folder, f"figures that cannot be used ({error!r})") from None
     _merge(run)  # nothing of the merged model is written, but an adapter that spoils it is of no use
-    with folder_writer(destination, _PEFT_CONFIG) as fresh:
+    with folder_writer(destination, ADAPTER_FILE) as fresh:
         for path in (*sorted(adapter.iterdir()), *([plot] if plot else [])):
             shutil.copyfile(path, fresh / path.name)
         if evaluation is not None:

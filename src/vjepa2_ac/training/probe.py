@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.windows import Split
-from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.variant_probe import VariantProbe, probe_variants
 from vjepa2_ac.latents import encode_batch, require_same_encoder, require_widths
@@ -37,9 +39,7 @@ def probe_config(
     world_model.to(accelerator.device)
     world_model.eval()
 
-    def encode(batch: Batch) -> LatentBatch:
-        return encode_batch(world_model, batch, device=accelerator.device, chunk=config.model.encode_chunk)
-
+    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     split: Split = "validation"
     try:
         dataset.windows(split)

@@ -30,7 +30,7 @@ from pathlib import Path
 from vjepa2_ac.config import Config
 from vjepa2_ac.config_file import changed_keys, config_as_dict, config_as_flat_dict, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.places import literal
+from vjepa2_ac.places import is_url, literal
 from vjepa2_ac.storage import read_bounded, write_atomically
 from vjepa2_ac.structured import read_json_list, shown
 from vjepa2_ac.training.checkpoint import remove_leavings
@@ -47,7 +47,6 @@ METRICS = "metrics.jsonl"
 TENSORBOARD, WANDB = "tensorboard", "wandb"
 _ID = re.compile(r"[\w.-]{0,128}")
 _MOST_BYTES_OF_ID = 1_000
-_URL = re.compile(r"[\w+.-]+://")  # a list of names may have one in it
 NOT_FINITE = "not_finite"  # each process writes its own, on the disk that it sees
 
 _OWN = (
@@ -177,7 +176,8 @@ def places_elsewhere(config: Config) -> list[str]:
 
     A run's config may come from anybody: whoever goes on with it should know where it leads.
     """
-    named = [f"{key}: {value}" for key, value in config_as_flat_dict(config).items() if _URL.match(str(value))]
+    knobs = config_as_flat_dict(config).items()
+    named = [f"{key}: {value}" for key, value in knobs if isinstance(value, str) and is_url(value)]
     return [*named, "tracking.wandb: online"] if config.tracking.wandb == "online" else named
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -12,7 +13,7 @@ from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.data.dataset import Dataset
 from vjepa2_ac.data.streams import copies_for
 from vjepa2_ac.data.windows import Split
-from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.calibration import Calibration, calibrate
 from vjepa2_ac.latents import encode_batch
@@ -116,9 +117,7 @@ def calibrate_model(
         )
     world_model.eval()
 
-    def encode(batch: Batch) -> LatentBatch:
-        return encode_batch(world_model, batch, device=accelerator.device, chunk=config.model.encode_chunk)
-
+    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     with accelerator.autocast(), torch.no_grad():
         return calibrate(
             world_model,
