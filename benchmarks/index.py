@@ -29,10 +29,10 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.sources.rlds import remote_index as rlds_remote_index
-from vjepa2_ac.data.sources.rlds.schema import dataset_info
+from vjepa2_ac.data.sources.rlds import index_remote as rlds_remote_index
 from vjepa2_ac.data.sources.rlds.source import RldsSource
 from vjepa2_ac.data.sources.rlds.tfrecord import encode_example
+from vjepa2_ac.data.sources.rlds.writing.droid_schema import dataset_info
 
 DROID_SHARDS, DROID_EPISODES, PER_SHARD = 2048, 95_658, 47
 STEPS, PICTURE_BYTES, ORDERS = 290, 17_000, 32

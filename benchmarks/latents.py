@@ -37,21 +37,21 @@ from timing import Turns, about, add_basics, add_repeats, clock_s, introduction,
 from torch import Tensor
 
 from vjepa2_ac.config import Config, DataConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
-from vjepa2_ac.config_file import parse_config
-from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.loader import validation_batches
-from vjepa2_ac.data.sources.latents.precision import DTYPES, bytes_per_frame, decoded, stored
-from vjepa2_ac.encoding.room import picture_bytes
+from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.clips.loader import validation_batches
+from vjepa2_ac.data.sources.latents.dtypes import DTYPES, bytes_per_frame, pack_latents, unpack_latents
+from vjepa2_ac.distributed.device import autocast
+from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.encoding.disk_space import picture_bytes
+from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.latents import encode_batch
-from vjepa2_ac.model.load import load_base
-from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.simulation.record import record_dataset
-from vjepa2_ac.training.assembly import Run, assemble, batches_from
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.simulation.recording.record import record_dataset
 from vjepa2_ac.training.cost.flops import frame_flops
-from vjepa2_ac.training.device import autocast
-from vjepa2_ac.training.encode import encode_config
-from vjepa2_ac.training.health import matmul_speed
+from vjepa2_ac.training.monitoring.throughput import matmul_speed
+from vjepa2_ac.training.setup import Run, batches_from, set_up
 from vjepa2_ac.training.step import training_step
 
 RATE_HZ, STRIDE = 15, 4
@@ -118,7 +118,7 @@ def measure_speed(options: argparse.Namespace, folder: Path, rows: Rows) -> None
         f"{'frames':>6}{'encoder frames/s':>18}{'MFU':>7}{'encode frames/s':>17}{'of encoder':>12}{'pictures, ms':>14}"
         f"{'min':>8}{'latents, ms':>13}{'min':>8}{'ratio':>8}"
     )
-    alone = encoder_speed(assemble(config_of(options, folder, options.frames[0], "off"), lambda _: None), options)
+    alone = encoder_speed(set_up(config_of(options, folder, options.frames[0], "off"), lambda _: None), options)
     mfu = alone * frame_flops(sizes) / matmul_speed(torch.device(options.device), dtype)
     rows.add({"measured": "encoder alone", "frames_per_s": alone, "mfu": mfu})
     for frames in options.frames:
@@ -139,7 +139,7 @@ def speed_row(options: argparse.Namespace, folder: Path, frames: int, rows: Rows
     pictures, latents = (config_of(options, folder, frames, cache) for cache in ("off", "require"))
     row: Row = {"measured": "speed", "frames": frames, "encode_frames_per_s": encode(latents, options.device)}
     rows.so_far(row)
-    runs = {"pictures": assemble(pictures, lambda _: None), "latents": assemble(latents, lambda _: None)}
+    runs = {"pictures": set_up(pictures, lambda _: None), "latents": set_up(latents, lambda _: None)}
     batches = {name: batches_from(run) for name, run in runs.items()}
     steps = {name: partial(training_step, run, batches[name], PAST_WARM_UP) for name, run in runs.items()}
     turns: dict[str, Turns] = {}
@@ -284,7 +284,7 @@ def errors(model: WorldModel, batches: list[LatentBatch], kind: Any) -> tuple[fl
 
 def read(latents: Tensor, kind: Any) -> Tensor:
     """Return latents as they are read back from a cache."""
-    return decoded(stored(latents, kind))
+    return unpack_latents(pack_latents(latents, kind))
 
 
 if __name__ == "__main__":

@@ -16,8 +16,8 @@ from pathlib import Path
 import torch
 
 from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
-from vjepa2_ac.model.weights import load_official, to_official
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.checkpoints.official import load_official, to_official
+from vjepa2_ac.model.network.world_model import WorldModel
 
 SMALL = ModelSizes(encoder=EncoderSizes(depth=4), predictor=PredictorSizes(depth=2))
 

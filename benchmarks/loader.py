@@ -25,18 +25,18 @@ import numpy as np
 import psutil
 import simplejpeg
 import video
-from drawn import draw_episodes
+from synthetic_droid import draw_episodes
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.index import kept_or_built
-from vjepa2_ac.data.kept import KeptSteps, clip_starts
-from vjepa2_ac.data.loader import clip_at, training_loader
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.clips.loader import clip_at, training_loader
+from vjepa2_ac.data.clips.windows import ClipOrder, windows_of
+from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
+from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
+from vjepa2_ac.data.index.index_cache import get_or_build
 from vjepa2_ac.data.sources.rlds.dataset_info import find_shards, index_shards
 from vjepa2_ac.data.sources.rlds.tfrecord import decode_example, read_record
-from vjepa2_ac.data.sources.rlds.writer import write_droid_rlds
-from vjepa2_ac.data.table import FORMAT, EpisodeTable
-from vjepa2_ac.data.windows import ClipOrder, windows_of
+from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
 from vjepa2_ac.episode import EpisodeInfo
 
 DROID_EPISODES = 95_658
@@ -172,7 +172,7 @@ def measure_index(config: DataConfig) -> None:
     ]
     columns = {"shard": np.int32, "record": np.int32, "offset": np.int64, "length": np.int64}
     locators = {name: np.arange(DROID_EPISODES, dtype=kind) for name, kind in columns.items()}
-    kept_or_built(config.disk_cache, "synthetic", lambda: EpisodeTable.of(infos, locators=locators))
+    get_or_build(config.disk_cache, "synthetic", lambda: EpisodeTable.of(infos, locators=locators))
     del infos
     with multiprocessing.get_context("spawn").Pool(1) as fresh:  # memory freed by this process would be used again
         clips, opened, taken, memory = fresh.apply(_open_index, (config,))
@@ -184,10 +184,10 @@ def measure_index(config: DataConfig) -> None:
 def _open_index(config: DataConfig) -> tuple[int, float, float, float]:
     process = psutil.Process()
     before, start = process.memory_info().rss, time.perf_counter()
-    table = kept_or_built(config.disk_cache, "synthetic", _never)
+    table = get_or_build(config.disk_cache, "synthetic", _never)
     opened = time.perf_counter() - start
     everyone = np.ones(len(table), bool)
-    kept = KeptSteps.whole(table, everyone)
+    kept = StepSelection.whole(table, everyone)
     order = ClipOrder(
         windows_of(table, everyone, clip_starts(table, kept, config), config, "train", table.id_hash), seed=0
     )

@@ -26,13 +26,13 @@ import torch
 from memory import let_go
 from random_models import no_fingerprints, random_model
 from rows import Rows
-from timed_steps import our_ways, take_way
 from timing import about, add_basics, introduction, prepare, settle
+from train_step_variants import our_ways, take_way
 
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.loss import prediction_losses
 
 # Tolerances: of losses in the first quarter, of all of them over what 1e-7 of the weights does, of bfloat16.

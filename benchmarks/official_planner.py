@@ -15,7 +15,7 @@ from typing import Any
 from unittest import mock
 
 import torch
-from official import build_predictor, built_on, imported, plain_names
+from official_predictor import build_predictor, built_on, imported, plain_names
 from torch import Tensor
 
 from vjepa2_ac.config import ModelSizes

@@ -39,11 +39,11 @@ from functools import partial
 from decision_ways import OFFICIAL, PLAIN, Way
 from memory import is_expandable, let_go, peak_alone, peak_gb
 from official_planner import PLANNER
+from planning_variants import Bench
 from rows import Row, Rows, cell, problem_of
-from timed_decisions import Bench
 from timing import Turns, about, add_options, introduction, prepare, profiled, ratio, rounds, settle
 
-from vjepa2_ac.training.health import matmul_speed
+from vjepa2_ac.training.monitoring.throughput import matmul_speed
 
 QUICK = {
     "layers": 1, "width": 128, "latent_dim": 128, "image_size": 32, "samples": 6, "iterations": 2, "at_once": [4, 1],

@@ -9,7 +9,7 @@ from unittest import mock
 import torch
 
 from vjepa2_ac.config import ModelSizes
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel
 
 
 def random_model(sizes: ModelSizes, dtype: torch.dtype, device: torch.device | str) -> WorldModel:
@@ -23,5 +23,5 @@ def random_model(sizes: ModelSizes, dtype: torch.dtype, device: torch.device | s
 @contextmanager
 def no_fingerprints() -> Iterator[None]:
     """Let models be adapted, merged and cached without the SHA-256 of their weights: seconds that nobody asked for."""
-    with mock.patch("vjepa2_ac.model.world_model.fingerprint", return_value="of a benchmark"):
+    with mock.patch("vjepa2_ac.model.network.world_model.fingerprint", return_value="of a benchmark"):
         yield

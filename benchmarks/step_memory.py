@@ -11,7 +11,7 @@ from pathlib import Path
 
 from memory import capped, let_go, peak_alone, peak_gb
 from rows import OUT_OF_MEMORY, Row, Rows, cell
-from timed_steps import OFFICIAL, OFFICIAL_FULL, Bench, Setting, our_ways
+from train_step_variants import OFFICIAL, OFFICIAL_FULL, Bench, Setting, our_ways
 
 NAMES = f"{'frames':>6} {'batch':>5} {'checkpointing':>13} {'source':>6}  {'way':18}"
 MEMORY_TITLES = f"{NAMES}{'peak GB':>9}{'doctor':>9}{'off by':>9}"

@@ -73,7 +73,7 @@ def main() -> int:
 
 def write_synthetic(folder: Path) -> Path:
     """Write a few drawn episodes with the tests' own helper."""
-    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
     from synthetic import write_synthetic_droid
 
     return write_synthetic_droid(folder, episodes=6, steps=40, shards=2)

@@ -7,9 +7,9 @@
 
 Ours is `training_step` itself on a LoRA of rank 16: loss, gradients, clipping, AdamW; latents are there already, or
 with --source pixels are computed in the step. The baseline is the same step of the official code with plain PEFT LoRA
-(`official.py`), where a checkout of facebookresearch/vjepa2 is at --official; before anything is timed both must give
-the same loss and gradients on the same weights, else there is no ratio to it. Without a checkout the baseline is our
-own step with a dense mask. A ratio over 1 means faster than the baseline.
+(`official_predictor.py`), where a checkout of facebookresearch/vjepa2 is at --official; before anything is timed both
+must give the same loss and gradients on the same weights, else there is no ratio to it. Without a checkout the
+baseline is our own step with a dense mask. A ratio over 1 means faster than the baseline.
 
 All take turns, so that a busy machine slows them alike. On a CPU the process's own time over its threads counts, else
 wall time; `ms` is the median, `min` the fastest. MFU: the model FLOPs of `training.cost.flops` over what the device
@@ -37,14 +37,14 @@ from dataclasses import asdict
 from functools import partial
 
 from memory import is_expandable, let_go
-from official import PREDICTOR
+from official_predictor import PREDICTOR
 from rows import Row, Rows, cell, problem_of
 from step_memory import MEMORY_TITLES, NAMES, asked, found, memory_line, memory_of_way, memory_row, names_of
-from timed_steps import OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, Started, has_checkout, our_ways
 from timing import Turns, about, add_options, introduction, prepare, profiled, ratio, rounds, settle
+from train_step_variants import OFFICIAL, OFFICIAL_FULL, PRECISIONS, Bench, Setting, Started, has_checkout, our_ways
 
-from vjepa2_ac.model.lora import trainable_report
-from vjepa2_ac.training.health import matmul_speed
+from vjepa2_ac.model.adapter.lora import trainable_report
+from vjepa2_ac.training.monitoring.throughput import matmul_speed
 
 QUICK = {
     "layers": 1, "width": 128, "latent_dim": 128, "encoder_layers": 1, "image_size": 64, "frames": [4], "batch": ["1"],

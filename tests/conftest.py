@@ -14,7 +14,9 @@ if missing.SHAPES not in ABSENT:
     _hook = install_import_hook("vjepa2_ac", "beartype.beartype")  # shapes and types of public functions, while testing
 
 import gcs as gcs_server  # noqa: E402 - the hook comes first
+from data_fixtures import droid, spoiled  # noqa: E402, F401 - fixtures for every folder
 from paths import ROOT  # noqa: E402
+from run_fixtures import base_folder, data_folder, make_config, nursery, reporter  # noqa: E402, F401
 
 
 def pytest_report_header() -> list[str]:
@@ -50,7 +52,7 @@ def _gcs() -> Iterator[gcs_server.Gcs]:
 @pytest.fixture
 def gcs(_gcs: gcs_server.Gcs, monkeypatch: pytest.MonkeyPatch) -> gcs_server.Gcs:
     """A local Google Cloud Storage, empty; gs:// means it. What fails is tried again at once, 5 times in all."""
-    from vjepa2_ac.remote import retries
+    from vjepa2_ac.storage.remote import retries
 
     _gcs.wipe()
     monkeypatch.setenv("STORAGE_EMULATOR_HOST", _gcs.url)
@@ -65,7 +67,7 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     import torch._dynamo
     from torch._dynamo.utils import counters
 
-    from vjepa2_ac.model import compilation
+    from vjepa2_ac.model.network import compilation
 
     monkeypatch.setattr(compilation, "BACKEND", "eager")
     torch._dynamo.reset()

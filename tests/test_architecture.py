@@ -1,102 +1,215 @@
-"""The order of rooms and the homes of heavy libraries, held by a machine."""
+"""The order of rooms and the homes of heavy libraries, held by a machine: each test lists every violation at once."""
+
+from __future__ import annotations
 
 import ast
 import subprocess
 import sys
+from collections import defaultdict
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 import vjepa2_ac
 
 PACKAGE = Path(vjepa2_ac.__file__).parent
 
-# A room imports only rooms of a lower rank; rooms of one rank do not know each other.
-RANK = {
-    "__init__": 0, "errors": 0, "output": 0, "ending": 0, "places": 0, "remote": 0.5,
-    "config": 1, "structured": 1.2, "config_errors": 1.4, "config_file": 1.5, "episode": 1, "geometry": 1,
-    "storage": 1, "data": 2, "model": 2, "latents": 3, "encoding": 3.5, "planning": 4, "evaluation": 5,
-    "training": 6, "simulation": 7,
-    "console": 8, "console_data": 8.2, "console_doctor": 8.2, "cli_parts": 8.4, "cli_data": 8.5, "cli_doctor": 8.5,
-    "cli_encode": 8.5, "console_evaluation": 8.2, "cli_evaluate": 8.7, "console_planning": 8.2, "cli_plan": 8.8,
-    "console_simulation": 8.2, "cli_simulate": 8.8, "cli": 9,
-}  # fmt: skip
-
-HOMES = {
-    "peft": {"model/lora.py", "model/lora_linear.py"},
-    "transformers": {"model/encoder.py", "model/predictor.py"},
-    "accelerate": {"training/"},
-    "google": {"data/sources/rlds/tfrecord.py"},
-    "google_crc32c": {"data/sources/rlds/tfrecord.py"},
-    "simplejpeg": {"data/"},
-    "PIL": {"data/picture_file.py"},
-    "mujoco": {"simulation/"},
-    "matplotlib": {
-        "evaluation/plots.py",
-        "evaluation/contact_sheet.py",
-        "evaluation/clip_picture.py",
-        "evaluation/plan_picture.py",
-        "evaluation/captioned.py",
-    },
-    "fsspec": {"remote/"},
-    "av": {"data/video.py", "data/video_writing.py"},
-    "h5py": {"data/sources/droid_raw/trajectory.py"},
-    "pyarrow": {"data/sources/lerobot/"},
-    "torchao": {"model/quantization.py"},
-    "rich": {"console.py", "console_data.py", "console_evaluation.py", "console_planning.py", "console_simulation.py"},
-    "tensorflow": set(),
-    "torchvision": set(),
-    "decord": set(),
+# A room imports only what stands before it; those in one line do not know each other. A folder has its own order.
+ORDERS: dict[str, list[str]] = {
+    "": [
+        "__init__ errors places output episode geometry",
+        "storage",
+        "config",
+        "media",
+        "model data",
+        "distributed",
+        "runs",
+        "encoding",
+        "planning",
+        "evaluation",
+        "reports",
+        "training export",
+        "simulation",
+        "console",
+        "cli",
+    ],
+    "data": ["picture_file", "index", "cache filters", "sources", "clips", "inspection"],
+    "data.sources": ["listing validation", "rlds droid_raw lerobot npz latents", "registry"],
+    "model": ["finite", "network", "adapter", "checkpoints", "quantization", "load lora heads"],
+    "evaluation": [
+        "intervals",
+        "result",
+        "estimates metrics strata",
+        "action_use",
+        "action_score",
+        "stride_calibration",
+        "data_variants",
+        "verdict examples",
+        "evaluate",
+        "evaluate_run",
+    ],
+    "reports": ["action_score_json", "metrics_json", "comparison", "figures html", "write"],
+    "simulation": ["world", "closed_loop", "recording"],
 }
 
+HOMES = {
+    "PIL": ["media/"],
+    "accelerate": [
+        "distributed/",
+        "training/",
+        "encoding/training_cache.py",
+        "evaluation/stride_calibration/measure.py",
+    ],
+    "av": ["media/"],
+    "decord": [],
+    "fsspec": ["storage/remote/"],
+    "google": ["data/sources/rlds/tfrecord.py"],
+    "google_crc32c": ["data/sources/rlds/tfrecord.py"],
+    "h5py": ["data/sources/droid_raw/trajectory.py"],
+    "huggingface_hub": ["export/"],
+    "matplotlib": ["reports/figures/"],
+    "mujoco": ["simulation/world/"],
+    "peft": ["model/adapter/"],
+    "pyarrow": ["data/sources/lerobot/"],
+    "rich": ["console/"],
+    "simplejpeg": ["media/", "data/sources/rlds/writing/droid_writer.py"],
+    "tensorflow": [],
+    "torchao": ["model/quantization.py"],
+    "torchvision": [],
+    "transformers": ["model/network/"],
+}  # fmt: skip
 
-def imports_of(path: Path) -> set[str]:
+MOST_FILES = 16  # in one folder, `__init__` included
+
+
+@cache
+def modules() -> dict[str, Path]:
+    """Every module by its name within the package; the package itself is `__init__`."""
+    found = {}
+    for path in sorted(PACKAGE.rglob("*.py")):
+        name = ".".join(path.relative_to(PACKAGE).with_suffix("").parts)
+        found[name if name == "__init__" else name.removesuffix(".__init__")] = path
+    return found
+
+
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
+def imports_of(path: Path) -> frozenset[str]:
+    """Every module or name that a file imports, dotted."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute"
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return frozenset(found)
+
+
+def own_imports(path: Path) -> set[str]:
+    """The modules of this package that a file imports."""
+    found = set()
+    for name in imports_of(path):
+        package, _, rest = name.partition(".")
+        if package == "vjepa2_ac":
+            found.add(rest if rest in modules() else rest.rpartition(".")[0] or "__init__")
     return found
 
 
-def room_of(module: str) -> str:
-    return module.split(".")[1] if "." in module else "__init__"
+def rooms_within(folder: str, module: str) -> str | None:
+    """The room of a folder that a module is in; None: it is not in that folder."""
+    if not folder:
+        return module.split(".", maxsplit=1)[0]
+    return module[len(folder) + 1 :].split(".", maxsplit=1)[0] if module.startswith(folder + ".") else None
 
 
-FILES = sorted(PACKAGE.rglob("*.py"))
+def test_a_room_imports_only_rooms_that_stand_before_it() -> None:
+    wrong = []
+    for folder, order in ORDERS.items():
+        rank = {room: place for place, line in enumerate(order) for room in line.split()}
+        for module, path in modules().items():
+            room = rooms_within(folder, module)
+            if room is None:
+                continue
+            if room not in rank:
+                wrong.append(f"{module}: not in the order of {folder or 'the package'}")
+                continue
+            for other_module in own_imports(path):
+                other = rooms_within(folder, other_module)
+                if other is not None and other != room and rank.get(other, -1) >= rank[room]:
+                    wrong.append(f"{module} imports {other_module}")
+    assert not wrong, "\n".join(sorted(wrong))
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_a_room_imports_only_rooms_that_stand_before_it(path: Path) -> None:
-    room = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
-    for module in imports_of(path):
-        if not module.startswith("vjepa2_ac"):
-            continue
-        other = room_of(module)
-        if other in RANK and other != room:
-            assert RANK[other] < RANK[room], f"{path.name} ({room}) imports {module}"
+def test_no_folder_imports_itself_by_way_of_another() -> None:
+    """At every level: what lies side by side in a folder forms no circle."""
+    wrong = []
+    folders = {""} | {name.rpartition(".")[0] for name in modules() if "." in name}
+    for folder in folders:
+        arrows = defaultdict(set)
+        for module, path in modules().items():
+            room = rooms_within(folder, module)
+            if room is not None:
+                others = {rooms_within(folder, other) for other in own_imports(path)}
+                arrows[room] |= {other for other in others if other not in {None, room}}
+        wrong += [f"{folder or 'the package'}: {' -> '.join(circle)}" for circle in _circles(arrows)]
+    assert not wrong, "\n".join(sorted(wrong))
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_heavy_libraries_stay_in_their_homes(path: Path) -> None:
-    name = path.relative_to(PACKAGE).as_posix()
-    for module in imports_of(path):
-        homes = HOMES.get(module.split(".")[0])
-        assert homes is None or any(name.startswith(home) for home in homes), f"{name} imports {module}"
+def _circles(arrows: dict[str, set[str]]) -> list[list[str]]:
+    found: list[list[str]] = []
+    done: set[str] = set()
+
+    def visit(node: str, way: list[str]) -> None:
+        if node in way:
+            found.append([*way[way.index(node) :], node])
+        elif node not in done:
+            for other in sorted(arrows.get(node, ())):
+                visit(other, [*way, node])
+            done.add(node)
+
+    for node in sorted(arrows):
+        visit(node, [])
+    return found
 
 
-def test_every_room_has_a_rank() -> None:
-    rooms = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in FILES}
-    assert rooms <= set(RANK)
+def test_a_folder_is_small_enough_to_be_read_at_a_glance() -> None:
+    count = defaultdict(int)
+    for path in modules().values():
+        count[path.parent.relative_to(PACKAGE).as_posix()] += 1
+    assert not {folder: files for folder, files in count.items() if files > MOST_FILES}
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(PACKAGE)))
-def test_a_file_opens_with_a_line_that_says_what_it_is_for(path: Path) -> None:
-    docstring = ast.get_docstring(ast.parse(path.read_text()))
-    assert docstring, f"{path}: no docstring"
-    assert len(docstring.splitlines()[0]) <= 118
+def test_heavy_libraries_stay_in_their_homes() -> None:
+    wrong = []
+    for path in modules().values():
+        name = path.relative_to(PACKAGE).as_posix()
+        for module in imports_of(path):
+            homes = HOMES.get(module.split(".")[0])
+            if homes is not None and not any(name.startswith(home) for home in homes):
+                wrong.append(f"{name} imports {module}")
+    assert not wrong, "\n".join(sorted(wrong))
+
+
+def test_no_two_public_classes_share_a_name() -> None:
+    places = defaultdict(list)
+    for module, path in modules().items():
+        for node in tree_of(path).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places[node.name].append(module)
+    assert not {name: found for name, found in places.items() if len(found) > 1}
+
+
+def test_a_file_opens_with_a_line_that_says_what_it_is_for() -> None:
+    wrong = []
+    for module, path in modules().items():
+        docstring = ast.get_docstring(tree_of(path)) or ""
+        if not docstring or len(docstring.splitlines()[0]) > 118:
+            wrong.append(module)
+    assert not wrong
 
 
 def test_importing_the_package_and_asking_for_help_do_not_import_torch() -> None:
@@ -110,8 +223,9 @@ def test_importing_the_package_and_asking_for_help_do_not_import_torch() -> None
 
 
 def test_only_the_command_line_prints() -> None:
-    for path in FILES:
-        if path.name in {"cli.py", "console.py"}:
-            continue
-        calls = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)]
-        assert not [c for c in calls if isinstance(c.func, ast.Name) and c.func.id == "print"], path
+    wrong = []
+    for module, path in modules().items():
+        if module.split(".")[0] not in {"cli", "console"}:
+            calls = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)]
+            wrong += [module for call in calls if isinstance(call.func, ast.Name) and call.func.id == "print"]
+    assert not wrong

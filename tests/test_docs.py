@@ -1,12 +1,18 @@
-"""What the documentation shows as a complete config is one."""
+"""What the documentation shows as a complete config is one; files, modules and knobs that it names are there."""
 
+import ast
 import re
+from functools import cache
+from pathlib import Path
+from typing import Any, get_args
 
 import pytest
 import yaml
+from pydantic import BaseModel
 
 from paths import ROOT
-from vjepa2_ac.config_file import parse_config
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import parse_config
 
 BLOCKS = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs/data.md").read_text(), flags=re.DOTALL)
 
@@ -19,3 +25,80 @@ def test_every_config_of_the_data_page_is_complete(text: str) -> None:
 def test_every_form_of_data_has_its_config() -> None:
     sources = {yaml.safe_load(text)["data"].get("source", "rlds") for text in BLOCKS}
     assert sources == {"rlds", "droid_raw", "lerobot", "npz"}
+
+
+# Names in docs and docstrings: files, modules, knobs.
+
+DOCS = [ROOT / "README.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md"))]
+SOURCES = sorted((ROOT / "src").rglob("*.py"))
+TODAY = [path for path in [*DOCS, *SOURCES] if path.name != "log.md"]  # the log tells of how things were
+PACKAGE = ROOT / "src/vjepa2_ac"
+OURS = {path.name for root in (ROOT, PACKAGE, ROOT / "tests") for path in root.iterdir() if path.is_dir()} - {"src"}
+
+FILES = ("json", "md", "npz", "png", "pt", "safetensors", "yaml")
+
+
+def is_there(path: str) -> bool:
+    """Whether a file is in the project, named from its root, from the package, or from the tests."""
+    return any((root / path).exists() for root in (ROOT, PACKAGE, ROOT / "tests"))
+
+
+def is_module_or_part_of_one(dotted: str) -> bool:
+    """Whether a dotted name within the package is a module, or what a module defines or imports."""
+    parts = dotted.split(".")
+    for length in range(len(parts), 0, -1):
+        place = PACKAGE.joinpath(*parts[:length])
+        file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")
+        if file.is_file():
+            rest = parts[length:]
+            return not rest or rest[0] in names_in(file)
+    return False
+
+
+@cache
+def names_in(file: Path) -> frozenset[str]:
+    tree = ast.parse(file.read_text())
+    defined = {node.name for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
+    assigned = {
+        name.id for node in tree.body if isinstance(node, ast.Assign | ast.AnnAssign)
+        for name in ast.walk(node) if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)
+    }  # fmt: skip
+    imported = {
+        alias.asname or alias.name for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    return frozenset(defined | assigned | imported)
+
+
+def is_knob(dotted: str) -> bool:
+    kind: Any = Config
+    for part in dotted.split("."):
+        if not (isinstance(kind, type) and issubclass(kind, BaseModel)) or part not in kind.model_fields:
+            return False
+        found = kind.model_fields[part].annotation
+        kinds = [one for one in (found, *get_args(found)) if isinstance(one, type) and issubclass(one, BaseModel)]
+        kind = kinds[0] if kinds else found
+    return True
+
+
+def test_files_that_are_named_are_there() -> None:
+    """Files of ours: with a folder before them. Those of other projects stand beside their commit."""
+    wrong = []
+    for path in TODAY:
+        text = re.sub(r"Source: .*?(?=\n\s*\n|\"\"\"|\Z)", "", path.read_text(), flags=re.DOTALL)
+        named = re.findall(r"(?<![\w./~-])((?:[a-z_]+/)+[A-Za-z_]+\.(?:py|md|yaml|png|sh|txt))\b", text)
+        ours = [name for name in named if name.split("/")[0] in OURS]
+        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in ours if not is_there(name)]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_modules_that_are_named_are_there() -> None:
+    """`vjepa2_ac.x.y` anywhere; and `x.y` where x is a room, unless that is a knob."""
+    wrong = []
+    for path in TODAY:
+        text = path.read_text()
+        whole = re.findall(r"\bvjepa2_ac\.([a-z_]\w*(?:\.[A-Za-z_]\w*)*)", text)
+        within = re.findall(r"`([a-z_]+(?:\.[A-Za-z_]\w*)+)`", text)
+        within = [name for name in within if (PACKAGE / name.split(".", maxsplit=1)[0]).is_dir() and not is_knob(name)]
+        named = [name for name in whole + within if not name.endswith(FILES)]
+        wrong += [f"{path.relative_to(ROOT)}: {name}" for name in named if not is_module_or_part_of_one(name)]
+    assert not wrong, "\n".join(wrong)

@@ -11,9 +11,9 @@ import yaml
 
 from paths import ROOT
 from vjepa2_ac.cli import main
+from vjepa2_ac.config.diagnostics import all_keys
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.config_errors import all_keys
-from vjepa2_ac.data.picture_file import read_picture
+from vjepa2_ac.media.image_file import read_image
 
 PAGE = (ROOT / "docs/planning.md").read_text()
 START = [0.498, -0.111, 0.211, 3.142, 0.0, -1.175, 0.0]
@@ -29,7 +29,7 @@ class Robot:
         return np.array(START)
 
     def picture(self) -> np.ndarray:
-        return read_picture(ROOT / f"docs/plan_{'start' if len(self.targets) < 2 else 'goal'}.png")
+        return read_image(ROOT / f"docs/plan_{'start' if len(self.targets) < 2 else 'goal'}.png")
 
     def move_to(self, target: np.ndarray) -> None:
         self.targets.append(target)
@@ -54,7 +54,7 @@ def test_the_command_runs_and_writes_what_the_page_lists(
     shown = PAGE.split("```sh\n")[1].split("```")[0].replace("\\\n", " ")
     shown = shown.replace("samples=200", "samples=12").replace("iterations=5", "iterations=1")
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr("vjepa2_ac.evaluation.plan_picture.plot_plan", lambda _, path: path)
+    monkeypatch.setattr("vjepa2_ac.reports.figures.plan.plot_plan", lambda _, path: path)
     words = shlex.split(shown)
     assert words[0] == "vjepa2-ac"
     assert main([*words[1:], "--out", str(tmp_path), "--nodes", "3"]) == 0

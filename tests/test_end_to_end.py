@@ -8,7 +8,7 @@ import yaml
 
 from paths import ROOT
 from vjepa2_ac.cli import main
-from vjepa2_ac.training.journal import read_journal
+from vjepa2_ac.runs.metrics_log import read_metrics_log
 
 TINY = {
     "image_size": 48,
@@ -151,7 +151,7 @@ def test_real_robot_pictures_go_the_whole_way_and_the_error_falls(shared: Path, 
     config = str(ROOT / "configs/bridge.yaml")
     overrides = [f"data.path={data}", f"run_dir={tmp_path / 'run'}", "training.steps=20", "validation.every=20"]
     assert main(["train", config, *overrides]) == 0
-    rows = list(read_journal(tmp_path / "run" / "metrics.jsonl"))
+    rows = list(read_metrics_log(tmp_path / "run" / "metrics.jsonl"))
     losses = [row["loss"] for row in rows if row["kind"] == "train"]
     errors = [row["error_over_persistence"] for row in rows if row["kind"] == "validation"]
     assert losses[-1] < 0.95 * losses[0]

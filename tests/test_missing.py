@@ -33,7 +33,7 @@ def run_without(*missing: str, folder: Path, **environment: str) -> subprocess.C
     tests.mkdir()
     (tests / "test_each.py").write_text(A_TEST_OF_EACH)
     (tests / "conftest.py").symlink_to(ROOT / "tests" / "conftest.py")
-    path = os.pathsep.join([str(folder), str(ROOT / "src"), str(ROOT / "tests")])
+    path = os.pathsep.join([str(folder), str(ROOT / "src"), str(ROOT / "tests" / "support")])
     inherited = {key: value for key, value in os.environ.items() if key not in {"CI", "PYTEST_CURRENT_TEST"}}
     return subprocess.run(
         [sys.executable, "-m", "pytest", "-rs", "-p", "no:cacheprovider", "--import-mode=importlib", str(tests)],

@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 from vjepa2_ac import places
-from vjepa2_ac.cli import _parser, main
-from vjepa2_ac.cli_parts import as_local, as_model, as_path, as_subject
+from vjepa2_ac.cli.options import as_local, as_model, as_path, as_subject
+from vjepa2_ac.cli.program import _parser, main
 from vjepa2_ac.config import DiskCacheConfig
-from vjepa2_ac.config_errors import all_keys
-from vjepa2_ac.config_file import config_as_flat_dict, parse_config
-from vjepa2_ac.data.index import cache_folder
+from vjepa2_ac.config.diagnostics import all_keys
+from vjepa2_ac.config.loading import config_as_flat_dict, parse_config
+from vjepa2_ac.data.index.index_cache import cache_folder
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.training.run_folder import read_run_config
+from vjepa2_ac.runs.folder import read_run_config
 
 ON_THIS_MACHINE = ("run_dir", "data.cache_dir", "data.disk_cache.dir", "model.base")
 ANYWHERE = ("data.path", "data.idle.ranges", "checkpoint.remote")

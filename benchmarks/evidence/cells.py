@@ -8,7 +8,7 @@ from typing import Literal
 
 from vjepa2_ac.config import AdapterConfig, TrainingConfig
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
-from vjepa2_ac.simulation.domains import DOMAIN_A, DOMAIN_B, Domain
+from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
 
 Shift = Literal["look", "motion"]
 Base = Literal["one camera", "many cameras", "none"]

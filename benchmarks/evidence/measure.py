@@ -16,22 +16,22 @@ from prepare import base_model, data_a, data_shifted, training_episodes
 
 from vjepa2_ac.config import Config, DataConfig, ModelConfig, PlanningConfig, ValidationConfig
 from vjepa2_ac.config.training import CheckpointConfig
-from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.loader import validation_batches
-from vjepa2_ac.data.windows import Split
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.clips.loader import validation_batches
+from vjepa2_ac.data.clips.windows import Split
+from vjepa2_ac.encoding.batch import encode_batch
+from vjepa2_ac.encoding.training_cache import with_latents_if_there
 from vjepa2_ac.evaluation.metrics import PredictionErrors, prediction_errors
-from vjepa2_ac.latents import encode_batch
-from vjepa2_ac.model.adapter_end import base_only, merge_adapter
-from vjepa2_ac.model.load import load_base
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.simulation.closed_loop import run_task
-from vjepa2_ac.simulation.policies import DoNothing, Oracle, Planning, Policy, RandomActions
-from vjepa2_ac.training.cached import with_latents_if_there
+from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
+from vjepa2_ac.simulation.closed_loop.rollout import run_task
 from vjepa2_ac.training.cost.parameters import count_parameters
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.quiet import QuietReporter
-from vjepa2_ac.training.runs import load_run
+from vjepa2_ac.training.reporter import NullReporter
 
 TEST_GOALS, VALIDATION_GOALS = 9_000, 4_000  # seeds of problems, to which a cell adds its own
 GOALS, CLIPS = 20, 128  # of one run; a row of the table pools its seeds, each with other goals
@@ -52,7 +52,7 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         model = load_base(config.model, seed=cell.seed)
         trained: dict[str, Any] = {"trained_share": 0.0, "trained_parameters": 0, "adapter_mb": 0.0}
     else:
-        run = train(config, QuietReporter())
+        run = train(config, NullReporter())
         model, trained = _trained(run)
     seconds = time.process_time() - started[0], time.perf_counter() - started[1]
     split: Split = "validation" if choosing else "test"

@@ -8,16 +8,16 @@ import numpy as np
 from cells import SHIFTS, TRAINING, Base, Shift
 
 from vjepa2_ac.config import Config, DataConfig, ModelConfig
-from vjepa2_ac.config_file import load_config
-from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.windows import split_of
-from vjepa2_ac.model.load import load_base
-from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.simulation.record import record_dataset
-from vjepa2_ac.training.encode import encode_config
-from vjepa2_ac.training.export import export_run
-from vjepa2_ac.training.loop import Reporter, train
-from vjepa2_ac.training.quiet import QuietReporter
+from vjepa2_ac.config.loading import load_config
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.clips.windows import split_of
+from vjepa2_ac.encoding.encode_dataset import encode_config
+from vjepa2_ac.export.export import export_run
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.reporter import NullReporter, Reporter
 
 BUILTIN = "builtin:sim-tiny"
 EPISODES_A, EPISODES_SHIFTED = 400, 100
@@ -59,7 +59,7 @@ def prepare(folder: Path, seeds: int, reporter: Reporter | None = None) -> None:
     for shift in SHIFTS:
         _record(data_shifted(folder, shift), shift, EPISODES_SHIFTED, SEED_SHIFTED)
     if not Path(base_model(folder, "one camera", 0)).exists():
-        run = train(_base_config(folder), reporter or QuietReporter())
+        run = train(_base_config(folder), reporter or NullReporter())
         export_run(run, Path(base_model(folder, "one camera", 0)))
     for seed in range(seeds):
         _without_a_past(Path(base_model(folder, "none", seed)), seed)

@@ -12,8 +12,7 @@ from cells import BASES, BEST, METHODS
 from plot import draw
 from results import Figures, last, main_cells, of_policy, pick, reached, read_results, share_reached
 
-from vjepa2_ac.evaluation.bootstrap import mean_of
-from vjepa2_ac.evaluation.proportion import share_of
+from vjepa2_ac.evaluation.intervals import mean_of, share_of
 
 TABLE, PLOT = "evidence.md", "evidence.png"
 _BEGIN, _END = "<!-- made by `make evidence`: begin -->", "<!-- made by `make evidence`: end -->"

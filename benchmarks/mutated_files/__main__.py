@@ -72,7 +72,7 @@ def _options() -> argparse.Namespace:
 def _names() -> list[str]:
     code = "import sys; sys.path[:0] = sys.argv[1:]; import readers; print('\\n'.join(readers.READERS))"
     run = subprocess.run(  # noqa: S603 - this Python, this folder
-        [sys.executable, "-W", "ignore", "-c", code, str(Path(__file__).parent), str(ROOT / "tests")],
+        [sys.executable, "-W", "ignore", "-c", code, str(Path(__file__).parent), str(ROOT / "tests" / "support")],
         check=True, capture_output=True, text=True, env=_environment(),
     )  # fmt: skip
     return run.stdout.splitlines()
@@ -136,7 +136,7 @@ def _computed_s(process: int) -> float:
 
 def _work(options: argparse.Namespace) -> None:
     """Spoil and read file after file, a line of JSON for each."""
-    sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "tests")]
+    sys.path[:0] = [str(Path(__file__).parent), str(ROOT / "tests" / "support")]
     import readers
     from numpy.random import default_rng
 

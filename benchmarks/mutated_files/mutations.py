@@ -16,7 +16,7 @@ from numpy.random import Generator
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 
-from vjepa2_ac.data.sources.latents.record import _BY_FRAME, _crc_of_rest
+from vjepa2_ac.data.sources.latents.episode_file import _BY_FRAME, _crc_of_rest
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, write_record
 
 Mutator = Callable[[bytes, Generator], bytes]

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from evaluation.results import evaluation
+from evaluation_results import evaluation
 from latent_sets import write_cache
 from lerobot_sets import recorded, write_v21, write_v30
 from recordings import write_raw_droid
@@ -30,27 +30,27 @@ from vjepa2_ac.config import (
     PredictorSizes,
     TrainingConfig,
 )
-from vjepa2_ac.config_file import config_as_yaml, load_config, parse_config
-from vjepa2_ac.data.dataset import open_dataset
-from vjepa2_ac.data.idle_search import _read_list
-from vjepa2_ac.data.picture_file import read_picture
+from vjepa2_ac.config.loading import config_as_yaml, load_config, parse_config
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.filters.idle_ranges import _read_list
 from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
-from vjepa2_ac.data.sources.latents.key import CacheKey
+from vjepa2_ac.data.sources.latents.cache_key import CacheKey
 from vjepa2_ac.data.sources.latents.source import LatentSource
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
 from vjepa2_ac.data.sources.npz.source import NpzSource
 from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.evaluation.comparison import compare
-from vjepa2_ac.evaluation.metrics_file import write_metrics
-from vjepa2_ac.model.lora import add_adapter, load_trained, save_trained
-from vjepa2_ac.model.weights import load_official, to_official
-from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.training.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, read_state, write_checkpoint
-from vjepa2_ac.training.evaluation import training_curves
-from vjepa2_ac.training.manifest import seal
+from vjepa2_ac.evaluation.evaluate_run import training_curves
+from vjepa2_ac.media.image_file import read_image
+from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained
+from vjepa2_ac.model.checkpoints.official import load_official, to_official
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reports.comparison import compare
+from vjepa2_ac.reports.metrics_json import write_metrics
+from vjepa2_ac.runs.checkpoint import ADAPTER, OPTIMIZER, RunState, newest_checkpoint, read_state, write_checkpoint
+from vjepa2_ac.runs.manifest import write_manifest
+from vjepa2_ac.runs.torch_file import write_torch
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 from vjepa2_ac.training.resume import _read as read_checkpoint
-from vjepa2_ac.training.torch_file import write_torch
 
 SIZES = ModelSizes(
     image_size=48,
@@ -151,7 +151,7 @@ def _write_run(folder: Path) -> None:
 def _reseal_run(folder: Path) -> None:
     checkpoint = next((folder / "checkpoints").glob("step-*"))
     (checkpoint / "manifest.json").unlink()
-    seal(checkpoint)
+    write_manifest(checkpoint)
 
 
 def _read_states(folder: Path) -> None:
@@ -301,7 +301,7 @@ def _write_pictures(folder: Path) -> None:
 
 def _read_pictures(folder: Path) -> None:
     for path in sorted(folder.glob("*.*g")):
-        read_picture(path)
+        read_image(path)
 
 
 def _write_ranges(folder: Path) -> None:
@@ -309,7 +309,7 @@ def _write_ranges(folder: Path) -> None:
 
 
 def _read_ranges(folder: Path) -> None:
-    from vjepa2_ac.data.idle_search import _checked
+    from vjepa2_ac.data.filters.idle_ranges import _checked
 
     for name, ranges in _read_list(str(folder / "ranges.json")).items():
         _checked(ranges, name, 40, "ranges.json")

@@ -60,7 +60,7 @@ class FrameReader(Protocol):
 
 @dataclass(frozen=True)
 class StoredLatents:
-    """Latents of frames as a cache keeps them; `latents.decoded` makes float32 of them, on the device."""
+    """Latents of frames as a cache keeps them; `dtypes.unpack_latents` makes float32 of them, on the device."""
 
     values: Num[Tensor, "*batch time tokens dim"]  # bfloat16, float32 or int8
     scales: Float32[Tensor, "*batch time tokens"] | None = None  # of int8: what a value of 1 means, for each token

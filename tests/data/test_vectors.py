@@ -14,16 +14,17 @@ from lerobot_sets import Recorded, recorded, write_v21, write_v30
 from memory_source import MemorySource
 from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.config_file import parse_config
-from vjepa2_ac.data.actions import actions_of, joined
-from vjepa2_ac.data.check import check_data, findings_in
-from vjepa2_ac.data.clips import clip_at
-from vjepa2_ac.data.dataset import open_dataset, open_source
-from vjepa2_ac.data.inspection import inspect_dataset
+from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.data.clips.actions import actions_of, joined
+from vjepa2_ac.data.clips.clip_reader import clip_at
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.inspection.check import check_data, findings_in
+from vjepa2_ac.data.inspection.statistics import inspect_dataset
+from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.data_picture import picture_data_set
 from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.reports.figures.dataset import plot_dataset
 
 JOINTS = ("steps/observation/joint_position", "steps/observation/gripper_position")
 VELOCITIES = ("steps/action_dict/joint_velocity", "steps/action_dict/gripper_velocity")
@@ -174,7 +175,7 @@ def test_an_episode_of_another_width_that_no_index_saw_is_named_when_it_is_read(
 
 
 def open_dataset_of(source: MemorySource) -> Any:
-    import vjepa2_ac.data.dataset as module
+    import vjepa2_ac.data.clips.dataset as module
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "open_source", lambda _: source)
@@ -262,7 +263,7 @@ def test_pictures_that_never_change_while_a_number_does_are_an_error() -> None:
 
 
 def test_inspection_and_picture_of_vectors(tmp_path: Path) -> None:
-    from vjepa2_ac.console_data import inspection_lines, motion_table
+    from vjepa2_ac.console.data import inspection_lines, motion_table
 
     dataset = open_dataset(knobs(write_vectors(tmp_path / "set", width=14)))
     found = inspect_dataset(dataset)
@@ -272,7 +273,7 @@ def test_inspection_and_picture_of_vectors(tmp_path: Path) -> None:
     assert [one["stride"] for one in figures["per_model_step"]] == [3, 5, 10]
     assert any(line.startswith("states") and "14 numbers: -" in line for line in inspection_lines(found))
     assert motion_table(found).row_count == 3
-    assert picture_data_set(dataset, found, tmp_path / "sheet.png").stat().st_size > 10_000
+    assert plot_dataset(dataset, found, tmp_path / "sheet.png").stat().st_size > 10_000
 
 
 def test_a_number_changes_by_a_share_of_its_range(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from vjepa2_ac.evaluation.bootstrap import Estimate
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
     gain_over,
@@ -20,13 +19,14 @@ from vjepa2_ac.evaluation.estimates import (
     stratum_gain,
     stratum_over_persistence,
 )
-from vjepa2_ac.evaluation.evaluate import Contender, Probes, evaluate
-from vjepa2_ac.evaluation.metrics_file import metrics_as_dict
+from vjepa2_ac.evaluation.evaluate import Contender, ProbeOptions, evaluate
+from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.result import METRICS, MODES, Errors, Evaluation, Predicted, Stratum
 from vjepa2_ac.evaluation.verdict import improvement, uses_actions, verdict
+from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, about, again, clips_batch
 
-PROBES = Probes(sensitivity_clips=6, samples=20, landscape_clips=3, nodes=5, examples=3, at_once=7)
+PROBES = ProbeOptions(sensitivity_clips=6, samples=20, landscape_clips=3, nodes=5, examples=3, at_once=7)
 
 
 def evaluated(trained: object, base: object | None = None, *, size: int = 4, **changes: object) -> Evaluation:
@@ -257,7 +257,7 @@ def test_what_was_not_asked_for_is_noted(nothing: dict[str, int], note: str | No
 
 
 def test_nothing_but_errors_is_measured_where_nothing_else_is_asked_for() -> None:
-    probes = Probes(sensitivity_clips=0, landscape_clips=0, examples=0)
+    probes = ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0)
     found = evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=probes)
     assert len(found.notes) == 2
     assert found.models["model"].sensitivity is None

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vjepa2_ac.console_evaluation import evaluation_tables
-from vjepa2_ac.evaluation.plots import plot_evaluation
+from vjepa2_ac.console.evaluation import evaluation_tables
 from vjepa2_ac.evaluation.result import Errors, Evaluation, Example, ModelResult, Predicted
 from vjepa2_ac.evaluation.strata import clips_of
 from vjepa2_ac.evaluation.verdict import improvement, spread, uses_actions, verdict
+from vjepa2_ac.reports.figures.evaluation import plot_evaluation
 from worlds import about
 
 CLIPS, HORIZON = 24, 3

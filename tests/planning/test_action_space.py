@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from planning.problems import space
+from solver_problems import space
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.planning.action_space import ActionSpace, Ball, pose_space
 

@@ -5,16 +5,16 @@ import pytest
 import torch
 from torch._dynamo.utils import counters
 
-from planning.tiny import actions, cost, tiny_model
+from tiny_models import actions, cost, tiny_model
 from tracing import tracing
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model import compilation
-from vjepa2_ac.model.lora import add_adapter, lora_layers
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.adapter.lora import add_adapter, lora_layers
+from vjepa2_ac.model.network import compilation
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.ready import make_ready
+from vjepa2_ac.planning.model_setup import prepare_for_planning
 
 pytestmark = tracing
 
@@ -63,8 +63,8 @@ def test_after_the_first_decision_nothing_is_compiled() -> None:
 @pytest.mark.usefixtures("traced")
 def test_switched_off_it_is_off_again() -> None:
     model, tried = tiny_model(), actions(3, 2)
-    make_ready(model, COMPILED)
-    make_ready(model, PLAIN)
+    prepare_for_planning(model, COMPILED)
+    prepare_for_planning(model, PLAIN)
     with torch.no_grad():
         cost(model)(tried)
     assert not counters["stats"]

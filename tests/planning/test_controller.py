@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from planning.tiny import tiny_model
+from tiny_models import tiny_model
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states, apply_action
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
 
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])

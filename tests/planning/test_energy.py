@@ -5,11 +5,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from planning.tiny import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_model
+from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_model
 from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.model.key_value_cache import KeyValueCache
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goal import Goal, patch_weights
 from vjepa2_ac.planning.planner import Planner

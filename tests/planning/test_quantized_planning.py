@@ -10,15 +10,15 @@ import torch
 from pydantic import ValidationError
 from torch.nn import Linear
 
-from planning.tiny import actions, cost, tiny_model
+from tiny_models import actions, cost, tiny_model
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.planning import CemConfig, GradientConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model import quantization
-from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.ready import make_ready
+from vjepa2_ac.planning.model_setup import prepare_for_planning
 
 with_torchao = pytest.mark.skipif(
     importlib.util.find_spec("torchao") is None, reason="torchao (extra quantize) is not installed"
@@ -43,7 +43,7 @@ def in_bfloat16(*, adapted: bool = False) -> WorldModel:
 def test_energies_in_8_bits_are_nearly_the_plain_ones(adapted: bool) -> None:
     model, tried = in_bfloat16(adapted=adapted), actions(50, 3)
     before, exact = cost(model)(tried), cost(copy.deepcopy(model).float())(tried)
-    smaller = make_ready(model, INT8)
+    smaller = prepare_for_planning(model, INT8)
     assert smaller.encoder is model.encoder
     assert smaller.adaptation is None
     energies = cost(smaller)(tried)
@@ -57,13 +57,19 @@ def test_energies_in_8_bits_are_nearly_the_plain_ones(adapted: bool) -> None:
 @with_torchao
 def test_a_controller_plans_in_8_bits() -> None:
     pictures = np.random.default_rng(0).integers(0, 256, (3, 48, 48, 3), dtype=np.uint8)
-    state, model, found = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2]), in_bfloat16(adapted=True), []
+    state, model = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2]), in_bfloat16(adapted=True)
+    found: list[list[np.ndarray]] = []
+    energies: list[list[float]] = []
     for config in (PLAIN, INT8, INT8):
         run = Controller(model, config)
         run.reset(pictures[0])
-        found.append([run.act(picture, state) for picture in pictures[1:]])
+        found.append([])
+        energies.append([])
+        for picture in pictures[1:]:
+            found[-1].append(run.act(picture, state))
+            energies[-1].append(run.decision.plan.energy)
     np.testing.assert_array_equal(found[1], found[2])
-    np.testing.assert_allclose(found[1], found[0], atol=0.03)
+    np.testing.assert_allclose(energies[1], energies[0], rtol=0.01)  # as good; which of two is taken hangs by a digit
     assert not np.array_equal(found[1], found[0])
 
 
@@ -87,7 +93,7 @@ def test_on_a_device_that_has_fp8_every_layer_of_the_blocks_is_in_it() -> None:
     sizes = sizes.model_copy(update={"predictor": sizes.predictor.model_copy(update={"width": 48})})
     model = WorldModel.random(sizes, seed=0, dtype=torch.bfloat16)
     add_adapter(model, AdapterConfig(rank=2), seed=0)
-    ready = make_ready(model, FP8).predictor
+    ready = prepare_for_planning(model, FP8).predictor
     layers = {name: layer.weight for name, layer in ready.named_modules() if isinstance(layer, Linear)}
     in_fp8 = {name for name, weight in layers.items() if getattr(weight, "qdata", weight).dtype == torch.float8_e4m3fn}
     assert in_fp8 == {name for name in layers if name.startswith("blocks.")}
@@ -118,7 +124,7 @@ def test_a_predictor_that_was_trained_whole_is_in_its_bases_type() -> None:
     model = in_bfloat16()
     add_adapter(model, AdapterConfig(kind="none"), seed=0)
     assert model.predictor.predictor_norm.weight.dtype == torch.float32
-    make_ready(model, INT8)
+    prepare_for_planning(model, INT8)
 
 
 def test_without_its_library_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

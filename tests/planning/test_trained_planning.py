@@ -10,17 +10,17 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from planning.tiny import actions, cost, tiny_model
+from tiny_models import actions, cost, tiny_model
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.config.planning import CemConfig, PlanningConfig
 from vjepa2_ac.episode import Widths
-from vjepa2_ac.model.heads import fit_heads
-from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.predictor import ActionConditionedPredictor
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.network.input_heads import fit_heads
+from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning import controller
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.ready import make_ready
+from vjepa2_ac.planning.model_setup import prepare_for_planning
 
 PLAIN = PlanningConfig(samples=16, iterations=2, horizon=2, cem=CemConfig(elites=4))
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
@@ -89,10 +89,10 @@ def test_the_same_is_decided_as_by_the_model_that_was_trained(
     model, tried = trained_model(adapter), actions(20, 2)
     with torch.no_grad():
         expected, of_base = cost(model)(tried), cost(tiny_model())(tried)
-        torch.testing.assert_close(cost(make_ready(model, PLAIN))(tried), expected, rtol=1e-5, atol=0)
+        torch.testing.assert_close(cost(prepare_for_planning(model, PLAIN))(tried), expected, rtol=1e-5, atol=0)
     assert (expected - of_base).norm() > 1e-3 * of_base.norm(), "training changed something"
     found = decided(model)
-    monkeypatch.setattr(controller, "make_ready", lambda given, _: given)
+    monkeypatch.setattr(controller, "prepare_for_planning", lambda given, _: given)
     np.testing.assert_allclose(found, decided(model), rtol=0, atol=1e-5)
 
 
@@ -103,7 +103,7 @@ def test_in_bfloat16_energies_are_those_of_float32_to_rounding(adapter: AdapterC
     precise, base = copy.deepcopy(model).float(), tiny_model().to(torch.bfloat16)
     exact, of_base = cost(precise)(tried), cost(copy.deepcopy(base).float())(tried)
     rounding = (cost(base)(tried) - of_base).norm() / of_base.norm()  # of a model that was never trained
-    error = (cost(make_ready(model, PLAIN))(tried) - exact).norm() / exact.norm()
+    error = (cost(prepare_for_planning(model, PLAIN))(tried) - exact).norm() / exact.norm()
     assert error < 2 * rounding < 0.01
 
 
@@ -124,7 +124,7 @@ def test_the_model_that_is_given_stays_as_it_is(adapter: AdapterConfig) -> None:
     weights = {name: value.clone() for name, value in model.state_dict().items()}
     trained = [value.requires_grad for value in model.parameters()]
     adaptation, predictor = model.adaptation, model.predictor
-    ready = make_ready(model, PLAIN)
+    ready = prepare_for_planning(model, PLAIN)
     assert ready.encoder is model.encoder
     assert ready.adaptation is None
     assert not any(part.training for part in ready.modules())
@@ -142,11 +142,11 @@ def test_fresh_heads_are_planned_with_as_they_were_trained() -> None:
     fit_heads(model, Widths(state=8, action=7), seed=0)
     add_adapter(model, AdapterConfig(rank=4, modules_to_save=("state_encoder",)), seed=0)
     model.get_submodule("predictor.base_model.model.state_encoder.modules_to_save.default").weight.data += 0.1
-    head = make_ready(model, PLAIN).predictor.state_encoder
+    head = prepare_for_planning(model, PLAIN).predictor.state_encoder
     expected = model.base_predictor.state_encoder.modules_to_save["default"].weight
     assert torch.equal(head.weight, expected.bfloat16())
 
 
 def test_a_base_is_not_copied() -> None:
     model = tiny_model()
-    assert make_ready(model, PLAIN) is model
+    assert prepare_for_planning(model, PLAIN) is model

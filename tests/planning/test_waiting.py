@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from planning.tiny import actions, cost, tiny_model
+from tiny_models import actions, cost, tiny_model
 
 ASKING = {
     "_local_scalar_dense", "_to_copy", "copy_", "equal", "index", "index_put_", "is_nonzero", "lift_fresh",

@@ -7,7 +7,7 @@ import torch
 
 from same_run import trained_weights
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model import compilation, layers
+from vjepa2_ac.model.network import blocks, compilation
 from vjepa2_ac.training.loop import train
 
 
@@ -15,7 +15,7 @@ def test_a_run_that_switches_compilation_on_and_off_is_the_run_that_never_did(
     make_config, reporter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
-    monkeypatch.setattr(layers, "compiled", lambda function, **_: asked.append(function.__name__) or function)
+    monkeypatch.setattr(blocks, "compiled", lambda function, **_: asked.append(function.__name__) or function)
     monkeypatch.setattr(compilation, "missing_for_compilation", lambda _: None)
     constant = {"training__schedule": "constant"}
     train(make_config(run_dir=str(tmp_path / "plain"), **constant), reporter)

@@ -11,17 +11,17 @@ from torch.utils.data import DataLoader
 
 from recording_cuda import RecordingCuda, recorded_copies
 from same_run import assert_same_run
-from vjepa2_ac.data import loader
-from vjepa2_ac.data.clips import Wish
-from vjepa2_ac.data.dataset import Dataset
-from vjepa2_ac.data.loader import training_loader
-from vjepa2_ac.data.prefetch import Batches, Row
+from vjepa2_ac.data.clips import loader
+from vjepa2_ac.data.clips.clip_reader import ClipRequest
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.data.clips.prefetch import Batches, MicroBatch
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.training import assembly
-from vjepa2_ac.training.assembly import Run, assemble, batches_from
-from vjepa2_ac.training.checkpoint import read_state
+from vjepa2_ac.runs.checkpoint import read_state
+from vjepa2_ac.training import setup
 from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.setup import Run, batches_from, set_up
 from vjepa2_ac.training.step import gradients, training_step
 
 COPY = [*["side 1: to pinned memory", "side 1: to device"] * 3]  # frames, states, actions
@@ -47,8 +47,8 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> RecordingCuda:
 def copied(run: Run, cuda: RecordingCuda) -> Batches:
     """Return the batches of a run, copied to a recording device."""
 
-    def rows() -> Generator[Row | InputError, None, None]:
-        yield from map(Row, training_loader(run.dataset, seed=0, batch_size=2))
+    def rows() -> Generator[MicroBatch | InputError, None, None]:
+        yield from map(MicroBatch, training_loader(run.dataset, seed=0, batch_size=2))
 
     return Batches(rows(), run.dataset.broken, recorded_copies(cuda))
 
@@ -58,7 +58,7 @@ def micro_batch(event: int) -> list[str]:
 
 
 def test_the_next_batch_is_on_its_way_before_the_host_waits_for_the_losses(make_config, reporter, cuda) -> None:
-    run = assemble(make_config(), reporter.note)
+    run = set_up(make_config(), reporter.note)
     batches = copied(run, cuda)
     for step in (1, 2):
         training_step(run, batches, step)
@@ -72,7 +72,7 @@ def test_the_next_batch_is_on_its_way_before_the_host_waits_for_the_losses(make_
 
 
 def test_after_the_last_step_and_in_a_trial_nothing_is_fetched_ahead(make_config, reporter, cuda) -> None:
-    run = assemble(make_config(training__steps=1), reporter.note)
+    run = set_up(make_config(training__steps=1), reporter.note)
     training_step(run, copied(run, cuda), 1)
     assert cuda.told[-1] == "host: waits for the losses"
     assert cuda.told[-2] == "backward"
@@ -91,7 +91,7 @@ def on_device(monkeypatch: pytest.MonkeyPatch) -> RecordingCuda:
 
     cuda = RecordingCuda()
     copies = recorded_copies(cuda)
-    monkeypatch.setattr(assembly, "copies_for", lambda _: copies)
+    monkeypatch.setattr(setup, "copies_for", lambda _: copies)
     monkeypatch.setattr(loader, "DataLoader", unpinned)
     return cuda
 
@@ -107,15 +107,15 @@ def test_a_run_that_copies_ahead_is_the_run_that_does_not(make_config, reporter,
 
 def test_a_checkpoint_knows_nothing_of_the_clips_of_the_next_step(make_config, reporter, monkeypatch, request) -> None:
     read, config = loader.read_clip, make_config(data__broken_episodes="skip", checkpoint__every=1)
-    third = next(itertools.islice(batches_from(assemble(config, reporter.note)), 4, None))  # of two in each step
+    third = next(itertools.islice(batches_from(set_up(config, reporter.note)), 4, None))  # of two in each step
     bad = (third.episode_ids[0], third.starts[0])
 
-    def read_some(dataset: Dataset, wish: Wish) -> Clip:
+    def read_some(dataset: Dataset, wish: ClipRequest) -> Clip:
         if (dataset.table.identity(wish.episode), wish.start) == bad:
             raise InputError(where="here", found="damaged")
         return read(dataset, wish)
 
-    monkeypatch.setattr("vjepa2_ac.data.broken.MOST_BROKEN", 0.2)
+    monkeypatch.setattr("vjepa2_ac.data.filters.broken_episodes.MOST_BROKEN", 0.2)
     monkeypatch.setattr(loader, "read_clip", read_some)
     request.getfixturevalue("on_device")
     train(config, reporter)
@@ -135,9 +135,9 @@ def test_a_clip_that_cannot_be_read_stops_the_run_at_its_own_step(
         return read(*arguments)
 
     del on_device
-    run = assemble(config, reporter.note)
+    run = set_up(config, reporter.note)
     monkeypatch.setattr(loader, "read_clip", read_some)
-    monkeypatch.setattr("vjepa2_ac.data.clips.read_clip", read_some)
+    monkeypatch.setattr("vjepa2_ac.data.clips.clip_reader.read_clip", read_some)
     batches = batches_from(run)
     for step in (1, 2):
         training_step(run, batches, step)

@@ -11,18 +11,18 @@ import torch
 from copied_sets import write_rlds
 from same_run import assert_same_run, figures, trained_weights
 from vjepa2_ac.config import CheckpointConfig, Config
-from vjepa2_ac.config_file import config_as_yaml
-from vjepa2_ac.data import loader
-from vjepa2_ac.data.clips import Wish
-from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.data.clips import loader
+from vjepa2_ac.data.clips.clip_reader import ClipRequest
+from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.load import load_base
-from vjepa2_ac.training import loop
-from vjepa2_ac.training.assembly import assemble, batches_from
-from vjepa2_ac.training.checkpoint import CheckpointClock, checkpoint_name, newest_checkpoint, read_state
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.runs.checkpoint import CheckpointClock, checkpoint_name, newest_checkpoint, read_state
+from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.runs import load_run
+from vjepa2_ac.training.setup import batches_from, set_up
 from vjepa2_ac.training.step import step_seed, training_step
 
 
@@ -109,7 +109,8 @@ def test_the_best_by_validation_is_written_kept_and_remembered(make_config, repo
         del errors
         return {"rollout_over_persistence_last": next(values)}
 
-    monkeypatch.setattr(loop, "validation_figures", measured)
+    for module in (loop, validation):
+        monkeypatch.setattr(module, "validation_metrics", measured)
     config = make_config(validation__every=1, checkpoint__every=100, checkpoint__keep=1)
     values = iter([0.1, 0.9, 0.7, 0.8, 0.75])  # the first is the base's
     with pytest.raises(KilledError):
@@ -134,7 +135,7 @@ def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporte
             training__batch_size=batch_size, training__accumulation=accumulation, adapter__dropout=0.0,
             training__max_grad_norm=None,
         )  # fmt: skip
-        run = assemble(config, reporter.note)
+        run = set_up(config, reporter.note)
         run.optimizer.step = lambda: None
         run.optimizer.zero_grad = lambda **_: None
         training_step(run, batches_from(run), 1)
@@ -148,7 +149,7 @@ def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporte
 
 def test_checkpointing_of_activations_changes_no_gradient(make_config, reporter) -> None:
     def one_step(checkpointing: bool) -> list[float]:
-        run = assemble(make_config(training__gradient_checkpointing=checkpointing), reporter.note)
+        run = set_up(make_config(training__gradient_checkpointing=checkpointing), reporter.note)
         figures_of_step = training_step(run, batches_from(run), 1)
         return [figures_of_step["loss"], figures_of_step["grad_norm"]]
 
@@ -204,7 +205,7 @@ def test_check_does_everything_but_writes_nothing(make_config, reporter) -> None
 
 
 def test_a_loss_that_is_not_finite_stops_before_the_weights_move(make_config, reporter) -> None:
-    run = assemble(make_config(), reporter.note)
+    run = set_up(make_config(), reporter.note)
     poisoned = next(p for p in run.world_model.parameters() if p.requires_grad)
     with torch.no_grad():
         poisoned[0, 0] = float("nan")
@@ -260,7 +261,7 @@ def test_another_config_on_purpose_is_written_and_what_changes_is_said(make_conf
 def test_what_the_optimizer_is_told_anew_on_purpose_counts(make_config, reporter) -> None:
     """Its saved state knows the old settings, and would bring them back."""
     train(make_config(training__steps=2, training__weight_decay=0.04), reporter)
-    run = assemble(make_config(training__weight_decay=0.5, training__betas=[0.8, 0.9]), reporter.note)
+    run = set_up(make_config(training__weight_decay=0.5, training__betas=[0.8, 0.9]), reporter.note)
     assert [(group["weight_decay"], group["betas"]) for group in run.optimizer.param_groups] == [(0.5, (0.8, 0.9))]
     assert all(moments["step"] == 2 for moments in run.optimizer.state_dict()["state"].values())
 
@@ -318,24 +319,24 @@ def test_bf16_runs_and_keeps_what_is_trained_in_float32(make_config: object, rep
 
 def test_a_resumed_run_still_counts_the_broken_episodes_that_it_met(make_config, reporter, monkeypatch) -> None:
     read, config = loader.read_clip, make_config(training__steps=2, data__broken_episodes="skip")
-    bad = next(batches_from(assemble(config, reporter.note))).episode_ids[0]
+    bad = next(batches_from(set_up(config, reporter.note))).episode_ids[0]
 
-    def read_some(dataset: Dataset, wish: Wish) -> Clip:
+    def read_some(dataset: Dataset, wish: ClipRequest) -> Clip:
         if dataset.table.identity(wish.episode) == bad:
             raise InputError(where="here", found="damaged")
         return read(dataset, wish)
 
-    monkeypatch.setattr("vjepa2_ac.data.broken.MOST_BROKEN", 0.2)
+    monkeypatch.setattr("vjepa2_ac.data.filters.broken_episodes.MOST_BROKEN", 0.2)
     monkeypatch.setattr(loader, "read_clip", read_some)
     train(config, reporter)
     monkeypatch.setattr(loader, "read_clip", read)
-    assert assemble(config, reporter.note).dataset.broken.reasons == {bad: "here: damaged."}
+    assert set_up(config, reporter.note).dataset.broken.reasons == {bad: "here: damaged."}
 
 
 def test_an_episode_may_be_left_out_within_a_run(make_config, reporter) -> None:
     config = make_config(training__steps=2)
     train(config, reporter)
-    broken = next(batches_from(assemble(config, reporter.note))).episode_ids[0]
+    broken = next(batches_from(set_up(config, reporter.note))).episode_ids[0]
     assert not any("data has changed" in note for note in reporter.notes)
     train(make_config(training__steps=2, data__exclude=[broken]), reporter)
     said = "\n".join(reporter.notes)

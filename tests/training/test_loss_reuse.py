@@ -10,9 +10,9 @@ from torch.nn.functional import layer_norm
 
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model import world_model
-from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.network import world_model
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.loss import prediction_losses
 
 FRAMES = 7

@@ -6,8 +6,9 @@ import pytest
 
 from vjepa2_ac.cli import main
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import Probes
-from vjepa2_ac.training.evaluation import Asked, evaluate_subject
+from vjepa2_ac.evaluation.evaluate import ProbeOptions
+from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
+from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.training.loop import train
 
 
@@ -34,9 +35,9 @@ def test_an_evaluation_says_what_its_plans_lack_before_it_opens_the_data(
     make_config, base_folder, monkeypatch, tmp_path
 ) -> None:
     monkeypatch.setitem(sys.modules, "torchao.quantization", None)
-    asked = Asked(
+    asked = EvaluationOptions(
         data=make_config(data__path="nowhere", data__frames=16, model__dtype="bfloat16", training__precision="bf16"),
-        probes=Probes(planning_clips=1), planning=("planning.quantize=int8",), out=tmp_path / "out",
+        probes=ProbeOptions(planning_clips=1), planning=("planning.quantize=int8",), out=tmp_path / "out",
     )  # fmt: skip
     with pytest.raises(InputError, match=r"torchao is not installed.*\[quantize\]"):
         evaluate_subject(str(base_folder), asked)
@@ -52,7 +53,7 @@ def needing(library: str):
 
 def test_a_library_of_every_installation_that_is_gone_is_named_in_one_line(monkeypatch, capsys, tmp_path) -> None:
     monkeypatch.setitem(sys.modules, "simplejpeg", None)
-    monkeypatch.setattr("vjepa2_ac.cli_data._check", needing("simplejpeg"))
+    monkeypatch.setattr("vjepa2_ac.cli.data._check", needing("simplejpeg"))
     assert main(["data", "check", str(tmp_path / "config.yaml")]) == 2
     assert capsys.readouterr().err == (
         "error: simplejpeg: it is not installed. Run pip install -c constraints.txt -e .\n"
@@ -60,6 +61,6 @@ def test_a_library_of_every_installation_that_is_gone_is_named_in_one_line(monke
 
 
 def test_a_part_of_this_program_that_is_gone_is_no_users_error(monkeypatch, tmp_path) -> None:
-    monkeypatch.setattr("vjepa2_ac.cli_data._check", needing("vjepa2_ac.not_there"))
+    monkeypatch.setattr("vjepa2_ac.cli.data._check", needing("vjepa2_ac.not_there"))
     with pytest.raises(ModuleNotFoundError):
         main(["data", "check", str(tmp_path / "config.yaml")])

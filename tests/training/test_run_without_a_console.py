@@ -13,10 +13,10 @@ import pytest
 
 from killable import Child, Nursery
 from same_run import assert_same_run
-from vjepa2_ac.config_file import config_as_yaml
-from vjepa2_ac.training.checkpoint import newest_checkpoint
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.distributed.preemption import EXIT_STATUS
+from vjepa2_ac.runs.checkpoint import newest_checkpoint
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.preemption import EXIT_STATUS
 
 CHANGES = {"training__steps": 4, "validation__every": 2, "checkpoint__every": 2, "tracking__tensorboard": True}
 SMALLEST_PIPE = 4096

@@ -13,7 +13,7 @@ import pytest
 
 from killable import KILLED, Child, Nursery, wait_for_the_end_of
 from same_run import assert_same_run
-from vjepa2_ac.config_file import config_as_yaml
+from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.training.loop import train
 
 logger = logging.getLogger(__name__)

@@ -1,18 +1,11 @@
-"""Which knobs are there? Every one, once: its type, range, default and meaning. `config_file` reads them."""
+"""Which knobs are there? Every one, once: its type, range, default and meaning. `config.loading` reads them."""
 
-from vjepa2_ac.config.data import (
-    AugmentConfig,
-    DataConfig,
-    DiskCacheConfig,
-    IdleConfig,
-    LeRobotFields,
-    RawDroidOptions,
-    RldsFields,
-)
+from vjepa2_ac.config.data import AugmentConfig, DataConfig, DiskCacheConfig, IdleConfig
 from vjepa2_ac.config.model import AdapterConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.config.run import Config
 from vjepa2_ac.config.section import Section
+from vjepa2_ac.config.sources import LeRobotFields, RawDroidOptions, RldsFields
 from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
 
 __all__ = [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.evaluation.bootstrap import Estimate, bootstrapped, ratio
+from vjepa2_ac.evaluation.intervals import Estimate, bootstrapped, ratio
 from vjepa2_ac.evaluation.result import Actions, EpisodeScore, Errors, Evaluation, Metric, Mode, Stratum
 
 Curve = tuple[Estimate, ...]  # at horizon 1, 2, ...; index h - 1

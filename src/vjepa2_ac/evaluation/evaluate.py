@@ -11,14 +11,15 @@ import torch
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.data.windows import spread
+from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import LatentBatch, Progress
+from vjepa2_ac.evaluation.action_score.measure import PlanningStart, measure_plans, planning_start, study_of
+from vjepa2_ac.evaluation.action_use.energy_landscape import measure_landscapes
+from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, start_of
+from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sensitivity
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.examples import chosen_clips, make_example, predicted_rollout
-from vjepa2_ac.evaluation.landscape import measure_landscapes
 from vjepa2_ac.evaluation.metrics import Predictor, measured, persistence_of, with_other_actions
-from vjepa2_ac.evaluation.planning_score import PlanningStart, measure_plans, planning_start, study_of
-from vjepa2_ac.evaluation.probe import Start, start_of
 from vjepa2_ac.evaluation.result import (
     About,
     Clips,
@@ -33,7 +34,6 @@ from vjepa2_ac.evaluation.result import (
     Role,
     Sensitivity,
 )
-from vjepa2_ac.evaluation.sensitivity import ActionPool, measure_sensitivity
 from vjepa2_ac.evaluation.strata import clips_of, strata_of
 
 ClipName = tuple[str, int]  # id of the episode, first control step
@@ -55,7 +55,7 @@ class Contender:
 
 
 @dataclass(frozen=True)
-class Probes:
+class ProbeOptions:
     """How much is done beyond the errors; 0 clips: nothing."""
 
     sensitivity_clips: int = 32
@@ -70,7 +70,7 @@ class Probes:
 
 
 @dataclass(frozen=True)
-class ClipsAgain:
+class RepeatableClips:
     """Clips that can be read more than once: all of them, or some by name; batches of latents with their pictures."""
 
     count: int
@@ -79,10 +79,10 @@ class ClipsAgain:
 
 def evaluate(
     contenders: Sequence[Contender],
-    clips: ClipsAgain,
+    clips: RepeatableClips,
     about: About,
     *,
-    probes: Probes | None = None,
+    probes: ProbeOptions | None = None,
     stage: Callable[[str], Progress] | None = None,
 ) -> Evaluation:
     """Measure models on the same clips.
@@ -97,7 +97,7 @@ def evaluate(
     Raises:
         ValueError: No clips; or to plan they have too few frames.
     """
-    probes = probes or Probes()
+    probes = probes or ProbeOptions()
     seen = _see_all(contenders, clips, probes, about, _bar(stage, "measuring"))
     ids, seconds = tuple(seen.ids), about.seconds_per_step
     known = clips_of(seen.actions, ids, tuple(seen.firsts), is_pose=about.is_pose, seconds_per_step=seconds)
@@ -134,7 +134,7 @@ def evaluate(
     return replace(evaluation, episodes=_episodes(evaluation), examples=examples, notes=notes)
 
 
-def _left_out(probes: Probes, about: About, *, action_dim: int) -> tuple[str, ...]:
+def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[str, ...]:
     """Return what a reader must know of what was not measured: by an option, or as there is no such thing."""
     notes = []
     if not probes.sensitivity_clips:
@@ -159,12 +159,16 @@ class _Seen:
     actions: Float[np.ndarray, "clips horizon action_dim"]
     errors: dict[tuple[str, str], list[Predicted]]  # by model and actions
     persistence: list[Predicted]
-    starts: list[Start]
+    starts: list[RolloutStart]
     planned: list[PlanningStart] = field(default_factory=list)
 
 
 def _see_all(
-    contenders: Sequence[Contender], clips: ClipsAgain, probes: Probes, about: About, progress: Progress | None
+    contenders: Sequence[Contender],
+    clips: RepeatableClips,
+    probes: ProbeOptions,
+    about: About,
+    progress: Progress | None,
 ) -> _Seen:
     seen = _Seen([], [], np.zeros((0, 0, 0)), {}, [], [])
     actions = []
@@ -208,9 +212,9 @@ def _joined(parts: Sequence[Predicted]) -> Predicted:
 
 def _sensitivity(
     contender: Contender,
-    starts: Sequence[Start],
+    starts: Sequence[RolloutStart],
     pool: ActionPool,
-    probes: Probes,
+    probes: ProbeOptions,
     about: About,
     stage: Callable[[str], Progress] | None,
 ) -> Sensitivity | None:
@@ -229,10 +233,10 @@ def _sensitivity(
 
 def _landscapes(
     contender: Contender,
-    starts: Sequence[Start],
+    starts: Sequence[RolloutStart],
     clips: Clips,
     pool: ActionPool,
-    probes: Probes,
+    probes: ProbeOptions,
     about: About,
     stage: Callable[[str], Progress] | None,
 ) -> Landscapes | None:
@@ -254,7 +258,7 @@ def _landscapes(
 def _plans(
     contender: Contender,
     starts: Sequence[PlanningStart],
-    probes: Probes,
+    probes: ProbeOptions,
     stage: Callable[[str], Progress] | None,
 ) -> Plans | None:
     if not starts:
@@ -274,7 +278,7 @@ def _episodes(evaluation: Evaluation) -> tuple[EpisodeScore, ...]:
 
 
 def _examples(
-    contenders: Sequence[Contender], clips: ClipsAgain, evaluation: Evaluation, probes: Probes
+    contenders: Sequence[Contender], clips: RepeatableClips, evaluation: Evaluation, probes: ProbeOptions
 ) -> tuple[Example, ...]:
     """Read the clips again that are worth a look: which ones these are is known only now."""
     known = evaluation.clips

@@ -11,7 +11,7 @@ from einops import rearrange
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.data.transforms import pixels_to_input
+from vjepa2_ac.data.clips.transforms import pixels_to_input
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.metrics import Predictor
 from vjepa2_ac.evaluation.result import Errors, Example

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.bootstrap import Estimate, ratio
+from vjepa2_ac.evaluation.intervals import Estimate, ratio
 from vjepa2_ac.evaluation.result import Errors, Predicted
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.evaluation.bootstrap import Estimate
+from vjepa2_ac.evaluation.intervals import Estimate
 
 Metric = Literal["l1", "l2", "cosine"]
 Mode = Literal["teacher_forced", "rollout"]

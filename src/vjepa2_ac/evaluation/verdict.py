@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vjepa2_ac.evaluation.bootstrap import Estimate
+from vjepa2_ac.evaluation.action_score.metrics import differences_of, metrics_of
+from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.estimates import gain_over, gap_of_actions, one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.planning_figures import differences_of, figures_of
-from vjepa2_ac.evaluation.planning_protocol import BEST_SCORE, STEPS
+from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.result import METRICS, Evaluation, Metric, Ranking
 
 _SIDES = {-1: "better", 0: "no clear difference", 1: "NOT better"}  # of an error over persistence
@@ -125,14 +125,14 @@ def _planned(evaluation: Evaluation) -> str:
     study, plans = evaluation.planning, evaluation.models[evaluation.trained].plans
     if study is None or plans is None:
         return ""
-    found, nothing = figures_of(study, plans), figures_of(study, study.zero).missed_cm.value
+    found, nothing = metrics_of(study, plans), metrics_of(study, study.zero).missed_cm.value
     side = _NEARER[found.missed_over_zero.side(of=1.0)]
     words = f"Its plans of {STEPS} steps end {found.missed_cm.value:.1f} cm from where the demonstrations do"
     words += f" ({interval(found.missed_cm, '.1f')}): {side} doing nothing ({nothing:.1f} cm)"
     base = None if evaluation.base is None else evaluation.models[evaluation.base].plans
     if base is not None:
         beside = differences_of(study, plans, base).missed_cm
-        words += f", {_NEARER[beside.side(of=0.0)]} the base ({figures_of(study, base).missed_cm.value:.1f} cm)"
+        words += f", {_NEARER[beside.side(of=0.0)]} the base ({metrics_of(study, base).missed_cm.value:.1f} cm)"
     return f"{words}; the Action Score is {found.score.value:.0f} of {BEST_SCORE:.0f}."
 
 

@@ -13,8 +13,8 @@ import torch
 from torch import nn
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter_end import base_dtype, unadapted_copy
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.adapter.merging import base_dtype, unadapted_copy
+from vjepa2_ac.model.network.world_model import WorldModel
 
 Kind = Literal["int8", "fp8"]
 

@@ -13,20 +13,20 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.data.transforms import Crop, pixels_to_input, view
+from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
 from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
-from vjepa2_ac.model.heads import widths_of_model
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.action_space import ActionSpace
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goal import Goal, patch_weights
-from vjepa2_ac.planning.observation import require_extrinsics, require_mask, require_picture, require_pose
-from vjepa2_ac.planning.plan import Plan
+from vjepa2_ac.planning.input_checks import require_extrinsics, require_mask, require_picture, require_pose
+from vjepa2_ac.planning.interfaces import Plan
+from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Clock, Planner
-from vjepa2_ac.planning.poses import states_along
-from vjepa2_ac.planning.ready import make_ready
+from vjepa2_ac.planning.pose_integration import states_along
 
 Seen = tuple[Tensor, np.ndarray]  # latents of a picture, and the state
 Why = Literal["planned", "out of time", "at the goal", "no finite energy"]
@@ -52,7 +52,7 @@ class Controller:
     """Plans towards a goal, one model step at a time, and remembers what was seen.
 
     The same seed, pictures and states give the same actions: the n-th decision after a reset (from 0) is drawn with
-    seed + n. Actions are within `config.limits`, whatever the model says.
+    seed + n. Actions are within `planning.limits`, whatever the model says.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Controller:
 
         Args:
             world_model: A base or merged, which is put into eval mode; or one that was trained, of which a merged copy
-                plans (see `planning.ready`).
+                plans (see `planning.model_setup`).
             config: How to plan.
             seed: Of all decisions.
             crop: As in training (`data.crop`).
@@ -94,12 +94,12 @@ class Controller:
                 found=f"{world_model.sizes.predictor.use_extrinsics}, camera pose given: {extrinsics is not None}",
                 needed="a camera pose exactly where the model uses it",
             )
-        self._model, self.config, self.seed, self.crop = make_ready(world_model, config), config, seed, crop
+        self._model, self.config, self.seed, self.crop = prepare_for_planning(world_model, config), config, seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
         self._planner = Planner(config, clock=clock, progress=progress)
         self._goal: Goal | None = None
         self._like = np.zeros(0)
-        self._seen: list[Seen] = []  # the newest `config.context`
+        self._seen: list[Seen] = []  # the newest `planning.context`
         self._done = 0
         self.decision: Decision | None = None  # the last one
 

@@ -13,10 +13,10 @@ from torch.nn.functional import cosine_similarity
 from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config.planning import EnergyConfig
-from vjepa2_ac.model.key_value_cache import KeyValueCache
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.goal import Goal
-from vjepa2_ac.planning.poses import states_along
+from vjepa2_ac.planning.pose_integration import states_along
 
 Motion = Callable[[Float[Tensor, " state_dim"], Float[Tensor, "samples steps action_dim"]], Tensor]
 

@@ -14,12 +14,12 @@ from torch import Generator, Tensor
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.planning.action_space import ActionSpace, pose_space
-from vjepa2_ac.planning.cem import CemSearch
-from vjepa2_ac.planning.gradient import GradientSearch
-from vjepa2_ac.planning.icem import IcemSearch
-from vjepa2_ac.planning.mppi import MppiSearch
-from vjepa2_ac.planning.plan import Cost, Iteration, Plan, Start, Stopped
-from vjepa2_ac.planning.search import Search, Tried
+from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan, PlanStart, Stopped
+from vjepa2_ac.planning.solvers.base import EvaluatedPlans, Solver
+from vjepa2_ac.planning.solvers.cem import CemSolver
+from vjepa2_ac.planning.solvers.gradient import GradientSolver
+from vjepa2_ac.planning.solvers.icem import IcemSolver
+from vjepa2_ac.planning.solvers.mppi import MppiSolver
 
 Clock = Callable[[], float]  # seconds, from anywhere
 
@@ -41,7 +41,7 @@ class Planner:
 
         Args:
             config: Which one, and how long it searches.
-            space: What is allowed; None: an arm's actions within `config.limits`.
+            space: What is allowed; None: an arm's actions within `planning.limits`.
             clock: What the time budget is measured by.
             progress: Is told how many iterations of a plan are done.
         """
@@ -49,7 +49,7 @@ class Planner:
         self.space = pose_space(config) if space is None else space
         self._clock, self._progress = clock, progress
 
-    def plan(self, cost: Cost, generator: Generator, start: Start | None = None) -> Plan:
+    def plan(self, cost: Cost, generator: Generator, start: PlanStart | None = None) -> Plan:
         """Return the best plan that was found.
 
         Args:
@@ -71,7 +71,7 @@ class Planner:
             if self._progress is not None:
                 self._progress(len(record), self.config.iterations)
         stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"
-        actions, energy, tried = self._chosen(search.answer(), best, cost, lowest=stopped == "out of time")
+        actions, energy, tried = self._chosen(search.result(), best, cost, lowest=stopped == "out of time")
         if actions is None:
             actions, stopped = torch.zeros(self.space.steps, self.space.dim), "no finite energy"
         return Plan(
@@ -87,15 +87,15 @@ class Planner:
             seconds=self._clock() - began,
         )
 
-    def _search(self, generator: Generator, start: Start | None) -> Search:
+    def _search(self, generator: Generator, start: PlanStart | None) -> Solver:
         config, space = self.config, self.space
         if config.planner == "cem":
-            return CemSearch(space, config.cem, config.samples, generator, start)
+            return CemSolver(space, config.cem, config.samples, generator, start)
         if config.planner == "icem":
-            return IcemSearch(space, config.icem, config.samples, config.iterations, generator, start)
+            return IcemSolver(space, config.icem, config.samples, config.iterations, generator, start)
         if config.planner == "mppi":
-            return MppiSearch(space, config.mppi, config.samples, generator, start)
-        return GradientSearch(space, config.gradient, config.iterations, generator, start)
+            return MppiSolver(space, config.mppi, config.samples, generator, start)
+        return GradientSolver(space, config.gradient, config.iterations, generator, start)
 
     def _has_time(self, began: float, record: list[Iteration]) -> bool:
         """Say whether an iteration as long as the longest so far would end within the budget."""
@@ -103,14 +103,14 @@ class Planner:
             return True
         return self._clock() - began + max(one.seconds for one in record) <= self.config.budget_s
 
-    def _iterate(self, search: Search, cost: Cost, best: _Best) -> Iteration:
+    def _iterate(self, search: Solver, cost: Cost, best: _Best) -> Iteration:
         began = self._clock()
-        decisions = search.propose()
+        decisions = search.sample()
         tried = self._try(cost, decisions, gradients=search.uses_gradients)
         elites = tried.best(search.elites)
         if len(elites.energies) and float(elites.energies[0]) < best.energy:
             best.decisions, best.energy = elites.decisions[0], float(elites.energies[0])
-        search.learn(tried)
+        search.update(tried)
         found = bool(len(elites.energies))
         return Iteration(
             samples=len(decisions),
@@ -124,7 +124,7 @@ class Planner:
             seconds=self._clock() - began,
         )
 
-    def _try(self, cost: Cost, decisions: Float[Tensor, "samples decisions dim"], *, gradients: bool) -> Tried:
+    def _try(self, cost: Cost, decisions: Float[Tensor, "samples decisions dim"], *, gradients: bool) -> EvaluatedPlans:
         decisions = decisions.detach().requires_grad_(gradients)
         with torch.set_grad_enabled(gradients):
             energies = cost(self.space.over_steps(decisions))
@@ -136,7 +136,7 @@ class Planner:
                 (downhill,) = torch.autograd.grad(energies.where(finite, 0.0).sum(), decisions)
                 downhill = torch.nan_to_num(downhill, nan=0.0, posinf=0.0, neginf=0.0)
         finite = finite.cpu()
-        return Tried(decisions.detach()[finite], energies.detach().float().cpu()[finite], downhill)
+        return EvaluatedPlans(decisions.detach()[finite], energies.detach().float().cpu()[finite], downhill)
 
     def _chosen(
         self, answer: Tensor | None, best: _Best, cost: Cost, *, lowest: bool

@@ -1,7 +1,7 @@
 """How are files found, read and hashed, on this machine and behind URLs?
 
 A path is local, or a URL such as `gs://bucket/folder` (see remote). That a file is not there, or ends too soon, is true
-of the file. What a network does is not: it is tried again, and in the end a `remote.UnreachableError`; neither is what
+of the file. What a network does is not: it is tried again, and in the end a `UnreachableError`; neither is what
 the system has against a file (see `unreadable`). That is an InputError that must never be booked as a broken episode:
 whoever makes problems of InputErrors lets it pass first.
 """
@@ -17,10 +17,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from vjepa2_ac import remote
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import is_url
-from vjepa2_ac.remote import UnreachableError
+from vjepa2_ac.storage import remote
+from vjepa2_ac.storage.remote import UnreachableError
 
 _HASH_CHUNK_BYTES = 1 << 20
 _ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG})

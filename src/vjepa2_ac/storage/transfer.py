@@ -14,10 +14,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from vjepa2_ac import remote
 from vjepa2_ac.places import is_url
-from vjepa2_ac.remote import RefusedError, UnreachableError
+from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.reading import join
+from vjepa2_ac.storage.remote import RefusedError, UnreachableError
 from vjepa2_ac.storage.writing import atomic_writer
 
 _AWAY = frozenset({

@@ -14,67 +14,33 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
 
 import torch
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config_file import config_as_dict
-from vjepa2_ac.data.loader import validation_batches
+from vjepa2_ac.config.loading import config_as_dict
+from vjepa2_ac.distributed.collectives import all_reduce_max, broadcast_object, require_same
+from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.distributed.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, prediction_errors, ratios_by_horizon
+from vjepa2_ac.runs.checkpoint import CheckpointClock
+from vjepa2_ac.runs.folder import CALIBRATION, check_run_folder, config_changes, open_run_folder, with_settled_stride
+from vjepa2_ac.runs.lock import RunLock
+from vjepa2_ac.runs.metrics_log import MetricsLog
+from vjepa2_ac.runs.mirror.background_sync import Mirror, NoMirror
+from vjepa2_ac.runs.mirror.open_remote import Remote, open_remote
+from vjepa2_ac.runs.relative_paths import require_start_folder
+from vjepa2_ac.runs.trackers import open_trackers, require_installed
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.training.assembly import Run, assemble, batches_from, encode, make_accelerator, save_checkpoint
-from vjepa2_ac.training.checkpoint import CheckpointClock
-from vjepa2_ac.training.divergence import WatchedJournal
-from vjepa2_ac.training.embodiment import NOT_ASKED
-from vjepa2_ac.training.health import Throughput, TimedBatches
-from vjepa2_ac.training.journal import Journal
-from vjepa2_ac.training.mirror.mirror import Mirror, NoMirror
-from vjepa2_ac.training.mirror.start import Remote, open_remote
+from vjepa2_ac.training.monitoring.divergence import WatchedMetricsLog
+from vjepa2_ac.training.monitoring.stopwatch import stopwatch_for
+from vjepa2_ac.training.monitoring.throughput import Throughput, TimedBatches
 from vjepa2_ac.training.optim import require_optimizer
-from vjepa2_ac.training.preemption import StoppedError, stop_on_signals
-from vjepa2_ac.training.processes import from_first, largest, require_same
-from vjepa2_ac.training.quiet import QuietJournal, QuietReporter
+from vjepa2_ac.training.reporter import NullMetricsLog, NullReporter, Reporter
 from vjepa2_ac.training.resume import refuse_if_overtaken
-from vjepa2_ac.training.run_folder import CALIBRATION, check_run_folder, config_changes, open_run_folder
-from vjepa2_ac.training.run_lock import RunLock
-from vjepa2_ac.training.start_folder import require_start_folder
+from vjepa2_ac.training.setup import Run, batches_from, save_checkpoint, set_up
 from vjepa2_ac.training.step import gradients, training_step
-from vjepa2_ac.training.stopwatch import stopwatch_for
-from vjepa2_ac.training.stride import with_settled_stride
-from vjepa2_ac.training.trackers import open_trackers, require_installed
-
-BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: the longest look ahead is what planning leans on
-
-
-@runtime_checkable
-class Reporter(Protocol):
-    """Shows a run to a person."""
-
-    def note(self, text: str) -> None:
-        """Say something once."""
-        ...
-
-    def looked_through(self, done: int, total: int) -> None:
-        """So much of a data set that was not known before is looked through."""
-        ...
-
-    def encoded(self, done: int, total: int) -> None:
-        """So many frames are encoded into the latent cache."""
-        ...
-
-    def started(self, done: int, total: int) -> None:
-        """The loop begins after `done` of `total` optimizer steps."""
-        ...
-
-    def stepped(self, step: int, figures: dict[str, float]) -> None:
-        """An optimizer step is done."""
-        ...
-
-    def validated(self, step: int, errors: PredictionErrors) -> None:
-        """Held-out clips were measured after `step` optimizer steps."""
-        ...
+from vjepa2_ac.training.validation import refuse_weak_base, validate, validate_if_due, validation_metrics
 
 
 def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
@@ -91,7 +57,7 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
 
     Raises:
         InputError: Something the user gave cannot be used; raised before the first step wherever that can be known.
-        StoppedError: A signal asked the run to stop between its first and last step; see `training.preemption`.
+        StoppedError: A signal asked the run to stop between its first and last step; see `distributed.preemption`.
     """
     accelerator = make_accelerator(config)
     require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
@@ -119,12 +85,10 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             )
             config = with_settled_stride(remote.config if remote else config)
         else:
-            reporter = QuietReporter()
-        config = from_first(accelerator, config)
+            reporter = NullReporter()
+        config = broadcast_object(accelerator, config)
         until_the_end.enter_context(_out_of_memory_explained())
-        run = assemble(
-            config, reporter.note, reporter.looked_through, accelerator, reporter.encoded, check_only=check_only
-        )
+        run = set_up(config, reporter.note, reporter.indexed, accelerator, reporter.encoded, check_only=check_only)
         try:
             return _train(run, lock, remote, reporter, check_only=check_only, allow_config_change=allow_config_change)
         except StoppedError:
@@ -136,9 +100,9 @@ def _train(
     run: Run, lock: RunLock, remote: Remote | None, reporter: Reporter, *, check_only: bool, allow_config_change: bool
 ) -> Path:
     config, folder, writes = run.config, Path(run.config.run_dir), run.accelerator.is_main_process
-    first = _validate(run, reporter) if run.state.step == 0 else None
+    first = validate(run, reporter) if run.state.step == 0 else None
     if first is not None:
-        _refuse_weak_base(run, first, reporter)
+        refuse_weak_base(run, first, reporter)
     if allow_config_change and writes:
         for line in config_changes(config):
             reporter.note(f"The config changes: {line}")
@@ -154,23 +118,23 @@ def _train(
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
     with _open_journal(run, folder, reporter) as journal:
         if first is not None:
-            journal.write("validation", 0, validation_figures(first))
+            journal.write("validation", 0, validation_metrics(first))
         with remote.mirror(run.state.run_id) if remote else NoMirror() as mirror:
             _loop(run, folder, journal, mirror, reporter)
     run.accelerator.end_training()
     return folder
 
 
-def _open_journal(run: Run, folder: Path, reporter: Reporter) -> Journal | QuietJournal:
+def _open_journal(run: Run, folder: Path, reporter: Reporter) -> MetricsLog | NullMetricsLog:
     if not run.accelerator.is_main_process:
-        return QuietJournal()
+        return NullMetricsLog()
     done = run.state.step
     trackers = open_trackers(run.config, folder, run_id=run.state.run_id, first_step=done)
-    return WatchedJournal(folder, config=run.config, note=reporter.note, first_step=done, trackers=trackers)
+    return WatchedMetricsLog(folder, config=run.config, note=reporter.note, first_step=done, trackers=trackers)
 
 
 def _loop(
-    run: Run, folder: Path, journal: Journal | QuietJournal, mirror: Mirror | NoMirror, reporter: Reporter
+    run: Run, folder: Path, journal: MetricsLog | NullMetricsLog, mirror: Mirror | NoMirror, reporter: Reporter
 ) -> None:
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
@@ -188,10 +152,10 @@ def _loop(
             if is_logged:
                 journal.write("train", step, figures)
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
-            is_best = _validate_if_due(run, journal, reporter)
+            is_best = validate_if_due(run, journal, reporter)
             # Agreed among all processes, and read once: a signal after this waits for the next step.
             is_due = clock.is_due(step) or is_best or last or journal.is_behind
-            stopped_by, due = largest(run.accelerator, [stop.number, is_due])
+            stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
                 with journal.before_a_checkpoint():
                     save_checkpoint(run, folder)
@@ -214,48 +178,6 @@ def _timed_step(
     return figures | throughput.figures(clips, time.perf_counter() - started, batches.waited_s - waited_s)
 
 
-def _validate_if_due(run: Run, journal: Journal | QuietJournal, reporter: Reporter) -> bool:
-    """Measure and note, where it is time to; return whether no earlier measurement was as good."""
-    step, config = run.state.step, run.config
-    if step % config.validation.every != 0 and step != config.training.steps:
-        return False
-    figures = validation_figures(_validate(run, reporter))
-    journal.write("validation", step, figures)
-    if not config.checkpoint.keep_best:
-        return False
-    before = run.state
-    run.state = before.measured(figures[BEST_BY])
-    return run.state != before
-
-
-def validation_figures(errors: PredictionErrors) -> dict[str, Any]:
-    """Return what a validation writes into the journal."""
-    by_horizon, one_step = ratios_by_horizon(errors), one_step_ratios(errors)
-    return {
-        "error_over_persistence": one_step["true"].value,
-        "error_over_persistence_zero_actions": one_step["zero"].value,
-        "error_over_persistence_shuffled_actions": one_step["shuffled"].value,
-        "rollout_over_persistence": [r.value for r in by_horizon],
-        "rollout_over_persistence_last": by_horizon[-1].value,
-    }
-
-
-def _validate(run: Run, reporter: Reporter) -> PredictionErrors:
-    config = run.config
-    run.world_model.eval()
-    batches = validation_batches(
-        run.dataset,
-        "validation",
-        clips=config.validation.clips,
-        batch_size=config.validation.batch_size,
-        copies=run.copies,
-    )
-    with run.accelerator.autocast():
-        errors = prediction_errors(run.world_model, (encode(run, batch) for batch in batches))
-    reporter.validated(run.state.step, errors)
-    return errors
-
-
 @contextlib.contextmanager
 def _out_of_memory_explained() -> Iterator[None]:
     try:
@@ -267,19 +189,3 @@ def _out_of_memory_explained() -> Iterator[None]:
             fix="Set training.gradient_checkpointing=true, or lower training.batch_size (and raise"
             " training.accumulation), model.encode_chunk or validation.batch_size",
         ) from error
-
-
-def _refuse_weak_base(run: Run, errors: PredictionErrors, reporter: Reporter) -> None:
-    config, error = run.config, one_step_ratios(errors)["true"].value
-    if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:
-        return
-    if run.world_model.fresh_heads is not None:
-        reporter.note(NOT_ASKED)
-        return
-    raise InputError(
-        where="model.base",
-        found=f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame",
-        needed="a base that is better than doing nothing (below 1)",
-        fix="Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction;"
-        " to adapt it all the same, set training.allow_weak_base=true",
-    )

@@ -13,8 +13,8 @@ from torch.nn.functional import mse_loss, smooth_l1_loss
 
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.key_value_cache import KeyValueCache
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.world_model import WorldModel
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, a mean over all elements
 

@@ -11,28 +11,28 @@ import torch
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.dataset import Dataset
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.distributed.collectives import broadcast_object, broadcast_tensors, require_same
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.lora import load_trained
-from vjepa2_ac.model.world_model import WorldModel
-from vjepa2_ac.training.checkpoint import (
+from vjepa2_ac.model.adapter.lora import load_trained
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.runs.checkpoint import (
     ADAPTER,
     OPTIMIZER,
     STATE,
     RunState,
-    damage,
+    find_damage,
     listed,
     newest_checkpoint,
     read_state,
     step_of,
 )
+from vjepa2_ac.runs.folder import CHECKPOINTS, run_id
+from vjepa2_ac.runs.torch_file import read_torch
 from vjepa2_ac.training.optim import load_moments
-from vjepa2_ac.training.processes import from_first, require_same, take_from_first
-from vjepa2_ac.training.run_folder import CHECKPOINTS, run_id
-from vjepa2_ac.training.torch_file import read_torch
 
 
-def take_up(
+def restore(
     config: Config,
     accelerator: Accelerator,
     world_model: WorldModel,
@@ -51,9 +51,9 @@ def take_up(
     if accelerator.is_main_process and (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is not None:
         state, moments = _read(checkpoint, world_model, optimizer)
         note(f"Going on from {checkpoint} ({state.step} of {config.training.steps} steps are done).")
-    state = from_first(accelerator, replace(state, run_id=state.run_id or run_id(folder)))
-    take_from_first(accelerator, world_model.predictor.state_dict().values())
-    moments = from_first(accelerator, moments)
+    state = broadcast_object(accelerator, replace(state, run_id=state.run_id or run_id(folder)))
+    broadcast_tensors(accelerator, world_model.predictor.state_dict().values())
+    moments = broadcast_object(accelerator, moments)
     if moments is not None and not accelerator.is_main_process:
         load_moments(optimizer, moments)
     return state
@@ -98,7 +98,7 @@ def refuse_if_overtaken(folder: Path, state: RunState) -> None:
     """
     # Those up to its own step were looked at when the run was taken up.
     further = [path for path in listed(folder / CHECKPOINTS) if (step_of(path.name) or 0) > state.step]
-    newest = next((path for path in reversed(further) if damage(path) is None), None)
+    newest = next((path for path in reversed(further) if find_damage(path) is None), None)
     if newest is not None:
         raise InputError(
             where=str(newest),
@@ -108,7 +108,7 @@ def refuse_if_overtaken(folder: Path, state: RunState) -> None:
         )
 
 
-def take_up_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
+def restore_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
     """Let losses be scaled as they were when the checkpoint was written.
 
     Raises:

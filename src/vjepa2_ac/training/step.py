@@ -12,17 +12,17 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
-from vjepa2_ac.data.prefetch import fetch_ahead
+from vjepa2_ac.data.clips.prefetch import fetch_ahead
+from vjepa2_ac.distributed.collectives import all_reduce_gradients, all_reduce_sum
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.checkpoint import checkpoint_name
+from vjepa2_ac.runs.folder import NOT_FINITE
 from vjepa2_ac.storage import is_url
-from vjepa2_ac.training.assembly import Run, encode
-from vjepa2_ac.training.checkpoint import checkpoint_name
-from vjepa2_ac.training.health import Update
-from vjepa2_ac.training.not_finite import LookBack
+from vjepa2_ac.training.monitoring.nonfinite_clips import ClipRecorder
+from vjepa2_ac.training.monitoring.throughput import Update
 from vjepa2_ac.training.optim import learning_rate_at, set_learning_rate
-from vjepa2_ac.training.processes import add_up_gradients, sums
-from vjepa2_ac.training.run_folder import NOT_FINITE
+from vjepa2_ac.training.setup import Run, encode
 
 SMALLEST_LOSS_SCALE = 1.0  # fp16: where gradients overflow even so, they are not finite for another reason
 
@@ -53,7 +53,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     torch.manual_seed(step_seed(run.config.seed, step, run.accelerator.process_index))
     learning_rate = learning_rate_at(step, run.config.training)
     set_learning_rate(run.optimizer, learning_rate)
-    taken = gradients(run, batches, LookBack(), more=step < run.config.training.steps)
+    taken = gradients(run, batches, ClipRecorder(), more=step < run.config.training.steps)
     update = Update(run.trained) if measure_update else None
     if taken.clips:  # without a clip there are no gradients, and nothing moves
         run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
@@ -72,7 +72,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
 
 
 def gradients(
-    run: Run, batches: Iterator[Batch], look_back: LookBack | None = None, *, more: bool = False
+    run: Run, batches: Iterator[Batch], look_back: ClipRecorder | None = None, *, more: bool = False
 ) -> Gradients:
     """Accumulate and clip the gradients of the next micro-batches of all processes; the weights do not move.
 
@@ -95,7 +95,7 @@ def gradients(
         totals, seen, fetched = _accumulate(run, batches, look_back)
     if more:
         fetch_ahead(batches)
-    *losses, clips, fetched_by_all = sums(run.accelerator, [*totals.tolist(), len(seen), fetched])
+    *losses, clips, fetched_by_all = all_reduce_sum(run.accelerator, [*totals.tolist(), len(seen), fetched])
     if not clips:
         return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(fetched_by_all))
     forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
@@ -104,7 +104,7 @@ def gradients(
     return Gradients(forced_loss, rollout_loss, norm, int(clips), int(fetched_by_all))
 
 
-def _accumulate(run: Run, batches: Iterator[Batch], look_back: LookBack | None) -> tuple[Tensor, list[str], int]:
+def _accumulate(run: Run, batches: Iterator[Batch], look_back: ClipRecorder | None) -> tuple[Tensor, list[str], int]:
     """Return the losses of this process's clips, as parts of the step's; names of the clips; and bytes fetched."""
     totals = torch.zeros(2, device=run.accelerator.device)
     seen: list[str] = []
@@ -125,7 +125,7 @@ def _accumulate(run: Run, batches: Iterator[Batch], look_back: LookBack | None) 
 
 def _settle(run: Run, factor: float) -> float:
     """Make the sums of scaled parts of all processes the gradient of the mean, clip it, and return its norm before."""
-    add_up_gradients(run.accelerator, run.trained)
+    all_reduce_gradients(run.accelerator, run.trained)
     run.scaler.unscale_(run.optimizer)
     if factor != 1:
         for parameter in run.trained:
@@ -152,7 +152,7 @@ def step_seed(seed: int, step: int, rank: int) -> int:
     return int.from_bytes(digest, "big") >> 1
 
 
-def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str], look_back: LookBack | None) -> None:
+def _refuse_not_finite(run: Run, loss: float, norm: float, clips: list[str], look_back: ClipRecorder | None) -> None:
     overflow = run.scaler.is_enabled() and run.scaler.get_scale() >= SMALLEST_LOSS_SCALE
     if math.isfinite(loss) and (math.isfinite(norm) or overflow):
         return

@@ -11,11 +11,11 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from paths import ROOT
 from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.config.loading import load_config, parse_config
 from vjepa2_ac.config.planning import EnergyConfig
-from vjepa2_ac.config_file import load_config, parse_config
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.model.lora import add_adapter
-from vjepa2_ac.model.world_model import WorldModel
+from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost
 from vjepa2_ac.planning.goal import Goal
 from vjepa2_ac.training.cost.flops import clip_flops, frame_flops, plan_flops

@@ -10,8 +10,8 @@ import torch
 from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
-from vjepa2_ac.console_doctor import memory_lines
-from vjepa2_ac.model.key_value_cache import KeyValueCache
+from vjepa2_ac.console.memory import memory_lines
+from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
 from vjepa2_ac.training.optim import make_optimizer
 

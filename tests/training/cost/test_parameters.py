@@ -6,7 +6,7 @@ import pytest
 
 from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.config import ModelSizes
-from vjepa2_ac.model.lora import trainable_report
+from vjepa2_ac.model.adapter.lora import trainable_report
 from vjepa2_ac.training.cost.parameters import adapted_layers, count_parameters, trained_tensors
 
 HEADS = ["action_encoder", "state_encoder"]

@@ -1,6 +1,6 @@
 """Will a run fit on the GPU? Its memory, part by part, by arithmetic: no model is built and torch is not needed.
 
-The counts of parameters are exact. What autograd keeps (`training.cost.kept`) is held by a test to what PyTorch
+The counts of parameters are exact. What autograd keeps (`training.cost.activations`) is held by a test to what PyTorch
 really keeps on a CPU. The whole has not yet been compared with the peak that a GPU measures.
 """
 
@@ -10,9 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.encoding.room import FRAMES_AT_ONCE
-from vjepa2_ac.training.cost.kept import Kept
-from vjepa2_ac.training.cost.kept_block import FLOAT32, HALF, Kind
+from vjepa2_ac.encoding.disk_space import FRAMES_AT_ONCE
+from vjepa2_ac.training.cost.activations import Activations
+from vjepa2_ac.training.cost.block_activations import FLOAT32, HALF, Kind
 from vjepa2_ac.training.cost.parameters import (
     CONDITIONS,
     Parameters,
@@ -73,12 +73,12 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
 
     Args:
         config: The run.
-        sizes: Sizes of its model, such as `model.load.base_sizes` gives.
+        sizes: Sizes of its model, such as `model.checkpoints.loading.base_sizes` gives.
         device: Whose rules of what is kept are meant.
     """
     parameters = count_parameters(config, sizes)
     number = 2 if config.model.dtype == "bfloat16" else FLOAT32
-    kept = Kept(config, sizes, device)
+    kept = Activations(config, sizes, device)
     return MemoryEstimate(
         parameters=parameters,
         checkpointing=config.training.gradient_checkpointing,

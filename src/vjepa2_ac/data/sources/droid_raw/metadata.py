@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import Any
 
-from vjepa2_ac.config.data import RAW_CAMERAS
+from vjepa2_ac.config.sources import RAW_CAMERAS
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.structured import json_object
+from vjepa2_ac.storage.structured import json_object
 
 
 @dataclass(frozen=True)

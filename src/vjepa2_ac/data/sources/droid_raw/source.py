@@ -12,11 +12,14 @@ from jaxtyping import Int, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.broken import as_error, as_problem
-from vjepa2_ac.data.index import kept_or_built, key_of
-from vjepa2_ac.data.labels import labels_of
-from vjepa2_ac.data.lines import line_of, pack_lines
-from vjepa2_ac.data.sources.droid_raw.folders import (
+from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
+from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.index.index_cache import get_or_build, key_of
+from vjepa2_ac.data.index.labels import labels_of
+from vjepa2_ac.data.index.packed_text import pack_texts, text_of
+from vjepa2_ac.data.index.state_hash import hash_of_states
+from vjepa2_ac.data.sources.droid_raw.episode_folders import (
     TRAJECTORY,
     VIDEOS,
     EpisodeFolder,
@@ -27,16 +30,13 @@ from vjepa2_ac.data.sources.droid_raw.folders import (
 )
 from vjepa2_ac.data.sources.droid_raw.metadata import DroidMetadata
 from vjepa2_ac.data.sources.droid_raw.trajectory import Trajectory, parse_trajectory
-from vjepa2_ac.data.sources.episode_files import EpisodeFiles
-from vjepa2_ac.data.sources.folders import in_parallel
-from vjepa2_ac.data.sources.states import require_plausible
-from vjepa2_ac.data.state_hash import hash_of_states
-from vjepa2_ac.data.table import EpisodeTable, Problem
-from vjepa2_ac.data.video import count_frames, read_frames
+from vjepa2_ac.data.sources.listing import in_parallel
+from vjepa2_ac.data.sources.validation import require_plausible
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.remote import UnreachableError
-from vjepa2_ac.structured import json_object
+from vjepa2_ac.media.video_reader import count_frames, read_frames
+from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.storage.structured import json_object
 
 logger = logging.getLogger(__name__)
 
@@ -98,7 +98,7 @@ class RawDroidSource:
             OSError: Data behind a URL cannot be read.
         """
         table = self.infos()
-        info, place = table[index], _Place(**json_object(line_of("place", table.locators, index), where="the index"))
+        info, place = table[index], _Place(**json_object(text_of("place", table.locators, index), where="the index"))
         metadata = self._metadata(place)
         serial = metadata.serial(camera or self._config.cameras[0])
         trajectory = self._trajectory(place, (serial,))
@@ -136,12 +136,12 @@ class RawDroidSource:
             listed = [list_episode(self._root, folder) for folder in folders]
         knobs = {"cameras": config.cameras, "droid_raw": config.droid_raw, "pose_frame": config.pose_frame}
         key = key_of({"source": "droid_raw", "path": storage.absolute(self._root), **knobs, "listed": listed})
-        return kept_or_built(config.disk_cache, key, lambda: self._scan_all(folders, progress))
+        return get_or_build(config.disk_cache, key, lambda: self._scan_all(folders, progress))
 
     def _scan_all(self, folders: list[str], progress: Progress | None) -> EpisodeTable:
         done = 0
 
-        def scan(folder: str) -> _Found | Problem:
+        def scan(folder: str) -> _Found | EpisodeProblem:
             nonlocal done
             found = self._scan(folder)
             done += 1
@@ -152,7 +152,7 @@ class RawDroidSource:
         usable: dict[str, _Found] = {}
         problems = []
         for found in in_parallel(scan, folders, self._config.connections if storage.is_url(self._root) else 1):
-            if isinstance(found, Problem):
+            if isinstance(found, EpisodeProblem):
                 problems.append(found)
             elif found.info.id in usable:
                 problems.append(_twice(found.info.id, self._path(found.place, TRAJECTORY)))
@@ -165,13 +165,13 @@ class RawDroidSource:
         return EpisodeTable.of(
             [one.info for one in usable.values()],
             problems=problems,
-            locators=pack_lines("place", [json.dumps(vars(one.place)) for one in usable.values()]),
+            locators=pack_texts("place", [json.dumps(vars(one.place)) for one in usable.values()]),
             texts=texts,
             state_hashes=[one.state_hash for one in usable.values()],
             labels=labels_of([one.labels for one in usable.values()]),
         )
 
-    def _scan(self, folder: str) -> _Found | Problem:
+    def _scan(self, folder: str) -> _Found | EpisodeProblem:
         identity = identity_of(self._root, folder)
         listed = list_episode(self._root, folder)
         try:
@@ -252,6 +252,8 @@ class _VideoReader:
         return read_frames(self.files.open(self.path, version=self.version), places, where=self.path)
 
 
-def _twice(identity: str, where: str) -> Problem:
+def _twice(identity: str, where: str) -> EpisodeProblem:
     found = f"a second episode of the same identity: {identity}"
-    return Problem(identity, where, found, "episodes that can be told apart", "Name a smaller folder in data.path")
+    return EpisodeProblem(
+        identity, where, found, "episodes that can be told apart", "Name a smaller folder in data.path"
+    )

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int
 
-from vjepa2_ac.data.sources.states import zero_steps
+from vjepa2_ac.data.sources.validation import zero_steps
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.remote import UnreachableError
+from vjepa2_ac.storage.remote import UnreachableError
 
 _POSE = "observation/robot_state/cartesian_position"
 _GRIPPER = "observation/robot_state/gripper_position"

@@ -12,8 +12,11 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.idle_search import FoundRanges
-from vjepa2_ac.data.sources.latents.folder import (
+from vjepa2_ac.data.filters.idle_ranges import FoundRanges
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.sources.latents.cache_key import OF_CLIPS, clip_parts
+from vjepa2_ac.data.sources.latents.episode_file import EpisodeFile
+from vjepa2_ac.data.sources.latents.manifest import (
     Manifest,
     path_of,
     read_episodes,
@@ -21,9 +24,6 @@ from vjepa2_ac.data.sources.latents.folder import (
     size_column,
     size_of,
 )
-from vjepa2_ac.data.sources.latents.key import OF_CLIPS, clip_parts
-from vjepa2_ac.data.sources.latents.record import Record
-from vjepa2_ac.data.table import EpisodeTable, Problem
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges, StoredLatents
 from vjepa2_ac.errors import InputError
 
@@ -105,7 +105,7 @@ class LatentSource:
                 where=f"{self._folder}: episode {info.id}",
                 found=f"no latents: it could not be read when they were encoded ({reason.rstrip('.')})",
             )
-        record = Record(path_of(self._folder, index, camera), opened.manifest.layout)
+        record = EpisodeFile(path_of(self._folder, index, camera), opened.manifest.layout)
         _require_as_indexed(record, info, camera)
         checked = self._checked.setdefault((index, camera), bytearray(len(record.frame_steps)))
         return Episode(
@@ -121,7 +121,7 @@ class LatentSource:
             frame_steps=record.frame_steps,
         )
 
-    def wrong_files(self) -> list[Problem]:
+    def wrong_files(self) -> list[EpisodeProblem]:
         """Return the episodes of which a file is missing or has another size than it was written with."""
         opened, problems = self._open(), []
         for place, camera in enumerate(opened.manifest.cameras):
@@ -132,7 +132,7 @@ class LatentSource:
                 if found != sizes[number]:
                     said = "no such file" if found is None else f"{found:,} bytes"
                     name = opened.table.identity(number)
-                    problems.append(Problem(name, f"{path} ({name})", said, f"{sizes[number]:,} bytes", _ENCODE))
+                    problems.append(EpisodeProblem(name, f"{path} ({name})", said, f"{sizes[number]:,} bytes", _ENCODE))
         return problems
 
     def require_encoded(self, episodes: Int[np.ndarray, " episodes"]) -> None:
@@ -187,7 +187,7 @@ def another_cache(folder: Path, differing: Sequence[str]) -> InputError:
 
 @dataclass(frozen=True)
 class _LatentReader:
-    record: Record
+    record: EpisodeFile
     checked: bytearray  # one for each frame
     check_crc: str
 
@@ -209,7 +209,7 @@ class _LatentReader:
 
 @dataclass(frozen=True)
 class _PictureReader:
-    record: Record
+    record: EpisodeFile
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
         """Return small pictures at these control steps, in this order: square, as the encoder saw them.
@@ -220,7 +220,7 @@ class _PictureReader:
         return self.record.pictures(self.record.places_of(steps))
 
 
-def _require_as_indexed(record: Record, info: EpisodeInfo, camera: str) -> None:
+def _require_as_indexed(record: EpisodeFile, info: EpisodeInfo, camera: str) -> None:
     found = record.id, record.camera, len(record["states"])
     if found != (info.id, camera, info.num_steps):
         raise InputError(

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.kept_file import KeptFile
+from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
 from vjepa2_ac.data.sources.lerobot.bounds import (
     FIX,
     MOST_PICTURE_BYTES,
@@ -22,15 +22,15 @@ from vjepa2_ac.data.sources.lerobot.bounds import (
     require_few,
     require_sane,
 )
-from vjepa2_ac.data.sources.lerobot.kept import Columns, KeptRows
+from vjepa2_ac.data.sources.lerobot.row_cache import Columns, RowCache
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.remote import UnreachableError
+from vjepa2_ac.storage.remote import UnreachableError
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow import parquet
 
-Opener = Callable[[str], "str | KeptFile"]  # a path, or a file far away
+Opener = Callable[[str], "str | BlockCachedFile"]  # a path, or a file far away
 
 EPISODE = "episode_index"
 
@@ -55,7 +55,7 @@ class ParquetRows:
         kept: Where rows stay on this machine that share their row group with those of other episodes.
     """
 
-    def __init__(self, open_file: Opener, columns: Sequence[str], kept: KeptRows | None = None) -> None:
+    def __init__(self, open_file: Opener, columns: Sequence[str], kept: RowCache | None = None) -> None:
         self._kept = kept
         self._open, self._columns = open_file, list(dict.fromkeys([EPISODE, *columns]))
         self._lock = threading.Lock()
@@ -141,7 +141,7 @@ class ParquetRows:
         return group
 
 
-def read_table(opened: str | KeptFile, path: str, wanted: Callable[[str], bool]) -> dict[str, list[Any]]:
+def read_table(opened: str | BlockCachedFile, path: str, wanted: Callable[[str], bool]) -> dict[str, list[Any]]:
     """Return the columns of a small Parquet file whose names are wanted, as lists of Python's own values.
 
     Raises:
@@ -187,7 +187,7 @@ def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
 
 
 @contextmanager
-def _opened(opened: str | KeptFile, path: str) -> Iterator[parquet.ParquetFile]:
+def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.ParquetFile]:
     """Open a Parquet file with its pages' checksums verified; say in the user's words what is wrong with it."""
     pa, parquet = _library(path)
     try:
@@ -198,7 +198,7 @@ def _opened(opened: str | KeptFile, path: str) -> Iterator[parquet.ParquetFile]:
     except FileNotFoundError:
         raise InputError(where=path, found="no such file", needed="one, says the data set", fix=FIX) from None
     except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError) as error:
-        if isinstance(opened, KeptFile) and opened.failure is not None:
+        if isinstance(opened, BlockCachedFile) and opened.failure is not None:
             raise opened.failure from None
         if isinstance(error, OSError) and error.errno is not None:  # of the system, not of the file's content
             raise storage.unreadable(path, error, fix=FIX) from None

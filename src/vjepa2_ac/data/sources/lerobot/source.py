@@ -10,11 +10,12 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.disk_cache import fetched_data
-from vjepa2_ac.data.index import kept_or_built, key_of
-from vjepa2_ac.data.sources.episode_files import EpisodeFiles
-from vjepa2_ac.data.sources.kept_file import KeptFile
-from vjepa2_ac.data.sources.lerobot.episodes import (
+from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
+from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
+from vjepa2_ac.data.cache.disk_cache import fetched_data
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index.index_cache import get_or_build, key_of
+from vjepa2_ac.data.sources.lerobot.episode_list import (
     EpisodeRow,
     Told,
     data_file,
@@ -22,19 +23,18 @@ from vjepa2_ac.data.sources.lerobot.episodes import (
     tables_of_episodes,
     video_file,
 )
-from vjepa2_ac.data.sources.lerobot.files import fingerprint, list_by_template
-from vjepa2_ac.data.sources.lerobot.index import check_rows, find_problems, row_of, table_of
-from vjepa2_ac.data.sources.lerobot.kept import KeptRows
-from vjepa2_ac.data.sources.lerobot.meta import DatasetInfo, read_info
+from vjepa2_ac.data.sources.lerobot.episode_rows import EpisodeContent, content_of, wanted_columns
+from vjepa2_ac.data.sources.lerobot.images import StoredPictures, VideoPictures
+from vjepa2_ac.data.sources.lerobot.index_build import check_rows, find_problems, row_of, table_of
+from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
-from vjepa2_ac.data.sources.lerobot.pictures import StoredPictures, VideoPictures
-from vjepa2_ac.data.sources.lerobot.rows import EpisodeContent, content_of, wanted_columns
-from vjepa2_ac.data.table import EpisodeTable
-from vjepa2_ac.data.video import Clock, require_decoder
+from vjepa2_ac.data.sources.lerobot.path_templates import fingerprint, list_by_template
+from vjepa2_ac.data.sources.lerobot.row_cache import RowCache
 from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.video_reader import Clock, require_decoder
 from vjepa2_ac.storage import FileInfo
-from vjepa2_ac.structured import json_list
+from vjepa2_ac.storage.structured import json_list
 
 logger = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ class LeRobotSource:
 
     @cached_property
     def _parquet(self) -> ParquetRows:
-        kept = KeptRows(fetched_data(self._config.disk_cache), self._data_version)
+        kept = RowCache(fetched_data(self._config.disk_cache), self._data_version)
         return ParquetRows(self._open, wanted_columns(self._config), kept)
 
     @cached_property
@@ -130,7 +130,7 @@ class LeRobotSource:
         """What differs when a file of the data set does, or what is wanted of it."""
         return self._table.texts["version"] if "_table" in self.__dict__ else self._version
 
-    def _open(self, path: str) -> str | KeptFile:
+    def _open(self, path: str) -> str | BlockCachedFile:
         return self._files.open(path, version=self._data_version)
 
     def _found_out(self, progress: Progress | None) -> EpisodeTable:
@@ -157,7 +157,7 @@ class LeRobotSource:
                 "files": fingerprint(tables, files),
             }
         )
-        return kept_or_built(config.disk_cache, self._version, lambda: self._built(list(tables), files, keys, progress))
+        return get_or_build(config.disk_cache, self._version, lambda: self._built(list(tables), files, keys, progress))
 
     def _built(
         self, tables: list[str], files: dict[str, FileInfo], keys: list[str], progress: Progress | None

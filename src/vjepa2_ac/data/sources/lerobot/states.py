@@ -9,7 +9,7 @@ from jaxtyping import Float, Shaped
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config import LeRobotFields
-from vjepa2_ac.data.sources.states import require_finite, require_plausible
+from vjepa2_ac.data.sources.validation import require_finite, require_plausible
 from vjepa2_ac.errors import InputError
 
 _UNIT_TOLERANCE = 1e-2

@@ -14,18 +14,18 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.broken import as_error, as_problem
-from vjepa2_ac.data.index import kept_or_built, key_of
-from vjepa2_ac.data.labels import labels_of
-from vjepa2_ac.data.sources.episode_files import EpisodeFiles
-from vjepa2_ac.data.sources.folders import in_parallel, walk, within
-from vjepa2_ac.data.sources.kept_file import KeptFile
-from vjepa2_ac.data.sources.npz.episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_pictures
-from vjepa2_ac.data.state_hash import hash_of_states
-from vjepa2_ac.data.table import EpisodeTable, Problem
+from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
+from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
+from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.data.index.index_cache import get_or_build, key_of
+from vjepa2_ac.data.index.labels import labels_of
+from vjepa2_ac.data.index.state_hash import hash_of_states
+from vjepa2_ac.data.sources.listing import in_parallel, walk, within
+from vjepa2_ac.data.sources.npz.npz_episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_pictures
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.remote import UnreachableError
+from vjepa2_ac.storage.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
@@ -106,12 +106,12 @@ class NpzSource:
             knobs |= {"states": config.states, "actions": config.actions}
         self._version = key_of({"source": "npz", "path": storage.absolute(self._root), **knobs, "listed": listed})
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
-        return kept_or_built(config.disk_cache, self._version, lambda: self._scan_all(ids, progress))
+        return get_or_build(config.disk_cache, self._version, lambda: self._scan_all(ids, progress))
 
     def _scan_all(self, ids: list[str], progress: Progress | None) -> EpisodeTable:
         counter = itertools.count(1)
 
-        def scan(identity: str) -> NpzEpisode | Problem:
+        def scan(identity: str) -> NpzEpisode | EpisodeProblem:
             found = self._scan(identity)
             if progress is not None:
                 progress(next(counter), len(ids))
@@ -120,7 +120,7 @@ class NpzSource:
         connections = self._config.connections if storage.is_url(self._root) else 1
         scanned = dict(zip(ids, in_parallel(scan, ids, connections), strict=True))
         found = {identity: one for identity, one in scanned.items() if isinstance(one, NpzEpisode)}
-        problems = [one for one in scanned.values() if isinstance(one, Problem)]
+        problems = [one for one in scanned.values() if isinstance(one, EpisodeProblem)]
         if not found:
             raise as_error(problems[0])
         rate = Counter(one.fps_hz for one in found.values()).most_common(1)[0][0]
@@ -140,7 +140,7 @@ class NpzSource:
             labels=labels_of([{"task": one.language, **one.labels} for one in usable.values()]),
         )
 
-    def _scan(self, identity: str) -> NpzEpisode | Problem:
+    def _scan(self, identity: str) -> NpzEpisode | EpisodeProblem:
         try:
             path = self._path(identity)
             return read_episode(self._opened(path), path, self._config.cameras, self._config)
@@ -149,19 +149,21 @@ class NpzSource:
         except InputError as error:
             return as_problem(error, identity)
 
-    def _other_rate(self, identity: str, rate: float, others: float) -> Problem:
+    def _other_rate(self, identity: str, rate: float, others: float) -> EpisodeProblem:
         needed = f"{others:g}, as in most episodes: strides count control steps"
-        return Problem(identity, f"{self._path(identity)}: fps_hz", f"{rate:g}", needed, "Resample the episode")
+        return EpisodeProblem(identity, f"{self._path(identity)}: fps_hz", f"{rate:g}", needed, "Resample the episode")
 
-    def _other_widths(self, identity: str, widths: tuple[int, int | None], others: tuple[int, int | None]) -> Problem:
+    def _other_widths(
+        self, identity: str, widths: tuple[int, int | None], others: tuple[int, int | None]
+    ) -> EpisodeProblem:
         found, needed = (
             f"{state} numbers a state" + ("" if action is None else f", {action} an action")
             for state, action in (widths, others)
         )
         fix = "Keep the recordings of different robots in different folders"
-        return Problem(identity, self._path(identity), found, f"{needed}, as in most episodes", fix)
+        return EpisodeProblem(identity, self._path(identity), found, f"{needed}, as in most episodes", fix)
 
-    def _opened(self, path: str) -> str | KeptFile:
+    def _opened(self, path: str) -> str | BlockCachedFile:
         return self._files.open(path, version=self._version)
 
     def _path(self, identity: str) -> str:
@@ -172,7 +174,7 @@ class NpzSource:
 class _PictureReader:
     """Reads the pictures of one camera that are asked for."""
 
-    opened: Callable[[], str | KeptFile]
+    opened: Callable[[], str | BlockCachedFile]
     path: str
     camera: str
     steps: int

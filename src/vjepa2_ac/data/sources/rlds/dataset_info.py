@@ -8,7 +8,7 @@ from typing import Any
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan, index_records
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.structured import read_json_object
+from vjepa2_ac.storage.structured import read_json_object
 
 _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"

@@ -15,15 +15,15 @@ import numpy as np
 from jaxtyping import Int64, UInt64
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard
-from vjepa2_ac.data.sources.rlds.fields import states_of
-from vjepa2_ac.data.sources.rlds.record import Record
-from vjepa2_ac.data.sources.rlds.remote_file import RemoteFile
+from vjepa2_ac.data.sources.rlds.example import ExampleRecord
+from vjepa2_ac.data.sources.rlds.features import states_of
+from vjepa2_ac.data.sources.rlds.range_reader import RemoteFile
 from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan
-from vjepa2_ac.data.state_hash import UNKNOWN, hash_of_states
-from vjepa2_ac.data.table import EpisodeTable
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.remote import UnreachableError
+from vjepa2_ac.storage.remote import UnreachableError
 
 _WINDOW = 1 << 16
 _LENGTH_BYTES = 5  # that grow with a name: of the text, its list, the feature, the entry of the map, and of them all
@@ -43,7 +43,7 @@ def hashes_of_lookalikes(
         shard = shards[at["shard"]]
         span = RecordSpan(path=shard.path, number=at["record"], offset=at["offset"], length=at["length"])
         try:
-            record = Record(RemoteFile(shard, window=_WINDOW), span)
+            record = ExampleRecord(RemoteFile(shard, window=_WINDOW), span)
             return hash_of_states(states_of(record, config, int(table.num_steps[index]), str(span)))
         except UnreachableError:
             raise  # says nothing of the record

@@ -9,10 +9,12 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.index import cache_folder, kept_or_built, key_of
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index.index_cache import cache_folder, get_or_build, key_of
+from vjepa2_ac.data.sources.rlds.crc_marks import CrcMarks
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard, find_shards
-from vjepa2_ac.data.sources.rlds.example_index import Read
-from vjepa2_ac.data.sources.rlds.fields import (
+from vjepa2_ac.data.sources.rlds.example import ExampleRecord
+from vjepa2_ac.data.sources.rlds.features import (
     STEP_FLAG,
     commands_of,
     features_of_steps,
@@ -23,15 +25,13 @@ from vjepa2_ac.data.sources.rlds.fields import (
     num_steps_of,
     states_of,
 )
-from vjepa2_ac.data.sources.rlds.index import index_local
-from vjepa2_ac.data.sources.rlds.pictures import LocalPictures, PicturesAt, wrong_count
-from vjepa2_ac.data.sources.rlds.record import Record
-from vjepa2_ac.data.sources.rlds.remote_index import index_remote
-from vjepa2_ac.data.sources.rlds.remote_pictures import RemoteCache, RemoteEpisode, whole_record
-from vjepa2_ac.data.sources.rlds.shard_file import open_shard
+from vjepa2_ac.data.sources.rlds.images_local import LocalPictures, PicturesAt, wrong_count
+from vjepa2_ac.data.sources.rlds.images_remote import RemoteCache, RemoteEpisode, whole_record
+from vjepa2_ac.data.sources.rlds.index_local import index_local
+from vjepa2_ac.data.sources.rlds.index_remote import index_remote
+from vjepa2_ac.data.sources.rlds.shard_reader import open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan, require_intact
-from vjepa2_ac.data.sources.rlds.verified import Verified
-from vjepa2_ac.data.table import EpisodeTable
+from vjepa2_ac.data.sources.rlds.wire_format import Read
 from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 
@@ -42,7 +42,7 @@ class _Opened:
 
     shards: tuple[Shard, ...]
     table: EpisodeTable
-    verified: Verified
+    verified: CrcMarks
     cache: RemoteCache
 
 
@@ -101,7 +101,7 @@ class RldsSource:
         info = opened.table[index]
         where = f"{span} ({info.id})"
         with open_shard(shard) as read:
-            record = Record(read, span)
+            record = ExampleRecord(read, span)
             if self._config.check_crc != "once" or index not in opened.verified:
                 self._check(record, read, span, info.num_steps, {feature, *self._features()}, where)
                 if self._config.check_crc == "once":
@@ -123,7 +123,7 @@ class RldsSource:
         where = f"{span} ({info.id})"
         if self._config.check_crc == "always":
             read = whole_record(shard, span)
-            record = Record(read, span)
+            record = ExampleRecord(read, span)
             self._check(record, read, span, info.num_steps, {feature}, where)
             pictures: FrameReader = PicturesAt(read, record.located[feature], info.num_steps, f"{where}: {feature}")
         else:
@@ -134,7 +134,7 @@ class RldsSource:
             pictures = remote.pictures(feature, record.located, info.num_steps, needed, f"{where}: {feature}")
         return self._episode(record, info, pictures, where)
 
-    def _episode(self, record: Record, info: EpisodeInfo, pictures: FrameReader, where: str) -> Episode:
+    def _episode(self, record: ExampleRecord, info: EpisodeInfo, pictures: FrameReader, where: str) -> Episode:
         config, fields = self._config, self._config.fields
         _require_as_indexed(record, info, config, where)
         return Episode(
@@ -148,7 +148,7 @@ class RldsSource:
         )
 
     def _check(
-        self, record: Record, read: Read, span: RecordSpan, num_steps: int, features: Iterable[str], where: str
+        self, record: ExampleRecord, read: Read, span: RecordSpan, num_steps: int, features: Iterable[str], where: str
     ) -> None:
         """Look at all of a record: its CRC, unless that is never to be checked, and the number of its pictures."""
         if self._config.check_crc != "never":
@@ -186,11 +186,11 @@ class RldsSource:
         def build() -> EpisodeTable:
             return make(shards, config, self._features(), threads=config.connections, progress=progress)
 
-        table = kept_or_built(config.disk_cache, key, build)
+        table = get_or_build(config.disk_cache, key, build)
         return _Opened(
             shards,
             replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)}),
-            Verified(cache_folder(config.disk_cache) / "index" / f"{key}.checked"),
+            CrcMarks(cache_folder(config.disk_cache) / "index" / f"{key}.checked"),
             RemoteCache.of(config.disk_cache, key),
         )
 
@@ -201,7 +201,7 @@ def _place_of(opened: _Opened, index: int) -> tuple[Shard, RecordSpan]:
     return shard, RecordSpan(path=shard.path, number=at["record"], offset=at["offset"], length=at["length"])
 
 
-def _require_as_indexed(record: Record, info: EpisodeInfo, config: DataConfig, where: str) -> None:
+def _require_as_indexed(record: ExampleRecord, info: EpisodeInfo, config: DataConfig, where: str) -> None:
     """Refuse a record that is not the one that the index speaks of."""
     found = info_of(identity_of(record, config.fields), num_steps_of(record, config))
     if found != info:

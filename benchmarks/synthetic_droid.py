@@ -1,0 +1,45 @@
+"""Episodes as long and as large as DROID's, drawn for measurements: noise as smooth as a camera's picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from vjepa2_ac.data.sources.rlds.writing.droid_writer import (
+    CAMERAS,
+    DroidCommands,
+    DroidEpisode,
+    DroidMeasurements,
+    encode_jpeg,
+)
+
+
+def draw_episodes(count: int = 12, steps: int = 290) -> Iterator[DroidEpisode]:
+    """Yield episodes with 180x320 JPEGs of 10 to 25 KB, and say so."""
+    generator = np.random.default_rng(0)
+    pictures = [encode_jpeg(draw_picture(generator), quality=quality) for quality in range(78, 94) for _ in range(4)]
+    sizes = sorted(len(picture) for picture in pictures)
+    print(f"JPEGs of {sizes[0] / 1e3:.0f} to {sizes[-1] / 1e3:.0f} KB, {count} episodes of {steps} steps, 3 cameras")
+    pose, gripper, joints = np.zeros((steps, 6)), np.zeros((steps, 1)), np.zeros((steps, 7))
+    for number in range(count):
+        folder = f"/data/success/episode_{number}"
+        yield DroidEpisode(
+            file_path=f"{folder}/trajectory.h5",
+            recording_folderpath=f"{folder}/recordings",
+            action=joints,
+            action_dict=DroidCommands(pose, pose, gripper, gripper, joints, joints),
+            observation=DroidMeasurements(pose, gripper, joints),
+            images={
+                camera: [pictures[place] for place in generator.integers(0, len(pictures), steps)] for camera in CAMERAS
+            },
+        )
+
+
+def draw_picture(generator: np.random.Generator) -> np.ndarray:
+    """Return a picture with detail of every size."""
+    picture = np.full((180, 320, 3), 128.0)
+    for cell in (1, 2, 4, 20, 60):
+        noise = generator.normal(0, 3 + cell**0.7, (180 // cell + 1, 320 // cell + 1, 3))
+        picture += noise.repeat(cell, axis=0).repeat(cell, axis=1)[:180, :320]
+    return picture.clip(0, 255).astype(np.uint8)

@@ -1,0 +1,218 @@
+"""What can be asked about data on the command line? check, index, inspect, calibrate."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vjepa2_ac.cli.options import Commands, Handler, as_local, as_model, as_path, command, count, whole_number
+from vjepa2_ac.errors import InputError
+
+if TYPE_CHECKING:
+    from vjepa2_ac.config import Config
+
+
+def add_data(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add `data` with its commands to a parser."""
+    text = "Look at a data set before training on it."
+    parser = commands.add_parser("data", help=text, description=text)
+    inner = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    _add_check(inner)
+    _add_index(inner)
+    _add_inspect(inner)
+    _add_calibrate(inner)
+
+
+def _command(
+    commands: Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
+) -> argparse.ArgumentParser:
+    parser = command(commands, name, handler, text)
+    parser.add_argument("config", metavar="CONFIG", type=as_local, help="a YAML config")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as data.camera=wrist_left")
+    return parser
+
+
+def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "check", _check,
+        "Open the data, load some clips as training would, and look at every number. Exit status 0: all is well or"
+        " only warnings, 1: training would learn nothing or not begin, 2: something cannot be used.",
+    )  # fmt: skip
+    parser.add_argument(
+        "--limit", metavar="N", type=count, default=32, help="clips to load (32); to probe, twice as many"
+    )
+    parser.add_argument(
+        "--model",
+        metavar="RUN_OR_MODEL",
+        type=as_model,
+        help="probe the data with a model that knows robots (a run, or what model.base takes): does it predict better"
+        " where pictures are shifted, mirrored, reversed, BGR, or the gripper is inverted?",
+    )
+
+
+def _check(options: argparse.Namespace) -> int:
+    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.console.data import print_finding
+    from vjepa2_ac.data.inspection.check import check_data
+
+    config = load_config(options.config, options.overrides)
+    wrong = 0
+    with _progress("looking through the data set") as progress:
+        findings = check_data(
+            config.data,
+            seed=config.seed,
+            batch_size=config.training.batch_size,
+            clips=options.limit,
+            progress=progress,
+        )
+        for finding in findings:
+            print_finding(finding)
+            wrong += finding.level == "error"
+    if options.model is not None:
+        _probe(config, options.model, clips=2 * options.limit)
+    return 1 if wrong else 0
+
+
+def _probe(config: Config, model: str, *, clips: int) -> None:
+    from vjepa2_ac.console.data import print_finding, probe_table
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.data.clips.dataset import open_dataset
+    from vjepa2_ac.data.inspection.check import at_some_stride
+    from vjepa2_ac.data.inspection.finding import Finding
+    from vjepa2_ac.evaluation.data_variants.from_config import probe_config
+
+    dataset = at_some_stride(open_dataset(config.data))
+    with _progress("probing") as progress:
+        probe = probe_config(config, dataset, model=model, clips=clips, progress=progress)
+    console.print(probe_table(probe))
+    print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
+
+
+def _add_index(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "index", _index, "Build the index of a data set, or show the one that is kept on this machine."
+    )
+    parser.add_argument("--rebuild", action="store_true", help="build it again, also where one is kept")
+
+
+def _index(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.console.data import index_lines
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.data.clips.dataset import open_dataset
+    from vjepa2_ac.data.index.index_cache import record_usage
+
+    config = load_config(options.config, options.overrides).data
+    started = time.perf_counter()
+    with _progress("looking through the data set") as progress, record_usage(rebuild=options.rebuild) as watch:
+        dataset = open_dataset(config, progress=progress)
+    for line in index_lines(dataset.table, watch, time.perf_counter() - started):
+        console.print(line)
+
+
+def _add_inspect(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "inspect", _inspect, "Say what is in a data set, and picture it: text, inspect.json, a contact sheet."
+    )
+    parser.add_argument("--out", metavar="DIR", type=as_path, default=Path("inspection"), help="where to (inspection)")
+    parser.add_argument(
+        "--episodes", "--limit", metavar="N", type=count, default=100, help="episodes whose motion is looked at (100)"
+    )
+    parser.add_argument("--rows", metavar="N", type=count, default=8, help="episodes on the contact sheet (8)")
+
+
+def _inspect(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.console.data import inspection_lines, motion_table
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.data.clips.dataset import open_dataset
+    from vjepa2_ac.data.inspection.check import at_some_stride
+    from vjepa2_ac.data.inspection.statistics import RELEASED, inspect_dataset
+    from vjepa2_ac.reports.figures.dataset import plot_dataset
+    from vjepa2_ac.storage import write_atomically
+
+    config = load_config(options.config, options.overrides)
+    _make_folder(options.out)
+    with _progress("looking through the data set") as progress:
+        dataset = at_some_stride(open_dataset(config.data, progress=progress))
+    if config.data.stride == "auto":
+        console.print(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
+    with _progress("reading states") as progress:
+        inspection = inspect_dataset(dataset, episodes=options.episodes, progress=progress)
+    for line in inspection_lines(inspection):
+        console.print(line)
+    console.print(motion_table(inspection))
+    if inspection.is_pose:
+        console.print(f"For comparison: {RELEASED}.")
+    write_atomically(options.out / "inspect.json", json.dumps(inspection.as_dict(), indent=1).encode())
+    path = options.out / "contact_sheet.png"
+    with _progress("reading pictures") as progress:
+        picture = plot_dataset(dataset, inspection, path, rows=options.rows, progress=progress)
+    console.print(f"  {picture}\n  {options.out / 'inspect.json'}")
+
+
+def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = _command(
+        commands, "calibrate", _calibrate,
+        "Let a model say how many control steps its model step is: its error over persistence at each stride.",
+    )  # fmt: skip
+    parser.add_argument(
+        "--model", metavar="MODEL", type=as_model, help="another than model.base: a .pt, a folder, or a run"
+    )
+    parser.add_argument("--split", choices=["train", "validation", "test"], default="validation", help="(validation)")
+    parser.add_argument("--limit", metavar="N", type=count, default=64, help="clips at each stride (64)")
+    parser.add_argument("--frames", metavar="N", type=whole_number(2, 256), help="of a clip (the config's, 8 at most)")
+    parser.add_argument("--out", metavar="DIR", type=as_path, default=Path("inspection"), help="where to (inspection)")
+
+
+def _calibrate(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.console.data import calibration_table
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
+    from vjepa2_ac.storage import write_atomically
+
+    config = load_config(options.config, options.overrides)
+    _make_folder(options.out)
+    with _progress("looking through the data set") as indexing, _progress("measuring clips") as measuring:
+        calibration = calibrate_config(
+            config,
+            model=options.model,
+            split=options.split,
+            clips=options.limit,
+            frames=options.frames,
+            indexing=indexing,
+            measuring=measuring,
+        )
+    console.print(calibration_table(calibration))
+    console.print(calibration.verdict())
+    path = options.out / "calibration.json"
+    write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
+    console.print(f"  {path}")
+
+
+@contextlib.contextmanager
+def _progress(title: str) -> Iterator[Callable[[int, int], None]]:
+    """Give a function that shows how far long work is; nothing is shown of work that is done at once."""
+    from vjepa2_ac.console.progress import LateProgress
+
+    bar = LateProgress(title)
+    try:
+        yield bar
+    finally:
+        bar.close()
+
+
+def _make_folder(folder: Path) -> None:
+    """Make the folder for results before anything long is begun."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            where=f"--out {folder}", found=f"cannot be made ({error.strerror})", needed="a folder of yours"
+        ) from None

@@ -1,0 +1,44 @@
+"""What can be asked about a run and this machine on the command line? doctor: will it fit on the GPU?"""
+
+from __future__ import annotations
+
+import argparse
+
+from vjepa2_ac.cli.options import Commands, as_local, command
+
+
+def add_doctor(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add `doctor` to a parser."""
+    text = (
+        "Estimate the GPU memory of a run, part by part, by arithmetic: nothing is loaded. Exit status 0: it fits,"
+        " 1: it does not, 2: something cannot be used."
+    )
+    parser = command(commands, "doctor", _doctor, text)
+    parser.add_argument("config", metavar="CONFIG", type=as_local, help="a YAML config")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as training.batch_size=4")
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    import torch
+
+    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.console.memory import memory_lines, verdict
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.model.checkpoints.loading import base_sizes
+    from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
+
+    config = load_config(options.config, options.overrides)
+    sizes = base_sizes(config.model)
+    console.print(f"PyTorch {torch.__version__}, CUDA {torch.version.cuda or 'not in this build'}")
+    gpu, available = "a GPU of 24 GB (there is none here)", USUAL_GPU
+    if torch.cuda.is_available():
+        device = torch.cuda.get_device_properties(torch.cuda.current_device())
+        gpu, available = device.name, device.total_memory
+    estimate = estimate_memory(config, sizes)
+    for line in memory_lines(config, estimate):
+        console.print(line)
+    needed = estimate.total(checkpointing=estimate.checkpointing)
+    knobs = ways_to_fit(config, sizes, available)
+    console.print(verdict(needed, available, gpu, knobs))
+    console.print(f"The data are looked at by: vjepa2-ac data check {options.config}")
+    return 0 if needed <= available else 1

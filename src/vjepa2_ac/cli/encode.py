@@ -1,0 +1,70 @@
+"""What can be asked about latents on the command line? encode: run the frozen encoder once, and keep what comes out."""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+from vjepa2_ac import output
+from vjepa2_ac.cli.options import Commands, as_local, as_path
+
+
+def add_encode(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add `encode` to a parser."""
+    text = (
+        "Run the frozen encoder once over every frame that the clips of a config need, and keep the latents. Whoever"
+        " stops it loses the few episodes under way at most: the same command goes on. Several processes"
+        " (torchrun) share the work."
+    )
+    parser = commands.add_parser("encode", help=text.split(".", maxsplit=1)[0] + ".", description=text)
+    parser.set_defaults(handler=_encode)
+    parser.add_argument("config", metavar="CONFIG", type=as_local, help="a YAML config")
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as data.cache_dtype=int8")
+    parser.add_argument(
+        "--out",
+        metavar="FOLDER",
+        type=as_path,
+        help="folder of the cache, for data.source: latents (default: where data.cache finds it)",
+    )
+
+
+def _encode(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.console.progress import EncodingBar, LateProgress, console
+    from vjepa2_ac.encoding.encode_dataset import encode_config
+
+    config = load_config(options.config, options.overrides)
+    output.never_wait()
+    is_first = os.environ.get("RANK", "0") == "0"
+    looking, bar = LateProgress("looking through the data set"), EncodingBar()
+
+    def note(text: str) -> None:
+        if is_first:
+            console.print(text)
+
+    try:
+        encoded = encode_config(
+            config,
+            note,
+            out=options.out,
+            indexed=looking if is_first else None,
+            progress=bar if is_first else None,
+        )
+    finally:
+        looking.close()
+        bar.close()
+    manifest = encoded.manifest
+    if manifest is None:
+        console.print(f"This process has done its share; others are still at work on {encoded.folder}")
+        return
+    for name, reason in manifest.broken.items():
+        console.print(f"left out: {name}: {reason}")
+    console.print(
+        f"{manifest.encoded:,} of {manifest.episodes:,} episodes, {manifest.frames:,} frames,"
+        f" {manifest.bytes / 1e9:.3g} GB are in {encoded.folder}",
+    )
+    console.print(
+        f"Train on them with data.source=latents data.path={encoded.folder}"
+        if options.out
+        else "Train on them with data.cache=auto",
+    )

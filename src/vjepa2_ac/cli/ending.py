@@ -1,0 +1,64 @@
+"""How does a command end that is told to? It leaves nothing half-written behind, then dies of the signal as any other.
+
+For commands that have no way of their own: a training run finishes its step first (`distributed.preemption`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from types import FrameType
+
+SIGNALS = (signal.SIGTERM, signal.SIGHUP)
+_SAME_WITHIN_S = 0.5  # `timeout`, some launchers and terminals signal twice
+
+
+class EndedError(BaseException):
+    """Ends what is under way, as KeyboardInterrupt does, so that temporary files go.
+
+    Args:
+        number: The signal that asked for it.
+    """
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(signal.Signals(number).name)
+
+
+@contextlib.contextmanager
+def tidy_end() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the block in good order, and then the process; a second one ends it at once.
+
+    Outside the main thread, and for signals that something else is done at already, nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came_at: list[float] = []
+
+    def end(number: int, _frame: FrameType | None) -> None:
+        if not came_at:
+            came_at.append(time.monotonic())
+            raise EndedError(number)
+        if time.monotonic() - came_at[0] >= _SAME_WITHIN_S:
+            _die(number)
+
+    taken = [number for number in SIGNALS if signal.getsignal(number) is signal.SIG_DFL]
+    for number in taken:
+        signal.signal(number, end)
+    try:
+        yield
+    except EndedError as ended:
+        _die(ended.number)
+    finally:
+        for number in taken:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _die(number: int) -> None:
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)

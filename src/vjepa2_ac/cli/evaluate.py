@@ -1,0 +1,196 @@
+"""What can be asked about how good something is, on the command line? evaluate, compare."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from vjepa2_ac.cli.options import (
+    Commands,
+    SubjectsAndOverrides,
+    as_local,
+    as_model,
+    as_path,
+    as_subject,
+    command,
+    count,
+    number_between,
+    require_overrides,
+    say_places_elsewhere,
+    whole_number,
+)
+from vjepa2_ac.errors import InputError
+
+
+def add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add `evaluate` and `compare` to a parser."""
+    _add_evaluate(commands)
+    _add_compare(commands)
+
+
+def add_checkpoint(parser: argparse._ActionsContainer) -> None:
+    """Add the option by which a checkpoint of a run is named."""
+    parser.add_argument(
+        "--checkpoint",
+        default="newest",
+        metavar="newest|best|STEP",
+        help="which one: the newest (default), the best by validation, or that of a step",
+    )
+
+
+def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = command(
+        commands,
+        "evaluate",
+        _evaluate,
+        "Measure a run or a model on held-out episodes, beside its base, doing nothing and wrong actions.",
+    )
+    parser.add_argument(
+        "subjects",
+        metavar="RUN_OR_MODEL",
+        type=as_subject,
+        nargs="+",
+        action=SubjectsAndOverrides,
+        help="folder of a run, or (with --data) what model.base takes; several: their spread, too",
+    )
+    parser.add_argument(
+        "--data",
+        metavar="CONFIG",
+        type=as_local,
+        help="measure on the data of this config (and with its model.dtype, device, seed)",
+    )
+    parser.add_argument(
+        "--against",
+        metavar="base|RUN|MODEL",
+        type=as_model,
+        nargs="+",
+        help="what to compare with, on the same latents; default: the base of a run, nothing for a model",
+    )
+    parser.add_argument("--out", metavar="FOLDER", type=as_path, help="where figures go; default: the run's folder")
+    parser.add_argument("--split", choices=["test", "validation"], default="test", help="which held-out episodes")
+    parser.add_argument("--clips", type=count, default=256, help="at most this many clips, spread over the episodes")
+    add_checkpoint(parser)
+    parser.add_argument("--calibrate", action="store_true", help="measure the one-step error at other strides, too")
+    probes = parser.add_argument_group("use of the actions")
+    probes.add_argument(
+        "--sensitivity-clips", metavar="N", type=whole_number(0), default=32, help="clips to try other actions on (32)"
+    )
+    probes.add_argument("--samples", metavar="N", type=count, default=64, help="other actions for each of them (64)")
+    probes.add_argument(
+        "--landscapes",
+        metavar="N",
+        type=whole_number(0),
+        default=8,
+        help="clips of those with an energy landscape (8)",
+    )
+    probes.add_argument(
+        "--nodes", metavar="N", type=whole_number(3, 51), default=9, help="of a landscape along each axis (9)"
+    )
+    probes.add_argument(
+        "--reach",
+        metavar="CM",
+        type=number_between(0.0, 1000.0, "cm"),
+        default=7.5,
+        help="half the width of landscape and box, in cm (7.5)",
+    )
+    probes.add_argument("--examples", metavar="N", type=whole_number(0), default=4, help="clips to show (4)")
+    probes.add_argument(
+        "--at-once", metavar="N", type=count, default=64, help="actions computed together (64): lower it to save memory"
+    )
+    planning = parser.add_argument_group("plans (they take long: see docs/evaluation.md)")
+    planning.add_argument(
+        "--planning",
+        metavar="planning.key=value",
+        nargs="*",
+        help="plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score;"
+        " settings of the plan of one step, such as planning.samples=200, in place of the config's, here or anywhere",
+    )
+    parser.set_defaults(overrides=[])
+    planning.add_argument(
+        "--planning-clips", metavar="N", type=count, default=32, help="clips to plan from, one frame of each (32)"
+    )
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.console.evaluation import Stages, evaluation_tables
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.evaluation.evaluate import ProbeOptions
+    from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
+    from vjepa2_ac.evaluation.verdict import spread, verdict
+    from vjepa2_ac.reports.write import evaluate_subject
+
+    _require_planning(options)
+    probes = ProbeOptions(
+        sensitivity_clips=options.sensitivity_clips,
+        samples=options.samples,
+        landscape_clips=options.landscapes,
+        nodes=options.nodes,
+        reach_cm=options.reach,
+        examples=options.examples,
+        at_once=options.at_once,
+        planning_clips=0 if options.planning is None else options.planning_clips,
+    )
+    data = load_config(options.data, []) if options.data else None
+    several, evaluations = len(options.subjects) > 1, []
+    for subject in options.subjects:
+        say_places_elsewhere(subject)
+        out = options.out / Path(subject).name if options.out and several else options.out
+        asked = EvaluationOptions(
+            split=options.split,
+            clips=options.clips,
+            checkpoint=options.checkpoint,
+            data=data,
+            against=tuple(options.against) if options.against else None,
+            out=out,
+            probes=probes,
+            calibrate=options.calibrate,
+            planning=(*(options.planning or ()), *options.overrides),
+        )
+        with Stages() as stages:
+            measured = evaluate_subject(subject, asked, stage=stages)
+        evaluations.append(measured.evaluation)
+        console.print(f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject)
+        for table in evaluation_tables(measured.evaluation):
+            console.print(table)
+        console.print(verdict(measured.evaluation))
+        for path in measured.files:
+            console.print(f"  {path}")
+    if several:
+        console.print(spread(evaluations))
+
+
+def _require_planning(options: argparse.Namespace) -> None:
+    """Refuse settings of plans where none are asked for: they would do nothing."""
+    require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
+    if options.overrides and options.planning is None:
+        raise InputError(
+            where="command line",
+            found=f"{' '.join(options.overrides)}, and no plans are asked for",
+            needed="--planning beside settings of planning; what else a config says is not changed by evaluate",
+            fix="Add --planning",
+        )
+
+
+def _add_compare(commands: Commands[argparse.ArgumentParser]) -> None:
+    parser = command(
+        commands,
+        "compare",
+        _compare,
+        "Put runs side by side that `evaluate` has measured on the same clips: one table, one picture.",
+    )
+    parser.add_argument("runs", metavar="RUN", type=as_path, nargs="+", help="folders with a metrics.json, two or more")
+    parser.add_argument("--out", metavar="PNG", type=as_path, default=Path("comparison.png"), help="the picture")
+
+
+def _compare(options: argparse.Namespace) -> None:
+    from vjepa2_ac.console.evaluation import comparison_table
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.reports.comparison import compare
+    from vjepa2_ac.reports.figures.evaluation import plot_comparison
+
+    comparison = compare(options.runs)
+    console.print(comparison_table(comparison))
+    for line in comparison.notes:
+        console.print(line)
+    console.print(f"  {plot_comparison(comparison, options.out)}")

@@ -1,0 +1,160 @@
+"""What do the commands of the command line have in common? How one is added, and how numbers are read."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from vjepa2_ac import places
+from vjepa2_ac.errors import InputError, printable
+
+Commands = argparse._SubParsersAction
+Handler = Callable[[argparse.Namespace], int | None]
+
+_MOST = 10**9
+_OPTION = re.compile(r"-(?![\d.])")  # but a negative number is a value
+_OVERRIDE = re.compile(r"[a-z_]+(\.\w+)+=")
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser whose messages cannot move a terminal's cursor, whatever was given."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print what is wrong, and end with status 2."""
+        super().error(printable(message))
+
+
+def command(
+    commands: Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
+) -> argparse.ArgumentParser:
+    """Add a command that a handler does, and return its parser."""
+    parser = commands.add_parser(name, help=text, description=text)
+    parser.set_defaults(handler=handler)
+    return parser
+
+
+def say_places_elsewhere(subject: str) -> None:
+    """Say which addresses the config of a run names, before any of them is contacted; nothing of a model."""
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.runs.folder import CONFIG, places_elsewhere, read_run_config
+
+    if (Path(subject) / CONFIG).is_file() and os.environ.get("RANK", "0") == "0":  # one of several processes
+        for place in places_elsewhere(read_run_config(Path(subject))):
+            console.print(f"{subject} names a place elsewhere: {place}")
+
+
+def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Parse a command line; `key=value` may stand anywhere behind a command that takes it.
+
+    argparse gives up on such words behind an option, and takes them for what it was not told of.
+    """
+    options, rest = parser.parse_known_args(arguments)
+    unknown = [word for word in rest if _OPTION.match(word)]
+    if rest and (unknown or not hasattr(options, "overrides")):
+        parser.error(f"unrecognized arguments: {' '.join(word for word in rest if not _OVERRIDE.match(word))}")
+    if rest:
+        options.overrides = [*options.overrides, *rest]
+    return options
+
+
+class SubjectsAndOverrides(argparse.Action):
+    """Takes names of runs or models, one or more, and among them the `key=value` that no folder is called."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, _option: str | None = None
+    ) -> None:
+        """Put each where it belongs."""
+        overrides = [word for word in values if _is_override(word)]
+        subjects = [word for word in values if word not in overrides]
+        if not subjects:
+            parser.error(f"the following arguments are required: {self.metavar}")
+        setattr(namespace, self.dest, subjects)
+        namespace.overrides = [*namespace.overrides, *overrides]
+
+
+def as_subject(text: str) -> str:
+    """Read likewise what names a run or a model, and leave a `key=value` for `SubjectsAndOverrides` as it is."""
+    return text if _is_override(text) else as_model(text)
+
+
+def _is_override(word: str) -> bool:
+    return _OVERRIDE.match(word) is not None and not Path(word).exists()
+
+
+def require_overrides(words: Sequence[str], *, fix: str = "") -> None:
+    """Refuse words that are no `key=value`, before anything is read.
+
+    Raises:
+        InputError: There is one.
+    """
+    others = [word for word in words if "=" not in word]
+    if others:
+        raise InputError(
+            where="command line",
+            found=f"{' '.join(others)!r}",
+            needed="key=value, such as training.steps=100",
+            fix=fix,
+        )
+
+
+def as_path(text: str) -> Path:
+    """Read an option that is a path of this machine; `~` is the user's home, also behind `--out=`."""
+    return Path(as_local(text))
+
+
+def as_local(text: str) -> str:
+    """Read a path of this machine, and keep it as it was written."""
+    return _meant(places.on_this_machine, text)
+
+
+def as_model(text: str) -> str:
+    """Read what names a run or a model: a path of this machine, or a model that comes with the package."""
+    return _meant(places.of_a_model, text)
+
+
+def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
+    """Return what reads an option that is a whole number from `least` to `most`; None: as many as anybody can need."""
+    meant = f"a whole number from {least}" + ("" if most is None else f" to {most}")
+
+    def read(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {meant}") from None
+        if most is None and number > _MOST:
+            raise argparse.ArgumentTypeError(f"{text!r} is not {meant} to {_MOST}")
+        if number < least or (most is not None and number > most):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {meant}")
+        return number
+
+    return read
+
+
+def number_between(least: float, most: float, unit: str) -> Callable[[str], float]:
+    """Return what reads an option that is a number of some unit; the bounds themselves are not among them."""
+
+    def read(text: str) -> float:
+        try:
+            number = float(text)
+        except ValueError:
+            number = math.nan
+        if not least < number < most:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number of {unit} above {least:g} and below {most:g}")
+        return number
+
+    return read
+
+
+count = whole_number(1)  # a number of things
+
+
+def _meant(read: Callable[[str], str], text: str) -> str:
+    try:
+        return read(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} {error}") from None

@@ -1,0 +1,179 @@
+"""What can be asked about what a robot should do, on the command line? plan."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vjepa2_ac.cli.evaluate import add_checkpoint
+from vjepa2_ac.cli.options import (
+    Commands,
+    as_local,
+    as_model,
+    as_path,
+    command,
+    require_overrides,
+    say_places_elsewhere,
+    whole_number,
+)
+from vjepa2_ac.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from vjepa2_ac.planning.decision import PlanRequest
+
+
+def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add `plan` to a parser."""
+    parser = command(
+        commands,
+        "plan",
+        _plan,
+        "Plan from a picture and a state to a goal's picture: plan.json, and a picture of how the planner came to it."
+        " Status 1 where the model gives no finite energy.",
+    )
+    parser._negative_number_matcher = re.compile(r"^-[\d.]")  # "-0.3,0.1,..." is a value, not an option
+    parser.add_argument(
+        "subject", metavar="RUN_OR_MODEL", type=as_model, help="folder of a run, or what model.base takes"
+    )
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as planning.horizon=2")
+    parser.add_argument(
+        "--start", metavar="PICTURE", type=as_local, required=True, help="what the camera sees: PNG or JPEG"
+    )
+    parser.add_argument(
+        "--state",
+        metavar="NUMBERS",
+        required=True,
+        help="measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed)",
+    )
+    parser.add_argument(
+        "--goal",
+        metavar="PICTURE",
+        type=as_local,
+        required=True,
+        action="append",
+        help="what it shall see; again for goals that follow one another",
+    )
+    parser.add_argument(
+        "--durations",
+        metavar="STEPS",
+        help="model steps of each goal but the last, as 2,1; default: equal shares of planning.horizon",
+    )
+    parser.add_argument(
+        "--mask",
+        metavar="PICTURE",
+        type=as_local,
+        help="what of the picture counts: of the goal's size, black where it does not",
+    )
+    parser.add_argument(
+        "--extrinsics",
+        metavar="NUMBERS",
+        help="the camera in the robot base frame: x,y,z,roll,pitch,yaw; where the model uses it",
+    )
+    parser.add_argument(
+        "--config", metavar="CONFIG", type=as_local, help="for a model: the config whose planning, crop and dtype count"
+    )
+    add_checkpoint(parser)
+    parser.add_argument("--seed", metavar="N", type=whole_number(0, 2**31 - 1), help="default: the config's")
+    parser.add_argument(
+        "--nodes",
+        metavar="N",
+        type=whole_number(0, 101),
+        default=13,
+        help="of an energy slice along each axis (13); below 3: no slices",
+    )
+    parser.add_argument("--out", metavar="FOLDER", type=as_path, default=Path("plan"), help="for both files (plan)")
+
+
+def _plan(options: argparse.Namespace) -> int:
+    from vjepa2_ac.console.evaluation import Stages
+    from vjepa2_ac.console.plan import plan_table
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.planning.decision import decide
+    from vjepa2_ac.planning.plan_json import PLAN_FILE, write_plan
+    from vjepa2_ac.planning.session import load_to_plan
+    from vjepa2_ac.planning.summary import summarize
+    from vjepa2_ac.reports.figures.plan import PLAN_IMAGE, plot_plan
+    from vjepa2_ac.storage import user_can_write
+
+    require_overrides(options.overrides, fix="Numbers of --state or --extrinsics go in one word: --state 0.4,0,0.3,...")
+    question, extrinsics = _question(options), _extrinsics(options)
+    with user_can_write(options.out):
+        options.out.mkdir(parents=True, exist_ok=True)
+    say_places_elsewhere(options.subject)
+    steering = load_to_plan(
+        options.subject, checkpoint=options.checkpoint, config=options.config, overrides=options.overrides
+    )
+    if not options.durations:
+        question = question.with_equal_durations(steering.config.planning.horizon)
+    with Stages() as stages:
+        progress = stages("planning, iterations")
+        controller = steering.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
+        found = decide(controller, question, nodes=options.nodes)
+    pictures = {"start": options.start, "goals": options.goal, "mask": options.mask}
+    with user_can_write(options.out):
+        written = [
+            write_plan(found, steering.as_dict() | pictures, options.out / PLAN_FILE),
+            plot_plan(found, options.out / PLAN_IMAGE),
+        ]
+    console.print(plan_table(found))
+    console.print(summarize(found))
+    for path in written:
+        console.print(f"  {path}")
+    return int(found.decision.why == "no finite energy")
+
+
+def _question(options: argparse.Namespace) -> PlanRequest:
+    """Read what was given and refuse what cannot be planned with, before a model is loaded."""
+    from vjepa2_ac.media.image_file import read_image
+    from vjepa2_ac.planning.decision import PlanRequest
+    from vjepa2_ac.planning.input_checks import require_mask, require_picture, require_pose
+
+    state = _numbers(options.state, "--state")
+    require_pose(state, where="--state")
+    durations = _durations(options.durations, len(options.goal)) if options.durations else ()
+    goals = [read_image(path) for path in options.goal]
+    for path, picture in zip(options.goal, goals, strict=True):
+        require_picture(picture, where=f"--goal {path}", like=goals[0])
+    start = read_image(options.start)
+    require_picture(start, where=f"--start {options.start}", like=goals[0])
+    mask = None if options.mask is None else read_image(options.mask).max(axis=-1)
+    if mask is not None:
+        require_mask(mask, where=f"--mask {options.mask}", like=goals[0])
+    return PlanRequest(start, state, tuple(goals), durations, mask)
+
+
+def _extrinsics(options: argparse.Namespace) -> np.ndarray | None:
+    from vjepa2_ac.planning.input_checks import require_extrinsics
+
+    if options.extrinsics is None:
+        return None
+    extrinsics = _numbers(options.extrinsics, "--extrinsics")
+    require_extrinsics(extrinsics, where="--extrinsics")
+    return extrinsics
+
+
+def _numbers(text: str, where: str) -> np.ndarray:
+    import numpy as np
+
+    words = text.replace(",", " ").split()
+    try:
+        return np.array([float(word) for word in words])
+    except ValueError as error:
+        raise InputError(
+            where=where, found=f"{text!r} ({error})", needed="numbers with commas between them, in one word"
+        ) from None
+
+
+def _durations(text: str, goals: int) -> tuple[int, ...]:
+    words = text.replace(",", " ").split()
+    if len(words) != goals - 1 or not all(word.isdecimal() and int(word) for word in words):
+        raise InputError(
+            where="--durations",
+            found=f"{text!r} for {goals} goal{'s' * (goals > 1)}",
+            needed=f"{goals - 1} whole numbers from 1, with commas between them: of each goal but the last",
+        )
+    return tuple(int(word) for word in words)

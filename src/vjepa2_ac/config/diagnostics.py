@@ -1,0 +1,212 @@
+"""What is wrong with a config, in words? Everything at once, and what was probably meant."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.storage.structured import message_of
+
+_ROUNDS = 20  # more than there are rules about several values
+_MOST_LINES = 30
+_LONGEST_KEY = 80
+
+# What people bring along from other programs, by the key that it has here.
+_ALSO_CALLED = {
+    "run_dir": ("output_dir", "out_dir", "save_dir"),
+    "data.path": ("dataset", "data_path", "data_dir", "root"),
+    "data.frames": ("num_frames", "clip_frames", "frames_per_clip"),
+    "data.stride": ("fps", "frame_stride", "frameskip"),
+    "data.workers": ("num_workers",),
+    "model.base": ("base_model", "pretrained", "pretrained_path"),
+    "adapter.rank": ("r", "lora_r", "lora_rank"),
+    "adapter.alpha": ("lora_alpha",),
+    "adapter.dropout": ("lora_dropout",),
+    "adapter.targets": ("target_modules",),
+    "training.steps": ("max_steps", "num_steps", "total_steps", "iterations", "epochs", "num_epochs"),
+    "training.batch_size": ("bs", "micro_batch_size", "per_device_train_batch_size"),
+    "training.accumulation": (
+        "grad_accum", "accumulation_steps", "gradient_accumulation_steps", "accumulate_grad_batches",
+    ),
+    "training.rollout_steps": ("auto_steps",),
+    "training.learning_rate": ("lr", "peak_lr", "max_lr"),
+    "training.final_learning_rate": ("min_lr", "final_lr"),
+    "training.start_learning_rate": ("start_lr",),
+    "training.weight_decay": ("wd",),
+    "training.warmup_steps": ("warmup",),
+    "training.max_grad_norm": ("grad_clip", "clip_grad", "clip_grad_norm", "gradient_clipping"),
+    "training.precision": ("amp", "mixed_precision"),
+    "training.gradient_checkpointing": ("activation_checkpointing", "grad_checkpointing"),
+    "training.compile": ("torch_compile",),
+    "training.log_every": ("logging_steps",),
+    "validation.every": ("eval_every", "eval_steps"),
+    "checkpoint.every": ("save_every", "save_steps"),
+}  # fmt: skip
+
+
+def wrong_values(values: Mapping[str, Any], error: ValidationError) -> list[str]:
+    """Return a line for everything that is wrong with plain values, by the error that they gave.
+
+    Rules about several values are only looked at when each value by itself is right. What is wrong is therefore taken
+    out, and the rest is looked at again; what a rule then says about something that was taken out does not count.
+    """
+    left, found, taken = json.loads(json.dumps(values)), error.errors(include_url=False)[:_MOST_LINES], set[str]()
+    lines: list[str] = []
+    for _ in range(_ROUNDS):
+        told = _told_once([one for one in found if not _is_about(one, taken)])
+        lines += [line for line in told if line not in lines]
+        if len(lines) >= _MOST_LINES:
+            return [*lines[:_MOST_LINES], "and more, which are not looked at before these are right"]
+        before = json.dumps(left)
+        for one in found:
+            taken |= _take_out(left, one)
+        _stand_in(left, taken)
+        if json.dumps(left) == before:
+            break
+        try:
+            Config.model_validate_json(json.dumps(left))
+            break
+        except ValidationError as again:
+            found = again.errors(include_url=False)[:_MOST_LINES]
+    return lines
+
+
+def all_keys(section: type[BaseModel] = Config, prefix: str = "") -> list[str]:
+    """Return the dotted keys of a section and those in it."""
+    keys = []
+    for name, info in section.model_fields.items():
+        keys.append(prefix + name)
+        if inner := _section_of(info.annotation):
+            keys += all_keys(inner, f"{prefix}{name}.")
+    return keys
+
+
+def _told_once(details: Sequence[Any]) -> list[str]:
+    """Return a line for each value that is wrong: what may be of several kinds is told once, not for each kind."""
+    kinds: dict[tuple[Any, ...], list[Any]] = {}
+    for detail in details:
+        kinds.setdefault(_union_of(detail["loc"]) or (*detail["loc"], detail["msg"]), []).append(detail)
+    lines = []
+    for together in kinds.values():
+        deepest = max(len(detail["loc"]) for detail in together)  # of a kind that fits at least from outside
+        line, *others = [_explain(detail) for detail in together if len(detail["loc"]) == deepest]
+        also = [other.split("Input should be ", 1)[-1].split(" (found ", 1)[0] for other in others]
+        message, found, rest = line.partition(" (found ")
+        lines.append(", or ".join([message, *also]) + found + rest)
+    return lines
+
+
+def _explain(detail: Any) -> str:
+    path = ".".join(_places(detail["loc"]))
+    if detail["type"] == "extra_forbidden":
+        meant = _meant(detail["loc"])
+        hint = f"did you mean {meant}?" if meant else f"known here: {', '.join(_keys_at(detail['loc'][:-1]))}"
+        return f"{path}: unknown key; {hint}"
+    if detail["type"] == "missing" and isinstance(detail["loc"][-1], int):
+        return f"{'.'.join(_places(detail['loc'][:-1]))}: List should have at least {detail['loc'][-1] + 1} items"
+    if detail["type"] == "missing":
+        return f"{path}: missing; it has no default"
+    return f"{path}: {message_of(detail)}" if path else message_of(detail)
+
+
+def _places(location: Sequence[Any]) -> list[str]:
+    """Return the keys and numbers of items that lead to a value; pydantic's names for kinds of values are no keys."""
+    union = _union_of(location)
+    kept = location if union is None else (*union, *location[len(union) + 1 :])
+    return [part if len(part := str(one)) <= _LONGEST_KEY else f"{part[:_LONGEST_KEY]}…" for one in kept]
+
+
+def _union_of(location: Sequence[Any]) -> tuple[Any, ...] | None:
+    """Return the place of the knob that a location lies in, if that may be of several kinds."""
+    for depth in range(1, len(location)):
+        section = _section_at(location[: depth - 1])
+        knob = None if section is None else section.model_fields.get(str(location[depth - 1]))
+        if knob is not None and len([kind for kind in get_args(knob.annotation) if kind is not NoneType]) > 1:
+            return tuple(location[:depth]) if get_origin(knob.annotation) in {Union, UnionType} else None
+    return None
+
+
+def _meant(location: Sequence[Any]) -> str | None:
+    """Return the key that was probably meant by an unknown one; with its section where that is another."""
+    name, here = str(location[-1]), "".join(f"{part}." for part in location[:-1])
+    known = [key.removeprefix(here) for key, names in _ALSO_CALLED.items() if name in names]
+    close = difflib.get_close_matches(name, _keys_at(location[:-1]), n=1)
+    elsewhere = [key for key in all_keys() if key.split(".")[-1] == name]
+    return next(iter([*known, *close, *elsewhere]), None)
+
+
+def _is_about(detail: Any, names: Iterable[str]) -> bool:
+    """Return whether a message speaks of one of these keys, or of a place that is one."""
+    return any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", _explain(detail)) for name in names)
+
+
+def _take_out(values: dict[str, Any], detail: Any) -> set[str]:
+    """Take what is wrong out of the values; return the names of what is no longer as it was meant."""
+    location, names = [str(part) for part in detail["loc"]], set[str]()
+    if detail["type"] == "missing" and isinstance(detail["loc"][-1], int):
+        return _delete(values, location[:-1], whole=False)
+    if detail["type"] == "missing":
+        return {location[-1]}
+    if detail["type"] in {"value_error", "assertion_error"} and _section_at(location) is not None:
+        words = re.findall(r"[a-z]\w*(?:\.\w+)*", str(detail["msg"]))
+        for path in [[*location, *word.split(".")] for word in words] + [word.split(".") for word in words]:
+            names |= _delete(values, path, whole=True)
+        return names
+    names |= _delete(values, location, whole=False)
+    if detail["type"] == "extra_forbidden" and (meant := _meant(location)):
+        names.add(meant.split(".")[-1])
+    return names
+
+
+def _delete(values: dict[str, Any], path: Sequence[str], *, whole: bool) -> set[str]:
+    """Delete what is at a path, or what is nearest above it; `whole`: only if all of the path is there."""
+    inside: Any = values
+    for depth, key in enumerate(path):
+        if key not in inside:
+            return set()
+        if depth == len(path) - 1 or not (isinstance(inside[key], dict) and path[depth + 1] in inside[key]):
+            if whole and (depth < len(path) - 1 or (not depth and _section_at(path) is not None)):
+                return set()
+            del inside[key]
+            if not inside and depth and _section_at(path[:depth]) is None:  # an empty list of cameras is no camera
+                return {key, *_delete(values, path[:depth], whole=False)}
+            return {key}
+        inside = inside[key]
+    return set()
+
+
+def _stand_in(values: dict[str, Any], taken: set[str]) -> None:
+    """Fill in what has no default, so that the rest can be looked at."""
+    data, model = (values.setdefault(section, {}) for section in ("data", "model"))
+    for inside, key, others in ((values, "run_dir", ()), (data, "path", ()), (model, "base", ("random",))):
+        if not any(inside.get(one) is not None for one in (key, *others)):
+            inside[key] = "?"
+            taken.add(key)
+
+
+def _section_at(location: Iterable[Any]) -> type[BaseModel] | None:
+    section: type[BaseModel] | None = Config
+    for part in location:
+        if section is None or part not in section.model_fields:
+            return None
+        section = _section_of(section.model_fields[part].annotation)
+    return section
+
+
+def _section_of(annotation: Any) -> type[BaseModel] | None:
+    for candidate in (annotation, *getattr(annotation, "__args__", ())):
+        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
+            return candidate
+    return None
+
+
+def _keys_at(location: Iterable[Any]) -> list[str]:
+    section = _section_at(location)
+    return list(section.model_fields) if section else []

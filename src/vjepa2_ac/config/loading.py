@@ -1,0 +1,147 @@
+"""How is a config read? Strict YAML with dotted overrides; all that is wrong is reported at once, with its path."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml  # to write: `storage.structured` reads
+from pydantic import ValidationError
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.diagnostics import wrong_values
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.structured import parse_yaml, require_shallow
+
+_MOST_BYTES = 4 << 20  # of a config: data.exclude may name thousands of episodes
+
+
+def load_config(path: str | Path, overrides: Iterable[str] = ()) -> Config:
+    """Read a config file and apply `key.sub=value` overrides.
+
+    Raises:
+        InputError: The file cannot be read or is not a valid config; names every key that is wrong.
+    """
+    return parse_config(_overridden(_read_yaml(Path(path)), overrides), where=str(path))
+
+
+def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str) -> Config:
+    """Return a config of plain values with `key.sub=value` overrides, without a file.
+
+    Raises:
+        InputError: Names every key that is wrong.
+    """
+    return parse_config(_overridden(copy.deepcopy(dict(values)), overrides), where=where)
+
+
+def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
+    """Validate plain values, as YAML or JSON gives them.
+
+    Raises:
+        InputError: Names every key that is wrong, all at once.
+    """
+    require_shallow(dict(values), where=where)
+    try:
+        return Config.model_validate_json(json.dumps(values))
+    except ValidationError as error:
+        lines = wrong_values(values, error)
+        raise InputError(
+            where=where,
+            found=f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n"
+            + "\n".join(f"  {line}" for line in lines)
+            + "\n",
+            fix="`vjepa2-ac config schema` lists every key with its range",
+        ) from None
+    except (TypeError, ValueError) as error:  # of values that are not from a file
+        raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
+
+
+def config_as_dict(config: Config) -> dict[str, Any]:
+    """Return the resolved config as plain values, defaults included."""
+    return dict(config.model_dump(mode="json"))
+
+
+def config_as_flat_dict(config: Config) -> dict[str, Any]:
+    """Return the resolved config by dotted keys, which is what trackers take."""
+    return _flatten(config_as_dict(config))
+
+
+def config_as_yaml(config: Config) -> str:
+    """Return the resolved config as YAML that `load_config` reads back to an equal config."""
+    return str(yaml.dump(config_as_dict(config), Dumper=_Dumper, sort_keys=False))
+
+
+def config_schema() -> dict[str, Any]:
+    """Return the JSON schema of a config file, for editors."""
+    return Config.model_json_schema()
+
+
+def changed_keys(old: Config, new: Config) -> list[str]:
+    """Return the dotted keys in which two configs differ."""
+    flat_old, flat_new = config_as_flat_dict(old), config_as_flat_dict(new)
+    return sorted(key for key in flat_old.keys() | flat_new.keys() if flat_old.get(key) != flat_new.get(key))
+
+
+class _Dumper(yaml.SafeDumper):
+    """Puts text in quotes that would be read as another thing."""
+
+
+_Dumper.add_implicit_resolver("!number", re.compile(r"^[-+]?[\d_]*\.?[\d_]*[eE][-+]?\d+$"), list("-+.0123456789"))
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:  # which may be a pipe
+            data = file.read(_MOST_BYTES + 1)
+        text = data.decode()
+    except FileNotFoundError:
+        raise InputError(
+            where=str(path), found="no such file", needed="a config", fix="See configs/ for examples"
+        ) from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
+    if len(data) > _MOST_BYTES:
+        raise InputError(where=str(path), found=f"more than {_MOST_BYTES:,} bytes", needed="a config")
+    values = parse_yaml(text, where=str(path))
+    if not isinstance(values, dict):
+        found = "nothing" if values is None else f"a {type(values).__name__}"
+        raise InputError(where=str(path), found=found, needed="a mapping of keys to values")
+    return values
+
+
+def _overridden(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:
+    for override in overrides:
+        key, separator, text = override.partition("=")
+        if not separator or not key:
+            raise InputError(
+                where="command line", found=f"{override!r}", needed="an override such as training.steps=100"
+            )
+        _set(values, key.split("."), parse_yaml(text, where=f"command line: {key}"), override)
+    return values
+
+
+def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> None:
+    for depth, key in enumerate(keys[:-1]):
+        inner = values.setdefault(key, {})
+        if inner is None:
+            inner = values[key] = {}
+        if not isinstance(inner, dict):
+            raise InputError(
+                where=f"command line: {override}", found=f"{'.'.join(keys[: depth + 1])} is a value", needed="a section"
+            )
+        values = inner
+    values[keys[-1]] = value
+
+
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, dict):
+            flat |= _flatten(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat

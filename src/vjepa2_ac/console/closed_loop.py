@@ -1,0 +1,57 @@
+"""How does a contest in closed loop look in a terminal?"""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from vjepa2_ac.console.progress import FigureTable
+from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
+from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
+from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M
+
+_USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that need no word
+
+
+def contest_table(contest: ClosedLoopBenchmark) -> Table:
+    """Return a row for each who did the task; the intervals are 95 %, over episodes."""
+    asked, threshold = contest.asked, f"{100 * SUCCESS_M[contest.asked.task]:g} cm"
+    table = FigureTable(
+        f"{asked.task} in domain {asked.domain}: {asked.episodes} problems of seed {asked.seed},"
+        f" {contest.results[0].steps} steps of {contest.seconds_per_step:.2f} s (95 % interval over episodes)",
+    )
+    table.add_column("")
+    columns = (f"within {threshold} at the end", "once on the way", "left at the end, cm", "steps", "s per decision")
+    for column in columns:
+        table.add_column(column, justify="right")
+    for result in contest.results:
+        table.add_row(result.policy, *_cells(result))
+    return table
+
+
+def contest_notes(contest: ClosedLoopBenchmark) -> tuple[str, ...]:
+    """Return what a reader should know of single decisions and commands: a line each, none where all was as usual."""
+    notes = []
+    for result in contest.results:
+        unusual = {why: number for why, number in result.why_counts.items() if why not in _USUAL}
+        if unusual:
+            told = ", ".join(f"{why} {number}" for why, number in unusual.items())
+            notes.append(f"{result.policy}: of {result.seconds.size} decisions {told}")
+        if result.unreachable.any():
+            notes.append(f"{result.policy}: {result.unreachable.sum()} commands led out of the arm's reach")
+    return tuple(notes)
+
+
+def _cells(result: ClosedLoopResult) -> tuple[str, ...]:
+    distance, seconds = result.final_distance_cm, result.seconds_per_decision
+    return (
+        _share(result.success_rate),
+        _share(result.success_ever_rate),
+        f"{distance.value:.1f}" + (f" [{distance.low:.1f}, {distance.high:.1f}]" if distance.has_interval else ""),
+        "" if result.steps_needed is None else f"{result.steps_needed.value:.1f}",
+        f"{seconds.value:.2f}",
+    )
+
+
+def _share(share: Estimate) -> str:
+    return f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]"

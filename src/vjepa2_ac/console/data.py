@@ -1,0 +1,143 @@
+"""How does a data set look in a terminal? The lines and tables of check, index, inspect and calibrate."""
+
+from __future__ import annotations
+
+from rich.table import Table
+from rich.text import Text
+
+from vjepa2_ac.console.progress import FigureTable, console
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.index.index_cache import Usage
+from vjepa2_ac.data.inspection.finding import Finding
+from vjepa2_ac.data.inspection.statistics import PERCENTILES, Inspection
+from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, rows_of
+from vjepa2_ac.evaluation.stride_calibration.measure import Calibration
+
+_COLOURS = {"ok": "green", "warning": "yellow", "error": "red"}
+
+
+def print_finding(finding: Finding) -> None:
+    """Print one line of `data check`."""
+    level = Text(f"{finding.level:<7}", style=_COLOURS[finding.level])
+    console.print(level, console.render_str(f"{finding.about:<16}{finding.text}"), sep="  ")
+
+
+def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
+    """Return what `data index` says."""
+    lines = [f"{len(table):,} episodes, {int(table.num_steps.sum()):,} steps; opened in {seconds:.2f} s"]
+    if table.problems:
+        lines.append(f"{len(table.problems):,} broken episodes; the first: {table.problems[0].where}")
+    for path in dict.fromkeys(watch.files):
+        size = f"{path.stat().st_size / 1e6:.2f} MB" if path.is_file() else "could not be kept"
+        lines.append(f"  {path}  {size}")
+    return lines
+
+
+def inspection_lines(inspection: Inspection) -> list[str]:
+    """Return what `data inspect` says before its table."""
+    success = inspection.success_share
+    known = int((inspection.success >= 0).sum())
+    shortest, low, median, high, longest = inspection.length_percentiles
+    config = inspection.config
+    splits = ", ".join(
+        f"{name} {windows:,} clips in {inspection.episodes_of[name]:,} episodes"
+        for name, windows in inspection.windows_of.items()
+    )
+    removed = ", ".join(f"{one.name} {one}" for one in inspection.removed if one.episodes or one.steps)
+    rows = {
+        "data set": f"{config.path} ({config.source})",
+        "episodes": f"{len(inspection.lengths):,} ({inspection.broken:,} broken)",
+        "steps": f"{int(inspection.lengths.sum()):,} at {inspection.control_rate_hz:g} per second:"
+        f" {_lasting(inspection.hours)}",
+        "length": f"{shortest} / {low} / {median} / {high} / {longest} steps (least, 10 %, median, 90 %, most)",
+        "cameras": f"{', '.join(inspection.cameras)}; used: {', '.join(config.cameras)}",
+        "success": "not known" if success is None else f"{success:.1%} of {known:,} episodes of which it is known",
+        "left out": removed or "nothing",
+        "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
+        "duplicates": str(inspection.duplicates) + _copies_are_listed(inspection),
+        "sample": f"{len(inspection.sample):,} episodes, for what follows",
+        **(_pose_rows(inspection) if inspection.is_pose else _vector_rows(inspection)),
+    }
+    return [f"{name:<16}{text}" for name, text in rows.items()]
+
+
+def _copies_are_listed(inspection: Inspection) -> str:
+    return "; inspect.json lists the copies" if inspection.duplicates.copies else ""
+
+
+def _pose_rows(inspection: Inspection) -> dict[str, str]:
+    gripper = inspection.range_of(6)
+    limits = [(axis, *inspection.range_of(column)) for column, axis in enumerate("xyz")]
+    places = ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in limits)
+    return {
+        "standing still": f"{inspection.still_share:.1%} of the steps, by the measured motion",
+        "position": f"{places} m",
+        "gripper": f"{gripper[0]:.2f} to {gripper[1]:.2f} (0 open, 1 closed)",
+    }
+
+
+def _vector_rows(inspection: Inspection) -> dict[str, str]:
+    config, widths = inspection.config, inspection.widths
+    ranges = ", ".join(f"{low:.2f} to {high:.2f}" for low, high in inspection.ranges)
+    how = f", joined by {config.join_actions}" if config.join_actions else ""
+    return {"states": f"{widths.state} numbers: {ranges}", "actions": f"{widths.action} numbers, {config.actions}{how}"}
+
+
+def _lasting(hours: float) -> str:
+    return f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
+
+
+def motion_table(inspection: Inspection) -> Table:
+    """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
+    if not inspection.is_pose:
+        return _change_table(inspection)
+    table = FigureTable("Motion per model step: 10 / 50 / 90 / 99 %")
+    for name in ("stride", "seconds", "moves by (cm)", "turns by (degrees)"):
+        table.add_column(name, justify="right")
+    for one in inspection.motions:
+        figures = (one.percentiles("moved_cm"), one.percentiles("turned_deg"))
+        cells = (" / ".join(f"{value:.1f}" for value in values) or "no step fits" for values in figures)
+        table.add_row(str(one.stride), f"{one.seconds:.2f}", *cells)
+    return table
+
+
+def _change_table(inspection: Inspection) -> Table:
+    table = FigureTable("Change per model step: 10 / 50 / 90 / 99 %")
+    for name in ("stride", "seconds", "the number that changes most (% of its range)"):
+        table.add_column(name, justify="right")
+    for one in inspection.changes:
+        cell = " / ".join(f"{value:.1f}" for value in one.percentiles(PERCENTILES)) or "no step fits"
+        table.add_row(str(one.stride), f"{one.seconds:.2f}", cell)
+    return table
+
+
+def probe_table(probe: VariantProbe) -> Table:
+    """Return the table of `data check --model`."""
+    table = FigureTable("One-step error / persistence of the data, read otherwise")
+    for name in ("variant", "error / persistence", "difference"):
+        table.add_column(name, justify="left" if name == "variant" else "right")
+    for row in rows_of(probe):
+        table.add_row(*row)
+    return table
+
+
+def calibration_table(calibration: Calibration) -> Table:
+    """Return the table of `data calibrate`."""
+    table = FigureTable(
+        f"One-step error / persistence on {calibration.split} episodes, {calibration.frames} frames a clip"
+        " (95 % interval over episodes)"
+    )
+    for name in ("stride", "seconds", "error / persistence", "error", "persistence", "moves by", "clips (episodes)"):
+        table.add_column(name, justify="right")
+    for one in calibration.tried:
+        mark = " <" if one is calibration.best else ""
+        moved = "" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
+        table.add_row(
+            f"{one.stride}{mark}", f"{one.seconds_per_step:.2f}", str(one.ratio), f"{one.error:.4f}",
+            f"{one.persistence:.4f}", moved, f"{one.clips} ({one.episodes})",
+        )  # fmt: skip
+    if calibration.impossible:
+        table.caption = "\n".join(
+            f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()
+        )
+    return table

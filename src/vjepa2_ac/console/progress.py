@@ -1,0 +1,238 @@
+"""How does a run look in a terminal? Progress, tables, numbers; plain lines where there is no terminal."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from datetime import timedelta
+from typing import Any
+
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TaskID, TextColumn, TimeRemainingColumn
+from rich.table import Column, Table
+from rich.text import Text
+
+from vjepa2_ac.errors import printable
+from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, ratios_by_horizon
+
+_MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
+_WIDE = 120  # columns that leave room for a long bar
+_BESIDE_A_CELL = 3  # a line and two spaces
+_WHOLE = 16  # characters: a longer word of a table, such as a path, may be divided
+
+
+class PlainConsole(Console):
+    """Shows every text as it is: no brackets, colons or control characters of a name or path mean anything.
+
+    Whatever is to have a colour is a `rich.text.Text`.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, highlight=False, soft_wrap=True, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return what is printed of a text: of a line, a cell, a title."""
+        return super().render_str(printable(text), **options)
+
+
+class FigureTable(Table):
+    """A table whose figures and words stay whole: where the terminal is narrow, cells go on below at their spaces.
+
+    A cell may not squeeze the others, however long it is.
+    """
+
+    def __init__(self, title: str) -> None:
+        super().__init__(title=title, title_justify="left", caption_justify="left")
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Any]:
+        """Yield what is shown."""
+        room = options.max_width - len(self.columns) * _BESIDE_A_CELL - 1
+        for column, width in zip(self.columns, self._widths(room), strict=True):
+            column.width, column.overflow = width, "fold"
+        yield from super().__rich_console__(console, options)
+
+    def _widths(self, room: int) -> list[int]:
+        """Return how wide columns are: as wide as they like, or else the widest give way, down to whole words."""
+        texts = [[str(text) for text in (column.header, *column.cells)] for column in self.columns]
+        widths = [max(map(cell_len, of_column), default=1) for of_column in texts]
+        words = [[cell_len(word) for text in of_column for word in text.split()] for of_column in texts]
+        least = [max((size for size in sizes if size <= _WHOLE), default=1) for sizes in words]
+        while sum(widths) > room and (shrinking := [n for n, width in enumerate(widths) if width > least[n]]):
+            widths[max(shrinking, key=lambda n: widths[n])] -= 1
+        return widths
+
+
+class _Words(TextColumn):
+    """A column of a bar, of text that is shown as it is."""
+
+    def __init__(self, text_format: str, table_column: Column | None = None) -> None:
+        super().__init__(text_format, markup=False, table_column=table_column)
+
+    def render(self, task: Task) -> Text:
+        """Return what is shown of a task."""
+        return Text(printable(self.text_format.format(task=task)))
+
+
+console = PlainConsole()
+if not console.is_terminal:
+    console.width = 120  # a log file has room
+
+
+class ProgressBar:
+    """A bar with a few words behind it in a terminal; a line every few seconds elsewhere."""
+
+    def __init__(self, title: str, total: int, done: int = 0, line_every_s: float = 10.0) -> None:
+        self._title, self._total, self._done, self._line_every_s = title, total, done, line_every_s
+        self._first, self._began = done, time.monotonic()
+        self._last_line = self._began
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+        if console.is_terminal:
+            self._bar = Progress(
+                _Words("{task.description}"),
+                BarColumn(bar_width=40 if console.width >= _WIDE else 6, table_column=Column(no_wrap=True)),
+                MofNCompleteColumn(table_column=Column(no_wrap=True)),
+                TimeRemainingColumn(table_column=Column(no_wrap=True)),
+                _Words("{task.fields[words]}", table_column=Column()),  # goes on below where it does not fit
+                console=console,
+            )
+            self._task = self._bar.add_task(title, total=total, completed=done, words="")
+            self._bar.start()
+
+    def advance_to(self, done: int, words: str = "") -> None:
+        """Show that `done` of the total are done."""
+        self._done = done
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=done, words=words)
+        elif done == self._total or time.monotonic() - self._last_line >= self._line_every_s:
+            self._last_line = time.monotonic()
+            console.print(f"{self._title} {done}/{self._total}  {words}{self._left()}")
+        if done >= self._total:
+            self.close()
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+    def _left(self) -> str:
+        """Return the time left at the speed so far, in words."""
+        advanced, remaining = self._done - self._first, self._total - self._done
+        if advanced <= 0 or remaining <= 0:
+            return ""
+        seconds = (time.monotonic() - self._began) / advanced * remaining
+        return f"  {timedelta(seconds=round(seconds))} left"
+
+
+class LateProgress:
+    """A bar of work of which one learns how long it is when it begins; none is shown where there is nothing to do."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._bar: ProgressBar | None = None
+        self._total = -1
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that `done` of `total` are done; another total begins another bar."""
+        if total != self._total:
+            self.close()
+            self._bar, self._total = ProgressBar(self._title, total), total
+        if self._bar is not None:
+            self._bar.advance_to(done)
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+
+class EncodingBar:
+    """A bar of frames that are encoded, with their number per second; begins when it is first told of any."""
+
+    def __init__(self) -> None:
+        self._bar: ProgressBar | None = None
+        self._began = 0.0
+
+    def __call__(self, done: int, total: int) -> None:
+        """Show that `done` of `total` are done."""
+        if self._bar is None:
+            self._bar, self._began = ProgressBar("encoding frames", total), time.monotonic()
+        speed = done / max(time.monotonic() - self._began, 1e-9)
+        self._bar.advance_to(done, f"{speed:.{1 if speed < 100 else 0}f} frames/s" if done else "")
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+class DownloadProgress:
+    """Shows a download as it grows."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._bar: ProgressBar | None = None
+
+    def __call__(self, done: int, whole: int | None) -> None:
+        """Show that `done` of `whole` bytes are here; in megabytes."""
+        if self._bar is None:
+            self._bar = ProgressBar(f"{self._name} (MB)", (whole or 0) // 10**6)
+        self._bar.advance_to(done // 10**6)
+
+
+class ConsoleReporter:
+    """Shows a training run."""
+
+    def __init__(self) -> None:
+        self._looking = LateProgress("looking through the data set")
+        self._encoding = EncodingBar()
+        self._bar: ProgressBar | None = None
+        self._validation = ""
+
+    def note(self, text: str) -> None:
+        """Say something once."""
+        console.print(text)
+
+    def indexed(self, done: int, total: int) -> None:
+        """Show how far a data set is looked through."""
+        self._looking(done, total)
+
+    def encoded(self, done: int, total: int) -> None:
+        """Show how far the latent cache is."""
+        self._encoding(done, total)
+
+    def started(self, done: int, total: int) -> None:
+        """Begin the bar."""
+        self._bar = ProgressBar("training", total, done)
+
+    def stepped(self, step: int, figures: Mapping[str, float]) -> None:
+        """Move the bar."""
+        if self._bar is not None:
+            speed = figures["samples_per_second"]
+            words = [f"loss {figures['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
+            if "bytes_per_clip" in figures:
+                words.append(f"{figures['bytes_per_clip'] / 1e6:.2f} MB/clip")
+            if figures.get("data_wait_share", 0.0) > _MUCH_WAITING:
+                words.append(f"waits for data {figures['data_wait_share']:.0%} of the time")
+            self._bar.advance_to(step, "  ".join(word for word in words if word))
+
+    def validated(self, step: int, errors: PredictionErrors) -> None:
+        """Print a line of the validation's figures."""
+        one_step = one_step_ratios(errors)
+        self._validation = f"error/persistence {one_step['true'].value:.3f}"
+        horizons = "  ".join(f"{h}: {r.value:.3f}" for h, r in enumerate(ratios_by_horizon(errors), start=1))
+        console.print(
+            f"validation at step {step}: one-step error/persistence {one_step['true'].value:.3f}"
+            f" (zero actions {one_step['zero'].value:.3f}, shuffled {one_step['shuffled'].value:.3f});"
+            f" rollout by horizon  {horizons}"
+        )
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        self._looking.close()
+        self._encoding.close()
+        if self._bar is not None:
+            self._bar.close()

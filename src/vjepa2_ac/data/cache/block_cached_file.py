@@ -1,0 +1,61 @@
+"""How is a large file far away read, here and there, without fetching a piece twice? In blocks, kept on this disk."""
+
+from __future__ import annotations
+
+from itertools import groupby
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.cache.disk_cache import DiskCache
+from vjepa2_ac.storage.remote.buffered_file import RangedFile
+
+_BLOCK_BYTES = 128 << 10
+
+
+class BlockCachedFile(RangedFile):
+    """A file behind a URL to read and seek in; each block is fetched once on this machine.
+
+    The error of a fetch stays in `failure`: libraries that read through this object may wrap it in one of theirs.
+
+    Args:
+        path: The URL.
+        version: Differs when the content does; blocks of another version are not used.
+        size: The file's size.
+        kept: Where blocks stay on this machine.
+    """
+
+    def __init__(self, path: str, *, version: str, size: int, kept: DiskCache) -> None:
+        super().__init__(self._fetched, size)
+        self._path, self._kept = path, kept
+        self._bytes, self._key = size, f"{path} {version} {size}"
+        self.failure: Exception | None = None
+
+    def _fetched(self, start: int, length: int) -> bytes:
+        first, last = start // _BLOCK_BYTES, (start + length - 1) // _BLOCK_BYTES
+        try:
+            data = b"".join(self._blocks_of(first, last))
+        except Exception as error:
+            self.failure = error
+            raise
+        return data[start - first * _BLOCK_BYTES :][:length]
+
+    def _blocks_of(self, first: int, last: int) -> list[bytes]:
+        """Return blocks from the disk; those that lack are fetched, neighbours together."""
+        found = {number: self._at_hand(number) for number in range(first, last + 1)}
+        lacking = [number for number, block in found.items() if block is None]
+        runs = [
+            [number for _, number in run] for _, run in groupby(enumerate(lacking), key=lambda pair: pair[1] - pair[0])
+        ]
+        ranges = [(run[0] * _BLOCK_BYTES, sum(map(self._length_of, run))) for run in runs]
+        for run, data in zip(runs, storage.read_ranges(self._path, ranges), strict=True):
+            for place, number in enumerate(run):
+                block = data[place * _BLOCK_BYTES :][: self._length_of(number)]
+                self._kept.write(f"{self._key} {number}", block)
+                found[number] = block
+        return [block for block in found.values() if block is not None]
+
+    def _at_hand(self, number: int) -> bytes | None:
+        block = self._kept.read(f"{self._key} {number}")
+        return block if block is not None and len(block) == self._length_of(number) else None
+
+    def _length_of(self, number: int) -> int:
+        return min(_BLOCK_BYTES, self._bytes - number * _BLOCK_BYTES)

@@ -1,0 +1,67 @@
+"""How are an episode's files read, whole or in parts, and not fetched twice when they lie elsewhere?"""
+
+from __future__ import annotations
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
+from vjepa2_ac.data.cache.disk_cache import fetched_data
+from vjepa2_ac.errors import InputError
+
+
+class EpisodeFiles:
+    """Reads files; what is read of those behind URLs stays on this machine, within `data.disk_cache.limit_gb`."""
+
+    def __init__(self, config: DataConfig) -> None:
+        self._cache = fetched_data(config.disk_cache)
+
+    def open(self, path: str, *, version: str) -> str | BlockCachedFile:
+        """Return what to open to read parts of a file: the path itself on this machine, a file of kept blocks else.
+
+        Args:
+            path: Local path or URL.
+            version: What tells apart the contents that the file has had; its size is asked for once for each.
+
+        Raises:
+            OSError: A file behind a URL is not there or cannot be reached.
+        """
+        if not storage.is_url(path):
+            return path
+        key = f"size {path} {version}"
+        size = self._cache.read(key)
+        if size is None:
+            size = str(storage.file_size(path)).encode()
+            self._cache.write(key, size)
+        return BlockCachedFile(path, version=version, size=int(size), kept=self._cache)
+
+    def read(self, path: str, *, version: str, where: str) -> bytes:
+        """Return a whole file.
+
+        Args:
+            path: Local path or URL.
+            version: What tells apart the contents that the file has had; for what is kept of a URL.
+            where: The file and its episode, as an error names them.
+
+        Raises:
+            InputError: There is no such file; an UnreachableError where a local one cannot be read.
+            OSError: A file behind a URL cannot be read.
+        """
+        if not storage.is_url(path):
+            return _read(path, where)
+        key = f"{path}@{version}"
+        data = self._cache.read(key)
+        if data is None:
+            data = _read(path, where)
+            self._cache.write(key, data)
+        return data
+
+
+def _read(path: str, where: str) -> bytes:
+    try:
+        return storage.read_bytes(path)
+    except FileNotFoundError:
+        raise InputError(where=where, found="no such file", fix="Copy the episode again") from None
+    except OSError as error:
+        if storage.is_url(path):
+            raise
+        raise storage.unreadable(where, error) from None

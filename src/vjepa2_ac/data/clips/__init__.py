@@ -1,0 +1,1 @@
+"""Clips: how do episodes become batches, in which order?"""

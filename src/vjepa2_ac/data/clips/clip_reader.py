@@ -1,0 +1,174 @@
+"""How do the steps and pictures of an episode become a clip, and clips a batch?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from vjepa2_ac.data.clips.actions import actions_of, require_widths
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.clips.transforms import view
+from vjepa2_ac.data.filters.exclusion import with_way_out
+from vjepa2_ac.episode import Augmentation, Batch, Clip, Episode, StoredLatents, Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import states_in_camera_frame
+from vjepa2_ac.storage.remote import UnreachableError
+
+Augment = Callable[[int, int], Augmentation | None]  # from the height and width of a clip's frames
+
+
+@dataclass(frozen=True)
+class ClipRequest:
+    """A clip that is to be read."""
+
+    episode: int
+    start: int
+    camera: str | None
+    augmentation: Augment | None = None
+
+
+def clip_at(
+    dataset: Dataset, episode: int, start: int, *, camera: str | None = None, augmentation: Augment | None = None
+) -> Clip:
+    """Return the clip that starts at a control step of an episode; decodes its frames only.
+
+    Args:
+        dataset: Where it comes from.
+        episode: Index into the data set's table.
+        start: First control step.
+        camera: Whose pictures; None: the config's (first) camera.
+        augmentation: Draws what is to be changed, once the size of the frames is known.
+
+    Raises:
+        InputError: The episode or one of the pictures cannot be read; says how to leave the episode out.
+    """
+    try:
+        return read_clip(dataset, ClipRequest(episode, start, camera, augmentation))
+    except UnreachableError:
+        raise  # the network's fault, not the episode's
+    except InputError as error:
+        raise with_way_out(error, [dataset.table.identity(episode)]) from None
+
+
+def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
+    """Stack clips into a batch; it has camera poses if each of the clips has.
+
+    Raises:
+        InputError: The pictures of two clips differ in size.
+    """
+    frames = [clip.frames for clip in clips if clip.frames is not None]
+    latents = [clip.latents for clip in clips if clip.latents is not None]
+    if frames:
+        _require_one_size(clips)
+    extrinsics = [clip.extrinsics for clip in clips if clip.extrinsics is not None]
+    augmentations = tuple(clip.augmentation for clip in clips if clip.augmentation is not None)
+    return Batch(
+        frames=torch.from_numpy(np.stack(frames)) if frames else None,
+        states=torch.from_numpy(np.stack([clip.states for clip in clips])),
+        actions=torch.from_numpy(np.stack([clip.actions for clip in clips])),
+        extrinsics=torch.from_numpy(np.stack(extrinsics)) if len(extrinsics) == len(clips) else None,
+        episode_ids=tuple(clip.episode_id for clip in clips),
+        starts=tuple(clip.start for clip in clips),
+        augmentations=augmentations,
+        bytes_fetched=bytes_fetched,
+        latents=_stacked(latents) if latents else None,
+        cameras=tuple(clip.camera for clip in clips),
+    )
+
+
+def pictures_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return the frames of a clip of a batch, cropped, for people to look at; of cached latents, small pictures.
+
+    Raises:
+        InputError: The pictures of a cache cannot be read.
+        ValueError: The clip is of another data set.
+    """
+    if batch.frames is not None:
+        return batch.frames[row].numpy()
+    episode, start = dataset.table.find(batch.episode_ids[row]), batch.starts[row]
+    if episode is None:
+        raise ValueError(f"no episode {batch.episode_ids[row]}")
+    steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
+    return view(dataset.source.read(episode, batch.cameras[row]).read_frames(steps), dataset.config.crop)
+
+
+def _require_one_size(clips: Sequence[Clip]) -> None:
+    shapes = [(clip.frames.shape, clip) for clip in clips if clip.frames is not None]
+    first_shape, first = shapes[0]
+    for shape, clip in shapes:
+        if shape != first_shape:
+            error = InputError(
+                where=f"episode {clip.episode_id}",
+                found=f"pictures of {'x'.join(map(str, shape[1:3]))} after the crop",
+                needed=f"{'x'.join(map(str, first_shape[1:3]))}, as in episode {first.episode_id}",
+                fix="Train on episodes of one size, or set training.batch_size: 1",
+            )
+            raise with_way_out(error, [clip.episode_id], skippable=False)
+
+
+def _stacked(latents: Sequence[StoredLatents]) -> StoredLatents:
+    scales = [one.scales for one in latents if one.scales is not None]
+    return StoredLatents(torch.stack([one.values for one in latents]), torch.stack(scales) if scales else None)
+
+
+def read_clip(dataset: Dataset, wish: ClipRequest) -> Clip:
+    """Return a clip; its errors do not say how to leave the episode out, as those of `clip_at` do."""
+    config = dataset.config
+    steps = range(wish.start, wish.start + config.clip_steps, config.model_stride)
+    recording = dataset.source.read(wish.episode, wish.camera, dataset.needed_steps(wish.episode))
+    require_widths(recording, dataset.widths)
+    frames = latents = augmentation = None
+    if recording.read_latents is not None:
+        latents = recording.read_latents(steps)
+    else:
+        frames = view(recording.read_frames(steps), config.crop)
+        draw_change = wish.augmentation
+        augmentation = None if draw_change is None else draw_change(frames.shape[1], frames.shape[2])
+    states, extrinsics = _states(recording, list(steps), in_camera_frame=config.pose_frame == "camera")
+    return Clip(
+        frames=frames,
+        states=states.astype(np.float32),
+        actions=actions_of(states, recording.commands, steps, config).astype(np.float32),
+        extrinsics=None if extrinsics is None else extrinsics.astype(np.float32),
+        episode_id=recording.info.id,
+        start=wish.start,
+        stride=config.model_stride,
+        augmentation=augmentation,
+        latents=latents,
+        camera=wish.camera,
+    )
+
+
+def _states(
+    recording: Episode, steps: list[int], *, in_camera_frame: bool
+) -> tuple[Float[np.ndarray, "time state_dim"], Float[np.ndarray, "time 6"] | None]:
+    """Return states and camera poses at some steps."""
+    states = recording.states[steps]
+    extrinsics = None if recording.extrinsics is None else recording.extrinsics[steps]
+    if not in_camera_frame:
+        return states, extrinsics
+    if extrinsics is None:
+        raise InputError(
+            where=f"episode {recording.info.id}",
+            found="no pose of the camera",
+            needed="one, for data.pose_frame: camera",
+            fix="Set data.pose_frame: base, or choose a camera that has one",
+        )
+    return states_in_camera_frame(states, extrinsics), extrinsics
+
+
+def no_clips(frames: int, widths: Widths, bytes_fetched: int) -> Batch:
+    """Return a micro-batch of which no clip could be read."""
+    return Batch(
+        frames=torch.zeros(0, frames, 1, 1, 3, dtype=torch.uint8),
+        states=torch.zeros(0, frames, widths.state),
+        actions=torch.zeros(0, frames - 1, widths.action),
+        extrinsics=None,
+        episode_ids=(),
+        starts=(),
+        bytes_fetched=bytes_fetched,
+    )

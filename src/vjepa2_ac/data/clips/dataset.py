@@ -1,0 +1,301 @@
+"""Which episodes and steps of a data set take part? Opened once, filtered once, and small enough for every worker."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Int, UInt64
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.clips.actions import widths_of
+from vjepa2_ac.data.clips.windows import Split, Windows, windows_of
+from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
+from vjepa2_ac.data.filters.exclusion import included, with_way_out
+from vjepa2_ac.data.filters.grouping import split_hash
+from vjepa2_ac.data.filters.idle_ranges import FoundRanges, find_ranges
+from vjepa2_ac.data.filters.step_ranges import ClipStarts, StepSelection, clip_starts
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.sources.latents.source import LatentSource
+from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.episode import POSE_WIDTHS, EpisodeSource, Progress, StepRanges, Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.remote import UnreachableError
+
+logger = logging.getLogger(__name__)
+
+_TRIED = 8  # episodes that are read for their widths, where some are broken
+
+
+@dataclass(frozen=True)
+class Removed:
+    """What a filter took away, after those before it."""
+
+    name: str  # excluded, broken, outcome, idle
+    episodes: int  # of which no step is left
+    steps: int  # of episodes that could be read
+    windows: int | None  # clips; None while data.stride is auto
+    stays: float = 0.0  # share of the clips from these steps that stay all the same (data.idle.keep_share)
+
+    def __str__(self) -> str:
+        clips = "" if self.windows is None else f", {self.windows:,} clips"
+        stays = f" ({self.stays:.0%} of the clips from these stay)" if self.stays else ""
+        return f"{self.episodes:,} episodes, {self.steps:,} steps{clips}{stays}"
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A data set that is open: its episodes, and what the config leaves of them. Can be pickled to a loader worker."""
+
+    config: DataConfig
+    source: EpisodeSource
+    table: EpisodeTable
+    kept: StepSelection
+    broken: BrokenEpisodes  # grows in the process that opened the set
+    groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each one's group; None: `data.split_by` names none
+
+    @property
+    def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
+        """What decides the split of each episode."""
+        return self.table.id_hash if self.groups is None else self.groups
+
+    def windows(self, split: Split) -> Windows:
+        """Return the clips of a split.
+
+        Raises:
+            InputError: There are none; see `windows_of`.
+        """
+        return windows_of(self.table, self.kept.taking_part, self.starts, self.config, split, self.split_hash)
+
+    def with_stride(self, stride: int) -> Dataset:
+        """Return the same data at another stride.
+
+        Raises:
+            InputError: The data is a latent cache, which has frames of one stride only.
+        """
+        if self.config.source == "latents" and stride != self.config.stride:
+            raise InputError(
+                where=self.config.path,
+                found=f"latents that were encoded for clips at stride {self.config.stride}",
+                needed=f"stride {stride}",
+                fix="Use the data set itself, with data.cache: off",
+            )
+        return replace(self, config=self.config.with_stride(stride))
+
+    @cached_property
+    def removed(self) -> tuple[Removed, ...]:
+        """What each filter took away, in the order in which they are applied."""
+        included_ones = included(self.table, self.config)
+        of_outcome = included_ones & _of_outcome(self.table, self.config)
+        excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
+        stages = (
+            ("excluded", np.ones(len(self.table), bool), excluded),
+            ("outcome", included_ones, 0),
+            ("broken", of_outcome, len(self.table.problems) - excluded),
+            ("idle", self.kept.taking_part, 0),
+        )
+        left = [self._count(StepSelection.whole(self.table, mask)) for _, mask, _ in stages]
+        pairs = zip(stages, left, [*left[1:], self._count(self.kept)], strict=True)
+        return tuple(
+            Removed(
+                name,
+                before[0] - after[0] + unread,
+                before[1] - after[1],
+                before[2] - after[2] if self.config.stride != "auto" else None,
+                self.config.idle.keep_share if name == "idle" else 0.0,
+            )
+            for (name, _, unread), before, after in pairs
+        )
+
+    def _count(self, kept: StepSelection) -> tuple[int, int, int]:
+        """Return episodes, steps and, where the stride is known, windows."""
+        windows = 0
+        if self.config.stride != "auto":
+            starts = self.starts if kept is self.kept else clip_starts(self.table, kept, self.config)
+            windows = starts.windows
+        episodes = self.episodes if kept is self.kept else np.unique(kept.episode)
+        return len(episodes), kept.steps, windows
+
+    @property
+    def episodes(self) -> Int[np.ndarray, " episodes"]:
+        """The episodes that clips may come from."""
+        if self.config.idle.rule != "none" and self.config.idle.keep_share > 0:
+            return np.flatnonzero(self.kept.taking_part)
+        return np.unique(self.kept.episode)
+
+    @cached_property
+    def starts(self) -> ClipStarts:
+        """The first steps of the clips of all splits.
+
+        Raises:
+            ValueError: The stride is still to be found out.
+        """
+        return clip_starts(self.table, self.kept, self.config)
+
+    @cached_property
+    def control_rate_hz(self) -> float:
+        """Control steps per second: what the source says of the whole set, or else of its first episode."""
+        said = self.table.texts.get("control_rate_hz")
+        return float(said) if said is not None else self.source.read(int(self.episodes[0])).control_rate_hz
+
+    @cached_property
+    def widths(self) -> Widths:
+        """How many numbers states and actions have: 7 of poses, else those of the first episode that can be read.
+
+        Raises:
+            InputError: None of the first ones can be.
+        """
+        if self.config.states == "pose":
+            return POSE_WIDTHS
+        if said := self.table.texts.get("widths"):
+            return Widths(*map(int, said.split()))
+        first_error: InputError | None = None
+        for episode in self.episodes[:_TRIED].tolist():
+            try:
+                return widths_of(self.source.read(episode))
+            except UnreachableError:
+                raise
+            except InputError as error:
+                first_error = first_error or error
+        raise first_error or ValueError("a data set without episodes")
+
+    def leave_out(self, episode: int, error: InputError) -> None:
+        """Do what `data.broken_episodes` says with an episode that cannot be read: take note of it, or stop.
+
+        Raises:
+            InputError: The error with the way out; or, too many are broken by now.
+        """
+        if isinstance(error, UnreachableError):
+            raise error  # the network's fault, not the episode's
+        name = self.table.identity(episode)
+        if self.config.broken_episodes == "error":
+            raise with_way_out(error, [name]) from None
+        self.broken.met(name, str(error))
+
+    def needed_steps(self, episode: int) -> StepRanges | None:
+        """Return the steps of an episode that clips may come from; None: all of them."""
+        if self.config.idle.rule == "none" or self.config.idle.keep_share > 0:
+            return None
+        return self.kept.of(episode)
+
+
+def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dataset:
+    """Open a data set and decide what of it takes part.
+
+    Args:
+        config: Where it is, and what is left out.
+        progress: Told (done, total) where the set is looked through for the first time.
+
+    Raises:
+        InputError: There is no such set; an episode is broken and `data.broken_episodes` does not skip it, or too many
+            are; two episodes have one identity; a filter or `data.split_by` cannot be applied; or nothing is left.
+    """
+    source = open_source(config)
+    table = EpisodeTable.of(source.infos(progress))
+    broken = BrokenEpisodes(config, len(table) + len(table.problems))
+    taking_part = included(table, config)
+    _require_distinct(table, taking_part, config)
+    excluded = frozenset(config.exclude)
+    broken.found([problem for problem in table.problems if problem.name not in excluded])
+    taking_part &= _of_outcome(table, config)
+    if config.idle.rule == "none":
+        kept = StepSelection.whole(table, taking_part)
+    else:
+        if isinstance(source, LatentSource):
+            ranges = source.kept_ranges()
+        else:
+            ranges = find_ranges(source, table, config, progress)
+        kept = _kept_of(ranges, table, taking_part, broken)
+        _say_how_many_are_listed(ranges, table, config)
+    dataset = Dataset(config, source, table, kept, broken, split_hash(table, kept.taking_part, config))
+    if not len(dataset.episodes):
+        raise _nothing_left(dataset)
+    if isinstance(source, LatentSource):
+        dataset = _of_latents(dataset, source)
+    logger.info("%s: %d episodes take part, %d steps of them", config.path, kept.taking_part.sum(), kept.steps)
+    return dataset
+
+
+def through_latents(dataset: Dataset, folder: Path) -> Dataset:
+    """Return the same data set, with the same clips in the same order, read from a latent cache that was made of it.
+
+    Raises:
+        InputError: The cache lacks episodes or is damaged.
+    """
+    changes = {"source": "latents", "path": str(folder), "cache": "off", "camera": dataset.config.cameras}
+    source = LatentSource(dataset.config.model_copy(update=changes))
+    return _of_latents(replace(dataset, source=source, table=source.infos()), source)
+
+
+def _of_latents(dataset: Dataset, source: LatentSource) -> Dataset:
+    """Check that a cache has what the clips need, and name its cameras in the config."""
+    source.require_encoded(dataset.starts.episode)
+    excluded = frozenset(dataset.config.exclude)
+    dataset.broken.found([problem for problem in source.wrong_files() if problem.name not in excluded])
+    return replace(dataset, config=source.settled_config)
+
+
+def _nothing_left(dataset: Dataset) -> InputError:
+    filters = ", ".join(f"{one.name} {one.episodes}" for one in dataset.removed if one.episodes)
+    return InputError(
+        where=f"data.path: {dataset.config.path}",
+        found=f"none of {len(dataset.table) + len(dataset.table.problems)} episodes is left"
+        + (f" (left out: {filters})" if filters else ""),
+        needed="at least one",
+        fix="Look at data.exclude, data.outcome and data.idle" if filters else "",
+    )
+
+
+def _kept_of(
+    found: FoundRanges, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], broken: BrokenEpisodes
+) -> StepSelection:
+    met = [(place, problem) for place, problem in found.problems if taking_part[place]]
+    broken.found([problem for _, problem in met])
+    taking_part[[place for place, _ in met]] = False
+    everything = StepSelection(found.episode, found.start, found.end, np.ones(len(table), bool))
+    return everything.only(taking_part)
+
+
+def _of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
+    if config.outcome == "all":
+        return np.ones(len(table), bool)
+    if len(table) and (table.success < 0).all():
+        raise InputError(
+            where=f"data.outcome: {config.outcome}",
+            found=f"no episode of {config.path} says whether it succeeded",
+            needed="at least some that do",
+            fix="Set data.outcome: all",
+        )
+    return np.asarray(table.success == (config.outcome == "success"))
+
+
+def _say_how_many_are_listed(found: FoundRanges, table: EpisodeTable, config: DataConfig) -> None:
+    if config.idle.rule != "published":
+        return
+    logger.log(
+        logging.INFO if found.listed == len(table) else logging.WARNING,
+        "%s: knows %d of the %d episodes; the other %d count as idle",
+        config.idle.ranges, found.listed, len(table), len(table) - found.listed,
+    )  # fmt: skip
+
+
+def _require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig) -> None:
+    """Refuse two episodes of one identity: they would fall into one split, and an error could not name one of them."""
+    order = np.argsort(table.id_hash, kind="stable")
+    order = order[taking_part[order]]
+    hashes = table.id_hash[order]
+    for place in np.flatnonzero(hashes[1:] == hashes[:-1]):
+        first, second = sorted((int(order[place]), int(order[place + 1])))
+        if table.identity(first) == table.identity(second):
+            error = InputError(
+                where=f"data.path: {config.path}",
+                found=f"episodes {first} and {second} have the same identity: {table.identity(first)}",
+                needed="episodes that can be told apart: the split is a hash of the identity",
+                fix="Add a feature to data.fields.identity that differs between them"
+                if config.source == "rlds"
+                else "",
+            )
+            raise with_way_out(error, [table.identity(first)], skippable=False)

@@ -1,0 +1,250 @@
+"""How do clips become batches, in an order that nothing can disturb?
+
+The batch at a place of the run is a pure function of the seed and that place. Workers only decide how soon it is there.
+"""
+
+from __future__ import annotations
+
+import atexit
+import itertools
+import multiprocessing
+from collections.abc import Generator, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader
+from torch.utils.data import Dataset as TorchDataset
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.clips.augmentation import draw
+from vjepa2_ac.data.clips.clip_reader import ClipRequest, clip_at, collate, no_clips, read_clip
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.clips.prefetch import Batches, MicroBatch
+from vjepa2_ac.data.clips.streams import NO_COPIES, Copies
+from vjepa2_ac.data.clips.windows import ClipOrder, Split, far_neighbours, spread
+from vjepa2_ac.data.clips.worker_processes import end_with_the_run, end_workers, start_servers_deaf
+from vjepa2_ac.data.filters.exclusion import named
+from vjepa2_ac.data.filters.step_ranges import drawn
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.episode import Augmentation, Batch, Clip, Skipped
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.remote import UnreachableError
+
+CLIPS_WORTH_WORKERS = 256  # fewer validation clips are read before the workers have started
+
+
+def training_loader(
+    dataset: Dataset,
+    *,
+    seed: int,
+    batch_size: int,
+    start_position: int = 0,
+    rank: int = 0,
+    world_size: int = 1,
+    copies: Copies = NO_COPIES,
+) -> Batches:
+    """Yield the micro-batches of one rank, without end, from any position of the run at once.
+
+    The run is one row of clips. Micro-batch m of rank r holds the `batch_size` clips from position
+    start_position + (m * world_size + r) * batch_size, so after m micro-batches of every rank the position to resume
+    from is start_position + m * world_size * batch_size. Where `data.broken_episodes` is skip, clips that cannot be
+    read are missing from their micro-batch, which may even be empty; no other clip takes their place.
+
+    Where batches are copied to a device ahead (`copies`), they are in pinned memory.
+
+    Raises:
+        InputError: There is nothing to train on, or a clip cannot be read, also where a worker met it.
+    """
+    clips = _Clips(dataset, _TrainingClips(dataset.config, ClipOrder(dataset.windows("train"), seed)))
+    rows = _rows(start_position + rank * batch_size, batch_size, batch_size * world_size)
+    return _batches(clips, rows, dataset.config.workers, copies)
+
+
+def validation_batches(
+    dataset: Dataset, split: Split, *, clips: int, batch_size: int, copies: Copies = NO_COPIES
+) -> Iterator[Batch]:
+    """Yield a fixed set of at most `clips` clips of a split, evenly spread over its windows, in batches.
+
+    The set follows from the data alone: neither the seed nor the number of shards changes it. Neighbours in it are
+    from far apart, so that the actions of one are no stand-in for those of the next. A large set is read by workers.
+
+    Raises:
+        InputError: The split is empty, or a clip cannot be read.
+    """
+    return batches_of(dataset, validation_windows(dataset, split, clips=clips), batch_size=batch_size, copies=copies)
+
+
+def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tuple[int, int]]:
+    """Return where those clips start: (episode, first control step), in their order.
+
+    Raises:
+        InputError: The split is empty.
+    """
+    windows = dataset.windows(split)
+    return [windows[index] for index in far_neighbours(spread(len(windows), clips))]
+
+
+def batches_of(
+    dataset: Dataset, windows: Sequence[tuple[int, int]], *, batch_size: int, copies: Copies = NO_COPIES
+) -> Iterator[Batch]:
+    """Yield the clips that start at these (episode, first control step), in this order, in batches.
+
+    Where `data.broken_episodes` is skip, a batch may be smaller; none is empty. Many clips are read by workers.
+
+    Raises:
+        InputError: A clip cannot be read; or, by policy, none of them.
+    """
+    count = len(windows)
+    rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
+    workers = dataset.config.workers if count >= CLIPS_WORTH_WORKERS else 0
+    clips = _Clips(dataset, _ChosenClips(dataset.config, dataset.table, list(windows)))
+    return _some_of(_batches(clips, iter(rows), workers, copies), dataset)
+
+
+def _some_of(batches: Iterator[Batch], dataset: Dataset) -> Iterator[Batch]:
+    """Yield the batches that hold clips.
+
+    Raises:
+        InputError: None does.
+    """
+    empty = True
+    for batch in batches:
+        if batch.starts:
+            empty = False
+            yield batch
+    if empty:
+        raise InputError(
+            where=f"data.path: {dataset.config.path}",
+            found=f"no clip that was tried can be read; broken episodes: {named(dataset.broken.names)}",
+            needed="at least one",
+            fix="Mend or fetch these episodes again, or add them to data.exclude",
+        )
+
+
+@runtime_checkable
+class _Wishes(Protocol):
+    """Says which clip stands at a position; a pure function, the same in every worker."""
+
+    def at(self, position: int) -> ClipRequest: ...
+
+
+@dataclass(frozen=True)
+class _TrainingClips:
+    """The endless row of a run: a permutation of all windows each epoch; camera and changes are drawn per clip."""
+
+    config: DataConfig
+    order: ClipOrder
+
+    def at(self, position: int) -> ClipRequest:
+        def augmentation(height: int, width: int) -> Augmentation | None:
+            return draw(self.config.augment, height, width, seed=self.order.seed, position=position)
+
+        cameras = self.config.cameras
+        return ClipRequest(
+            *self.order.window(position), cameras[self.order.choice(position, len(cameras))], augmentation
+        )
+
+
+@dataclass(frozen=True)
+class _ChosenClips:
+    """A fixed list of windows; the camera is drawn per window."""
+
+    config: DataConfig
+    table: EpisodeTable
+    windows: list[tuple[int, int]]
+
+    def at(self, position: int) -> ClipRequest:
+        episode, start = self.windows[position]
+        # Not the number by which idle windows were drawn: those that stay have a small one, and would share a camera.
+        number = drawn(~self.table.id_hash[[episode]], np.array([start], np.int32))[0]
+        return ClipRequest(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
+
+
+@dataclass(frozen=True)
+class _Clips(TorchDataset[MicroBatch]):
+    """Clips by position, read a micro-batch at a time."""
+
+    dataset: Dataset
+    wishes: _Wishes
+
+    def __getitems__(self, positions: list[int]) -> MicroBatch | InputError:
+        """Return a micro-batch, or the error that prevents it: DataLoader could not carry that one home unharmed."""
+        before = storage.bytes_fetched()
+        try:
+            read = self._read(positions)
+            clips = [one for one in read if isinstance(one, Clip)]
+            skipped = tuple(one for one in read if isinstance(one, Skipped))
+            fetched = storage.bytes_fetched() - before
+            if not clips:
+                return MicroBatch(no_clips(self.dataset.config.frames, self.dataset.widths, fetched), skipped)
+            return MicroBatch(collate(clips, fetched), skipped)
+        except InputError as error:
+            return error
+
+    def _read(self, positions: list[int]) -> list[Clip | Skipped]:
+        config = self.dataset.config
+        if not storage.is_url(config.path):
+            return [self._clip(position) for position in positions]
+        with ThreadPoolExecutor(min(len(positions), config.connections)) as pool:
+            return list(pool.map(self._clip, positions))
+
+    def _clip(self, position: int) -> Clip | Skipped:
+        wish = self.wishes.at(position)
+        if self.dataset.config.broken_episodes == "error":
+            return clip_at(self.dataset, wish.episode, wish.start, camera=wish.camera, augmentation=wish.augmentation)
+        try:
+            return read_clip(self.dataset, wish)
+        except UnreachableError:
+            raise  # the network's fault, not the episode's
+        except InputError as error:
+            return Skipped(self.dataset.table.identity(wish.episode), str(error))
+
+
+def _rows(first: int, length: int, distance: int) -> Iterator[list[int]]:
+    for start in itertools.count(first, distance):
+        yield list(range(start, start + length))
+
+
+def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int, copies: Copies) -> Batches:
+    return Batches(_read(clips, positions, workers, pinned=copies.overlap), clips.dataset.broken, copies)
+
+
+def _read(
+    clips: _Clips, positions: Iterator[list[int]], workers: int, *, pinned: bool
+) -> Generator[MicroBatch | InputError, None, None]:
+    # A fork server has no threads: a plain fork may hang in OpenMP or CUDA, and Python warns of it.
+    context = multiprocessing.get_context("forkserver") if workers else None
+    if context is not None:
+        context.set_forkserver_preload([__name__])
+        start_servers_deaf()
+    loader = DataLoader(
+        clips,
+        batch_sampler=positions,
+        collate_fn=_as_it_is,
+        generator=torch.Generator(),  # else the loader draws from the generator that dropout draws from
+        num_workers=workers,
+        multiprocessing_context=context,
+        worker_init_fn=end_with_the_run if workers else None,
+        prefetch_factor=clips.dataset.config.prefetch if workers else None,
+        pin_memory=pinned,
+    )
+    others = set(multiprocessing.active_children())
+    rows = iter(loader)
+    ours = set(multiprocessing.active_children()) - others
+    at_exit = partial(end_workers, ours)
+    atexit.register(at_exit)  # multiprocessing's own way is SIGTERM, and to wait for those that are deaf to it
+    try:
+        yield from rows
+    finally:
+        del rows  # asks the workers to end, and waits a while
+        end_workers(ours)
+        atexit.unregister(at_exit)
+
+
+def _as_it_is(batch: Any) -> Any:
+    return batch

@@ -1,0 +1,104 @@
+"""How is a batch on the device before it is asked for? It is fetched ahead, and told of only when its turn has come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass, replace
+from typing import Protocol, runtime_checkable
+
+from vjepa2_ac.data.clips.streams import Copies
+from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
+from vjepa2_ac.episode import Batch, Skipped
+from vjepa2_ac.errors import InputError
+
+
+@dataclass(frozen=True)
+class MicroBatch:
+    """What a worker sends home for one micro-batch."""
+
+    batch: Batch
+    skipped: tuple[Skipped, ...] = ()
+
+    def pin_memory(self) -> MicroBatch:
+        """Return it in pinned memory; DataLoader calls a method of this name, where it pins."""
+        return replace(self, batch=self.batch.pin_memory())
+
+
+@runtime_checkable
+class FetchesAhead(Protocol):
+    """Batches of which the next one can be fetched before it is asked for."""
+
+    def fetch_ahead(self) -> None:
+        """Fetch it now."""
+        ...
+
+
+def fetch_ahead(batches: Iterator[Batch]) -> None:
+    """Fetch the next batch where these batches can do so ahead: to be called before the host waits for the device."""
+    if isinstance(batches, FetchesAhead):
+        batches.fetch_ahead()
+
+
+class Batches(Iterator[Batch]):
+    """The batches of a loader, in order, each on its way to the device since it was fetched.
+
+    They stay on the host; a copy on the device is in `on_device`. What is wrong with a batch, and which clips it lacks,
+    is told when it is asked for and not when it is fetched ahead: a checkpoint in between must not know of it.
+
+    Args:
+        rows: What the workers send home: micro-batches, and errors in the place of such.
+        broken: Takes note of clips that could not be read.
+        copies: How batches get to the device; where nothing overlaps they do not, and nothing is fetched ahead.
+    """
+
+    def __init__(
+        self, rows: Generator[MicroBatch | InputError, None, None], broken: BrokenEpisodes, copies: Copies
+    ) -> None:
+        self._rows, self._broken, self._copies = rows, broken, copies
+        self._ahead: Exception | _Fetched | None = None
+
+    def __next__(self) -> Batch:
+        """Return the next batch.
+
+        Raises:
+            InputError: A clip cannot be read, also where a worker met it; or too many cannot.
+        """
+        fetched, self._ahead = self._ahead or self._fetched(), None
+        if isinstance(fetched, Exception):
+            self.close()
+            raise fetched
+        for one in fetched.row.skipped:
+            self._broken.met(one.episode_id, one.reason)
+        return replace(fetched.row.batch, on_device=fetched.on_device)
+
+    def fetch_ahead(self) -> None:
+        """Fetch the next batch and start its way to the device."""
+        if self._copies.overlap and self._ahead is None:
+            self._ahead = self._fetched()
+
+    def close(self) -> None:
+        """End the workers; what was fetched ahead is nobody's."""
+        self._ahead = None
+        self._rows.close()
+
+    def _fetched(self) -> Exception | _Fetched:
+        try:
+            row = next(self._rows)
+            if isinstance(row, InputError):
+                return row
+            on_device = _given_once(self._copies.to_device.start(row.batch.mapped)) if self._copies.overlap else None
+        except Exception as error:  # also the end of the rows
+            return error
+        return _Fetched(row, on_device)
+
+
+@dataclass(frozen=True)
+class _Fetched:
+    row: MicroBatch
+    on_device: Callable[[], Batch | None] | None
+
+
+def _given_once(taken: Callable[[], Batch]) -> Callable[[], Batch | None]:
+    """Return what gives a copy and forgets it, so that it lives no longer than it is used."""
+    held = [taken]
+    return lambda: held.pop()() if held else None

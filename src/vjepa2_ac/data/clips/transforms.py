@@ -1,0 +1,131 @@
+"""How does a camera's picture become what the encoder sees? Crop, augmentation, scaling, normalisation.
+
+The crop is taken in the loader, on uint8; all else runs on the device, on a whole batch.
+
+Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/transforms.py and src/datasets/utils/video/transforms.py. The
+recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, is always taken: nothing is random.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vjepa2_ac.data.clips.augmentation import jittered
+from vjepa2_ac.episode import Augmentation
+
+Crop = Literal["released", "square", "letterbox"]
+
+NARROWEST, WIDEST = 0.75, 1.35  # width over height that the recipe lets through uncropped
+
+_MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)  # of ImageNet, as the encoder was trained
+_STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
+
+
+@dataclass(frozen=True)
+class CropBox:
+    """A part of a picture, in pixels."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+
+def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
+    """Return the part of a picture that the model sees: all of it, or the centre cut to an aspect (width over height).
+
+    released: an aspect between 0.75 and 1.35. square: 1, as upstream evaluates. letterbox: all.
+    """
+    narrowest, widest = {
+        "released": (NARROWEST, WIDEST),
+        "square": (1.0, 1.0),
+        "letterbox": (0.0, float("inf")),
+    }[kind]
+    box_height, box_width = height, width
+    if width / height < narrowest:
+        box_height = round(width / narrowest)
+    elif width / height > widest:
+        box_width = round(height * widest)
+    return CropBox((height - box_height) // 2, (width - box_width) // 2, box_height, box_width)
+
+
+def view(
+    frames: UInt8[np.ndarray, "time height width 3"], kind: Crop = "released"
+) -> UInt8[np.ndarray, "time seen_height seen_width 3"]:
+    """Return what the model sees of the pictures, in their own pixels; see `DataConfig.crop`.
+
+    A slice of the same memory, but for letterbox where bars must be added.
+    """
+    if kind == "letterbox":
+        return _with_bars(frames)
+    box = crop_box(frames.shape[1], frames.shape[2], kind)
+    return frames[:, box.top : box.top + box.height, box.left : box.left + box.width]
+
+
+def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time side side 3"]:
+    time, height, width, channels = frames.shape
+    if height == width:
+        return frames
+    side = max(height, width)
+    top, left = (side - height) // 2, (side - width) // 2
+    square = np.zeros((time, side, side, channels), np.uint8)
+    square[:, top : top + height, left : left + width] = frames
+    return square
+
+
+def pixels_to_input(
+    frames: UInt8[Tensor, "batch time height width 3"],
+    image_size: int,
+    augmentations: Sequence[Augmentation] = (),
+) -> Float[Tensor, "batch time 3 size size"]:
+    """Return cropped pictures as the encoder wants them: squashed to a square (bilinear), ImageNet mean 0 and std 1.
+
+    Args:
+        frames: What `view` returned, stacked, on any device.
+        image_size: Height and width of a result, in pixels.
+        augmentations: What is changed on the way, one for each clip; none: nothing.
+
+    Raises:
+        ValueError: There are some augmentations, but not one for each clip.
+    """
+    batch, time = frames.shape[:2]
+    if not augmentations:
+        resized = _resized(frames.flatten(0, 1), image_size)
+    elif len(augmentations) == batch:
+        pairs = zip(frames, augmentations, strict=True)
+        resized = torch.cat([_augmented(clip, image_size, augmentation) for clip, augmentation in pairs])
+    else:
+        raise ValueError(f"{len(augmentations)} augmentations for {batch} clips")
+    mean, std = _mean_and_std(frames.device)
+    normalised: Tensor = (resized - mean) / std
+    return normalised.reshape(batch, time, 3, image_size, image_size)
+
+
+@lru_cache(maxsize=8)
+def _mean_and_std(device: torch.device) -> tuple[Float[Tensor, "3 1 1"], Float[Tensor, "3 1 1"]]:
+    # Once for each device, since the way there is one that the host waits for; not as a tensor of inference mode.
+    with torch.inference_mode(False):
+        return (
+            torch.tensor(_MEAN, device=device).view(3, 1, 1),
+            torch.tensor(_STD, device=device).view(3, 1, 1),
+        )
+
+
+def _augmented(clip: Tensor, image_size: int, augmentation: Augmentation) -> Float[Tensor, "time 3 size size"]:
+    top, left, height, width = augmentation.box
+    return jittered(_resized(clip[:, top : top + height, left : left + width], image_size), augmentation)
+
+
+def _resized(frames: UInt8[Tensor, "count height width 3"], size: int) -> Float[Tensor, "count 3 size size"]:
+    pixels = frames.permute(0, 3, 1, 2).to(torch.float32)
+    return torch.nn.functional.interpolate(
+        pixels, size=(size, size), mode="bilinear", align_corners=False, antialias=False
+    )

@@ -1,0 +1,204 @@
+"""Which clips are there, which split do they belong to, and in which order are they seen?
+
+Everything here is a pure function of the episodes' identities and kept steps, the seed and a position: nothing depends
+on the number of shards, workers or ranks, and nothing needs to be saved to go on where a run stopped.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import logging
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Int32, Int64, UInt64
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.clips.permutation import permuted
+from vjepa2_ac.data.filters.exclusion import NAMED, named
+from vjepa2_ac.data.filters.step_ranges import ClipStarts
+from vjepa2_ac.data.index.episode_table import EpisodeTable, identity_hash
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+Split = Literal["train", "validation", "test"]
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Every clip of a split, in the order of the episodes' identities, then of the starts; runs of neighbours."""
+
+    starts: ClipStarts
+    ends: Int64[np.ndarray, " runs"]  # windows up to and including each run
+    short: Int32[np.ndarray, " short"]  # episodes left out because they are shorter than a clip
+    id_hash: UInt64[np.ndarray, " episodes"]
+    keep_share: float  # of the idle windows
+
+    def __len__(self) -> int:
+        return int(self.ends[-1])
+
+    def __getitem__(self, index: int) -> tuple[int, int]:
+        """Return (episode, first control step) of a window."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"window {index} of {len(self)}")
+        run = int(np.searchsorted(self.ends, index, side="right"))
+        episode, first, span, count = (int(column[run]) for column in self.starts.columns)
+        place = index - (int(self.ends[run]) - count)
+        if count == span:
+            return episode, first + self.starts.every * place
+        return episode, int(self.starts.steps_of(run, self.id_hash, self.keep_share)[place])
+
+    @property
+    def episodes(self) -> Int32[np.ndarray, " episodes"]:
+        """The episodes that clips come from; an index into the source."""
+        return np.unique(self.starts.episode)
+
+
+@dataclass(frozen=True)
+class ClipOrder:
+    """The endless order of training: every window once per epoch, each epoch in an order of its own."""
+
+    windows: Windows
+    seed: int
+
+    def window(self, position: int) -> tuple[int, int]:
+        """Return (episode, first control step) of the clip at a position of the run."""
+        epoch, index = divmod(position, len(self.windows))
+        return self.windows[permuted(index, size=len(self.windows), seed=self.seed, epoch=epoch)]
+
+    def choice(self, position: int, count: int) -> int:
+        """Return one of `range(count)` for the clip at a position of the run, each as likely."""
+        digest = hashlib.blake2b(f"{self.seed} {position}".encode(), digest_size=8).digest()
+        return int.from_bytes(digest, "big") % count
+
+
+def split_of(name: str, config: DataConfig) -> Split:
+    """Return where an episode belongs: a hash of its identity, as a number in [0, 1), against the shares.
+
+    Args:
+        name: Its identity; with `data.split_by`, the name of its group.
+        config: The shares.
+    """
+    number = identity_hash(name) / 2**64
+    if number < config.test_share:
+        return "test"
+    return "validation" if number < config.test_share + config.validation_share else "train"
+
+
+def in_split(
+    split_hash: UInt64[np.ndarray, " episodes"], config: DataConfig, split: Split
+) -> Bool[np.ndarray, " episodes"]:
+    """Return which episodes belong to a split: `split_of` for all at once, from the hashes of the names."""
+    number = split_hash.astype(np.float64) / 2**64
+    held_out = config.test_share + config.validation_share
+    low, high = {"test": (0.0, config.test_share), "validation": (config.test_share, held_out)}.get(
+        split, (held_out, 2.0)
+    )
+    return np.asarray((number >= low) & (number < high))
+
+
+def windows_of(
+    table: EpisodeTable,
+    taking_part: Bool[np.ndarray, " episodes"],
+    starts: ClipStarts,
+    config: DataConfig,
+    split: Split,
+    split_hash: UInt64[np.ndarray, " episodes"],
+) -> Windows:
+    """Return the windows of a split.
+
+    Args:
+        table: The episodes.
+        taking_part: Which of them take part.
+        starts: What `clip_starts` returned for all of these.
+        config: Shares of the splits, and what to do with short episodes.
+        split: Which split.
+        split_hash: What decides the split of each episode.
+
+    Raises:
+        InputError: The split has no episodes, or only short ones, or none with a clip's length of kept steps, or
+            `data.short_episodes` forbids short ones.
+    """
+    members = taking_part & in_split(split_hash, config, split)
+    if not members.any():
+        groups = None if config.split_by is None else len(np.unique(split_hash[taking_part]))
+        raise _empty_split(int(taking_part.sum()), groups, config, split)
+    short = np.flatnonzero(members & (table.num_steps < config.clip_steps)).astype(np.int32)
+    short = short[np.argsort(table.id_rank[short])]
+    if len(short) and (config.short_episodes == "error" or len(short) == members.sum()):
+        raise _too_short(table, short, int(members.sum()), config, split)
+    if len(short):
+        names = tuple(table.identity(int(number)) for number in short[: NAMED + 1])
+        _warn_of_short(config.path, split, config.clip_steps, int(members.sum()), len(short), names)
+    own = starts[members[starts.episode]]
+    if not own.windows:
+        raise _nothing_kept(config, split)
+    return Windows(own, np.cumsum(own.count, dtype=np.int64), short, table.id_hash, config.idle.keep_share)
+
+
+def spread(size: int, count: int) -> list[int]:
+    """Return at most `count` of `range(size)`, evenly spread, each once."""
+    count = min(size, count)
+    return [(2 * number + 1) * size // (2 * count) for number in range(count)]
+
+
+def far_neighbours(items: list[int]) -> list[int]:
+    """Return sorted items in an order in which neighbours lie about half the list apart."""
+    half = (len(items) + 1) // 2
+    pairs = itertools.zip_longest(items[:half], items[half:])
+    return [item for pair in pairs for item in pair if item is not None]
+
+
+@lru_cache(maxsize=64)  # said once: every validation asks for the same windows
+def _warn_of_short(path: str, split: Split, clip_steps: int, members: int, short: int, names: tuple[str, ...]) -> None:
+    logger.warning(
+        "%s: %d of %d %s episodes are shorter than a clip of %d control steps and left out: %s",
+        path, short, members, split, clip_steps, named(names, short),
+    )  # fmt: skip
+
+
+def _empty_split(episodes: int, groups: int | None, config: DataConfig, split: Split) -> InputError:
+    shares = f"validation_share {config.validation_share:g}, test_share {config.test_share:g}"
+    fix = (
+        "Lower data.validation_share or data.test_share"
+        if split == "train"
+        else f"Raise data.{split}_share: a hash of its identity draws an episode, so few episodes need a large share"
+        if groups is None
+        else f"Raise data.{split}_share: a hash of its name draws a group, so few groups need a large share"
+    )
+    together = "" if groups is None else f" in {groups} groups (data.split_by)"
+    return InputError(
+        where=f"data.path: {config.path}",
+        found=f"no {split} episodes among {episodes}{together} ({shares})",
+        needed="one or more",
+        fix=fix,
+    )
+
+
+def _too_short(
+    table: EpisodeTable, short: Int32[np.ndarray, " short"], members: int, config: DataConfig, split: Split
+) -> InputError:
+    longest = int(short[np.argmax(table.num_steps[short])])
+    everyone = len(short) == members
+    fix = "Lower data.frames or data.stride" + ("" if everyone else ", or set data.short_episodes: skip")
+    names = [table.identity(int(number)) for number in short[:NAMED]]
+    return InputError(
+        where=f"data.path: {config.path}",
+        found=f"{len(short)} of {members} {split} episodes are shorter than a clip; the longest of these,"
+        f" {table.identity(longest)}, has {table.num_steps[longest]} steps. Too short: {named(names, len(short))}",
+        needed=f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}",
+        fix=fix,
+    )
+
+
+def _nothing_kept(config: DataConfig, split: Split) -> InputError:
+    return InputError(
+        where=f"data.path: {config.path}",
+        found=f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})",
+        needed=f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}",
+        fix="Lower data.frames or data.stride, raise data.idle.keep_share, or set data.idle.rule: none",
+    )

@@ -1,0 +1,1 @@
+"""Filters: which episodes and steps take part?"""

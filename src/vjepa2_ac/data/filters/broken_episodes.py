@@ -1,0 +1,96 @@
+"""What becomes of episodes that cannot be used? One policy for all sources: stop, or leave them out and count them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.filters.exclusion import named, with_way_out
+from vjepa2_ac.data.index.episode_table import EpisodeProblem
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+MOST_BROKEN = 0.01  # share of the episodes
+
+
+class BrokenEpisodes:
+    """The broken episodes of an opened data set: those found when it was opened, and those that clips met since.
+
+    It lives in the process that opened the set; a loader worker reports to it what it met.
+    """
+
+    def __init__(self, config: DataConfig, episodes: int) -> None:
+        self._config, self._episodes = config, episodes
+        self._reasons: dict[str, str] = {}
+
+    def __len__(self) -> int:
+        return len(self._reasons)
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """The broken episodes and what is wrong with each, in the order in which they were met."""
+        return dict(self._reasons)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The broken episodes, in the order in which they were met."""
+        return tuple(self._reasons)
+
+    def found(self, problems: Sequence[EpisodeProblem]) -> None:
+        """Take note of what was found when the data set was opened or looked through.
+
+        Raises:
+            InputError: `data.broken_episodes` is error: the first of them; or too many are broken.
+        """
+        if not problems:
+            return
+        if self._config.broken_episodes == "error":
+            raise with_way_out(as_error(problems[0]), [problem.name for problem in problems])
+        self._reasons |= {problem.name: str(as_error(problem)) for problem in problems}
+        logger.warning(
+            "%s: %d of %d episodes are broken and left out: %s; the first: %s",
+            self._config.path, len(problems), self._episodes, named([problem.name for problem in problems]),
+            as_error(problems[0]),
+        )  # fmt: skip
+        self._refuse_too_many()
+
+    def recall(self, reasons: Mapping[str, str]) -> None:
+        """Count what a run met before it was resumed: the share that may be broken is that of the whole run."""
+        excluded = frozenset(self._config.exclude)
+        self._reasons = {name: why for name, why in reasons.items() if name not in excluded} | self._reasons
+
+    def met(self, name: str, reason: str) -> None:
+        """Take note of an episode that a clip could not be read from.
+
+        Raises:
+            InputError: Now too many are broken.
+        """
+        if name in self._reasons:
+            return
+        self._reasons[name] = reason
+        logger.warning("A clip is left out, %d of %d episodes are broken: %s", len(self), self._episodes, reason)
+        self._refuse_too_many()
+
+    def _refuse_too_many(self) -> None:
+        if len(self) <= MOST_BROKEN * self._episodes:
+            return
+        name, reason = next(iter(self._reasons.items()))
+        raise InputError(
+            where=f"data.path: {self._config.path}",
+            found=f"{len(self)} of {self._episodes} episodes are broken: {named(self.names)}."
+            f" The first, {name}: {reason.rstrip('.')}",
+            needed=f"{MOST_BROKEN:.0%} at most: data.broken_episodes is skip",
+            fix="Mend or fetch them again, or add them to data.exclude",
+        )
+
+
+def as_error(problem: EpisodeProblem) -> InputError:
+    """Return what the user reads of an episode that cannot be used."""
+    return InputError(where=problem.where, found=problem.found, needed=problem.needed, fix=problem.fix)
+
+
+def as_problem(error: InputError, name: str) -> EpisodeProblem:
+    """Return what is noted of an episode that cannot be used."""
+    return EpisodeProblem(name=name, where=error.where, found=error.found, needed=error.needed, fix=error.fix)

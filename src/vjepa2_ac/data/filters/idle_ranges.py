@@ -1,0 +1,236 @@
+"""Which steps does the idle filter keep, in every episode? Looked up or computed once, and kept on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int32
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
+from vjepa2_ac.data.filters.idle_rules import kept_ranges
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable, NotATableError
+from vjepa2_ac.data.index.index_cache import get_or_make, key_of
+from vjepa2_ac.episode import EpisodeSource, Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.arrays import read_arrays
+from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.storage.structured import json_object, record_of, shown
+
+logger = logging.getLogger(__name__)
+
+_MOST_BYTES = 1 << 28  # of a published list
+_ALL_BROKEN = 10  # as many broken episodes at the start, and no other, are no accident
+
+Found = list[tuple[int, int]] | EpisodeProblem
+
+
+@dataclass(frozen=True, eq=False)
+class FoundRanges:
+    """The kept ranges [start, end) of all episodes of a table, and the episodes that broke on the way."""
+
+    episode: Int32[np.ndarray, " ranges"]  # ascending
+    start: Int32[np.ndarray, " ranges"]
+    end: Int32[np.ndarray, " ranges"]
+    problems: tuple[tuple[int, EpisodeProblem], ...] = ()  # with the episode's place in the table
+    listed: int = 0  # episodes of the table that the list knows, for the rule `published`
+
+    @classmethod
+    def of(cls, found: Sequence[Found], *, listed: int = 0) -> FoundRanges:
+        """Join what was found in each episode."""
+        problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, EpisodeProblem))
+        ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
+        columns = np.array(ranges, np.int32).reshape(-1, 3)
+        episode, start, end = (np.ascontiguousarray(column) for column in columns.T)
+        return cls(episode, start, end, problems, listed)
+
+    def to_bytes(self) -> bytes:
+        """Return this as a file's content, with checksums."""
+        problems = [[place, vars(problem)] for place, problem in self.problems]
+        text = json.dumps({"problems": problems, "listed": self.listed}).encode()
+        file = io.BytesIO()
+        np.savez(file, text=np.frombuffer(text, np.uint8), episode=self.episode, start=self.start, end=self.end)
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> FoundRanges:
+        """Read what `to_bytes` returned.
+
+        Raises:
+            NotATableError: It is something else, or damaged.
+        """
+        try:
+            arrays = read_arrays(data)
+            columns = (arrays["episode"], arrays["start"], arrays["end"])
+            text = record_of(_Text, json_object(arrays["text"].tobytes(), where="text"), where="text")
+        except (InputError, KeyError) as error:
+            raise NotATableError(str(error)) from None
+        if any(column.dtype != np.int32 or column.shape != (len(columns[0]),) for column in columns):
+            raise NotATableError("columns that do not fit together")
+        return cls(*columns, text.problems, text.listed)
+
+    def require_of(self, table: EpisodeTable) -> None:
+        """Refuse ranges that are not of the episodes of a table.
+
+        Raises:
+            NotATableError: They are not.
+        """
+        places = [place for place, _ in self.problems]
+        known = len(table) > self.episode.max(initial=-1) and len(table) > max(places, default=-1)
+        if not known or self.episode.min(initial=0) < 0 or min(places, default=0) < 0:
+            raise NotATableError(f"ranges of other episodes than these {len(table)}")
+        within = (self.start >= 0) & (self.start <= self.end) & (self.end <= table.num_steps[self.episode])
+        if not within.all() or (np.diff(self.episode) < 0).any():
+            raise NotATableError("ranges that are not in their episodes, or not in their order")
+
+
+@dataclass(frozen=True)
+class _Text:
+    """What of the ranges is no numbers."""
+
+    problems: tuple[tuple[int, EpisodeProblem], ...]
+    listed: int
+
+
+def find_ranges(
+    source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress | None
+) -> FoundRanges:
+    """Return the ranges that `data.idle.rule` keeps, of all episodes, whether they take part or not.
+
+    Raises:
+        InputError: The list of ranges cannot be read or is of another data set; or the rule fits no episode.
+    """
+    parts: dict[str, object] = {
+        "found": "idle ranges",
+        "table": fingerprint_of(table),
+        "data": _knobs_that_matter(config),
+    }
+    if config.idle.rule == "published":
+        path = str(config.idle.ranges)
+        return _kept(config, parts | {"list": _version(path)}, lambda: _published(path, table))
+    return _kept(config, parts, lambda: _computed(source, table, config, progress))
+
+
+def _kept(config: DataConfig, parts: dict[str, object], make: Callable[[], FoundRanges]) -> FoundRanges:
+    return get_or_make(
+        config.disk_cache, key_of(parts), make, to_bytes=FoundRanges.to_bytes, from_bytes=FoundRanges.from_bytes
+    )
+
+
+def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress | None) -> FoundRanges:
+    def look(place: int) -> Found:
+        try:
+            return kept_ranges(source.read(place), config.idle)
+        except UnreachableError:
+            raise
+        except InputError as error:
+            return as_problem(error, table.identity(place))
+
+    threads = config.connections if storage.is_url(config.path) else 1
+    found: list[Found] = []
+    for one in _in_order(look, len(table), threads):
+        found.append(one)
+        if progress is not None:
+            progress(len(found), len(table))
+        if isinstance(one, EpisodeProblem) and len(found) == min(_ALL_BROKEN, len(table)):
+            _refuse_all_broken(found)
+    return FoundRanges.of(found)
+
+
+def _in_order(look: Callable[[int], Found], count: int, threads: int) -> Iterator[Found]:
+    """Look at every episode, several at once; an error is raised in its turn."""
+    with ThreadPoolExecutor(threads) as pool:
+        for first in range(0, count, 4 * threads):
+            yield from pool.map(look, range(first, min(first + 4 * threads, count)))
+
+
+def _refuse_all_broken(found: list[Found]) -> None:
+    problems = [one for one in found if isinstance(one, EpisodeProblem)]
+    if len(problems) == len(found):
+        raise as_error(problems[0])
+
+
+def _published(path: str, table: EpisodeTable) -> FoundRanges:
+    lists = _read_list(path)
+    found: list[Found] = []
+    listed = 0
+    for place in range(len(table)):
+        name = table.identity(place)
+        listed += name in lists
+        found.append(_checked(lists.get(name, []), name, int(table.num_steps[place]), path))
+    if not listed:
+        first = next(iter(lists), "none at all")
+        raise InputError(
+            where=f"data.idle.ranges: {path}",
+            found=f"none of the {len(table)} episodes; its first is {first}",
+            needed="the identities of the episodes" + (f", such as {table.identity(0)}" if len(table) else ""),
+            fix="Name the list of this version of the data set, or set data.idle.rule: commands or motion",
+        )
+    return FoundRanges.of(found, listed=listed)
+
+
+def _read_list(path: str) -> dict[str, object]:
+    needed = 'a JSON object {"identity of an episode": [[start, end], ...], ...}'
+    where = f"data.idle.ranges: {path}"
+    try:
+        return json_object(storage.read_bounded(path, _MOST_BYTES), where=where, needed=needed)
+    except OSError as error:
+        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed) from None
+
+
+def _checked(ranges: object, name: str, steps: int, path: str) -> list[tuple[int, int]]:
+    try:
+        pairs = sorted((start, end) for start, end in ranges)  # type: ignore[attr-defined] # that is what is tried
+        whole = all(type(number) is int for pair in pairs for number in pair)
+    except (TypeError, ValueError):
+        pairs, whole = [], False
+    edges = [edge for pair in pairs for edge in pair]
+    if not whole or edges != sorted(edges) or any(start == end for start, end in pairs):
+        raise InputError(
+            where=f"data.idle.ranges: {path}: {name}",
+            found=shown(ranges),
+            needed="pairs [start, end) of steps that do not overlap",
+        )
+    if edges and not 0 <= edges[0] <= edges[-1] <= steps:
+        raise InputError(
+            where=f"data.idle.ranges: {path}: {name}",
+            found=f"steps {edges[0]} to {edges[-1]}",
+            needed=f"steps from 0 to {steps}, which is the length of the episode",
+            fix="Name the list of this version of the data set, or set data.idle.rule: commands or motion",
+        )
+    return pairs
+
+
+def fingerprint_of(table: EpisodeTable) -> str:
+    """Name everything that the episodes depend on: the key of their index, or where none is kept, what is known."""
+    if "index" in table.texts:
+        return table.texts["index"]
+    digest = hashlib.sha256(json.dumps(dict(table.texts)).encode())
+    columns = {name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)}
+    for name, column in sorted({**columns, **table.locators}.items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(column).data)
+    return digest.hexdigest()
+
+
+def _knobs_that_matter(config: DataConfig) -> dict[str, object]:
+    knobs = {"source", "path", "fields", "droid_raw", "lerobot"}
+    return config.model_dump(include=knobs, exclude={"fields": {"action"}, "lerobot": {"action"}}) | {
+        "idle": config.idle.model_dump(exclude={"keep_share"})
+    }
+
+
+def _version(path: str) -> list[object]:
+    """Tell one content of the list from another without reading it, as far as that goes."""
+    try:
+        return [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
+    except OSError:
+        return [path]

@@ -1,0 +1,241 @@
+"""What is known of every episode of a data set, in a few bytes each?
+
+DROID has 95,658 episodes: a list of as many objects is slow to load and to send to workers. Here are columns instead.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, overload
+
+import numpy as np
+from jaxtyping import Int8, Int32, Int64, UInt8, UInt64
+
+from vjepa2_ac.data.index.labels import Labels
+from vjepa2_ac.data.index.packed_text import NotPackedTextError, pack_texts, require_texts, text_of
+from vjepa2_ac.episode import EpisodeInfo
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.arrays import read_arrays
+from vjepa2_ac.storage.structured import json_object, record_of
+
+FORMAT = 2  # of `to_bytes`: with another number an index is built again
+
+_UNKNOWN = -1
+_LOCATOR, _LABEL = "locator.", "label."
+
+
+class NotATableError(ValueError):
+    """The bytes are not a table that `to_bytes` wrote."""
+
+
+@dataclass(frozen=True)
+class EpisodeProblem:
+    """An episode that cannot be used, and why."""
+
+    name: str  # its identity; where even that cannot be read, its place
+    where: str
+    found: str
+    needed: str = ""
+    fix: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeTable(Sequence[EpisodeInfo]):
+    """The usable episodes of a data set, in the source's order, as columns.
+
+    `locators` are columns of the source's own (where an episode lies); `labels` say what an episode belongs to, such as
+    its scene; `texts` are small values of the whole set.
+    """
+
+    num_steps: Int32[np.ndarray, " episodes"]
+    success: Int8[np.ndarray, " episodes"]  # 1, 0, or -1: the data set does not say
+    id_ends: Int64[np.ndarray, " episodes"]
+    id_bytes: UInt8[np.ndarray, " bytes"]
+    id_hash: UInt64[np.ndarray, " episodes"]  # the first 8 bytes of the identity's SHA-256
+    id_rank: Int32[np.ndarray, " episodes"]  # place of the identity in alphabetical order
+    problems: tuple[EpisodeProblem, ...] = ()
+    locators: Mapping[str, np.ndarray] = field(default_factory=dict)
+    texts: Mapping[str, str] = field(default_factory=dict)
+    state_hash: UInt64[np.ndarray, " episodes"] | None = None  # `state_hash.hash_of_states`; None: not known of any
+    labels: Mapping[str, Labels] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        infos: Sequence[EpisodeInfo],
+        *,
+        problems: Sequence[EpisodeProblem] = (),
+        locators: Mapping[str, np.ndarray] | None = None,
+        texts: Mapping[str, str] | None = None,
+        state_hashes: Sequence[int] | None = None,
+        labels: Mapping[str, Labels] | None = None,
+    ) -> EpisodeTable:
+        """Make a table; one that is given is returned as it is."""
+        if isinstance(infos, EpisodeTable):
+            return infos
+        ids = [info.id for info in infos]
+        rank = np.empty(len(ids), np.int32)
+        rank[sorted(range(len(ids)), key=ids.__getitem__)] = np.arange(len(ids), dtype=np.int32)
+        return cls(
+            num_steps=np.array([info.num_steps for info in infos], np.int32),
+            success=np.array([_UNKNOWN if info.success is None else info.success for info in infos], np.int8),
+            **pack_texts("id", ids),
+            id_hash=np.array([identity_hash(name) for name in ids], np.uint64),
+            id_rank=rank,
+            problems=tuple(problems),
+            locators=dict(locators or {}),
+            texts=dict(texts or {}),
+            state_hash=None if state_hashes is None else np.array(state_hashes, np.uint64),
+            labels=dict(labels or {}),
+        )
+
+    def __len__(self) -> int:
+        return len(self.num_steps)
+
+    @overload
+    def __getitem__(self, index: int) -> EpisodeInfo: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[EpisodeInfo]: ...
+
+    def __getitem__(self, index: int | slice) -> EpisodeInfo | Sequence[EpisodeInfo]:
+        """Return what is known of one episode, or of several."""
+        if isinstance(index, slice):
+            return [self[number] for number in range(*index.indices(len(self)))]
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"episode {index} of {len(self)}")
+        index %= len(self)
+        success = int(self.success[index])
+        return EpisodeInfo(
+            id=self.identity(index),
+            num_steps=int(self.num_steps[index]),
+            success=None if success == _UNKNOWN else bool(success),
+        )
+
+    def __iter__(self) -> Iterator[EpisodeInfo]:
+        return (self[number] for number in range(len(self)))
+
+    def identity(self, index: int) -> str:
+        """Return the identity of one episode."""
+        return text_of("id", {"id_ends": self.id_ends, "id_bytes": self.id_bytes}, index)
+
+    def find(self, identity: str) -> int | None:
+        """Return the place of an episode, or None where no episode is called so."""
+        for index in np.flatnonzero(self.id_hash == np.uint64(identity_hash(identity))):
+            if self.identity(int(index)) == identity:
+                return int(index)
+        return None
+
+    def to_bytes(self) -> bytes:
+        """Return the table as a file's content, with checksums."""
+        text = json.dumps({
+            "problems": [vars(problem) for problem in self.problems],
+            "texts": dict(self.texts),
+            "labels": {name: labels.names for name, labels in self.labels.items()},
+        })  # fmt: skip
+        file = io.BytesIO()
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in _COLUMNS}
+        arrays |= {} if self.state_hash is None else {_HASH: self.state_hash}
+        arrays |= {f"{_LOCATOR}{name}": column for name, column in self.locators.items()}
+        arrays |= {f"{_LABEL}{name}": labels.number for name, labels in self.labels.items()}
+        np.savez(file, text=np.frombuffer(text.encode(), np.uint8), **arrays)
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, data: bytes) -> EpisodeTable:
+        """Read what `to_bytes` returned; of before there were hashes and labels (latent caches), it has none.
+
+        Raises:
+            NotATableError: It is something else, or damaged.
+        """
+        try:
+            arrays = read_arrays(data)
+            text = record_of(_Text, json_object(arrays.pop("text").tobytes(), where="text"), where="text")
+        except (InputError, KeyError) as error:
+            raise NotATableError(str(error)) from None
+        locators = {name.removeprefix(_LOCATOR): one for name, one in arrays.items() if name.startswith(_LOCATOR)}
+        _require_columns(arrays, locators)
+        columns = {name: arrays[name] for name in _COLUMNS}
+        return cls(
+            **columns,
+            problems=text.problems,
+            locators=locators,
+            texts=text.texts,
+            state_hash=_column(arrays, _HASH, np.uint64) if _HASH in arrays else None,
+            labels={name: _labels(arrays, name, names) for name, names in text.labels.items()},
+        )
+
+
+@dataclass(frozen=True)
+class _Text:
+    """What of a table is no numbers."""
+
+    problems: tuple[EpisodeProblem, ...]
+    texts: Mapping[str, str]
+    labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+_HASH = "state_hash"
+_COLUMNS = {
+    "num_steps": np.int32,
+    "success": np.int8,
+    "id_ends": np.int64,
+    "id_bytes": np.uint8,
+    "id_hash": np.uint64,
+    "id_rank": np.int32,
+}
+
+
+def _require_columns(arrays: Mapping[str, np.ndarray], locators: Mapping[str, np.ndarray]) -> None:
+    """Refuse columns that contradict each other: places of episodes would lead anywhere.
+
+    Raises:
+        NotATableError: They do.
+    """
+    for name, kind in _COLUMNS.items():
+        if name not in arrays or arrays[name].dtype != kind or arrays[name].ndim != 1:
+            raise NotATableError(f"no column {name} of {np.dtype(kind)}")
+    episodes = len(arrays["num_steps"])
+    whole = {name: arrays[name] for name in _COLUMNS} | {f"locator {name}": one for name, one in locators.items()}
+    for name, column in whole.items():
+        if column.ndim != 1 or column.dtype.kind not in "iuf" or (len(column) != episodes and not _is_packed(name)):
+            raise NotATableError(f"the column {name} is {column.dtype} of shape {column.shape}, of {episodes} episodes")
+    for packed in [name.removesuffix("_ends") for name in whole if name.endswith("_ends")]:
+        try:
+            require_texts(whole[f"{packed}_ends"], whole.get(f"{packed}_bytes"))
+        except NotPackedTextError:
+            raise NotATableError(f"the texts of {packed} do not fit together") from None
+    if (arrays["num_steps"] < 0).any():
+        raise NotATableError("an episode of less than no steps")
+
+
+def _column(arrays: Mapping[str, np.ndarray], name: str, kind: type[np.generic]) -> np.ndarray:
+    """Return a column that not every table has: one value for each episode.
+
+    Raises:
+        NotATableError: It is missing, or of another type or length.
+    """
+    column, episodes = arrays.get(name), len(arrays["num_steps"])
+    if column is None or column.dtype != kind or column.shape != (episodes,):
+        raise NotATableError(f"no column {name} of {np.dtype(kind)} for {episodes} episodes")
+    return column
+
+
+def _labels(arrays: Mapping[str, np.ndarray], name: str, names: tuple[str, ...]) -> Labels:
+    try:
+        return Labels(names, _column(arrays, f"{_LABEL}{name}", np.int32))
+    except ValueError as error:
+        raise NotATableError(str(error)) from None
+
+
+def _is_packed(name: str) -> bool:
+    return name.endswith("_bytes")
+
+
+def identity_hash(identity: str) -> int:
+    """Return 64 bits of the identity's SHA-256: as a share of 2**64 it decides the episode's split."""
+    return int.from_bytes(hashlib.sha256(identity.encode()).digest()[:8], "big")

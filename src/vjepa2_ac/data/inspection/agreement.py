@@ -1,0 +1,137 @@
+"""Do the pictures move when the robot does? The change of pictures beside that of states, step for step and shifted.
+
+Where a robot moves faster, its picture changes more. The rank correlation of the two within an episode is 0.5 and more
+on simulated arms at 15 Hz and on BridgeData at 5 Hz (docs/log.md); with the pictures of another episode, at the best of
+21 shifts, it is 0.1 to 0.4. So the shift at which it is highest tells of pictures that are late, pictures that fit
+backwards are reversed, and where nothing fits better than another episode's, they are of another one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from scipy.stats import rankdata
+
+from vjepa2_ac.data.inspection.excerpts import Excerpt
+
+MOST_LAG = 10  # control steps
+_LAG_SHARE = 4  # an excerpt is shifted by a quarter of its length at most
+_FEWEST_CHANGES = 8  # of an excerpt
+_SHIFTS = 20  # pairings with other episodes, each of all episodes
+FEWEST_EPISODES = 8  # of fewer, chance is not known well enough
+_SURE = 3.0  # standard errors, or deviations of chance
+_GAIN = 0.25  # of what is above chance, that another shift must add
+_ABOVE = 0.15  # chance, at least, of a robot with its own pictures: 0.3 and more was seen
+
+Verdict = Literal["together", "late", "reversed", "foreign", "unknown"]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How well pictures and states fit."""
+
+    verdict: Verdict
+    episodes: int
+    lag: int = 0  # control steps by which pictures lag behind states where they fit best; below 0: are ahead
+    best: float = 0.0  # mean rank correlation there
+    unshifted: float = 0.0
+    backwards: float = 0.0  # with the pictures in reverse, at the best shift
+    chance: float = 0.0  # with pictures of other episodes, at the best shift
+    is_farthest: bool = False  # no wider shift was tried
+
+
+def agreement_of(
+    excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]], *, least_lag: int = 2
+) -> Agreement:
+    """Compare the change of pictures with that of states.
+
+    Args:
+        excerpts: Some episodes.
+        moved: How far each has moved at each step, in any unit.
+        least_lag: Control steps that are called late; a camera is soon one step behind.
+    """
+    pairs = [(one, other.picture_change) for one, other in zip(moved, excerpts, strict=True)]
+    pairs = [pair for pair in pairs if all(len(values) and np.ptp(values) > 0 for values in pair)]
+    usual = float(np.median([len(one) for one, _ in pairs])) if pairs else 0.0
+    pairs = [pair for pair in pairs if len(pair[0]) >= usual / 2]  # shorter ones would tell of few shifts only
+    most = min(MOST_LAG, int(usual) // _LAG_SHARE)
+    if len(pairs) < FEWEST_EPISODES or usual < _FEWEST_CHANGES:
+        return Agreement("unknown", len(pairs))
+    lags = range(-most, most + 1)
+    ways, seen = (_ranks([pair[which] for pair in pairs]) for which in (0, 1))
+    turned = _ranks([change[::-1] for _, change in pairs])
+    shifts = range(1, min(len(pairs), _SHIFTS + 1))
+    chance = np.array([_profiles(ways, np.roll(seen, -shift, axis=0), lags).mean(axis=0).max() for shift in shifts])
+    return _judged(_profiles(ways, seen, lags), _profiles(ways, turned, lags), chance, lags, least_lag)
+
+
+def _judged(
+    own: Float[np.ndarray, "episodes lags"],
+    turned: Float[np.ndarray, "episodes lags"],
+    chance: Float[np.ndarray, " shifts"],
+    lags: range,
+    least_lag: int,
+) -> Agreement:
+    mean, backwards = own.mean(axis=0), turned.mean(axis=0)
+    best, turned_best, unshifted = int(mean.argmax()), int(backwards.argmax()), lags.index(0)
+    limit = chance.mean() + _SURE * chance.std(ddof=1)
+    gain = mean[best] - mean[unshifted]
+    verdict: Verdict = "together"
+    if backwards[turned_best] > limit and _surely_above(turned[:, turned_best], own[:, best]):
+        verdict = "reversed"
+    elif mean[best] <= limit:
+        highest = mean[best] + 2 * own[:, best].std(ddof=1) / np.sqrt(len(own))
+        verdict = "foreign" if highest < chance.mean() + _ABOVE else "unknown"
+    elif (
+        abs(lags[best]) >= least_lag
+        and gain > _GAIN * (mean[best] - chance.mean())
+        and _surely_above(own[:, best], own[:, unshifted])
+    ):
+        verdict = "late"
+    return Agreement(
+        verdict,
+        len(own),
+        lags[best],
+        float(mean[best]),
+        float(mean[unshifted]),
+        float(backwards[turned_best]),
+        float(chance.mean()),
+        is_farthest=abs(lags[best]) == lags[-1],
+    )
+
+
+def _ranks(rows: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, "rows longest"]:
+    """Return the ranks of each row's values, from 0 to 1; NaN behind the shorter ones."""
+    ranks = np.full((len(rows), max(map(len, rows))), np.nan)
+    for place, row in enumerate(rows):
+        ranks[place, : len(row)] = rankdata(row) / len(row)
+    return ranks
+
+
+def _profiles(
+    moved: Float[np.ndarray, "episodes longest"], seen: Float[np.ndarray, "episodes longest"], lags: range
+) -> Float[np.ndarray, "episodes lags"]:
+    """Return each row's correlation where what is seen is taken so many steps later than what has moved."""
+    length = moved.shape[1]
+    columns = []
+    for lag in lags:
+        one = moved[:, max(-lag, 0) : length - max(lag, 0)]
+        other = seen[:, max(lag, 0) : length - max(-lag, 0)]
+        both = ~np.isnan(one + other)
+        count = np.maximum(both.sum(axis=1, keepdims=True), 1)
+        first, second = (np.where(both, values, 0) for values in (one, other))
+        first, second = (
+            np.where(both, values - values.sum(axis=1, keepdims=True) / count, 0) for values in (first, second)
+        )
+        size = np.sqrt((first**2).sum(axis=1) * (second**2).sum(axis=1))
+        columns.append((first * second).sum(axis=1) / np.where(size > 0, size, np.inf))
+    return np.stack(columns, axis=1)
+
+
+def _surely_above(one: Float[np.ndarray, " episodes"], other: Float[np.ndarray, " episodes"]) -> bool:
+    difference = one - other
+    return bool(difference.mean() > _SURE * difference.std(ddof=1) / np.sqrt(len(difference)))

@@ -1,0 +1,244 @@
+"""Can this data set be trained on? Open it, load a few batches as training would, and look at every number in them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from itertools import islice
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.data.clips.windows import Split
+from vjepa2_ac.data.inspection.check_excerpts import excerpt_findings
+from vjepa2_ac.data.inspection.check_vectors import has_moved, vector_findings
+from vjepa2_ac.data.inspection.duplicates import find_duplicates
+from vjepa2_ac.data.inspection.finding import Finding, Level
+from vjepa2_ac.episode import Batch, Progress
+from vjepa2_ac.errors import InputError
+
+_MOVED_M = 0.01  # of the flange: it should be seen
+_DARK = 8  # of 255: mean of pictures that show next to nothing
+_STILL_CM, _FAR_CM = 0.2, 30.0  # medians of |dxyz| per model step that are worth a word
+_REACH_M = 1.6  # beyond the reach of common arms
+_LONGEST = 300  # letters of a reason
+_NARROW = 0.2  # a gripper that never closes further may be given in metres
+
+
+def at_some_stride(dataset: Dataset) -> Dataset:
+    """Return a data set at its stride; where that is auto, at the smallest that would be tried."""
+    if dataset.config.stride != "auto":
+        return dataset
+    return dataset.with_stride(min(dataset.config.strides_to_try(dataset.control_rate_hz)))
+
+
+def check_data(
+    config: DataConfig,
+    *,
+    seed: int = 0,
+    batch_size: int = 2,
+    clips: int = 32,
+    progress: Progress | None = None,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Iterator[Finding]:
+    """Yield what was found, line after line, as training would meet it.
+
+    An `error` line says that training would learn nothing or not begin; a `warning` is worth a look.
+
+    Args:
+        config: The data.
+        seed: Of the order of clips.
+        batch_size: Clips in a batch.
+        clips: About as many are read.
+        progress: Told where the index is built.
+        clock: Seconds.
+
+    Raises:
+        InputError: The data cannot be opened, or a clip cannot be read.
+    """
+    started = clock()
+    dataset = open_dataset(config, progress=progress)
+    config = dataset.config
+    seconds = clock() - started
+    steps = int(dataset.table.num_steps.sum())
+    yield Finding("ok", "source", f"{config.source}, {config.path}, camera {', '.join(config.cameras)}")
+    yield Finding("ok", "index", f"{len(dataset.table):,} episodes, {steps:,} steps; opened in {seconds:.1f} s")
+    if config.stride == "auto":
+        dataset = at_some_stride(dataset)
+        yield Finding("ok", "stride", f"auto; looked at here at the smallest candidate, {dataset.config.stride}")
+    yield from _what_takes_part(dataset)
+    yield from _read(dataset, seed=seed, batch_size=batch_size, clips=clips, clock=clock)
+    yield from excerpt_findings(dataset)
+
+
+def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
+    config = dataset.config
+    for one in dataset.removed:
+        if one.episodes or one.steps or one.windows:
+            yield Finding("warning" if one.name == "broken" else "ok", f"filter {one.name}", f"left out: {one}")
+    for problem in dataset.table.problems[:3]:
+        yield Finding("warning", "broken episode", f"{problem.where}: {problem.found}")
+    splits: tuple[tuple[Split, float], ...] = (
+        ("train", 1.0), ("validation", config.validation_share), ("test", config.test_share),
+    )  # fmt: skip
+    for split, share in splits:
+        try:
+            windows = dataset.windows(split)
+        except InputError as error:
+            if split == "train":
+                raise
+            level: Level = "error" if split == "validation" or share else "ok"  # training opens every split it is given
+            yield Finding(level, split, f"{_shortened(error.found)}. {error.fix}")
+            continue
+        episodes = len(np.unique(windows.episodes))
+        short = f"; {len(windows.short):,} episodes are too short" if len(windows.short) else ""
+        clip = f"clips of {config.frames} frames at stride {config.stride}"
+        yield Finding("ok", split, f"{len(windows):,} {clip} in {episodes:,} episodes{short}")
+    if config.split_by is not None:
+        groups = len(np.unique(dataset.split_hash[dataset.kept.taking_part]))
+        yield Finding("ok", "groups", f"{groups:,} by {config.split_by}, each in one split")
+    duplicates = find_duplicates(dataset)
+    yield Finding("warning" if duplicates.episodes else "ok", "duplicates", str(duplicates))
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST].rsplit(' ', 1)[0]} …"
+
+
+def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int, clock: Callable[[], float]) -> Iterator[Finding]:
+    started = clock()
+    loader = training_loader(dataset, seed=seed, batch_size=batch_size)
+    batches = [next(loader)]
+    first_s = clock() - started
+    started = clock()
+    batches += islice(loader, max(1, -(-clips // batch_size) - 1))
+    rest_s = clock() - started
+    read = [batch for batch in batches if batch.starts]
+    if not read:
+        yield Finding("error", "clips", f"none of {len(batches) * batch_size} could be read: see data.broken_episodes")
+        return
+    yield from findings_in(read, is_pose=dataset.config.states == "pose")
+    rate = sum(len(batch.starts) for batch in batches[1:]) / max(rest_s, 1e-9)
+    speed = f"first batch of {batch_size} after {first_s:.2f} s, then {rate:.1f} clips/s"
+    yield Finding("ok", "timing", f"{speed} with {dataset.config.workers} workers")
+    if storage.is_url(dataset.config.path):
+        fetched = sum(batch.bytes_fetched for batch in batches)
+        count = sum(len(batch.starts) for batch in read)
+        yield Finding("ok", "network", f"{fetched / count / 1e3:,.0f} kB fetched per clip, over {count} clips")
+
+
+def findings_in(batches: Sequence[Batch], *, is_pose: bool = True) -> Iterator[Finding]:
+    """Yield what the numbers of some batches say, whose states are poses or not; a pure look, nothing is read."""
+    clips = sum(len(batch.starts) for batch in batches)
+    first = batches[0]
+    name, seen = ("latents", first.latents.values) if first.latents else ("frames", _frames(first))
+    shapes = f"{name} {tuple(seen.shape)} {str(seen.dtype).removeprefix('torch.')}"
+    poses = "no camera poses" if first.extrinsics is None else f"camera poses {tuple(first.extrinsics.shape)}"
+    yield Finding(
+        "ok", "batch", f"{shapes}, states {tuple(first.states.shape)}, actions {tuple(first.actions.shape)}, {poses}"
+    )
+    states = np.concatenate([batch.states.flatten(0, 1).numpy() for batch in batches]).astype(np.float64)
+    actions = np.concatenate([batch.actions.flatten(0, 1).numpy() for batch in batches]).astype(np.float64)
+    has_pixels = first.latents is None
+    if has_pixels:
+        yield _pixels(batches)
+    if not is_pose:
+        ranges = torch.from_numpy((states.max(axis=0) - states.min(axis=0)).astype(np.float32))
+        if has_pixels:
+            yield _still_pictures(batches, [has_moved(batch.states, ranges) for batch in batches])
+        yield from vector_findings(states, actions)
+        return
+    if has_pixels:
+        yield _still_pictures(batches, [batch.actions[..., :3].norm(dim=-1) > _MOVED_M for batch in batches])
+    yield _positions(states)
+    yield _rotations(states, actions)
+    yield _gripper(states[:, 6], clips)
+    yield _motion(actions)
+
+
+def _pixels(batches: Sequence[Batch]) -> Finding:
+    low = min(int(_frames(batch).min()) for batch in batches)
+    high = max(int(_frames(batch).max()) for batch in batches)
+    mean = float(np.mean([_frames(batch).float().mean().item() for batch in batches]))
+    text = f"{low} to {high}, mean {mean:.0f}"
+    if low == high:
+        return Finding("error", "pixels", f"all are {low}: there is nothing to see. Check data.camera")
+    if mean < _DARK:
+        return Finding("warning", "pixels", f"{text}: the pictures are nearly black. Check data.camera")
+    return Finding("ok", "pixels", text)
+
+
+def _frames(batch: Batch) -> Tensor:
+    if batch.frames is None:
+        raise ValueError("a batch of cached latents has no pixels")
+    return batch.frames
+
+
+def _still_pictures(batches: Sequence[Batch], has_moved: Sequence[Tensor]) -> Finding:
+    """Compare pictures with the ones before them, where the robot has moved."""
+    same = moved = 0
+    for batch, far in zip(batches, has_moved, strict=True):
+        frames = _frames(batch)
+        equal = (frames[:, 1:] == frames[:, :-1]).flatten(2).all(dim=-1)
+        moved += int(far.sum())
+        same += int((far & equal).sum())
+    text = f"{same} of {moved} pictures equal the one before although the robot moved"
+    if same > moved / 2:
+        return Finding("error", "pictures", f"{text}: they do not show it. Check data.camera and the control rate")
+    return Finding("warning" if same > moved / 20 else "ok", "pictures", text)
+
+
+def _positions(states: np.ndarray) -> Finding:
+    low, high = states[:, :3].min(axis=0), states[:, :3].max(axis=0)
+    text = ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " m"
+    if (high - low).max() == 0:
+        return Finding("error", "position", f"{text}: it never changes. Check which fields the state is made of")
+    if np.linalg.norm(states[:, :3], axis=1).max() > _REACH_M:
+        return Finding("warning", "position", f"{text}: farther than most arms reach. Is it metres, from the base?")
+    if (high - low).max() < 0.01:
+        return Finding("warning", "position", f"{text}: all within 1 cm. Is it metres?")
+    return Finding("ok", "position", text)
+
+
+def _rotations(states: np.ndarray, actions: np.ndarray) -> Finding:
+    turned = np.rad2deg(Rotation.from_euler("xyz", actions[:, 3:6]).magnitude())
+    low, high = states[:, 3:6].min(), states[:, 3:6].max()
+    text = f"angles {low:.2f} to {high:.2f} rad; degrees per model step {_percentiles(turned, '.1f')}"
+    if turned.max() == 0:
+        return Finding("warning", "rotation", f"{text}: it never changes. Is it in the state?")
+    if np.percentile(turned, 90) > 90:
+        return Finding("warning", "rotation", f"{text}: wild. Are these extrinsic xyz Euler angles in radians?")
+    return Finding("ok", "rotation", text)
+
+
+def _gripper(closedness: np.ndarray, clips: int) -> Finding:
+    low, high = closedness.min(), closedness.max()
+    text = f"{low:.2f} to {high:.2f} (0 open, 1 closed)"
+    if low == high:
+        return Finding("warning", "gripper", f"{text}: it never moves in {clips} clips. Is it in the state?")
+    if high < _NARROW:
+        return Finding("warning", "gripper", f"{text}: it never closes. Is it a width in metres? 0..1 is needed")
+    return Finding("ok", "gripper", text)
+
+
+def _motion(actions: np.ndarray) -> Finding:
+    moved = np.linalg.norm(actions[:, :3], axis=1) * 100
+    text = f"cm per model step {_percentiles(moved, '.2f')}"
+    if not np.any(actions):
+        return Finding("error", "actions", f"{text}: all are zero; there is nothing to learn from")
+    if np.median(moved) < _STILL_CM:
+        return Finding("warning", "actions", f"{text}: nearly still. See data.idle, or a wider data.stride")
+    if np.median(moved) > _FAR_CM:
+        return Finding("warning", "actions", f"{text}: very far. Is it metres? Is data.stride too wide?")
+    return Finding("ok", "actions", text)
+
+
+def _percentiles(values: np.ndarray, form: str) -> str:
+    """Return the percentiles 10, 50, 90 and 99 in words."""
+    return " / ".join(f"{value:{form}}" for value in np.percentile(values, [10, 50, 90, 99])) + " (10/50/90/99 %)"

@@ -1,0 +1,267 @@
+"""What is in a data set? Lengths, outcomes, idle time, and how far the robot moves in one model step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.sources import RAW_CAMERAS
+from vjepa2_ac.data.clips.dataset import Dataset, Removed
+from vjepa2_ac.data.clips.windows import Split, in_split, spread
+from vjepa2_ac.data.filters.idle_rules import idle_by_motion
+from vjepa2_ac.data.inspection.duplicates import Duplicates, find_duplicates
+from vjepa2_ac.data.inspection.statistics_vectors import ChangePerStep, change_per_step
+from vjepa2_ac.episode import Episode, Progress, Widths
+from vjepa2_ac.errors import InputError
+
+PERCENTILES = (10, 50, 90, 99)
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+
+RELEASED_STEP_CM = 12.9  # what the flange moves between the two frames of upstream's example (franka_example_traj.npz)
+RELEASED = (
+    "the released weights saw DROID at a step of 4, 8 or 15 control steps (0.27, 0.53 or 1 s): which one is unsettled."
+    f" The one known pair of frames, upstream's own example, is {RELEASED_STEP_CM} cm apart."
+    " `data calibrate` lets the weights choose"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ReadEpisode:
+    """An episode of the sample, without pictures."""
+
+    index: int  # place in the data set's table
+    states: Float[np.ndarray, "steps state_dim"]
+    kept: tuple[tuple[int, int], ...]  # ranges that clips come from
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPerStep:
+    """How far the flange moves and turns from one model step to the next, at one stride."""
+
+    stride: int
+    seconds: float
+    moved_cm: Float[np.ndarray, " pairs"]
+    turned_deg: Float[np.ndarray, " pairs"]
+
+    def percentiles(self, name: str) -> list[float]:
+        """Return the percentiles 10, 50, 90 and 99 of `moved_cm` or `turned_deg`; empty if no pair of steps fits."""
+        values = getattr(self, name)
+        return [float(value) for value in np.percentile(values, PERCENTILES)] if len(values) else []
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """What was found; figures of motion are those of a sample of the episodes that take part."""
+
+    config: DataConfig
+    control_rate_hz: float
+    lengths: np.ndarray  # control steps of every readable episode
+    success: np.ndarray  # of every readable episode: 1, 0, or -1 where the data set does not say
+    broken: int
+    removed: tuple[Removed, ...]
+    episodes_of: dict[Split, int]
+    windows_of: dict[Split, int]
+    duplicates: Duplicates
+    sample: tuple[ReadEpisode, ...]
+    widths: Widths
+    still_share: float | None  # of the sample's steps: in a run of idle ones, by the measured motion; None: no poses
+    motions: tuple[MotionPerStep, ...]  # of poses
+    changes: tuple[ChangePerStep, ...]  # of vectors
+
+    @property
+    def hours(self) -> float:
+        """How long all readable episodes last."""
+        return float(self.lengths.sum() / self.control_rate_hz / 3600)
+
+    @property
+    def success_share(self) -> float | None:
+        """The share of successes among the episodes of which that is known; None: of none."""
+        known = self.success >= 0
+        return float(self.success[known].mean()) if known.any() else None
+
+    @property
+    def length_percentiles(self) -> list[int]:
+        """The shortest, the percentiles 10, 50 and 90, and the longest length in control steps."""
+        return [int(value) for value in np.percentile(self.lengths, [0, 10, 50, 90, 100])]
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras that can be asked for, as far as the config knows."""
+        known = self.config.known_cameras
+        return known if known is not None else RAW_CAMERAS if self.config.source == "droid_raw" else self.config.cameras
+
+    @property
+    def is_pose(self) -> bool:
+        """Whether the states are poses."""
+        return self.config.states == "pose"
+
+    @property
+    def ranges(self) -> Float[np.ndarray, "state_dim 2"]:
+        """The least and the greatest value of each number of the sample's states."""
+        return np.array([self.range_of(column) for column in range(self.widths.state)])
+
+    def range_of(self, column: int) -> tuple[float, float]:
+        """Return the least and the greatest value of one number of the sample's states."""
+        values = np.concatenate([one.states[:, column] for one in self.sample])
+        return float(values.min()), float(values.max())
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return every figure as plain values, for `inspect.json`."""
+        return {
+            "path": self.config.path,
+            "source": self.config.source,
+            "cameras": list(self.cameras),
+            "camera": list(self.config.cameras),
+            "control_rate_hz": self.control_rate_hz,
+            "episodes": len(self.lengths),
+            "broken_episodes": self.broken,
+            "steps": int(self.lengths.sum()),
+            "hours": self.hours,
+            "length_percentiles_0_10_50_90_100": self.length_percentiles,
+            "success_share": self.success_share,
+            "success_known_of": int((self.success >= 0).sum()),
+            "removed": [vars(one) for one in self.removed],
+            "splits": {name: {"episodes": self.episodes_of[name], "windows": self.windows_of[name]} for name in SPLITS},
+            "duplicates": self.duplicates.as_dict(),
+            "sampled_episodes": len(self.sample),
+            "state_dim": self.widths.state,
+            "action_dim": self.widths.action,
+            "percentiles": list(PERCENTILES),
+            **(self._poses_as_dict() if self.is_pose else self._vectors_as_dict()),
+        }
+
+    def _poses_as_dict(self) -> dict[str, Any]:
+        return {
+            "still_share": self.still_share,
+            "xyz_m": [self.range_of(column) for column in range(3)],
+            "gripper": self.range_of(6),
+            "per_model_step": [
+                {
+                    "stride": one.stride,
+                    "seconds": one.seconds,
+                    "moved_cm": one.percentiles("moved_cm"),
+                    "turned_deg": one.percentiles("turned_deg"),
+                }
+                for one in self.motions
+            ],
+            "released_weights": RELEASED,
+        }
+
+    def _vectors_as_dict(self) -> dict[str, Any]:
+        return {
+            "ranges": self.ranges.tolist(),
+            "per_model_step": [
+                {
+                    "stride": one.stride,
+                    "seconds": one.seconds,
+                    "changed_percent_of_range": one.percentiles(PERCENTILES),
+                }
+                for one in self.changes
+            ],
+        }
+
+
+def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress | None = None) -> Inspection:
+    """Look at a data set: at the table for what concerns all episodes, at the states of a sample for the motion.
+
+    Args:
+        dataset: Its stride is a number.
+        episodes: At most as many are read, without pictures, spread over those that take part.
+        progress: Told (episodes read, episodes in all).
+
+    Raises:
+        InputError: Episodes of the sample cannot be read, and `data.broken_episodes` does not leave them out.
+    """
+    sample = tuple(_read(dataset, sample_of(dataset, episodes), progress))
+    rate, strides = dataset.control_rate_hz, dataset.config.strides_to_try(dataset.control_rate_hz)
+    found = Inspection(
+        config=dataset.config,
+        control_rate_hz=rate,
+        lengths=dataset.table.num_steps,
+        success=dataset.table.success,
+        broken=len(dataset.table.problems),
+        removed=dataset.removed,
+        episodes_of={name: _episodes(dataset, name) for name in SPLITS},
+        windows_of={name: _windows(dataset, name) for name in SPLITS},
+        duplicates=find_duplicates(dataset),
+        sample=sample,
+        widths=dataset.widths,
+        still_share=None,
+        motions=(),
+        changes=(),
+    )
+    if not found.is_pose:
+        pieces = [one.states[start:end] for one in sample for start, end in one.kept]
+        return replace(found, changes=tuple(change_per_step(pieces, found.ranges, stride, rate) for stride in strides))
+    idle = np.concatenate([idle_runs(one.states, dataset.config) for one in sample])
+    motions = tuple(motion_per_step(sample, stride, rate) for stride in strides)
+    return replace(found, still_share=float(idle.mean()), motions=motions)
+
+
+def sample_of(dataset: Dataset, count: int) -> list[int]:
+    """Return at most `count` episodes of those that take part: a random draw that is always the same."""
+    # A latent cache has only the episodes of which clips are made.
+    members = dataset.starts.episodes if dataset.config.source == "latents" else dataset.episodes
+    members = members[np.argsort(dataset.table.id_hash[members], kind="stable")]
+    return [int(members[place]) for place in spread(len(members), count)]
+
+
+def motion_per_step(sample: Sequence[ReadEpisode], stride: int, control_rate_hz: float) -> MotionPerStep:
+    """Return what the flange does from each step to the one `stride` later, where both are in one kept range."""
+    pieces = [one.states[start:end] for one in sample for start, end in one.kept if end - start > stride]
+    if not pieces:
+        return MotionPerStep(stride, stride / control_rate_hz, np.zeros(0), np.zeros(0))
+    moved = [np.linalg.norm(piece[stride:, :3] - piece[:-stride, :3], axis=1) for piece in pieces]
+    turned = []
+    for piece in pieces:
+        rotations = Rotation.from_euler("xyz", piece[:, 3:6])
+        turned.append((rotations[stride:] * rotations[:-stride].inv()).magnitude())
+    return MotionPerStep(
+        stride, stride / control_rate_hz, np.concatenate(moved) * 100, np.rad2deg(np.concatenate(turned))
+    )
+
+
+def idle_runs(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[np.ndarray, " steps"]:
+    """Return which steps are in a run of idle ones, by the measured motion, that is long enough for the idle filter."""
+    idle = idle_by_motion(states, config.idle)
+    edges = np.flatnonzero(np.diff(idle.astype(np.int8), prepend=0, append=0))
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        idle[start:end] = end - start >= config.idle.shortest_idle_steps
+    return idle
+
+
+def _read(dataset: Dataset, episodes: Sequence[int], progress: Progress | None) -> Iterator[ReadEpisode]:
+    def look(index: int) -> Episode | InputError:
+        try:
+            return dataset.source.read(index)
+        except InputError as error:
+            return error
+
+    threads = dataset.config.connections if storage.is_url(dataset.config.path) else 1
+    with ThreadPoolExecutor(threads) as pool:
+        for done, (index, episode) in enumerate(zip(episodes, pool.map(look, episodes), strict=True), start=1):
+            if progress is not None:
+                progress(done, len(episodes))
+            if isinstance(episode, InputError):
+                dataset.leave_out(index, episode)
+            else:
+                yield ReadEpisode(index, np.asarray(episode.states, np.float64), tuple(dataset.kept.of(index)))
+
+
+def _episodes(dataset: Dataset, split: Split) -> int:
+    return int((in_split(dataset.split_hash, dataset.config, split) & dataset.kept.taking_part).sum())
+
+
+def _windows(dataset: Dataset, split: Split) -> int:
+    try:
+        return len(dataset.windows(split))
+    except InputError:  # an empty split is a figure here, not a mistake
+        return 0

@@ -1,0 +1,140 @@
+"""What must agree for cached latents to be used? Everything that decides them, by the names that users know."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.filters.idle_ranges import fingerprint_of
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.sources.latents.dtypes import DTYPES, CacheType
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.structured import shown
+
+NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: raise it when one of them changes
+
+# What a cache alone is checked against. The rest says which data set it was made from, and how that was read.
+OF_CLIPS = ("data.crop", "data.states", "data.actions", "data.idle", "data.frames", "data.stride", "data.start_every")
+OF_ENCODING = ("encoder", "image_size", "patch_size", "normalisation", "model.dtype", "training.precision")
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """What besides a picture decides its latents, and how many numbers they are; made by `encoding.batch.encoding_of`.
+
+    How many frames go through the encoder at once is no part of it: with the encoder in use that changes no bit on a
+    CPU (measured, tests/encoding/test_latent_cache.py), and elsewhere no more than the order of a sum.
+    """
+
+    encoder: str  # WorldModel.encoder_fingerprint
+    image_size: int
+    patch_size: int
+    tokens: int
+    dim: int
+    weights: str  # model.dtype
+    precision: str  # training.precision
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """The parts of a key that this decides."""
+        return {
+            "encoder": self.encoder,
+            "image_size": self.image_size,
+            "patch_size": self.patch_size,
+            "normalisation": NORMALISATION,
+            "model.dtype": self.weights,
+            "training.precision": self.precision,
+        }
+
+
+@dataclass(frozen=True)
+class CacheKey:
+    """What decides what is in a cache, as {name: JSON value}; names are those of knobs where there is one."""
+
+    parts: Mapping[str, Any]
+
+    @property
+    def digest(self) -> str:
+        """A short name for it: of the cache's folder, and in each of its files."""
+        return hashlib.sha256(json.dumps(dict(self.parts), sort_keys=True).encode()).hexdigest()[:32]
+
+    @property
+    def kind(self) -> CacheType:
+        """The type in which latents are kept."""
+        kind: CacheType = self.parts["data.cache_dtype"]
+        return kind
+
+    def require_whole(self, *, where: str, fix: str) -> None:
+        """Refuse a key from a file that lacks what a cache is read by.
+
+        Raises:
+            InputError: It does.
+        """
+        cameras, kind = self.parts.get("data.camera"), self.parts.get("data.cache_dtype")
+        named = isinstance(cameras, list) and cameras and all(isinstance(camera, str) for camera in cameras)
+        if not named or not isinstance(kind, str) or kind not in DTYPES:
+            found = f"a key with data.camera {shown(cameras)} and data.cache_dtype {shown(kind)}"
+            raise InputError(
+                where=where, found=found, needed=f"names of cameras, and one of {', '.join(DTYPES)}", fix=fix
+            )
+
+    def differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
+        """Return what is other here than wanted, as "data.stride: 8, not 4"; of these names, or of all."""
+        differing = []
+        for name in sorted(self.parts.keys() | wanted) if names is None else names:
+            here, there = self.parts.get(name), wanted.get(name)
+            if here != there:
+                differing += _in_words(name, here, there)
+        return differing
+
+
+def key_of_cache(config: DataConfig, table: EpisodeTable, encoding: Encoding) -> CacheKey:
+    """Return the key of the cache of a data set that is open, with a stride that is a number."""
+    return CacheKey({
+        "format": 1,
+        **encoding.parts,
+        **clip_parts(config),
+        "data.cache_dtype": config.cache_dtype,
+        "data.camera": list(config.cameras),
+        "data.pose_frame": config.pose_frame,
+        "data set": {"source": config.source, "episodes": fingerprint_of(table), **_reading(config)},
+    })  # fmt: skip
+
+
+def clip_parts(config: DataConfig) -> dict[str, Any]:
+    """Return the parts that decide which frames clips need, and what else they are made of."""
+    return {
+        "data.crop": config.crop,
+        "data.states": config.states,
+        "data.actions": config.actions,
+        "data.idle": config.idle.model_dump(mode="json"),
+        "data.frames": config.frames,
+        "data.stride": config.model_stride,
+        "data.start_every": config.start_every,
+    }
+
+
+def _reading(config: DataConfig) -> dict[str, Any]:
+    """Return the knobs by which this form of data set is read."""
+    section = {"rlds": "fields", "droid_raw": "droid_raw", "lerobot": "lerobot"}.get(config.source)
+    return {} if section is None else {section: getattr(config, section).model_dump(mode="json")}
+
+
+def _in_words(name: str, here: Any, there: Any) -> list[str]:
+    if isinstance(here, dict) and isinstance(there, dict):
+        return [
+            words
+            for inner in sorted(here.keys() | there)
+            if here.get(inner) != there.get(inner)
+            for words in _in_words(f"{name}.{inner}", here.get(inner), there.get(inner))
+        ]
+    return [f"{name}: {_shown(here)}, not {_shown(there)}"]
+
+
+def _shown(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,0 +1,42 @@
+"""In which type are latents kept, and what does that cost in exactness? bfloat16, float32, or int8 with scales."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vjepa2_ac.episode import StoredLatents
+
+CacheType = Literal["bf16", "fp32", "int8"]
+
+DTYPES: dict[CacheType, torch.dtype] = {"bf16": torch.bfloat16, "fp32": torch.float32, "int8": torch.int8}
+_LARGEST = 127
+
+
+def pack_latents(latents: Float[Tensor, "*batch tokens dim"], kind: CacheType) -> StoredLatents:
+    """Return latents in the type that they are kept in.
+
+    bf16 rounds to the nearest: off by 2**-8 of the value at most. int8 divides each token by its largest value over
+    127, its scale: off by half a scale at most. fp32 changes nothing.
+    """
+    if kind != "int8":
+        return StoredLatents(latents.to(DTYPES[kind]))
+    latents = latents.float()
+    scales = latents.abs().amax(dim=-1) / _LARGEST
+    divisor = torch.where(scales > 0, scales, torch.ones_like(scales))  # a token of zeros stays one
+    values = (latents / divisor[..., None]).round().clamp(-_LARGEST, _LARGEST)
+    return StoredLatents(values.to(torch.int8), scales)
+
+
+def unpack_latents(kept: StoredLatents) -> Float[Tensor, "*batch tokens dim"]:
+    """Return kept latents as float32, as the encoder gave them but for what `pack_latents` rounded off."""
+    values = kept.values.float()
+    return values if kept.scales is None else values * kept.scales[..., None]
+
+
+def bytes_per_frame(tokens: int, dim: int, kind: CacheType) -> int:
+    """Return the room that the latents of a frame take."""
+    return tokens * dim * DTYPES[kind].itemsize + (tokens * 4 if kind == "int8" else 0)

@@ -1,0 +1,307 @@
+"""How does an episode of one camera lie in a latent cache? As a safetensors file, read at random by frame.
+
+Tensors (control steps as in `episode`; `frames` are the steps whose pictures were encoded):
+    latents            [frames, tokens, dim] bfloat16, float32 or int8
+    scales             [frames, tokens] float32, with int8 only: a latent is its value times the scale of its token
+    frame_steps        [frames] int32: the control step of each frame, ascending
+    frame_crc          [frames] int64: CRC-32 of the frame's latents and, behind them, its scales
+    states             [steps, state_dim], and where the source has them commands, extrinsics, joint_velocities
+    pictures           [bytes] uint8: the frames as small JPEGs, one behind the other; for people to look at
+    picture_ends       [frames] int64: where each of them ends; picture_crc likewise: its CRC-32
+The header's metadata (texts): format, id, camera, num_steps, control_rate_hz, metadata (JSON), key (of the cache), and
+crc: CRC-32 of all these texts and of every tensor but latents, scales and pictures.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int, UInt8
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.sources.latents.dtypes import DTYPES, CacheType
+from vjepa2_ac.episode import Episode, StoredLatents
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.jpeg import decode_jpegs, encode_jpeg
+from vjepa2_ac.storage.structured import json_object, shown
+
+FORMAT = "vjepa2-ac latents 1"
+
+_OPTIONAL = ("commands", "extrinsics", "joint_velocities")
+_BY_FRAME = frozenset({"latents", "scales", "pictures"})  # read and checked by frame, when asked for
+_JPEG_QUALITY = 85
+_FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
+
+
+@dataclass(frozen=True)
+class EpisodeLayout:
+    """What is the same in every file of a cache."""
+
+    key: str  # of the cache
+    kind: CacheType
+    tokens: int
+    dim: int
+
+
+def write_episode_file(
+    path: str | Path,
+    layout: EpisodeLayout,
+    episode: Episode,
+    camera: str,
+    *,
+    steps: Sequence[int],
+    latents: StoredLatents,
+    pictures: UInt8[np.ndarray, "frames height width 3"],
+) -> int:
+    """Write an episode of one camera, whole or not at all, and return the size of the file.
+
+    Args:
+        path: The file; missing folders are made.
+        layout: What all files of the cache have in common.
+        episode: Its states and what else a clip needs; no picture of it is read.
+        camera: Whose latents they are.
+        steps: Control steps of the frames, ascending; there may be none.
+        latents: Of these frames, in the type of the layout (`dtypes.pack_latents` makes them so).
+        pictures: Of these frames, square as the encoder sees them and small.
+
+    Raises:
+        InputError: The file cannot be written, or the disk is full.
+        ValueError: The arguments do not fit together.
+    """
+    values, scales = latents.values.detach().cpu(), None if latents.scales is None else latents.scales.cpu()
+    if list(values.shape) != [len(steps), layout.tokens, layout.dim] or len(pictures) != len(steps):
+        raise ValueError(f"{len(steps)} steps, latents {tuple(values.shape)}, pictures {pictures.shape}")
+    if values.dtype != DTYPES[layout.kind]:
+        raise ValueError(f"latents of {values.dtype} for a cache of {layout.kind}")
+    if any(after <= before for before, after in zip([-1, *steps], [*steps, episode.info.num_steps], strict=True)):
+        raise ValueError(f"steps {list(steps)} of {episode.info.num_steps}")
+    jpegs = [encode_jpeg(picture, quality=_JPEG_QUALITY) for picture in pictures]
+    tensors = _small_tensors(episode, steps, jpegs) | {
+        "frame_crc": torch.tensor([_crc_of_frame(frame) for frame in _frames_of(values, scales)], dtype=torch.int64)
+    }
+    about = {
+        "format": FORMAT,
+        "id": episode.info.id,
+        "camera": camera,
+        "num_steps": str(episode.info.num_steps),
+        "control_rate_hz": repr(float(episode.control_rate_hz)),
+        "metadata": json.dumps(dict(episode.metadata), sort_keys=True),
+        "key": layout.key,
+    }
+    about["crc"] = str(_crc_of_rest(about, tensors))
+    tensors["latents"] = values.contiguous()
+    tensors["pictures"] = torch.from_numpy(np.array(np.frombuffer(b"".join(jpegs), np.uint8)))
+    if scales is not None:
+        tensors["scales"] = scales.contiguous()
+    content = save(tensors, metadata=about)
+    with storage.user_can_write(path), storage.atomic_writer(path) as file:
+        file.write(content)
+    return len(content)
+
+
+def _small_tensors(episode: Episode, steps: Sequence[int], jpegs: Sequence[bytes]) -> dict[str, Tensor]:
+    arrays: dict[str, np.ndarray | None] = {
+        "states": episode.states,
+        **{name: getattr(episode, name) for name in _OPTIONAL},
+        "frame_steps": np.array(steps, np.int32),
+        "picture_ends": np.cumsum([len(jpeg) for jpeg in jpegs], dtype=np.int64),
+        "picture_crc": np.array([zlib.crc32(jpeg) for jpeg in jpegs], np.int64),
+    }
+    return {name: torch.from_numpy(np.array(array, order="C")) for name, array in arrays.items() if array is not None}
+
+
+class EpisodeFile:
+    """An open file: everything but the latents is in memory and has been checked.
+
+    Args:
+        path: The file.
+        layout: What all files of the cache have in common.
+
+    Raises:
+        InputError: The file is missing, damaged, or belongs to another cache.
+    """
+
+    def __init__(self, path: str | Path, layout: EpisodeLayout) -> None:
+        self.path = str(path)
+        with _reading(self.path):
+            self._file: Any = safe_open(self.path, framework="pt").__enter__()  # type: ignore[no-untyped-call] # mapped until nobody has it any more
+            self.about: Mapping[str, str] = self._file.metadata() or {}
+            self._names = frozenset(self._file.keys())
+            if unknown := self._names - _BY_FRAME - _SMALL.keys():
+                raise _damaged(self.path, f"the unknown tensors {shown(sorted(unknown))}")
+            tensors = {name: self._file.get_tensor(name) for name in self._names - _BY_FRAME}
+        if self.about.get("format") != FORMAT:
+            raise _damaged(self.path, f"the format {shown(self.about.get('format'))}", FORMAT)
+        if self.about.get("crc") != str(_crc_of_rest(self.about, tensors)):
+            raise _damaged(self.path, "damaged: its CRC is wrong")
+        if self.about.get("key") != layout.key:
+            raise _damaged(self.path, "a file of another cache", "a file that was made with this one's cache.json")
+        _require_fitting(self.path, tensors)
+        self._arrays = {name: np.array(tensor.numpy()) for name, tensor in tensors.items()}
+        self.frame_steps: Int[np.ndarray, " frames"] = self._arrays["frame_steps"]
+        self.id, self.camera, self.metadata = self._told()
+        self._require_shapes(layout)
+
+    def __getitem__(self, name: str) -> Any:
+        """Return states, or commands, extrinsics or joint_velocities; None where there are none."""
+        return self._arrays.get(name)
+
+    def _told(self) -> tuple[str, str, dict[str, str]]:
+        """Return identity and camera, and the language instruction and the like."""
+        if absent := [name for name in ("id", "camera", "metadata") if name not in self.about]:
+            raise _damaged(self.path, f"no {absent[0]} in its header")
+        metadata = json_object(self.about["metadata"], where=f"{self.path}: metadata", fix=_FIX)
+        return self.about["id"], self.about["camera"], {name: str(text) for name, text in metadata.items()}
+
+    def places_of(self, steps: Sequence[int]) -> list[int]:
+        """Return which frames were taken at these control steps.
+
+        Raises:
+            InputError: The cache has none of one of them.
+        """
+        places = np.searchsorted(self.frame_steps, np.asarray(steps))
+        for place, step in zip(places.tolist(), steps, strict=True):
+            if place == len(self.frame_steps) or self.frame_steps[place] != step:
+                raise InputError(
+                    where=f"{self.path} ({self.id})",
+                    found=f"no frame of control step {step}",
+                    needed=f"one; there are {len(self.frame_steps)}, of every step that a clip needed",
+                    fix="Encode with the same data.stride, data.frames, data.start_every and data.idle as are used now",
+                )
+        return [int(place) for place in places]
+
+    def latents(self, places: Sequence[int], *, check: Sequence[int]) -> StoredLatents:
+        """Return the latents of frames, read by frame.
+
+        Args:
+            places: Which frames.
+            check: Those whose CRC is checked.
+
+        Raises:
+            InputError: A frame is damaged.
+        """
+        with _reading(self.path):
+            frames = StoredLatents(*(self._rows(name, places) for name in ("latents", "scales")))
+        for place in check:
+            number = list(places).index(place)
+            scales = None if frames.scales is None else frames.scales[number]
+            if _crc_of_frame(StoredLatents(frames.values[number], scales)) != self._arrays["frame_crc"][place]:
+                raise _damaged(self.path, f"damaged: the CRC of control step {self.frame_steps[place]} is wrong")
+        return frames
+
+    def pictures(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
+        """Return the small pictures of frames.
+
+        Raises:
+            InputError: One is damaged.
+        """
+        ends, steps = self._arrays["picture_ends"].tolist(), self.frame_steps[list(places)].tolist()
+        with _reading(self.path):
+            data = self._file.get_slice("pictures")
+            jpegs = [bytes(data[ends[place - 1] if place else 0 : ends[place]].numpy()) for place in places]
+        for place, step, jpeg in zip(places, steps, jpegs, strict=True):
+            if zlib.crc32(jpeg) != self._arrays["picture_crc"][place]:
+                raise _damaged(self.path, f"damaged: the CRC of the picture of control step {step} is wrong")
+        return decode_jpegs(jpegs, steps, self.path)
+
+    def _rows(self, name: str, places: Sequence[int]) -> Any:
+        if name not in self._names:
+            return None
+        rows = self._file.get_slice(name)
+        return torch.stack([rows[place] for place in places])
+
+    def _require_shapes(self, layout: EpisodeLayout) -> None:
+        """Refuse latents of another type or shape: their bytes would be read as something else."""
+        names = {"latents": [len(self.frame_steps), layout.tokens, layout.dim]}
+        if layout.kind == "int8":
+            names["scales"] = names["latents"][:2]
+        with _reading(self.path):
+            found = {name: self._file.get_slice(name) for name in names}
+            types = {name: slice_.get_dtype() for name, slice_ in found.items()}
+            shapes = {name: list(slice_.get_shape()) for name, slice_ in found.items()}
+            pictures = self._file.get_slice("pictures")
+            bytes_of_pictures, type_of_pictures = pictures.get_shape(), pictures.get_dtype()
+        if shapes != names or types["latents"] != _SAFETENSORS_NAMES[layout.kind]:
+            raise _damaged(self.path, f"{types} {shapes}", f"latents of {_SAFETENSORS_NAMES[layout.kind]}, {names}")
+        if "scales" in names and types["scales"] != "F32":
+            raise _damaged(self.path, f"scales of {types['scales']}", "F32")
+        if type_of_pictures != "U8" or bytes_of_pictures != [max(self._arrays["picture_ends"], default=0)]:
+            said = f"pictures of {bytes_of_pictures} values of {type_of_pictures}"
+            raise _damaged(self.path, said, "as many bytes as picture_ends says")
+
+
+_NUMBERS = (torch.float32, torch.float64)
+_SMALL: dict[str, tuple[int, tuple[torch.dtype, ...]]] = {  # axes and types
+    "states": (2, _NUMBERS),
+    **dict.fromkeys(_OPTIONAL, (2, _NUMBERS)),
+    "frame_steps": (1, (torch.int32,)),
+    **dict.fromkeys(("frame_crc", "picture_ends", "picture_crc"), (1, (torch.int64,))),
+}
+
+
+def _require_fitting(path: str, tensors: Mapping[str, Tensor]) -> None:
+    """Refuse what contradicts itself, whatever its CRC says: anybody can write one."""
+    if absent := _SMALL.keys() - set(_OPTIONAL) - tensors.keys():
+        raise _damaged(path, f"no {', '.join(sorted(absent))}")
+    frames, steps = (len(tensors[name]) if tensors[name].ndim else -1 for name in ("frame_steps", "states"))
+    for name, tensor in tensors.items():
+        axes, types = _SMALL[name]
+        rows = steps if axes == 2 else frames
+        if tensor.ndim != axes or tensor.dtype not in types or len(tensor) != rows:
+            raise _damaged(path, f"{name} of {tensor.dtype} and shape {list(tensor.shape)}", f"{rows} rows")
+    within = torch.cat([torch.tensor([-1]), tensors["frame_steps"], torch.tensor([steps])])
+    ends = torch.cat([torch.tensor([0]), tensors["picture_ends"]])
+    if (within.diff() <= 0).any() or (ends.diff() < 0).any():
+        raise _damaged(path, f"frames that are not in the order of the {steps} steps, or pictures that overlap")
+
+
+_SAFETENSORS_NAMES: dict[CacheType, str] = {"bf16": "BF16", "fp32": "F32", "int8": "I8"}
+
+
+@contextmanager
+def _reading(path: str) -> Iterator[None]:
+    """Say in the user's words that a file is missing, cut off, or no safetensors file."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise InputError(where=path, found="no such file", needed="latents of an episode", fix=_FIX) from None
+    except (SafetensorError, OSError) as error:
+        raise _damaged(path, f"not a whole safetensors file ({error})") from None
+
+
+def _damaged(path: str, found: str, needed: str = "") -> InputError:
+    return InputError(where=path, found=found, needed=needed, fix=_FIX)
+
+
+def _frames_of(values: Tensor, scales: Tensor | None) -> Iterator[StoredLatents]:
+    for place, frame in enumerate(values):
+        yield StoredLatents(frame, None if scales is None else scales[place])
+
+
+def _crc_of_frame(frame: StoredLatents) -> int:
+    crc = zlib.crc32(_bytes_of(frame.values))
+    return crc if frame.scales is None else zlib.crc32(_bytes_of(frame.scales), crc)
+
+
+def _crc_of_rest(about: Mapping[str, str], tensors: Mapping[str, Tensor]) -> int:
+    """Return the CRC-32 of everything in a file but latents and scales."""
+    crc = zlib.crc32(json.dumps({name: text for name, text in about.items() if name != "crc"}, sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        crc = zlib.crc32(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode(), crc)
+        crc = zlib.crc32(_bytes_of(tensor), crc)
+    return crc
+
+
+def _bytes_of(tensor: Tensor) -> memoryview:
+    return tensor.contiguous().flatten().view(torch.uint8).numpy().data

@@ -1,0 +1,220 @@
+"""Which episodes does a LeRobot data set have, and where do they lie? v3.0: Parquet tables. v2.1: lines of JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_bytes
+from vjepa2_ac.data.sources.lerobot.info import DatasetInfo
+from vjepa2_ac.data.sources.lerobot.parquet import Opener, read_table
+from vjepa2_ac.data.sources.lerobot.path_templates import filled, list_by_template
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import FileInfo
+from vjepa2_ac.storage.structured import json_object
+
+EPISODES_V21 = "meta/episodes.jsonl"
+EPISODES_V30 = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+
+_T = TypeVar("_T")
+
+_MOST_BYTES = 1 << 28  # of meta/episodes.jsonl
+_FIX = "Get the files in meta again"
+_STATISTICS = ("min", "max", "mean", "std")
+
+
+@dataclass(frozen=True)
+class VideoPlace:
+    """Where the pictures of one camera of an episode lie."""
+
+    chunk: int
+    file: int
+    start_s: float  # of the episode's first picture
+    length_s: float | None  # None: the data set does not say
+
+
+@dataclass(frozen=True)
+class EpisodeRow:
+    """What the data set's own tables say of one episode."""
+
+    index: int
+    length: int
+    tasks: tuple[str, ...]
+    chunk: int  # of its rows
+    file: int
+    videos: Mapping[str, VideoPlace] = field(default_factory=dict)
+    success: bool | None = None
+    state_hash: int = UNKNOWN
+
+    @property
+    def id(self) -> str:
+        """Its identity."""
+        return identity(self.index)
+
+
+@dataclass(frozen=True)
+class Told:
+    """Columns of which the tables' statistics tell something."""
+
+    states: tuple[str, ...]  # whether two episodes have the same states; none: their rows are read
+    success: str | None  # whether an episode succeeded
+
+
+def identity(index: int) -> str:
+    """Return how an episode is called: by its number, the only name that LeRobot gives."""
+    return f"episode_{index:06d}"
+
+
+def tables_of_episodes(info: DatasetInfo, connections: int) -> dict[str, FileInfo]:
+    """Return the files that list the episodes.
+
+    Raises:
+        OSError: They cannot be listed.
+    """
+    template = EPISODES_V30 if info.version == "v3.0" else EPISODES_V21
+    return list_by_template(info.root, template, connections=connections)
+
+
+def read_episodes(
+    info: DatasetInfo, tables: Sequence[str], keys: Sequence[str], told: Told, open_file: Opener
+) -> list[EpisodeRow]:
+    """Return every episode, sorted by number.
+
+    Args:
+        info: Of the data set.
+        tables: The files that list the episodes, within the data set.
+        keys: Videos whose places are wanted.
+        told: Columns of which statistics are wanted; of v2.1 none are read.
+        open_file: Gives what to open for a path.
+
+    Raises:
+        InputError: The tables are missing, damaged, or list other episodes than meta/info.json counts.
+        OSError: A file far away cannot be read.
+    """
+    videos = [key for key in keys if info.features[key].dtype == "video"]
+    if info.version == "v3.0":
+        rows = [row for table in tables for row in _rows_of_table(info, table, videos, told, open_file)]
+    else:
+        rows = list(_rows_of_lines(info, videos))
+    rows.sort(key=lambda row: row.index)
+    numbers = [row.index for row in rows]
+    if len(set(numbers)) != len(numbers) or len(rows) != info.episodes:
+        raise InputError(
+            where=storage.join(info.root, tables[0] if tables else "meta"),
+            found=f"{len(rows)} episodes, of {len(set(numbers))} numbers",
+            needed=f"{info.episodes} of as many numbers, says {info.where}",
+            fix=_FIX,
+        )
+    return rows
+
+
+def data_file(info: DatasetInfo, row: EpisodeRow) -> str:
+    """Return the path, within the data set, of the file with an episode's rows."""
+    return filled(info.data_path, row.chunk, row.file)
+
+
+def video_file(info: DatasetInfo, place: VideoPlace, key: str) -> str:
+    """Return the path, within the data set, of the file with an episode's pictures."""
+    return filled(info.video_path or "", place.chunk, place.file, key)
+
+
+def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[EpisodeRow]:
+    where = storage.join(info.root, EPISODES_V21)
+    try:
+        lines = storage.read_bounded(where, _MOST_BYTES).decode().splitlines()
+    except FileNotFoundError:
+        raise InputError(where=where, found="no such file", needed="one line for each episode", fix=_FIX) from None
+    except UnicodeDecodeError as error:
+        raise _damaged(where, error) from None
+    for number, line in enumerate(lines):
+        if not line.strip():
+            continue
+        with_line = f"{where}: line {number + 1}"
+        row = json_object(line, where=with_line, needed="an episode", fix=_FIX, allow_nan=True)
+        yield _checked(with_line, _of_line, info, row, videos)
+
+
+def _of_line(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str]) -> EpisodeRow:
+    index = _count(row["episode_index"])
+    chunk = index // info.chunk_episodes
+    return EpisodeRow(
+        index=index,
+        length=_count(row["length"]),
+        tasks=_texts(row.get("tasks")),
+        chunk=chunk,
+        file=index,
+        videos={key: VideoPlace(chunk, index, 0.0, None) for key in videos},
+    )
+
+
+def _rows_of_table(
+    info: DatasetInfo, table: str, videos: Sequence[str], told: Told, open_file: Opener
+) -> Iterator[EpisodeRow]:
+    path = storage.join(info.root, table)
+    outcome = f"stats/{told.success}/max"
+    statistics = [f"stats/{name}/{kind}" for name in told.states for kind in _STATISTICS]
+    prefixes = tuple(f"videos/{key}/" for key in videos)
+    own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome, *statistics}
+    columns = read_table(open_file(path), path, lambda name: name in own or name.startswith(prefixes))
+    lengths = {len(column) for column in columns.values()}
+    if len(lengths) > 1:
+        raise _damaged(path, f"columns of {sorted(lengths)} rows")
+    for number in range(max(lengths, default=0)):
+        row = {name: column[number] for name, column in columns.items()}
+        yield _checked(f"{path}: row {number}", _of_row, row, videos, row.get(outcome), statistics)
+
+
+def _of_row(row: Mapping[str, Any], videos: Sequence[str], outcome: object, statistics: Sequence[str]) -> EpisodeRow:
+    while isinstance(outcome, list) and outcome:
+        outcome = outcome[0]
+    return EpisodeRow(
+        index=_count(row["episode_index"]),
+        length=_count(row["length"]),
+        tasks=_texts(row.get("tasks")),
+        chunk=_count(row["data/chunk_index"]),
+        file=_count(row["data/file_index"]),
+        videos={key: _place(row, f"videos/{key}") for key in videos},
+        success=bool(outcome) if isinstance(outcome, bool | int | float) else None,
+        state_hash=_hash_of(row["length"], [row.get(name) for name in statistics]),
+    )
+
+
+def _hash_of(length: object, statistics: Sequence[object]) -> int:
+    """Return what stands for an episode's states where its rows are not read: their statistics, all of them."""
+    if not statistics or any(one is None for one in statistics):
+        return UNKNOWN
+    return hash_of_bytes(json.dumps([length, *statistics], default=str).encode())
+
+
+def _place(row: Mapping[str, Any], name: str) -> VideoPlace:
+    start, end = float(row[f"{name}/from_timestamp"]), row.get(f"{name}/to_timestamp")
+    if not math.isfinite(start) or start < 0:
+        raise ValueError(f"{name}/from_timestamp {start}")
+    length = None if end is None else float(end) - start
+    return VideoPlace(_count(row[f"{name}/chunk_index"]), _count(row[f"{name}/file_index"]), start, length)
+
+
+def _checked(where: str, read: Callable[..., _T], *arguments: object) -> _T:
+    try:
+        return read(*arguments)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        raise _damaged(where, error) from None
+
+
+def _count(value: object) -> int:
+    """Return a number of things; other than by `int`, neither True nor 1.5 nor "1" is one."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value) or not 0 <= value < 2**31:
+        raise ValueError(f"{value!r} is no count")
+    return int(value)
+
+
+def _texts(value: object) -> tuple[str, ...]:
+    return tuple(map(str, value)) if isinstance(value, list) else () if value is None else (str(value),)
+
+
+def _damaged(where: str, error: object) -> InputError:
+    return InputError(where=where, found=f"not a list of episodes ({error!r})", needed="LeRobot's own", fix=_FIX)

@@ -1,0 +1,206 @@
+"""What does a LeRobot data set say of itself? meta/info.json: its version, rate, columns, cameras and file names."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig, LeRobotFields
+from vjepa2_ac.data.sources.lerobot.path_templates import require_template
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.structured import read_json_object
+
+INFO = "meta/info.json"
+VERSIONS = ("v2.1", "v3.0")
+
+_STATE_NUMBERS = {"euler_xyz": 7, "quaternion_wxyz": 8, "quaternion_xyzw": 8}
+_FIX = "Get meta/info.json again"
+_WAY_TO_HUB = "Check the name in hf://datasets/owner/name; for a private data set, `hf auth login` or set HF_TOKEN"
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One column, or one camera."""
+
+    dtype: str
+    shape: tuple[int, ...]
+    names: tuple[str, ...] = ()
+
+    @property
+    def width(self) -> int:
+        """How many numbers it has at each step."""
+        return math.prod(self.shape)
+
+    @property
+    def is_camera(self) -> bool:
+        """Whether it holds pictures."""
+        return self.dtype in {"video", "image"}
+
+
+@dataclass(frozen=True)
+class DatasetInfo:
+    """What meta/info.json says, as far as it is used."""
+
+    root: str
+    version: str
+    fps: float
+    episodes: int
+    chunk_episodes: int  # v2.1: episodes in a chunk's folder
+    data_path: str
+    video_path: str | None
+    features: Mapping[str, Feature]
+
+    @property
+    def where(self) -> str:
+        """The file."""
+        return storage.join(self.root, INFO)
+
+    def require_mapping(self, config: DataConfig) -> None:
+        """Check that the data set has what `data.lerobot` and `data.camera` name, before anything large is read.
+
+        Raises:
+            InputError: A column or camera is not there (lists those that are), or they do not make up a state.
+        """
+        fields = config.lerobot
+        columns = [name for name, feature in self.features.items() if not feature.is_camera]
+        wanted = {"state": fields.state, "action": fields.action if config.actions == "recorded" else ()}
+        for knob, names in wanted.items():
+            for name in names:
+                if name not in columns:
+                    raise missing(f"data.lerobot.{knob}", "column", name, self.where, columns)
+        _require_state(self, fields, is_pose=config.states == "pose")
+        for camera in config.cameras:
+            self.camera_key(fields, camera)
+
+    def camera_key(self, fields: LeRobotFields, camera: str) -> str:
+        """Return the feature with a camera's pictures.
+
+        Raises:
+            InputError: The config or the data set has no such camera.
+        """
+        if camera not in fields.cameras:
+            raise missing("data.camera", "camera", camera, "data.lerobot.cameras", fields.cameras)
+        key = fields.cameras[camera]
+        cameras = [name for name, feature in self.features.items() if feature.is_camera]
+        if key not in cameras:
+            raise missing(f"data.lerobot.cameras.{camera}", "camera", key, self.where, cameras)
+        if self.features[key].dtype == "video" and self.video_path is None:
+            raise InputError(where=self.where, found=f"no video_path, and {key} is a video", needed="one", fix=_FIX)
+        return key
+
+    def known_keys(self, fields: LeRobotFields) -> list[str]:
+        """Return the cameras that both the config and the data set have."""
+        return [key for key in dict.fromkeys(fields.cameras.values()) if key in self.features]
+
+
+def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
+    """Return the error of something that is not there, with what is, and what may have been meant."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"Did you mean {close[0]}? " if close else ""
+    return InputError(
+        where=where,
+        found=f"no {kind} {name} in {place}",
+        needed=f"one of its {kind}s",
+        fix=f"{hint}It has: {', '.join(known) or 'none'}",
+    )
+
+
+def read_info(root: str) -> DatasetInfo:
+    """Read meta/info.json.
+
+    Raises:
+        InputError: There is no data set, it is of another version, or the file is damaged.
+        UnreachableError: It cannot be read.
+    """
+    where = storage.join(root, INFO)
+    try:
+        content = read_json_object(where, needed="a description of a data set", fix=_FIX, allow_nan=True)
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(
+            where="data.path",
+            found=f"no {INFO} in {root}",
+            needed="a LeRobot data set",
+            fix=_WAY_TO_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos",
+        ) from None
+    except OSError as error:
+        raise storage.unreadable(where, error) from None
+    try:
+        _require_version(where, content.get("codebase_version"))
+        return _parsed(root, where, content)
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
+        raise _damaged(where, error) from None
+
+
+def _parsed(root: str, where: str, content: Mapping[str, Any]) -> DatasetInfo:
+    video_path = content.get("video_path")
+    fps, episodes, chunk = float(content["fps"]), content["total_episodes"], content.get("chunks_size", 1000)
+    if not 0 < fps <= 1000 or type(episodes) is not int or type(chunk) is not int or episodes < 0 or chunk < 1:
+        raise ValueError(f"fps {fps}, total_episodes {episodes}, chunks_size {chunk}")
+    return DatasetInfo(
+        root=root,
+        version=content["codebase_version"],
+        fps=fps,
+        episodes=episodes,
+        chunk_episodes=chunk,
+        data_path=require_template(content["data_path"], f"{where}: data_path"),
+        video_path=None if video_path is None else require_template(video_path, f"{where}: video_path"),
+        features={name: _feature(feature) for name, feature in content["features"].items()},
+    )
+
+
+def _feature(content: Mapping[str, Any]) -> Feature:
+    dtype, shape, names = content["dtype"], tuple(content["shape"]), content.get("names")
+    if not isinstance(dtype, str) or not all(type(size) is int and size > 0 for size in shape):
+        raise TypeError(f"a feature of dtype {dtype!r} and shape {shape!r}")
+    if isinstance(names, dict) and len(names) == 1:  # {"motors": ["x", "y", ...]}, as in older ports
+        names = next(iter(names.values()))
+    return Feature(dtype, shape, tuple(map(str, names)) if isinstance(names, list) else ())
+
+
+def _require_version(where: str, version: object) -> None:
+    if version in VERSIONS:
+        return
+    raise InputError(
+        where=where,
+        found=f"codebase_version {version!r}",
+        needed=" or ".join(VERSIONS),
+        fix="Convert the data set with the lerobot package, which has a script for each step from older versions",
+    )
+
+
+def _require_state(info: DatasetInfo, fields: LeRobotFields, *, is_pose: bool) -> None:
+    described = " + ".join(_described(name, info.features[name]) for name in fields.state)
+    where = "data.lerobot.select" if fields.select is not None else "data.lerobot.state"
+    joined = sum(info.features[name].width for name in fields.state)
+    if fields.select is not None and (beyond := [number for number in fields.select if number >= joined]):
+        raise InputError(
+            where=where, found=f"{beyond[0]}, of {joined} numbers in {described}", needed=f"0 to {joined - 1}"
+        )
+    width, needed = len(fields.select or range(joined)), _STATE_NUMBERS[fields.rotation]
+    if is_pose and width != needed:
+        rotation = "3 Euler angles" if needed == STATE_WITH_EULER else "a quaternion's 4"
+        raise InputError(
+            where=where,
+            found=f"{width} numbers a step from {described}",
+            needed=f"{needed}: x, y, z, {rotation} (data.lerobot.rotation: {fields.rotation}), the gripper",
+            fix="Name other columns in data.lerobot.state, or choose among their numbers with data.lerobot.select",
+        )
+
+
+STATE_WITH_EULER = _STATE_NUMBERS["euler_xyz"]
+
+
+def _described(name: str, feature: Feature) -> str:
+    names: Collection[str] = feature.names
+    return f"{name} [{', '.join(names) if len(names) == feature.width else feature.width}]"
+
+
+def _damaged(where: str, error: Exception) -> InputError:
+    return InputError(
+        where=where, found=f"not a description of a data set ({error!r})", needed="LeRobot's own", fix=_FIX
+    )

@@ -1,0 +1,86 @@
+"""Which files does a LeRobot data set have, and what are they called? Templates such as `chunk-{chunk_index:03d}`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.sources.listing import in_parallel
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage import FileInfo
+
+_PLACE = re.compile(r"\{(\w+)(?::0(\d)d)?\}")
+_NUMBERS = {"chunk_index", "file_index", "episode_chunk", "episode_index"}
+
+
+def require_template(template: object, where: str) -> str:
+    """Return a template of paths as meta/info.json names it.
+
+    Raises:
+        InputError: It is none, leads out of the data set, or has places that LeRobot does not have.
+    """
+    if isinstance(template, str) and template and not template.startswith("/") and ".." not in template.split("/"):
+        rest = _PLACE.sub("", template)
+        if "{" not in rest and "}" not in rest and set(_names(template)) <= _NUMBERS | {"video_key"}:
+            return template
+    raise InputError(
+        where=where,
+        found=f"the template {template!r}",
+        needed="one within the data set, with places such as {chunk_index:03d}",
+        fix="Get meta/info.json again",
+    )
+
+
+def filled(template: str, chunk: int, file: int, key: str = "") -> str:
+    """Return the path, within the data set, of a file: of v3.0 by chunk and file, of v2.1 by chunk and episode."""
+    numbers = {"chunk_index": chunk, "episode_chunk": chunk, "file_index": file, "episode_index": file}
+
+    def value(place: re.Match[str]) -> str:
+        if place[1] == "video_key":
+            return key
+        return f"{numbers[place[1]]:0{int(place[2] or 1)}d}"
+
+    return _PLACE.sub(value, template)
+
+
+def list_by_template(root: str, template: str, key: str = "", *, connections: int = 1) -> dict[str, FileInfo]:
+    """Return the files whose paths fit a template, sorted by path within the data set.
+
+    Raises:
+        OSError: A folder cannot be listed.
+    """
+    *folders, name = template.replace("{video_key}", key).split("/")
+    found = [""]
+    for part in folders:
+        if _PLACE.search(part):
+            names = [
+                [name for name in storage.list_names(storage.join(root, folder)) if _fits(name, part)]
+                for folder in found
+            ]
+            found = [f"{folder}{name}/" for folder, inside in zip(found, names, strict=True) for name in inside]
+        else:
+            found = [f"{folder}{part}/" for folder in found]
+    listings = in_parallel(lambda folder: storage.list_files(storage.join(root, folder)), found, connections)
+    files = {
+        f"{folder}{info.name}": info
+        for folder, infos in zip(found, listings, strict=True)
+        for info in infos
+        if _fits(info.name, name)
+    }
+    return dict(sorted(files.items()))
+
+
+def fingerprint(*listings: Mapping[str, FileInfo]) -> Sequence[tuple[str, int, str]]:
+    """Return what differs when any of the files does."""
+    return [(path, info.size, info.version) for files in listings for path, info in files.items()]
+
+
+def _names(template: str) -> list[str]:
+    return [place[1] for place in _PLACE.finditer(template)]
+
+
+def _fits(name: str, part: str) -> bool:
+    pieces = re.split(r"\{\w+(?::0\dd)?\}", part)
+    # Possessive: a template of many places would else be tried in every way that there is.
+    return re.fullmatch(r"\d++".join(re.escape(piece) for piece in pieces), name) is not None

@@ -1,0 +1,51 @@
+"""Which records of a data set have had their CRC checked on this machine?"""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+
+logger = logging.getLogger(__name__)
+
+_CHECKED = b"\xc3"  # no byte of zeros or ones, so that a damaged file seldom says more than is true
+
+
+class CrcMarks:
+    """A mark for each record, in a file that all loader processes share: one byte each.
+
+    A mark that cannot be read is not there; one that cannot be written costs a warning and another check.
+
+    Args:
+        path: The file; made when the first mark is.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._warned = path, False
+
+    def __contains__(self, number: int) -> bool:
+        """Return whether a record has been checked."""
+        try:
+            handle = os.open(self._path, os.O_RDONLY)
+        except OSError:
+            return False
+        try:
+            return os.pread(handle, 1, number) == _CHECKED
+        except OSError:
+            return False
+        finally:
+            os.close(handle)
+
+    def add(self, number: int) -> None:
+        """Remember that a record has been checked."""
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            handle = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o666)
+            try:
+                os.pwrite(handle, _CHECKED, number)
+            finally:
+                os.close(handle)
+        except OSError as error:
+            if not self._warned:
+                logger.warning("%s: cannot be written (%s); records are checked each time", self._path, error)
+            self._warned = True

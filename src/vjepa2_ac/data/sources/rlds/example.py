@@ -1,0 +1,147 @@
+"""What does one record of a data set hold, feature by feature?"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32
+
+from vjepa2_ac.data.sources.rlds.tfrecord import Kind, RecordSpan, decode_feature
+from vjepa2_ac.data.sources.rlds.wire_format import (
+    DELIMITED,
+    FLOAT_LIST,
+    INT64_LIST,
+    Located,
+    NotAnExampleError,
+    Read,
+    locate_features,
+    locate_items,
+    packed_numbers,
+)
+from vjepa2_ac.errors import InputError
+
+
+class ExampleRecord:
+    """The features of one Example, read when asked for.
+
+    Args:
+        read: Returns bytes of the file.
+        span: The record's place in it.
+        located: Where each feature lies, where that is known already.
+    """
+
+    def __init__(self, read: Read, span: RecordSpan, located: dict[str, Located] | None = None) -> None:
+        self._read, self._span = read, span
+        if located is not None:
+            self.located = located
+
+    @cached_property
+    def located(self) -> dict[str, Located]:
+        """Where each feature lies."""
+        try:
+            return locate_features(self._read, self._span.data_offset, self._span.length)
+        except NotAnExampleError as error:
+            raise not_an_example(self._span, error) from None
+
+    def require(self, names: Iterable[str]) -> None:
+        """Refuse a record that lacks a feature."""
+        for name in names:
+            if name not in self.located:
+                raise self._missing(name)
+
+    def floats(self, name: str) -> Float32[np.ndarray, " values"]:
+        """Return the numbers of a feature.
+
+        Raises:
+            InputError: There is no such feature, or it holds no floats.
+        """
+        packed = packed_numbers(self.serialised(name), FLOAT_LIST)
+        if packed is None or len(packed) % 4:
+            return np.asarray(self.values(name, "float_list"), np.float32)
+        return np.frombuffer(packed, "<f4")
+
+    def is_float(self, name: str) -> bool:
+        """Return whether a feature holds floats, as far as its first byte tells."""
+        return self._read(self.located[name].offset, 1) == bytes([FLOAT_LIST << 3 | DELIMITED])
+
+    def count_integers(self, name: str) -> int:
+        """Return how many integers a feature holds.
+
+        Raises:
+            InputError: There is no such feature, or it holds no integers.
+        """
+        packed = packed_numbers(self.serialised(name), INT64_LIST)
+        if packed is None or (packed and packed[-1] >= 0x80):
+            return len(self.values(name, "int64_list"))
+        return int(np.count_nonzero(np.frombuffer(packed, np.uint8) < 0x80))
+
+    def items(self, name: str, count: int | None = None) -> tuple[list[int], list[int]]:
+        """Return offsets and lengths of the texts or pictures of a feature, of the first `count`, reading none of them.
+
+        Raises:
+            InputError: There is no such feature, or it holds something else.
+        """
+        self.require([name])
+        try:
+            return locate_items(self._read, self.located[name], count)
+        except NotAnExampleError as error:
+            self.values(name, "bytes_list")  # says better what it is, where it can
+            raise not_an_example(self._span, error) from None
+
+    def first_text(self, name: str) -> str:
+        """Return the first text of a feature; empty where it has none.
+
+        Raises:
+            InputError: There is no such feature, or it holds something else.
+        """
+        for offset, length in zip(*self.items(name, 1), strict=True):
+            return self._read(offset, length).decode(errors="replace")
+        return ""
+
+    def values(self, name: str, *kinds: Kind) -> Sequence[Any]:
+        """Return a feature's values, of any kind, in any form.
+
+        Raises:
+            InputError: There is no such feature, or it holds values of another kind.
+        """
+        data = self.serialised(name)
+        where = f"{self._span}: {name}"
+        found, values = decode_feature(data, where=where)
+        if found is not None and found not in kinds:
+            raise InputError(where=where, found=f"a {found}", needed=f"a {' or '.join(kinds)}", fix="Check data.fields")
+        return values
+
+    def serialised(self, name: str) -> bytes:
+        """Return a feature as it is in the file.
+
+        Raises:
+            InputError: There is no such feature, or the file ends within it.
+        """
+        self.require([name])
+        offset, length = self.located[name]
+        data = self._read(offset, length)
+        if len(data) < length:
+            raise InputError(
+                where=f"{self._span}: {name}", found=f"{len(data)} bytes at {offset}", needed=f"{length} bytes"
+            )
+        return data
+
+    def _missing(self, name: str) -> InputError:
+        names = sorted(self.located)
+        close = difflib.get_close_matches(name, names, n=1)
+        hint = f"Did you mean {close[0]}? " if close else ""
+        return InputError(
+            where=str(self._span),
+            found=f"no feature {name}; the record has {', '.join(names) or 'none'}",
+            needed="the features that data.fields names",
+            fix=f"{hint}Set data.fields",
+        )
+
+
+def not_an_example(span: RecordSpan, error: NotAnExampleError) -> InputError:
+    """Return what to tell the user of a record that cannot be read as features."""
+    return InputError(where=str(span), found=f"not a tf.train.Example ({error})", needed="an RLDS data set")

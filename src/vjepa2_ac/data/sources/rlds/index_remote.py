@@ -1,0 +1,240 @@
+"""Which episodes does an RLDS data set behind a URL hold? Found out with a few small reads for each.
+
+A read costs tens of milliseconds, so many shards are read at once, and of a record no more is read than names it and
+tells its steps: its states are checked when it is read, and here only where it may be a copy (`lookalikes`). TFDS
+writes the features of a record in a hash's order, another one in every process: its names lie before, between or behind
+the pictures. Looked at are its head; its end, which comes with the head of the next record; then what lies between the
+pictures. That is one read a record where the names come first, three on the average of all orders. How many bytes one
+read takes is decided by a few records.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+from vjepa2_ac.config import DataConfig, RldsFields
+from vjepa2_ac.data.filters.broken_episodes import as_problem
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.rlds.example import ExampleRecord, not_an_example
+from vjepa2_ac.data.sources.rlds.features import (
+    STEP_FLAG,
+    commands_of,
+    features_of_steps,
+    identity_of,
+    info_of,
+    num_steps_of,
+    states_of,
+)
+from vjepa2_ac.data.sources.rlds.index_local import Found, ScannedEpisode, in_parallel, place_of, scan_shard, table_of
+from vjepa2_ac.data.sources.rlds.lookalikes import hashes_of_lookalikes
+from vjepa2_ac.data.sources.rlds.range_reader import RemoteFile
+from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, RecordSpan, span_at
+from vjepa2_ac.data.sources.rlds.wire_format import (
+    Located,
+    NotAnExampleError,
+    Read,
+    features_behind,
+    iterate_features,
+)
+from vjepa2_ac.data.sources.validation import zero_steps
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.remote import UnreachableError
+
+logger = logging.getLogger(__name__)
+
+FEWEST_IN_FLIGHT = 128  # reads of an index are small and wait for one another within a shard
+
+_SAMPLES = 16
+_PIECES = 8  # reads of a record that are kept: its end holds the head of the next
+_NAME_BYTES = 160  # more than a feature's name and headers take
+_SAMPLE_WINDOW = 1 << 16
+_WINDOWS = tuple(1 << power for power in range(10, 16))
+_ASSUMED_LATENCY_S, _ASSUMED_REQUEST_S, _ASSUMED_BYTES_PER_S = 0.04, 5e-4, 1e8  # a request: of Python's own time
+_FLAGS = (STEP_FLAG, "steps/is_last", "steps/is_terminal")  # one byte a step, always
+
+
+@dataclass(frozen=True)
+class RecordLayout:
+    """What a few whole records say of all: how many bytes of which feature are one step, and what to read at once."""
+
+    step_bytes: dict[str, int]
+    window: int
+
+    def steps_in(self, name: str, length: int) -> int | None:
+        """Return the number of steps that a feature's length tells, or None where it does not."""
+        payload = _payload(_payload(length))
+        width = self.step_bytes.get(name)
+        if width is None or payload is None or payload % width:
+            return None
+        return payload // width
+
+
+def index_remote(
+    shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str], *, threads: int, progress: Progress | None
+) -> EpisodeTable:
+    """Return every episode of shards behind a URL, by identity and number of steps.
+
+    Args:
+        shards: All of the data set's.
+        config: Names of the features, and what a state is.
+        cameras: Features with pictures that episodes must have; looked for in a few of them.
+        threads: Shards that are read at once, at least `FEWEST_IN_FLIGHT`.
+        progress: Told how many of the episodes have been found.
+
+    Raises:
+        InputError: No episode can be used; a shard cannot be read.
+    """
+    layout = learn_layout(shards, config, cameras)
+
+    def examine(read: Read, span: RecordSpan) -> Found:
+        return _examine(read, span, config, layout)
+
+    def scan(shard: Shard) -> list[Found]:
+        return list(scan_shard(RemoteFile(shard, window=layout.window, kept=_PIECES), shard, examine))
+
+    threads = max(threads, FEWEST_IN_FLIGHT)
+    table = table_of(shards, in_parallel(scan, shards, threads, progress))
+    return replace(table, state_hash=hashes_of_lookalikes(table, shards, config, threads=threads))
+
+
+def learn_layout(shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str]) -> RecordLayout:
+    """Look at the first record of a few shards, as closely as at a local one.
+
+    Raises:
+        InputError: None of them can be used: the settings are at fault, or the data set is.
+    """
+
+    def first_record(shard: Shard) -> tuple[ExampleRecord, int] | InputError:
+        try:
+            return _whole_record(shard, config, cameras)
+        except UnreachableError:
+            raise  # says nothing of the record
+        except InputError as error:
+            return error
+
+    chosen = [shards[number * len(shards) // _SAMPLES] for number in range(_SAMPLES)]
+    with ThreadPoolExecutor(_SAMPLES) as pool:
+        looked = list(pool.map(first_record, dict.fromkeys(chosen)))
+    good = [one for one in looked if not isinstance(one, InputError)]
+    if not good:
+        raise next(one for one in looked if isinstance(one, InputError))
+    fields = config.fields
+    step_bytes = _step_bytes(good, fields)
+    seconds = {
+        window: sum(_cost_s(record, fields, step_bytes.keys(), window) for record, _ in good) for window in _WINDOWS
+    }
+    window = min(seconds, key=seconds.__getitem__)
+    logger.info("the index is made with reads of %d KB", window >> 10)
+    return RecordLayout(step_bytes, window)
+
+
+def _whole_record(shard: Shard, config: DataConfig, cameras: Sequence[str]) -> tuple[ExampleRecord, int]:
+    read = RemoteFile(shard, window=_SAMPLE_WINDOW)
+    span = span_at(read(0, HEADER_BYTES), shard.path, 0, 0, shard.size)
+    record = ExampleRecord(read, span)
+    record.require([*config.fields.identity, *features_of_steps(config), *cameras])
+    steps = num_steps_of(record, config)
+    states_of(record, config, steps, str(span))
+    commands_of(record, config, steps, str(span))
+    return record, steps
+
+
+def _step_bytes(records: Iterable[tuple[ExampleRecord, int]], fields: RldsFields) -> dict[str, int]:
+    """Return the bytes of a step of every feature that has as many for each step, in all of the records."""
+    found: dict[str, set[float]] = {}
+    for record, steps in records:
+        for name, place in record.located.items():
+            if name in fields.state or (name.startswith("steps/") and record.is_float(name)) or name in _FLAGS:
+                found.setdefault(name, set()).add((_payload(_payload(place.length)) or 0) / steps)
+    widths = {name: next(iter(of_all)) for name, of_all in found.items() if len(of_all) == 1}
+    return {name: int(width) for name, width in widths.items() if width >= 1 and width == int(width)}
+
+
+def _cost_s(record: ExampleRecord, fields: RldsFields, telling: Iterable[str], window: int) -> float:
+    """Return the seconds that it takes to find identity and steps with reads of a window: latency, and its bytes."""
+    reads = 0
+    places, wanted = record.located, frozenset(fields.identity)
+    first, last = min(place.offset for place in places.values()), max(sum(place) for place in places.values())
+    pieces: list[tuple[int, int]] = [(first, first + window)]
+
+    def is_read(start: int, end: int) -> bool:
+        return any(piece[0] <= start and end <= piece[1] for piece in pieces)
+
+    missing, steps_known, before = set(wanted), False, first
+    for name, place in places.items():
+        end = sum(place) if name in missing else place.offset
+        if not is_read(place.offset, end) and reads == 0:
+            pieces.append((last - window, last))  # together with the head of the next record
+            reads = 1
+            missing -= {one for one in missing if is_read(places[one].offset, sum(places[one]))}
+            if not missing and steps_known:
+                break
+        if not is_read(place.offset, end):
+            reads += 1
+            pieces.append((before, before + window))
+        missing.discard(name)
+        steps_known = steps_known or name in telling
+        before = sum(place)
+        if steps_known and not missing:
+            break
+    read_bytes = window * (1 + reads)
+    shared_s = max(1, reads) * _ASSUMED_REQUEST_S + read_bytes / _ASSUMED_BYTES_PER_S
+    return max(1, reads) * _ASSUMED_LATENCY_S + FEWEST_IN_FLIGHT * shared_s
+
+
+def _examine(read: Read, span: RecordSpan, config: DataConfig, layout: RecordLayout) -> Found:
+    """Look at the record's head; if need be at its end, with the head of the next; then hop from one to the other."""
+    name = place_of(span)
+    try:
+        found, steps = _search(read, span, config.fields, layout)
+        record = ExampleRecord(read, span, found)
+        name = identity_of(record, config.fields)
+        steps = num_steps_of(record, config) if steps is None else steps
+        if steps == 0:
+            raise zero_steps(f"{span} ({name})")
+    except UnreachableError:
+        raise  # says nothing of the record
+    except InputError as error:
+        return as_problem(error, name)
+    return ScannedEpisode(info_of(name, steps), span)
+
+
+def _search(
+    read: Read, span: RecordSpan, fields: RldsFields, layout: RecordLayout
+) -> tuple[dict[str, Located], int | None]:
+    """Return features, the identity's among them, and the number of steps; of a record without them, all features."""
+    found: dict[str, Located] = {}
+    steps: int | None = None
+    end = span.data_offset + span.length
+    head_end, tail_start = span.offset + layout.window, max(span.data_offset, end - layout.window)
+    looked_at_end = False
+    try:
+        for feature, place in iterate_features(read, span.data_offset, span.length):
+            found[feature] = place
+            steps = layout.steps_in(feature, place.length) if steps is None else steps
+            if not looked_at_end and not found.keys() >= set(fields.identity) and sum(place) + _NAME_BYTES > head_end:
+                looked_at_end = True
+                tail = read(tail_start, end + layout.window - tail_start)[: end - tail_start]
+                for name in fields.identity:
+                    found |= features_behind(name, tail, tail_start) if name not in found else {}
+            if steps is not None and found.keys() >= set(fields.identity):
+                break
+    except NotAnExampleError as error:
+        raise not_an_example(span, error) from None
+    return found, steps
+
+
+def _payload(length: int | None) -> int | None:
+    """Return how long the content of a length-delimited field is that takes `length` bytes with its tag and length."""
+    if length is None:
+        return None
+    for header in range(2, 7):
+        content = length - header
+        if content >= 0 and 1 + max(1, -(-content.bit_length() // 7)) == header:
+            return content
+    return None

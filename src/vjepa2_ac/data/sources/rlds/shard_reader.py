@@ -1,0 +1,46 @@
+"""How are parts of a shard read, while somebody may change it?"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.rlds.wire_format import Read
+from vjepa2_ac.errors import InputError
+
+
+@contextmanager
+def open_shard(shard: Shard) -> Iterator[Read]:
+    """Open a shard on this machine to read at any offset; several threads may.
+
+    Nothing is mapped into memory: a file that is cut while it is in use gives short reads, not a dead process.
+
+    Raises:
+        InputError: The file cannot be read, or is another one than when the data set was opened.
+    """
+    try:
+        handle = os.open(shard.path, os.O_RDONLY)
+    except OSError as error:
+        raise unreadable(shard, error) from None
+    try:
+        found = os.fstat(handle)
+        if (found.st_size, str(found.st_mtime_ns)) != (shard.size, shard.version):
+            raise InputError(
+                where=shard.path,
+                found=f"{found.st_size:,} bytes: it has changed since the data set was opened",
+                needed=f"the file of {shard.size:,} bytes that was there",
+                fix="Start again",
+            )
+        yield lambda offset, length: os.pread(handle, length, offset)
+    except OSError as error:
+        raise unreadable(shard, error) from None
+    finally:
+        os.close(handle)
+
+
+def unreadable(shard: Shard, error: OSError) -> InputError:
+    """Return what to tell the user of a file that the system refuses to read."""
+    return storage.unreadable(shard.path, error, needed="a TFRecord file")

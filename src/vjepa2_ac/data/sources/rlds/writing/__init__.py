@@ -1,0 +1,1 @@
+"""Writing RLDS: a data set in DROID's schema, field for field."""

@@ -1,0 +1,95 @@
+"""On what does a config compute, and does that compute in its types? Asked before anything is loaded."""
+
+from __future__ import annotations
+
+import os
+
+import torch
+
+from vjepa2_ac.config import ModelConfig, TrainingConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.compilation import require_compiler
+
+PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
+_BF16_FROM = (8, 0)  # compute capability; PyTorch's own is_bf16_supported counts emulation, which is slower than fp32
+
+
+def is_on_cpu(training: TrainingConfig) -> bool:
+    """Return whether a config computes on a CPU; else on CUDA.
+
+    Raises:
+        InputError: CUDA was asked for and there is none.
+    """
+    has_cuda = torch.cuda.is_available()
+    if training.device == "cuda" and not has_cuda:
+        raise InputError(
+            where="training.device",
+            found="cuda, but this PyTorch sees no CUDA device",
+            fix="Set training.device=cpu, or install a CUDA build of PyTorch and a driver",
+        )
+    return training.device == "cpu" or not has_cuda
+
+
+def computing_device(training: TrainingConfig) -> torch.device:
+    """Return the device of this process, once it is certain that it computes so.
+
+    Raises:
+        InputError: CUDA was asked for and there is none, fp16 without CUDA, bfloat16 on a GPU that has none, or nothing
+            to compile with.
+    """
+    on_cpu = is_on_cpu(training)
+    if training.precision == "fp16" and on_cpu:
+        raise InputError(
+            where="training.precision",
+            found="fp16 on a CPU",
+            needed="a CUDA device: only there are losses scaled so that small gradients do not vanish",
+            fix="Set training.precision to bf16 or fp32",
+        )
+    if training.cuda_graph and on_cpu:
+        raise InputError(
+            where="training.cuda_graph", found="true, on a CPU", needed="a CUDA device", fix="Set it to false"
+        )
+    device = torch.device("cpu") if on_cpu else torch.device("cuda", cuda_index())
+    if training.precision == "bf16":  # fp32 is for float32 weights only, and fp16 casts them, whatever they are
+        _require_bf16(device, where="training.precision", found="bf16", fix="Set training.precision=fp16")
+    if training.compile == "blocks":
+        require_compiler(device.type, where="training.compile")
+    return device
+
+
+def require_type_of_weights(model: ModelConfig, device: torch.device) -> None:
+    """Refuse to compute in the type of the weights where the device has it not: what planning does, without autocast.
+
+    Raises:
+        InputError: They are bfloat16 on a GPU that has none.
+    """
+    if model.dtype == "bfloat16":
+        _require_bf16(device, where="model.dtype", found="bfloat16", fix="Set model.dtype=float32")
+
+
+def has_bf16() -> bool:
+    """Return whether the CUDA device of this process computes in bfloat16."""
+    return torch.cuda.get_device_capability(cuda_index()) >= _BF16_FROM
+
+
+def cuda_index() -> int:
+    """Return which of the CUDA devices of its machine is that of this process."""
+    return int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count()
+
+
+def autocast(training: TrainingConfig, device: torch.device) -> torch.autocast:
+    """Return the arithmetic that `training.precision` asks for, as Accelerate gives it to a run."""
+    kind = None if training.precision == "fp32" else PRECISIONS[training.precision]
+    return torch.autocast(device.type, dtype=kind, enabled=kind is not None)
+
+
+def _require_bf16(device: torch.device, *, where: str, found: str, fix: str) -> None:
+    if device.type != "cuda" or has_bf16():
+        return
+    major, minor = torch.cuda.get_device_capability(cuda_index())
+    raise InputError(
+        where=where,
+        found=f"{found}, on {torch.cuda.get_device_name(cuda_index())} of compute capability {major}.{minor}",
+        needed="8.0 or more (Ampere or later): earlier GPUs only emulate bfloat16",
+        fix=fix,
+    )

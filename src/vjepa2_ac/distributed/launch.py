@@ -1,0 +1,103 @@
+"""The launch: on which device and in which precision does a run compute, and in how many processes?"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from datetime import timedelta
+
+from accelerate import Accelerator
+from accelerate.state import AcceleratorState
+from accelerate.utils import InitProcessGroupKwargs
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.distributed.device import computing_device
+from vjepa2_ac.errors import InputError
+
+LONGEST_WAIT = timedelta(hours=2)  # of a process for the others: one may look through a data set for the first time
+_OTHER_WAYS = {
+    "ACCELERATE_USE_DEEPSPEED": "DeepSpeed",
+    "ACCELERATE_USE_MEGATRON_LM": "Megatron-LM",
+    "ACCELERATE_USE_PARALLELISM_CONFIG": "a parallelism config",
+}
+_OPTIONS = {  # that would do nothing, and are not known by their default
+    "FSDP_OFFLOAD_PARAMS": ("--fsdp_offload_params true", "start without it"),
+    "FSDP_ACTIVATION_CHECKPOINTING": (
+        "--fsdp_activation_checkpointing true",
+        "start without it, and set training.gradient_checkpointing=true",
+    ),
+}
+
+
+def make_accelerator(config: Config) -> Accelerator:
+    """Return the device and precision of a run.
+
+    Where there are several processes it joins them.
+
+    Raises:
+        InputError: CUDA was asked for and there is none, the device does not compute so (fp16 on a CPU, bf16 on an old
+            GPU), or a launch that cannot be followed.
+    """
+    check_launch(config)
+    training, on_cpu = config.training, computing_device(config.training).type == "cpu"
+    AcceleratorState._reset_state(reset_partial_state=False)  # or a second run keeps the first's precision
+    precision = "no" if training.precision == "fp32" else training.precision
+    patience = InitProcessGroupKwargs(timeout=LONGEST_WAIT)
+    return Accelerator(mixed_precision=precision, cpu=on_cpu, kwargs_handlers=[patience])
+
+
+def check_launch(config: Config, environment: Mapping[str, str] = os.environ) -> None:
+    """Refuse ways to share a model that this program does not know, and runs that FSDP2 cannot share.
+
+    Raises:
+        InputError: Any of these, with the way out.
+    """
+    for name, way in _OTHER_WAYS.items():
+        if _is_set(environment, name):
+            raise _refusal(way, "processes that share clips, or weights by FSDP2", "Start it without that")
+    if not _is_set(environment, "ACCELERATE_USE_FSDP"):
+        return
+    version = environment.get("FSDP_VERSION", "1")
+    if version != "2":
+        raise _refusal(f"FSDP version {version}", "version 2", "Add --fsdp_version 2")
+    _check_run(config)
+    for name, (option, way_out) in _OPTIONS.items():
+        if _is_set(environment, name):
+            raise _refusal(option, "FSDP2 without it", way_out[0].upper() + way_out[1:])
+
+
+def shares_weights(environment: Mapping[str, str] = os.environ) -> bool:
+    """Return whether the launch asks for FSDP."""
+    return _is_set(environment, "ACCELERATE_USE_FSDP")
+
+
+def _check_run(config: Config) -> None:
+    """Refuse runs whose weights FSDP2 cannot share."""
+    if config.adapter.kind == "lora":
+        raise _refusal(
+            "FSDP with adapter.kind lora",
+            "adapter.kind none: an adapter needs no shards",
+            "Start without --use_fsdp",
+        )
+    if config.training.optimizer == "adamw_8bit":
+        raise _refusal("FSDP with training.optimizer adamw_8bit", "adamw", "Set training.optimizer=adamw")
+    if config.training.compile != "off":
+        raise _refusal(
+            "FSDP with training.compile blocks", "off: together they are untried", "Set training.compile=off"
+        )
+    if config.training.cuda_graph:
+        raise _refusal("FSDP with training.cuda_graph", "false: together they are untried", "Set it to false")
+    if config.data.broken_episodes == "skip":
+        raise _refusal(
+            "FSDP with data.broken_episodes skip",
+            "clips for every process: one without would leave the others waiting",
+            "Set data.broken_episodes=error, or start without --use_fsdp",
+        )
+
+
+def _is_set(environment: Mapping[str, str], name: str) -> bool:
+    return environment.get(name, "false").lower() in {"1", "true", "yes", "on"}
+
+
+def _refusal(found: str, needed: str, fix: str) -> InputError:
+    return InputError(where="accelerate launch", found=found, needed=needed, fix=fix)

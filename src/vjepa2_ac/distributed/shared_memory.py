@@ -1,0 +1,91 @@
+"""Is there room for the batches that workers send home? They lie in /dev/shm, of which a container has little."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from accelerate import Accelerator
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.clips.loader import CLIPS_WORTH_WORKERS, validation_batches
+from vjepa2_ac.distributed.collectives import all_gather_object
+from vjepa2_ac.episode import Batch
+
+SHARED_MEMORY = "/dev/shm"  # noqa: S108  # where PyTorch puts them on Linux
+_CLIPS_TRIED = 8  # one is read; the others are for where data.broken_episodes passes over it
+_GIGABYTE, _MEGABYTE = 10**9, 10**6
+
+
+@runtime_checkable
+class FileSystem(Protocol):
+    """What is asked of `os.statvfs_result`."""
+
+    @property
+    def f_bavail(self) -> int:
+        """Free blocks."""
+        ...
+
+    @property
+    def f_frsize(self) -> int:
+        """Bytes of a block."""
+        ...
+
+
+def say_if_shared_memory_is_small(
+    config: Config, dataset: Dataset, pictured: Batch, accelerator: Accelerator, note: Callable[[str], None]
+) -> None:
+    """Note before the first step where batches of this run may not fit. All processes have to call.
+
+    Args:
+        config: The run.
+        dataset: Its clips.
+        pictured: One of them, as it was before they came from a cache of latents.
+        accelerator: Tells how many processes are on this machine.
+        note: Told.
+    """
+    here = platform.node()
+    processes = all_gather_object(accelerator, here).count(here)
+    if not config.data.workers:
+        return
+    clip = pictured
+    if pictured.latents is None and dataset.config.source == "latents":
+        clip = next(validation_batches(dataset, "train", clips=_CLIPS_TRIED, batch_size=1))
+    text = small_shared_memory(config, clip.nbytes, processes)
+    if text is not None:
+        note(text)
+
+
+def small_shared_memory(
+    config: Config, clip_bytes: int, processes: int = 1, *, statvfs: Callable[[str], FileSystem] | None = None
+) -> str | None:
+    """Return what to tell where shared memory may not hold the batches that are prepared ahead; None where it does.
+
+    A validation that is read by workers, too, comes while those of training wait.
+
+    Args:
+        config: The run.
+        clip_bytes: Of one clip as it leaves the loader.
+        processes: Of the run, on this machine.
+        statvfs: Tells what a file system has free; None: the system's.
+    """
+    data, validation = config.data, config.validation
+    clips = config.training.batch_size + validation.batch_size * (validation.clips >= CLIPS_WORTH_WORKERS)
+    needed = processes * data.workers * (data.prefetch + 1) * clips * clip_bytes
+    try:
+        found = (statvfs or os.statvfs)(SHARED_MEMORY)
+    except OSError:  # another system has none
+        return None
+    free = found.f_bavail * found.f_frsize
+    if needed <= free:
+        return None
+    times = f"{processes} processes x " if processes > 1 else ""
+    return (
+        f"{SHARED_MEMORY} has {free / _GIGABYTE:.3g} GB free, and batches on their way from the loader's workers may"
+        f" take {needed / _GIGABYTE:.3g} GB: {times}{data.workers} workers x ({data.prefetch} prefetched + 1) x {clips}"
+        f" clips of {clip_bytes / _MEGABYTE:.3g} MB. Where it is full, workers die of a bus error. Give a container"
+        f" more (docker run --shm-size={-(-needed // _GIGABYTE)}g), or lower data.workers or data.prefetch"
+    )

@@ -1,0 +1,140 @@
+"""Pixels to latents: where is the frozen encoder run, or are the latents of a cache taken instead?
+
+Training, evaluation and planning see only what comes out of here.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.clips.transforms import pixels_to_input
+from vjepa2_ac.data.sources.latents.cache_key import Encoding
+from vjepa2_ac.data.sources.latents.dtypes import unpack_latents
+from vjepa2_ac.encoding.cache_lookup import require_encoding
+from vjepa2_ac.episode import Batch, LatentBatch, StoredLatents, Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.world_model import WorldModel
+
+
+@torch.no_grad()
+def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int) -> LatentBatch:
+    """Encode the frames of a batch, each by itself, on the device; a training batch is augmented there, too.
+
+    Of a batch from a latent cache, the latents are taken as they are: `require_encoding` has compared the encoders.
+
+    Args:
+        world_model: The model whose frozen encoder is used.
+        batch: Clips as the loader gives them: uint8 pixels, cropped, of any size; or latents. If they are on their way
+            to the device, what arrives there is taken.
+        device: Where the model is.
+        chunk: Frames that go through the encoder at once.
+
+    Raises:
+        InputError: The model wants camera poses and a clip has none; or cached latents are of another width.
+    """
+    batch = _arrived(batch)
+    extrinsics = extrinsics_for(world_model, batch)
+    return LatentBatch(
+        latents=_latents_of(world_model, batch, device, chunk),
+        states=batch.states.to(device, non_blocking=True),
+        actions=batch.actions.to(device, non_blocking=True),
+        extrinsics=None if extrinsics is None else extrinsics.to(device, non_blocking=True),
+        episode_ids=batch.episode_ids,
+        starts=batch.starts,
+    )
+
+
+def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
+    """Return what decides the latents that a model makes in a run: by this a cache is found, or refused.
+
+    Takes as long as it takes to hash the encoder's weights.
+    """
+    return Encoding(
+        encoder=world_model.encoder_fingerprint(),
+        image_size=world_model.image_size,
+        patch_size=world_model.sizes.patch_size,
+        tokens=world_model.num_tokens,
+        dim=world_model.latent_dim,
+        weights=config.model.dtype,
+        precision=config.training.precision,
+    )
+
+
+def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Config) -> None:
+    """Refuse cached latents that another encoder made, or the same in another precision; other data sets pass.
+
+    Raises:
+        InputError: Names what differs.
+    """
+    if dataset.config.source == "latents":  # else the weights need not be hashed
+        require_encoding(dataset, encoding_of(world_model, config))
+
+
+def _arrived(batch: Batch) -> Batch:
+    """Return the copy of a batch on the device; the batch itself where there is none, or it was taken before."""
+    there = None if batch.on_device is None else batch.on_device()
+    return batch if there is None else there
+
+
+def _latents_of(
+    world_model: WorldModel, batch: Batch, device: torch.device, chunk: int
+) -> Float[Tensor, "batch time tokens dim"]:
+    if batch.latents is None:
+        if batch.frames is None:
+            raise ValueError("a batch with neither frames nor latents")
+        frames = batch.frames.to(device, non_blocking=True)
+        return world_model.encode(pixels_to_input(frames, world_model.image_size, batch.augmentations), chunk=chunk)
+    values, scales = batch.latents.values, batch.latents.scales
+    if values.shape[-2:] != (world_model.num_tokens, world_model.latent_dim):
+        raise InputError(
+            where="data.path",
+            found=f"cached latents of {values.shape[-2]} tokens of {values.shape[-1]} numbers",
+            needed=f"{world_model.num_tokens} of {world_model.latent_dim}, as this model's encoder makes them",
+            fix="Use a cache that was made with this model",
+        )
+    moved = None if scales is None else scales.to(device, non_blocking=True)
+    return unpack_latents(StoredLatents(values.to(device, non_blocking=True), moved))
+
+
+def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> None:
+    """Refuse data whose states or actions are wider or narrower than what the model takes.
+
+    Args:
+        world_model: The model.
+        widths: Of the data.
+        where: What named the model.
+
+    Raises:
+        InputError: Names both.
+    """
+    needed = widths_of_model(world_model.sizes)
+    if widths != needed:
+        raise InputError(
+            where=where,
+            found=f"data with states of {widths.state} and actions of {widths.action} numbers",
+            needed=f"{needed.state} and {needed.action}, which this model takes",
+            fix="Choose other data, or train on these: `train` then replaces the model's input heads",
+        )
+
+
+def extrinsics_for(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "batch time 6"] | None:
+    """Return the camera poses of a batch if the model wants them.
+
+    Raises:
+        InputError: It does, and a clip has none; names the episodes of the batch.
+    """
+    if not world_model.sizes.predictor.use_extrinsics:
+        return None
+    if batch.extrinsics is None:
+        raise InputError(
+            where="model: predictor.use_extrinsics",
+            found=f"no pose of the camera in some of these episodes: {', '.join(dict.fromkeys(batch.episode_ids))}",
+            needed="one at every step of every episode",
+            fix="Choose a data.source and data.camera that have them, or a model without use_extrinsics",
+        )
+    return batch.extrinsics

@@ -1,0 +1,128 @@
+"""How is the encoder kept full? Frames of neighbouring episodes share a chunk, and every chunk has one shape."""
+
+from __future__ import annotations
+
+import itertools
+from collections import deque
+from collections.abc import Callable, Generator, Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vjepa2_ac.data.clips.streams import Copies
+from vjepa2_ac.data.clips.transforms import pixels_to_input
+from vjepa2_ac.encoding.prefetch import FramesToEncode, Part, Unreadable
+from vjepa2_ac.episode import Episode, StoredLatents
+
+_CHUNKS_UNDER_WAY = 2  # the device computes one while the one before it is fetched
+
+Encode = Callable[[Float[Tensor, "time 3 size size"]], StoredLatents]  # normalised frames to what is stored of them
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded:
+    """Everything that was wanted of one camera of one episode."""
+
+    wanted: FramesToEncode
+    recording: Episode
+    latents: StoredLatents  # of all its frames, on the CPU
+    pictures: UInt8[np.ndarray, "frames side side 3"]
+
+
+class Chunks:
+    """Encodes frames a whole chunk at a time, whatever episode they are of.
+
+    The last chunk is filled up with copies of its last frame: a product of matrices of another shape may round
+    otherwise.
+
+    Args:
+        encode: What is stored of normalised frames, on the device.
+        chunk: Frames of a chunk.
+        image_size: Height and width of a frame, in pixels.
+        copies: How frames get to where they are encoded, and latents back.
+    """
+
+    def __init__(self, encode: Encode, *, chunk: int, image_size: int, copies: Copies) -> None:
+        self._encode, self._chunk = encode, chunk
+        self._image_size, self._copies = image_size, copies
+        self._inputs: list[Tensor] = []  # prepared, not yet encoded
+        self._owners: list[FramesToEncode] = []  # of each of these frames
+        self._under_way: deque[tuple[Callable[[], StoredLatents], list[FramesToEncode]]] = deque()
+        self._done: dict[FramesToEncode, list[StoredLatents]] = {}
+        self._pictures: dict[FramesToEncode, list[np.ndarray]] = {}
+        self._ends: deque[tuple[FramesToEncode, Episode]] = deque()  # all of whose frames are here, in order
+        self.frames = 0  # encoded so far
+
+    def encoded(self, parts: Iterable[Part | Unreadable]) -> Generator[Encoded | Unreadable, None, None]:
+        """Yield what is complete, in order; of what cannot be read, the error."""
+        for part in parts:
+            if isinstance(part, Unreadable):
+                self._done.pop(part.wanted, None)
+                self._pictures.pop(part.wanted, None)
+                yield part
+                continue
+            self._add(part)
+            while len(self._owners) >= self._chunk:
+                self._start()
+            yield from self._complete(_CHUNKS_UNDER_WAY - 1)
+        if self._owners:
+            self._start()
+        yield from self._complete(0)
+
+    def _add(self, part: Part) -> None:
+        frames = torch.from_numpy(part.frames)
+        arrived = self._copies.to_device.start(lambda copy: copy(frames))()
+        self._inputs.append(pixels_to_input(arrived[None], self._image_size)[0])
+        self._owners += [part.wanted] * len(frames)
+        self._done.setdefault(part.wanted, [])
+        self._pictures.setdefault(part.wanted, []).append(part.pictures)
+        if part.is_last:
+            self._ends.append((part.wanted, part.recording))
+
+    def _start(self) -> None:
+        """Encode one chunk, and let its latents come as soon as they are there."""
+        waiting = torch.cat(self._inputs)
+        now, owners = waiting[: self._chunk], self._owners[: self._chunk]
+        self._inputs, self._owners = [waiting[self._chunk :]], self._owners[self._chunk :]
+        missing = self._chunk - len(now)
+        if missing:
+            now = torch.cat([now, now[-1:].expand(missing, -1, -1, -1)])
+        self._under_way.append((self._copies.to_host.start(self._encode(now).mapped), owners))
+        self.frames += len(owners)
+
+    def _complete(self, under_way: int) -> Generator[Encoded, None, None]:
+        """Fetch chunks until so many are under way, and yield what is whole by then."""
+        while len(self._under_way) > under_way:
+            fetched, owners = self._under_way.popleft()
+            self._hand_out(fetched().mapped(_unpinned), owners)
+        while self._ends and self._is_whole(self._ends[0][0]):
+            wanted, recording = self._ends.popleft()
+            pictures = np.concatenate(self._pictures.pop(wanted))
+            yield Encoded(wanted, recording, _joined(self._done.pop(wanted)), pictures)
+
+    def _hand_out(self, latents: StoredLatents, owners: list[FramesToEncode]) -> None:
+        """Give each its own frames of a chunk."""
+        values, scales = latents.values, latents.scales
+        start = 0
+        for owner, frames in itertools.groupby(owners):
+            end = start + len(list(frames))
+            if owner in self._done:  # else it turned out to be unreadable
+                own_scales = None if scales is None else scales[start:end]
+                self._done[owner].append(StoredLatents(values[start:end], own_scales))
+            start = end
+
+    def _is_whole(self, wanted: FramesToEncode) -> bool:
+        return sum(len(piece.values) for piece in self._done[wanted]) == len(wanted.steps)
+
+
+def _unpinned(tensor: Tensor) -> Tensor:
+    """Return a tensor in memory that may be held for as long as an episode takes: pinned memory is never given back."""
+    return tensor.clone() if tensor.is_pinned() else tensor
+
+
+def _joined(pieces: list[StoredLatents]) -> StoredLatents:
+    scales = [piece.scales for piece in pieces if piece.scales is not None]
+    return StoredLatents(torch.cat([piece.values for piece in pieces]), torch.cat(scales) if scales else None)

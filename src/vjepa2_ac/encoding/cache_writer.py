@@ -1,0 +1,129 @@
+"""How is a latent cache written? An episode at a time, by any number of processes, and finished by one of them."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Int64, UInt8
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.filters.idle_ranges import find_ranges
+from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding
+from vjepa2_ac.data.sources.latents.episode_file import EpisodeLayout, write_episode_file
+from vjepa2_ac.data.sources.latents.manifest import EPISODES, KEPT, MANIFEST, Manifest, path_of, size_column
+from vjepa2_ac.episode import Episode, StoredLatents
+
+if TYPE_CHECKING:
+    from vjepa2_ac.data.clips.dataset import Dataset
+
+
+@dataclass(frozen=True)
+class CacheWriter:
+    """Writes one cache into a folder. Several processes may each have one for the same folder.
+
+    To go on after a kill: leave out the episodes that `has` knows; a file appears under its name when it is whole.
+    """
+
+    folder: Path
+    key: CacheKey
+    encoding: Encoding
+
+    def has(self, number: int, camera: str) -> bool:
+        """Return whether an episode, by its place in the data set, has been written."""
+        return path_of(self.folder, number, camera).is_file()
+
+    def write_episode(
+        self,
+        number: int,
+        camera: str,
+        episode: Episode,
+        *,
+        steps: Sequence[int],
+        latents: StoredLatents,
+        pictures: UInt8[np.ndarray, "frames height width 3"],
+    ) -> int:
+        """Write an episode of one camera and return the size of its file.
+
+        Args:
+            number: Place of the episode in the data set.
+            camera: One of `data.camera`.
+            episode: What the source gave for this camera; no picture of it is read.
+            steps: Control steps of the frames, as `latent_cache.needed_frames` names them.
+            latents: Of these frames, in the type that the key names (`precision.stored` makes them so).
+            pictures: Of these frames, square as the encoder sees them and small; for people to look at.
+
+        Raises:
+            InputError: The folder cannot be written, or the disk is full.
+        """
+        layout = EpisodeLayout(self.key.digest, self.key.kind, self.encoding.tokens, self.encoding.dim)
+        path = path_of(self.folder, number, camera)
+        return write_episode_file(path, layout, episode, camera, steps=steps, latents=latents, pictures=pictures)
+
+    def finish(
+        self, dataset: Dataset, *, broken: Mapping[str, str], frames: int, about: Mapping[str, Any] | None = None
+    ) -> Manifest:
+        """Make the cache whole, when every episode of which clips are made is written: one process does this, once.
+
+        Args:
+            dataset: What was encoded, as it was opened: without a cache.
+            broken: Identities of the episodes that could not be read (`data.broken_episodes` is skip), and why.
+            frames: How many were encoded, of all cameras; for people to know.
+            about: Whatever else is worth knowing, as JSON.
+
+        Raises:
+            InputError: The folder cannot be written.
+            ValueError: An episode is neither written nor broken.
+        """
+        sizes = self._sizes_without(broken, dataset)
+        texts = {"control_rate_hz": str(dataset.control_rate_hz), "widths": " ".join(map(str, dataset.widths))}
+        table = replace(dataset.table, locators=sizes, texts={**dataset.table.texts, **texts})
+        files = {EPISODES: table.to_bytes()}
+        if dataset.config.idle.rule != "none":
+            files[KEPT] = find_ranges(dataset.source, dataset.table, dataset.config, None).to_bytes()
+        manifest = Manifest(
+            key=self.key.parts,
+            digest=self.key.digest,
+            tokens=self.encoding.tokens,
+            dim=self.encoding.dim,
+            control_rate_hz=dataset.control_rate_hz,
+            episodes=len(table),
+            encoded=int((np.stack(list(sizes.values())) > 0).all(axis=0).sum()),
+            frames=frames,
+            bytes=sum(int(column.sum()) for column in sizes.values()),
+            broken=dict(broken),
+            checksums={name: zlib.crc32(data) for name, data in files.items()},
+            about=dict(about or {}),
+        )
+        with storage.user_can_write(self.folder):
+            for name, data in files.items():
+                storage.write_atomically(self.folder / name, data)
+            storage.write_atomically(self.folder / MANIFEST, manifest.to_text())
+        return manifest
+
+    def _sizes_without(self, broken: Mapping[str, str], dataset: Dataset) -> dict[str, Int64[np.ndarray, " episodes"]]:
+        """Return the size of every file, a column for each camera.
+
+        Raises:
+            ValueError: One that clips need is not there, and its episode is not broken.
+        """
+        found = [dataset.table.find(name) for name in broken]
+        unread = np.array([place for place in found if place is not None], np.int64)
+        sizes = {}
+        for place, camera in enumerate(dataset.config.cameras):
+            column = self._sizes(len(dataset.table), camera)
+            column[unread] = 0
+            needed = dataset.starts.episodes
+            lacking = np.setdiff1d(needed[column[needed] == 0], unread)
+            if len(lacking):
+                raise ValueError(f"{len(lacking)} episodes are not written: {lacking[:10].tolist()}")
+            sizes[size_column(place)] = column
+        return sizes
+
+    def _sizes(self, episodes: int, camera: str) -> Int64[np.ndarray, " episodes"]:
+        paths = [path_of(self.folder, number, camera) for number in range(episodes)]
+        return np.array([path.stat().st_size if path.is_file() else 0 for path in paths], np.int64)

@@ -1,0 +1,84 @@
+"""How much room does a cache of latents take, and is it there? Asked before the first frame is encoded."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+from vjepa2_ac.errors import InputError
+
+GIGABYTE = 10**9
+FRAMES_AT_ONCE = 64  # that are decoded in one go: a run of a video, and 180 MB of 720p at most
+PICTURE_SIDE = 192  # pixels, at most, of the small pictures for people to look at
+
+
+@dataclass(frozen=True)
+class CacheSize:
+    """The size of a cache, and of what of it is still to be written."""
+
+    frames: int  # of the whole cache
+    frames_left: int
+    bytes_per_frame: int  # with its small picture
+    hours: float  # of robot data that clips come from
+
+    @property
+    def bytes(self) -> int:
+        """Of the whole cache."""
+        return self.frames * self.bytes_per_frame
+
+    @property
+    def bytes_left(self) -> int:
+        """That are still to be written."""
+        return self.frames_left * self.bytes_per_frame
+
+    @property
+    def gigabytes_per_hour(self) -> float:
+        """Of robot data."""
+        return self.bytes / GIGABYTE / self.hours if self.hours else 0.0
+
+    def __str__(self) -> str:
+        return (
+            f"{self.frames:,} frames, {self.bytes / GIGABYTE:.3g} GB"
+            f" ({self.gigabytes_per_hour:.3g} GB per hour of robot data, of which there are {self.hours:.3g})"
+        )
+
+
+def picture_side(image_size: int) -> int:
+    """Return height and width of the small pictures of a model's frames."""
+    return min(PICTURE_SIDE, image_size)
+
+
+def picture_bytes(image_size: int) -> int:
+    """Return what a small picture takes as JPEG, about, with a share of the states."""
+    return 1000 + picture_side(image_size) ** 2 // 3
+
+
+def free_bytes(folder: Path) -> int:
+    """Return how much room there is on the disk of a folder, which need not be there yet."""
+    return shutil.disk_usage(next(there for there in [folder, *folder.parents] if there.exists())).free
+
+
+def require_space(room: CacheSize, folder: Path, *, smaller: tuple[str, ...]) -> None:
+    """Refuse to begin what the disk cannot take.
+
+    Args:
+        room: What is to be written.
+        folder: Where to.
+        smaller: Knobs that would make it smaller.
+
+    Raises:
+        InputError: Says how much there is, how much is needed, and the ways out.
+    """
+    free = free_bytes(folder)
+    if room.bytes_left <= free:
+        return
+    fix = f"Set {', '.join(smaller)}; " if smaller else ""
+    raise InputError(
+        where=str(folder),
+        found=f"{free / GIGABYTE:.4g} GB free on its disk",
+        needed=f"{room.bytes_left / GIGABYTE:.4g} GB for the latents of {room.frames_left:,} frames"
+        f" ({room.bytes_per_frame / 1e6:.3g} MB each)",
+        fix=f"{fix}take fewer episodes (data.outcome, data.idle, data.exclude); or name a folder on a larger disk"
+        " (data.cache_dir)",
+    )

@@ -1,0 +1,78 @@
+"""What of a whole cache is missing or damaged after all, and how is it encoded again? As it was made: a file at a time.
+
+A file that is missing, cut off or was never wanted before is found by its size, without reading it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.sources.latents.manifest import (
+    MANIFEST,
+    path_of,
+    read_episodes,
+    read_manifest,
+    size_column,
+    size_of,
+)
+from vjepa2_ac.encoding.cache_writer import CacheWriter
+
+
+@dataclass(frozen=True)
+class MissingFiles:
+    """A file that a whole cache should have."""
+
+    path: Path
+    episode: str  # its identity
+    said: str  # what is there instead
+    size: int  # that it was written with; 0: it was not needed when the cache was made
+
+    def __str__(self) -> str:
+        return f"{self.episode} ({self.path.name}: {self.said})"
+
+
+def missing_files(dataset: Dataset, writer: CacheWriter) -> list[MissingFiles]:
+    """Return the files that are damaged, and those that clips need and are not there.
+
+    Episodes that could not be read when the cache was made are not among them.
+
+    Raises:
+        InputError: What the cache says of itself cannot be read.
+    """
+    manifest = read_manifest(writer.folder)
+    table, _ = read_episodes(writer.folder, manifest)
+    needed, found = set(dataset.starts.episodes.tolist()), []
+    for place, camera in enumerate(manifest.cameras):
+        for number, size in enumerate(table.locators[size_column(place)].tolist()):
+            name, path = table.identity(number), path_of(writer.folder, number, camera)
+            if size and (there := size_of(path)) != size:
+                said = "no such file" if there is None else f"{there:,} bytes instead of {size:,}"
+                found.append(MissingFiles(path, name, said, size))
+            elif not size and number in needed and name not in manifest.broken:
+                found.append(MissingFiles(path, name, "not encoded yet", 0))
+    return found
+
+
+def restart(writer: CacheWriter, lacking: Sequence[MissingFiles]) -> None:
+    """Make a whole cache one that was begun, and lacks these files; whoever goes on with it encodes them.
+
+    Damaged files go first, and cache.json, which makes a cache whole, last: after a kill the same is found again.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    with storage.user_can_write(writer.folder):
+        for one in lacking:
+            if size_of(one.path) != one.size:  # or another process has written it by now
+                one.path.unlink(missing_ok=True)
+        (writer.folder / MANIFEST).unlink(missing_ok=True)
+
+
+def describe(lacking: Sequence[MissingFiles]) -> str:
+    """Say which episodes are encoded again."""
+    more = f" and {len(lacking) - 1:,} more" if len(lacking) > 1 else ""
+    return f"Missing in the latent cache or damaged: {lacking[0]}{more}"

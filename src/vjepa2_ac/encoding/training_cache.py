@@ -1,0 +1,132 @@
+"""Do the clips of a run come from a latent cache? It is encoded on first use, asked for, or taken where it is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from accelerate import Accelerator
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.sources.latents.manifest import is_whole
+from vjepa2_ac.distributed.collectives import broadcast_object
+from vjepa2_ac.encoding.batch import require_same_encoder
+from vjepa2_ac.encoding.cache_lookup import through_cache
+from vjepa2_ac.encoding.cache_writer import CacheWriter
+from vjepa2_ac.encoding.disk_space import require_space
+from vjepa2_ac.encoding.encode_dataset import duration, encode_share, encoder_at_work, smaller_caches, writer_for
+from vjepa2_ac.encoding.pipeline import frames_per_second
+from vjepa2_ac.encoding.repair import MissingFiles, describe, missing_files, restart
+from vjepa2_ac.encoding.workload import Workload, WorkloadShare
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.world_model import WorldModel
+
+
+def with_latents(
+    config: Config,
+    dataset: Dataset,
+    model: WorldModel,
+    accelerator: Accelerator,
+    note: Callable[[str], None],
+    *,
+    encoding: Progress | None = None,
+    check_only: bool = False,
+) -> Dataset:
+    """Return the data set of a run, its clips from the latent cache where the config has one.
+
+    Args:
+        config: The run.
+        dataset: As it was opened, at its stride.
+        model: Whose encoder is asked.
+        accelerator: Its processes share the encoding.
+        note: Told what a person should know.
+        encoding: Told (done, total) in frames of this process.
+        check_only: Encode nothing: say what would be, and leave the clips as pictures.
+
+    Raises:
+        InputError: The cache is another encoder's, is required and not there, or cannot be made.
+    """
+    if config.data.source == "latents" or config.data.cache == "off":
+        require_same_encoder(model, dataset, config)
+        return dataset
+    writer = writer_for(config, dataset, model)
+    if lacking := _lacking(config, dataset, accelerator, writer):
+        note(f"{describe(lacking)}. " + ("A run would encode it again." if check_only else "It is encoded again."))
+        if check_only:
+            return dataset
+        if accelerator.is_main_process:
+            restart(writer, lacking)
+    if not broadcast_object(accelerator, is_whole(writer.folder)):
+        if config.data.cache == "require":
+            return through_cache(dataset, writer.encoding)  # which says what is there instead
+        if check_only:
+            _say_what_would_be(config, dataset, model, accelerator, writer, note)
+            return dataset
+        _encode(config, dataset, model, accelerator, writer, note, encoding)
+    note(f"Latents come from {writer.folder}: the encoder is not needed")
+    return through_cache(dataset, writer.encoding)
+
+
+def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -> Dataset:
+    """Return a data set with its clips from the latent cache if there is a whole one of this encoder, else as it is.
+
+    Raises:
+        InputError: The data set is itself a cache, of another encoder.
+    """
+    if config.data.source == "latents" or config.data.cache == "off":
+        require_same_encoder(model, dataset, config)
+        return dataset
+    writer = writer_for(config, dataset, model)
+    return through_cache(dataset, writer.encoding) if is_whole(writer.folder) else dataset
+
+
+def _lacking(config: Config, dataset: Dataset, accelerator: Accelerator, writer: CacheWriter) -> list[MissingFiles]:
+    """Return what a cache lacks that is whole by its own account: the first process looks, for all of them."""
+    looks = accelerator.is_main_process and config.data.cache == "auto" and is_whole(writer.folder)
+    return broadcast_object(accelerator, missing_files(dataset, writer) if looks else [])
+
+
+def _encode(
+    config: Config,
+    dataset: Dataset,
+    model: WorldModel,
+    accelerator: Accelerator,
+    writer: CacheWriter,
+    note: Callable[[str], None],
+    encoding: Progress | None,
+) -> None:
+    """Let all processes encode their share.
+
+    Raises:
+        InputError: They do not see the same folder; or as `encode_share`.
+    """
+    share = WorkloadShare(accelerator.process_index, accelerator.num_processes)
+    encoder = encoder_at_work(config, model, accelerator.device)
+    encode_share(config, dataset, writer, encoder, share, note, encoding)
+    accelerator.wait_for_everyone()
+    if not is_whole(writer.folder):
+        raise InputError(
+            where=f"data.cache_dir: {writer.folder.parent}",
+            found=f"a folder in which process {share.rank} does not see what the others of {share.processes} wrote",
+            needed="one that all machines of the run share",
+            fix="Set data.cache_dir to a shared folder; or run `vjepa2-ac encode` once on every machine",
+        )
+
+
+def _say_what_would_be(
+    config: Config,
+    dataset: Dataset,
+    model: WorldModel,
+    accelerator: Accelerator,
+    writer: CacheWriter,
+    note: Callable[[str], None],
+) -> None:
+    work = Workload.of(dataset, writer, WorkloadShare())
+    require_space(work.room, writer.folder, smaller=smaller_caches(config))
+    speed = frames_per_second(encoder_at_work(config, model, accelerator.device)) * accelerator.num_processes
+    note(
+        f"A run would first encode {work.left_of_all:,} of {work.room} as {config.data.cache_dtype}, into"
+        f" {writer.folder}. At the {speed:.3g} frames/s of one chunk just timed that takes"
+        f" {duration(work.left_of_all, speed)}"
+    )

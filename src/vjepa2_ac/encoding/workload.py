@@ -1,0 +1,158 @@
+"""What of a cache is still to be written, and by which process?"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from vjepa2_ac import storage
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.sources.latents.cache_key import CacheKey
+from vjepa2_ac.data.sources.latents.dtypes import bytes_per_frame
+from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest
+from vjepa2_ac.encoding.cache_lookup import needed_frames
+from vjepa2_ac.encoding.cache_writer import CacheWriter
+from vjepa2_ac.encoding.disk_space import CacheSize, picture_bytes
+from vjepa2_ac.encoding.prefetch import FramesToEncode
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.structured import read_json_object, record_of
+
+_BROKEN, _KEY = "broken", "key.json"
+
+
+@dataclass(frozen=True)
+class WorkloadShare:
+    """The place of a process among those that encode."""
+
+    rank: int = 0
+    processes: int = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Workload:
+    """A cache that is to be written, and what of it this process does: every episode belongs to one process."""
+
+    dataset: Dataset
+    writer: CacheWriter
+    frames: int  # of the whole cache, of all cameras
+    left: tuple[FramesToEncode, ...]  # of this process
+    left_of_all: int  # frames, of all processes
+
+    @classmethod
+    def of(cls, dataset: Dataset, writer: CacheWriter, share: WorkloadShare) -> Workload:
+        """Look at what is there: an episode whose file is there is not encoded again; a broken one is tried again."""
+        frames, left_of_all, left = 0, 0, []
+        for place, needed in enumerate(needed_frames(dataset)):
+            for camera in dataset.config.cameras:
+                frames += len(needed.steps)
+                if writer.has(needed.episode, camera):
+                    continue
+                left_of_all += len(needed.steps)
+                if place % share.processes == share.rank:
+                    left.append(FramesToEncode(needed.episode, camera, needed.steps))
+        return cls(dataset, writer, frames, tuple(left), left_of_all)
+
+    @property
+    def frames_left(self) -> int:
+        """Frames that this process still has to encode."""
+        return sum(len(one.steps) for one in self.left)
+
+    @property
+    def room(self) -> CacheSize:
+        """What the cache takes on the disk."""
+        writer, table = self.writer, self.dataset.table
+        steps = int(table.num_steps[np.unique(self.dataset.starts.episode)].sum())
+        per_frame = bytes_per_frame(writer.encoding.tokens, writer.encoding.dim, writer.key.kind)
+        per_frame += picture_bytes(writer.encoding.image_size)
+        return CacheSize(self.frames, self.left_of_all, per_frame, steps / self.dataset.control_rate_hz / 3600)
+
+    @property
+    def lacks(self) -> bool:
+        """Whether, by now, an episode is neither written nor noted as broken, by whatever process."""
+        cameras, broken = self.dataset.config.cameras, broken_in(self.writer.folder)
+        return any(
+            not self.writer.has(needed.episode, camera)
+            for needed in needed_frames(self.dataset)
+            if self.dataset.table.identity(needed.episode) not in broken
+            for camera in cameras
+        )
+
+
+def take_folder(writer: CacheWriter) -> None:
+    """See that a folder is for this cache and no other, whole or begun.
+
+    Raises:
+        InputError: It holds another one, and what differs; or it cannot be written.
+    """
+    path = writer.folder / _KEY
+    there = read_manifest(writer.folder).cache_key if is_whole(writer.folder) else _begun(path)
+    if there is not None and there.digest != writer.key.digest:
+        raise InputError(
+            where=str(writer.folder),
+            found=f"a latent cache that was made otherwise: {'; '.join(there.differences(writer.key.parts))}",
+            needed="a new or empty folder, or the same cache",
+            fix="Name another folder, or delete this one",
+        )
+    if there is None:
+        _require_empty(writer.folder)
+        with storage.user_can_write(writer.folder):
+            storage.write_atomically(path, json.dumps(dict(writer.key.parts), indent=1) + "\n")
+
+
+def _require_empty(folder: Path) -> None:
+    """Keep a cache out of a folder of other things, such as that of a run; `.` and what other processes begin pass."""
+    others = sorted(path.name for path in folder.iterdir() if path.name[0] != ".") if folder.is_dir() else []
+    ours = (_KEY, _BROKEN, "episodes")
+    strange = [name for name in others if not name.startswith(ours)]
+    if strange:
+        raise InputError(
+            where=str(folder),
+            found=f"a folder with other things in it, such as {strange[0]}",
+            needed="a new or empty one for a latent cache",
+            fix="Name another folder",
+        )
+
+
+def _begun(path: Path) -> CacheKey | None:
+    """Return the key of a cache that was begun."""
+    try:
+        return CacheKey(read_json_object(path, fix="Delete this folder"))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise InputError(where=str(path), found=f"cannot be read ({error})", fix="Delete this folder") from None
+
+
+def note_broken(folder: Path, episode: int, name: str, reason: str) -> None:
+    """Note, for the process that finishes the cache, that an episode cannot be read."""
+    with storage.user_can_write(folder):
+        storage.write_atomically(_note_of(folder, episode), json.dumps({"name": name, "reason": reason}) + "\n")
+
+
+def forget_broken(folder: Path, episode: int) -> None:
+    """Take back what was noted of an episode: it is tried again."""
+    with storage.user_can_write(folder):
+        _note_of(folder, episode).unlink(missing_ok=True)
+
+
+def broken_in(folder: Path) -> Mapping[str, str]:
+    """Return the episodes that were noted, by whatever process, and why."""
+    paths = sorted((folder / _BROKEN).glob("*.json"))
+    notes = [record_of(_Note, read_json_object(path), where=str(path), fix="Delete this file") for path in paths]
+    return {note.name: note.reason for note in notes}
+
+
+@dataclass(frozen=True)
+class _Note:
+    """An episode that cannot be read, and why."""
+
+    name: str
+    reason: str
+
+
+def _note_of(folder: Path, episode: int) -> Path:
+    return folder / _BROKEN / f"{episode:06d}.json"

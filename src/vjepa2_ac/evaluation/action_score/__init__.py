@@ -1,0 +1,1 @@
+"""The Action Score: how near do plans come to what was demonstrated?"""

@@ -1,0 +1,96 @@
+"""What would a model predict from one frame under many actions, and how far from the truth? The energy of an action."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.metrics import Predictor
+
+
+@dataclass(frozen=True)
+class RolloutStart:
+    """One frame of a held-out clip, and what really came next: where a planner would stand before an action."""
+
+    clip: int  # place in the evaluation's clips
+    episode_id: str
+    first_step: int  # control step at which the clip begins
+    frame: Float[Tensor, "tokens dim"]
+    following: Float[Tensor, "tokens dim"]  # the next frame
+    state: Float[Tensor, " state_dim"]
+    action: Float[Tensor, " action_dim"]  # that led there
+    extrinsics: Float[Tensor, " 6"] | None
+
+    @property
+    def persistence(self) -> float:
+        """The L1 error of predicting that nothing changes."""
+        return float((self.frame.float() - self.following.float()).abs().mean())
+
+    def generator(self, seed: int) -> np.random.Generator:
+        """Return randomness that depends on the seed and on this clip alone, not on those before it."""
+        return clip_generator(seed, self.episode_id, self.first_step)
+
+
+@dataclass(frozen=True)
+class TriedActions:
+    """What came of each action that was tried from a start."""
+
+    energy: Float[np.ndarray, " samples"]  # L1 distance of the prediction to the true next frame
+    change: Float[np.ndarray, " samples"]  # L1 distance of the prediction to that with the true action
+
+
+def clip_generator(seed: int, episode_id: str, first_step: int) -> np.random.Generator:
+    """Return randomness that depends on the seed and on the name of a clip alone, not on the clips before it."""
+    digest = hashlib.blake2b(f"{episode_id} {first_step}".encode(), digest_size=8).digest()
+    return np.random.default_rng([seed, int.from_bytes(digest, "big")])
+
+
+def start_of(batch: LatentBatch, row: int, step: int, clip: int) -> RolloutStart:
+    """Return a step of a clip in a batch as a start."""
+    return RolloutStart(
+        clip=clip,
+        episode_id=batch.episode_ids[row],
+        first_step=batch.starts[row],
+        frame=batch.latents[row, step].clone(),
+        following=batch.latents[row, step + 1].clone(),
+        state=batch.states[row, step],
+        action=batch.actions[row, step],
+        extrinsics=None if batch.extrinsics is None else batch.extrinsics[row, step],
+    )
+
+
+@torch.no_grad()
+def try_actions(
+    model: Predictor, start: RolloutStart, actions: Float[np.ndarray, "samples action_dim"], *, at_once: int
+) -> TriedActions:
+    """Predict one step from one frame under each action; the true state and camera throughout.
+
+    Args:
+        model: What predicts.
+        start: From where.
+        actions: To try, in the units of the data.
+        at_once: How many samples are computed together: bounds the memory.
+    """
+    expected = _predict(model, start, start.action[None])[0]
+    energies, changes = [], []
+    for part in torch.from_numpy(actions.astype(np.float32)).to(start.action).split(at_once):  # type: ignore[no-untyped-call]  # torch
+        predicted = _predict(model, start, part)
+        energies.append((predicted - start.following.float()).abs().mean(dim=(1, 2)))
+        changes.append((predicted - expected).abs().mean(dim=(1, 2)))
+    return TriedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
+
+
+def _predict(
+    model: Predictor, start: RolloutStart, actions: Float[Tensor, "samples action_dim"]
+) -> Float[Tensor, "samples tokens dim"]:
+    """Return the predictions in float32. The only frame has its action beside it: no keys could be shared."""
+    count = len(actions)
+    camera = None if start.extrinsics is None else start.extrinsics.expand(count, 1, -1)
+    frames = start.frame.expand(count, 1, *start.frame.shape)
+    return model.predict(frames, actions[:, None], start.state.expand(count, 1, -1), camera)[:, 0].float()

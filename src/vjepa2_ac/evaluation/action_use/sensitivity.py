@@ -1,0 +1,130 @@
+"""Does a model listen to its actions? How predictions change with them, and where the true one ranks by its energy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, try_actions
+from vjepa2_ac.evaluation.intervals import mean_of, ratio
+from vjepa2_ac.evaluation.metrics import Predictor
+from vjepa2_ac.evaluation.result import Ranking, Sensitivity
+
+TOP = (1, 5, 10)
+_SAME = 1e-6  # energies whose difference is a smaller share of them are equal: rounding decides no rank
+
+
+@dataclass(frozen=True)
+class ActionPool:
+    """Actions of all clips, to draw others from."""
+
+    actions: Float[np.ndarray, "count action_dim"]
+    episode_ids: tuple[str, ...]  # of each action
+    is_pose: bool
+    reach: float  # half the width of the box along each of x, y, z, in metres; of poses only
+
+    def of_others(
+        self, start: RolloutStart, samples: int, generator: np.random.Generator
+    ) -> Float[np.ndarray, "samples action_dim"]:
+        """Draw actions of other episodes, with replacement; of the same one where there is no other."""
+        others = np.flatnonzero(np.array(self.episode_ids) != start.episode_id)
+        chosen = generator.choice(others if len(others) else np.arange(len(self.actions)), size=samples)
+        return np.asarray(self.actions[chosen])
+
+    def in_box(
+        self, start: RolloutStart, samples: int, generator: np.random.Generator
+    ) -> Float[np.ndarray, "samples action_dim"]:
+        """Draw uniformly: of poses (dx, dy, dz) in the box, the rest as it truly was; of vectors every number."""
+        true = start.action.cpu().numpy().astype(np.float64)
+        half = np.abs(self.actions).max(axis=0)
+        drawn = generator.uniform(-1.0, 1.0, size=(samples, len(true)))
+        if not self.is_pose:
+            return np.asarray(drawn * half)
+        tried = np.tile(true, (samples, 1))
+        tried[:, :3] = drawn[:, :3] * self.reach
+        return tried
+
+    def words(self, drawn_from: Literal["clips", "box"]) -> str:
+        """Say where actions are drawn from."""
+        if drawn_from == "clips":
+            return "actions of other episodes"
+        if self.is_pose:
+            return f"(dx, dy, dz) uniform within {self.reach * 100:g} cm along each axis"
+        return "every number uniform within its largest size"
+
+
+def measure_sensitivity(
+    model: Predictor,
+    starts: Sequence[RolloutStart],
+    pool: ActionPool,
+    *,
+    samples: int,
+    seed: int,
+    at_once: int,
+    progress: Progress | None = None,
+) -> Sensitivity:
+    """Try other actions from each start.
+
+    Args:
+        model: What predicts.
+        starts: One frame of each clip that is measured.
+        pool: Where others come from.
+        samples: Others per start, from each of the two places.
+        seed: Decides which; a start gets the same ones whatever else is measured.
+        at_once: Samples that are computed together.
+        progress: Told how many starts are done.
+    """
+    changes, persistence = [], []
+    ranks: dict[Literal["clips", "box"], list[tuple[float, float]]] = {"clips": [], "box": []}
+    for done, start in enumerate(starts, start=1):
+        generator = start.generator(seed)
+        true = start.action.cpu().numpy().astype(np.float64)[None]
+        drawn = [pool.of_others(start, samples, generator), pool.in_box(start, samples, generator)]
+        tried = try_actions(model, start, np.concatenate([true, *drawn]), at_once=at_once)
+        own, others, boxed = np.split(tried.energy, [1, 1 + samples])
+        ranks["clips"].append(_place(own[0], others))
+        ranks["box"].append(_place(own[0], boxed))
+        changes.append(float(tried.change[1 : 1 + samples].mean()))
+        persistence.append(start.persistence)
+        if progress is not None:
+            progress(done, len(starts))
+    ids = tuple(start.episode_id for start in starts)
+    clips = tuple(start.clip for start in starts)
+    return Sensitivity(
+        change=ratio(np.array(changes), np.array(persistence), ids),
+        change_by_clip=np.array(changes) / np.maximum(np.array(persistence), 1e-12),
+        rankings=tuple(_ranking(name, pool.words(name), samples, clips, np.array(ranks[name]), ids) for name in ranks),
+    )
+
+
+def _place(true: float, others: Float[np.ndarray, " samples"]) -> tuple[float, float]:
+    """Return how many others have a lower energy, and how many the same."""
+    same = np.abs(others - true) <= _SAME * max(abs(true), 1e-12)
+    return float(((others < true) & ~same).sum()), float(same.sum())
+
+
+def _ranking(
+    drawn_from: Literal["clips", "box"],
+    words: str,
+    samples: int,
+    clips: tuple[int, ...],
+    places: Float[np.ndarray, "clips 2"],
+    episode_ids: tuple[str, ...],
+) -> Ranking:
+    lower, same = places[:, 0], places[:, 1]
+    rank = (lower + same / 2) / samples
+    among = {k: np.clip((k - lower) / (same + 1), 0.0, 1.0) for k in TOP if k <= samples}
+    return Ranking(
+        drawn_from=drawn_from,
+        words=words,
+        samples=samples,
+        clips=clips,
+        rank=rank,
+        mean_rank=mean_of(rank, episode_ids),
+        top={k: mean_of(share, episode_ids) for k, share in among.items()},
+    )

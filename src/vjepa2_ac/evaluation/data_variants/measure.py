@@ -1,0 +1,186 @@
+"""Under which variant of a data set does a model that knows robots predict best? As it is, mirrored, shifted, ...?
+
+A model's one-step error is lowest where actions and states are those of the pictures. So the same clips are measured as
+they are and with one thing changed at a time; what surely fits better is most likely how the data really are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.clips.loader import batches_of, validation_windows
+from vjepa2_ac.data.clips.windows import Split, spread
+from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.evaluation.data_variants.variants import ChangedSource, RememberingSource, Variant, variants_of
+from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
+from vjepa2_ac.evaluation.metrics import Predictor, distances
+
+FRAMES = 8  # of a clip, at most
+SHIFTS = (1, 2, 4, 8)  # control steps
+_TRIED_FOR_ONE = 8  # windows that are looked at for each clip, since shifts need room on both sides
+_EPISODES_TO_BE_SURE = 5
+_MARGIN = 2.0  # half-widths of the 95 % interval: one of a dozen variants is soon better by chance
+_GAIN = 0.01  # of persistence: what is less changes nothing
+
+
+@dataclass(frozen=True)
+class TriedVariant:
+    """How well a model predicts under a variant."""
+
+    name: str
+    mend: str
+    ratio: Estimate  # one-step error over persistence
+    difference: Estimate  # of this to that of the data as they are, on the same clips; below 0: fits better
+
+
+@dataclass(frozen=True)
+class VariantProbe:
+    """What was found of each variant."""
+
+    ratio: Estimate  # one-step error over persistence, of the data as they are
+    tried: tuple[TriedVariant, ...]
+    clips: int
+    episodes: int
+
+    @property
+    def better(self) -> TriedVariant | None:
+        """The variant that fits best, where it surely fits better than the data as they are."""
+        surely = [one for one in self.tried if self._is_surely_better(one)]
+        return min(surely, key=lambda one: one.difference.value) if surely else None
+
+    def _is_surely_better(self, one: TriedVariant) -> bool:
+        difference = one.difference
+        if not difference.has_interval or self.episodes < _EPISODES_TO_BE_SURE:
+            return False
+        limit = difference.value + _MARGIN * (difference.high - difference.value)
+        return difference.value < -_GAIN and limit < 0 and one.ratio.high < 1  # else it only fails less
+
+    def verdict(self) -> str:
+        """Say in words whether the data fit the model best as they are."""
+        said = f"error / persistence {self.ratio} on {self.clips} clips of {self.episodes} episodes"
+        if (better := self.better) is not None:
+            less = f"{-better.difference.value:.3f} [{-better.difference.high:.3f}, {-better.difference.low:.3f}]"
+            return f"{said}, and {less} less with {better.name}: {better.mend}"
+        if self.episodes < _EPISODES_TO_BE_SURE:
+            return f"{said}: too few episodes to compare, {_EPISODES_TO_BE_SURE} are needed"
+        if self.ratio.value >= 1:
+            return f"{said}: the model predicts none of this better than persistence, and cannot tell"
+        return f"{said}; no variant surely fits better"
+
+
+def rows_of(probe: VariantProbe) -> Iterator[tuple[str, str, str]]:
+    """Yield name, error over persistence, and difference, for a table; the data as they are first."""
+    yield "as they are", str(probe.ratio), ""
+    for one in probe.tried:
+        yield one.name, str(one.ratio), str(one.difference)
+
+
+def probe_variants(
+    model: Predictor,
+    encode: Callable[[Batch], LatentBatch],
+    dataset: Dataset,
+    *,
+    split: Split = "validation",
+    clips: int = 64,
+    batch_size: int = 8,
+    progress: Progress | None = None,
+) -> VariantProbe:
+    """Measure a model's one-step error on clips as they are, and under each variant.
+
+    Args:
+        model: What predicts.
+        encode: Turns a batch of pixels into latents on the model's device.
+        dataset: Where clips come from, at a stride that is a number.
+        split: Which episodes.
+        clips: How many, at most.
+        batch_size: Clips that are measured at once.
+        progress: Told (clips done, clips in all).
+
+    Raises:
+        InputError: The split is empty, or a clip cannot be read.
+    """
+    candidates = validation_windows(dataset, split, clips=clips * _TRIED_FOR_ONE)  # of whole clips, as a cache has them
+    dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": min(dataset.config.frames, FRAMES)}))
+    windows, shifts = _with_room(dataset, candidates, clips)
+    variants = variants_of(dataset.config, shifts)
+    measured: list[list[_Errors]] = []
+    ids: list[str] = []
+    for batch in batches_of(dataset, windows, batch_size=batch_size):
+        latents = encode(batch)
+        here = _of_batch(dataset, batch)
+        measured.append([_errors(model, latents), *(_under(one, model, encode, *here, latents) for one in variants)])
+        ids += batch.episode_ids
+        if progress is not None:
+            progress(len(ids), len(windows))
+    plain, *others = [
+        _Errors(*map(np.concatenate, zip(*of_one, strict=True))) for of_one in zip(*measured, strict=True)
+    ]
+    tried = [
+        TriedVariant(variant.name, variant.mend, ratio(*one, ids), ratio_difference(one, plain, ids))
+        for variant, one in zip(variants, others, strict=True)
+    ]
+    return VariantProbe(ratio(*plain, ids), tuple(tried), len(ids), len(set(ids)))
+
+
+class _Errors(NamedTuple):
+    """Of each clip; persistence is another one where a variant changes the pictures."""
+
+    one_step: Float[np.ndarray, " clips"]
+    persistence: Float[np.ndarray, " clips"]
+
+
+@torch.no_grad()
+def _errors(model: Predictor, batch: LatentBatch) -> _Errors:
+    latents, truth = batch.latents[:, :-1], batch.latents[:, 1:]
+    extrinsics = None if batch.extrinsics is None else batch.extrinsics[:, :-1]
+    predicted = model.predict(latents, batch.actions, batch.states[:, :-1], extrinsics)
+    return _Errors(distances(predicted, truth).l1.mean(axis=1), distances(latents, truth).l1.mean(axis=1))
+
+
+def _of_batch(dataset: Dataset, batch: Batch) -> tuple[Dataset, list[tuple[int, int]]]:
+    """Return the data set such that each episode is read once for all variants, and where the clips of a batch are."""
+    config = dataset.config.model_copy(update={"workers": 0})  # what one has read, another would not know
+    places = [dataset.table.find(name) for name in batch.episode_ids]
+    windows = [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
+    return replace(dataset, config=config, source=RememberingSource(dataset.source)), windows
+
+
+def _under(
+    variant: Variant,
+    model: Predictor,
+    encode: Callable[[Batch], LatentBatch],
+    dataset: Dataset,
+    windows: list[tuple[int, int]],
+    plain: LatentBatch,
+) -> _Errors:
+    """Return the errors of the same clips under a variant; pictures are encoded again only where it changes them."""
+    source = ChangedSource(dataset.source, variant)
+    changed = next(iter(batches_of(replace(dataset, source=source), windows, batch_size=len(windows))))
+    if variant.changes_pictures:
+        return _errors(model, encode(changed))
+    device = plain.states.device
+    return _errors(model, replace(plain, states=changed.states.to(device), actions=changed.actions.to(device)))
+
+
+def _with_room(
+    dataset: Dataset, candidates: list[tuple[int, int]], clips: int
+) -> tuple[list[tuple[int, int]], tuple[int, ...]]:
+    """Return where clips start, and the shifts for which each has states before and behind it."""
+    steps, length = dataset.table.num_steps, dataset.config.clip_steps
+    enough = max(1, min(clips, len(candidates) // 4))
+    fitting: list[tuple[int, int]] = candidates
+    shifts: tuple[int, ...] = ()
+    for count in range(1, len(SHIFTS) + 1):
+        room = SHIFTS[count - 1]
+        wider = [(episode, start) for episode, start in fitting if room <= start <= steps[episode] - length - room]
+        if len(wider) < enough:
+            break
+        fitting, shifts = wider, SHIFTS[:count]
+    return [fitting[place] for place in spread(len(fitting), clips)], shifts

@@ -1,0 +1,342 @@
+"""How good is a run, or a model, on held-out episodes? Load it and what it is compared with, measure, write it down."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from vjepa2_ac import __version__
+from vjepa2_ac.config import Config, PlanningConfig
+from vjepa2_ac.config.loading import config_as_dict, config_from
+from vjepa2_ac.data.clips.clip_reader import pictures_of
+from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.clips.loader import batches_of, validation_windows
+from vjepa2_ac.data.clips.streams import copies_for
+from vjepa2_ac.data.clips.windows import Split
+from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.encoding.batch import encode_batch, require_widths
+from vjepa2_ac.encoding.training_cache import with_latents_if_there
+from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.action_score.protocol import FRAMES
+from vjepa2_ac.evaluation.evaluate import ClipName, Contender, Pictures, ProbeOptions, RepeatableClips, evaluate
+from vjepa2_ac.evaluation.examples import seen_by_the_encoder
+from vjepa2_ac.evaluation.result import About, Evaluation, Role, TrainingCurve
+from vjepa2_ac.evaluation.stride_calibration.measure import calibrate_model
+from vjepa2_ac.model.adapter.merging import base_only, unadapted_copy
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.quantization import require_8_bits
+from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.runs.checkpoint_selection import NEWEST, select_checkpoint
+from vjepa2_ac.runs.folder import METRICS, read_run_config
+from vjepa2_ac.runs.loading import TrainedRun, is_run, load_run
+from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
+from vjepa2_ac.runs.relative_paths import DATA, with_paths_from_start
+from vjepa2_ac.storage import user_can_write
+
+BASE = "base"
+_NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
+
+
+@dataclass(frozen=True)
+class EvaluationOptions:
+    """What is asked of an evaluation."""
+
+    split: Split = "test"
+    clips: int = 256  # at most, spread over the episodes
+    checkpoint: str = NEWEST  # of a run: newest, best, or a number of optimizer steps
+    data: Config | None = None  # other data than the run's own; a model has none of its own
+    against: tuple[str, ...] | None = None  # base, runs, models; None: the base of a run, nothing for a model
+    out: Path | None = None  # folder for what is written; None: the run's
+    probes: ProbeOptions = field(default_factory=ProbeOptions)
+    calibrate: bool = False  # measure the error at other strides, too
+    planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured."""
+
+    evaluation: Evaluation
+    checkpoint: str  # which one, in words; "" of a model
+    folder: Path  # for what is written of it
+
+
+def measure_subject(
+    subject: str, asked: EvaluationOptions | None = None, *, stage: Callable[[str], Progress] | None = None
+) -> Measured:
+    """Measure a run or a model on held-out episodes. Cheap failures first.
+
+    Args:
+        subject: The folder of a run; or a model: what `model.base` takes.
+        asked: How.
+        stage: Gives a bar for a part of the work, by its title.
+
+    Raises:
+        InputError: The subject, the data, or what to compare with cannot be used; the split is empty.
+    """
+    asked = asked or EvaluationOptions()
+    config, folder = _config_of(subject, asked)
+    _check_long_enough(config, asked.probes)
+    planning = _planning_of(config, asked)
+    _check_writable(folder)
+    accelerator = make_accelerator(config)
+    if asked.probes.planning_clips and planning.quantize != "off":
+        dtype = getattr(torch, config.model.dtype)
+        require_8_bits(planning.quantize, dtype, accelerator.device, where="planning.quantize")
+    dataset = open_dataset(config.data, progress=stage("looking through the data") if stage else None)
+    chosen = validation_windows(dataset, asked.split, clips=asked.clips)
+    run = load_run(Path(subject), asked.checkpoint) if is_run(subject) else None
+    world_model = run.world_model if run else _load_model(subject, config)
+    require_widths(world_model, dataset.widths, where=subject)
+    through_cache = with_latents_if_there(config, dataset, world_model)
+    contenders, notes = _contenders(subject, config, run, world_model, asked)
+    if through_cache.config.source == "latents" and not asked.calibrate:
+        world_model.set_encoder_aside()
+    for each in contenders:  # the encoder of the first one is enough
+        if isinstance(each.model, WorldModel):
+            each.model.predictor.to(accelerator.device).eval()
+    world_model.to(accelerator.device).eval()
+    calibration = None
+    if asked.calibrate:
+        calibration = calibrate_model(
+            world_model,
+            dataset,
+            config,
+            accelerator,
+            clips=asked.clips,
+            split=asked.split,
+            progress=stage("calibrating strides") if stage else None,
+        ).as_dict()
+    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
+    read = partial(batches_of, batch_size=config.validation.batch_size, copies=copies_for(accelerator.device))
+    clips = _clips(through_cache, chosen, read, encode, world_model.image_size)
+    with accelerator.autocast():
+        evaluation = evaluate(
+            contenders,
+            clips,
+            _about(subject, run, config, dataset, asked),
+            probes=replace(asked.probes, planning=planning),
+            stage=stage,
+        )
+    evaluation = replace(
+        evaluation,
+        training=training_curves(Path(subject)) if run else (),
+        calibration=calibration,
+        notes=(*notes, *(_warnings(Path(subject)) if run else ()), *evaluation.notes),
+    )
+    return Measured(evaluation, run.chosen if run else "", folder)
+
+
+def _warnings(folder: Path) -> list[str]:
+    """Return what training warned of, as sentences."""
+    return [f"In training, {text}." for text in warnings_of(folder / METRICS)]
+
+
+def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
+    """Return every figure of a run's metrics.jsonl that is one number, over optimizer steps."""
+    points: dict[str, list[tuple[int, float]]] = {}
+    for row in read_metrics_log(folder / METRICS):
+        for name, value in row.items():
+            if name != "step" and isinstance(value, int | float):
+                points.setdefault(f"{row['kind']}/{name}", []).append((row["step"], float(value)))
+    return tuple(
+        TrainingCurve(name, tuple(step for step, _ in found), tuple(value for _, value in found))
+        for name, found in points.items()
+    )
+
+
+def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
+    """Return the config to measure with, and the folder for what is found."""
+    if is_run(subject):
+        config, needed = read_run_config(Path(subject)), [DATA] if asked.data is None else []
+        config = with_paths_from_start(config, Path(subject), needed=needed)
+        select_checkpoint(Path(subject), asked.checkpoint)
+        if asked.data is None:
+            return config, asked.out or Path(subject)
+        config = config.model_copy(update={"data": asked.data.data})
+    elif asked.data is None:
+        raise _nothing_to_measure(subject)
+    else:
+        config = asked.data
+    if asked.out is None:
+        raise InputError(
+            where="command line",
+            found="--data without --out: metrics.json of a run's own folder tells of its own data",
+            needed="a folder for what is found on these data",
+            fix="Add --out FOLDER",
+        )
+    if config.data.stride == "auto":
+        raise InputError(
+            where="data.stride",
+            found="auto",
+            needed="a number, to evaluate",
+            fix="`vjepa2-ac data calibrate CONFIG` tells which",
+        )
+    return config, asked.out
+
+
+def _nothing_to_measure(subject: str) -> InputError:
+    path = Path(subject)
+    found = "no config.yaml: not the folder of a run" if path.exists() else "no such folder"
+    return InputError(
+        where=subject,
+        found=found,
+        needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
+        fix="To measure a model, name the data with --data CONFIG and a folder with --out",
+    )
+
+
+def _planning_of(config: Config, asked: EvaluationOptions) -> PlanningConfig:
+    """Return how one step is planned: the config's settings, some of them replaced.
+
+    Raises:
+        InputError: A setting is wrong, or is none of planning.
+    """
+    for setting in asked.planning:
+        if not setting.startswith("planning."):
+            raise InputError(
+                where="--planning", found=setting, needed="settings of planning, such as planning.samples=200"
+            )
+    return config_from(config_as_dict(config), asked.planning, where="--planning").planning
+
+
+def _check_long_enough(config: Config, probes: ProbeOptions) -> None:
+    if probes.planning_clips and config.data.states == "pose" and config.data.frames < FRAMES:
+        raise InputError(
+            where="--planning",
+            found=f"clips of {config.data.frames} frames (data.frames)",
+            needed=f"{FRAMES} or more: plans are held against {FRAMES - 1} steps that were demonstrated",
+            fix=f"Give --data a config with data.frames of {FRAMES} or more, and --out",
+        )
+
+
+def _check_writable(folder: Path) -> None:
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+
+
+def _load_model(name: str, config: Config) -> WorldModel:
+    return load_base(config.model.model_copy(update={"base": name, "random": None}), seed=config.seed)
+
+
+def _contenders(
+    subject: str, config: Config, run: TrainedRun | None, world_model: WorldModel, asked: EvaluationOptions
+) -> tuple[list[Contender], tuple[str, ...]]:
+    """Return the models to measure, the base first and the subject last; and what a reader must know of them."""
+    against = asked.against if asked.against is not None else (BASE,) * (run is not None)
+    found: list[Contender] = []
+    notes: tuple[str, ...] = ()
+    if BASE in against and run is not None and config.model.base is not None:
+        if world_model.fresh_heads is not None:
+            notes = (_NO_BASE,)
+        else:
+            found.append(_contender(BASE, "base", world_model, partial(base_only, world_model)))
+    elif BASE in against and run is None:
+        if config.model.base is None:
+            raise InputError(
+                where="--against base", found="a config without model.base", needed="a base to compare with"
+            )
+        found.append(Contender(BASE, "base", _like(world_model, config.model.base, config, subject)))
+    name = "adapter" if world_model.adaptation is not None and world_model.adaptation.kind == "lora" else "model"
+    for other in against:
+        if other != BASE:
+            taken = {each.name for each in found} | {name, BASE, "persistence"}
+            called = Path(other).name if Path(other).name not in taken else other
+            found.append(_contender(called, "other", _like(world_model, other, config, subject)))
+    return [*found, _contender(name, "trained", world_model)], notes
+
+
+def _contender(
+    name: str, role: Role, model: WorldModel, switched: Callable[[], AbstractContextManager[object]] = nullcontext
+) -> Contender:
+    """Return a model to measure as it is; a merged copy plans in its place (see `planning.model_setup`)."""
+    adaptation = model.adaptation
+    plans_as_it_is = adaptation is None or (role == "base" and adaptation.kind == "lora")  # whose adapter is off then
+    return Contender(name, role, model, switched, None if plans_as_it_is else partial(unadapted_copy, model))
+
+
+def _like(world_model: WorldModel, other: str, config: Config, subject: str) -> WorldModel:
+    """Load another run or model that can be measured on the same latents.
+
+    Raises:
+        InputError: It has another encoder, or takes other states or actions.
+    """
+    if not (other.startswith(BUILTIN) or Path(other).exists()):
+        raise InputError(
+            where=f"--against {other}",
+            found="no such file or folder",
+            needed="base, the folder of a run, or a model: what model.base takes",
+        )
+    loaded = load_run(Path(other)).world_model if is_run(other) else _load_model(other, config)
+    same = loaded.image_size == world_model.image_size
+    if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
+        raise InputError(
+            where=f"--against {other}",
+            found=f"another encoder than that of {subject}",
+            needed="the same one: errors are compared on the same latents",
+            fix="Evaluate each by itself, and put their ratios to persistence side by side with `vjepa2-ac compare`",
+        )
+    ours, theirs = world_model.sizes.predictor, loaded.sizes.predictor
+    if (ours.state_dim, ours.action_dim) != (theirs.state_dim, theirs.action_dim):
+        raise InputError(
+            where=f"--against {other}",
+            found=f"a model of states of {theirs.state_dim} and actions of {theirs.action_dim} numbers",
+            needed=f"{ours.state_dim} and {ours.action_dim}, as {subject} takes",
+        )
+    return loaded
+
+
+def _clips(
+    dataset: Dataset,
+    windows: Sequence[tuple[int, int]],
+    batches: Callable[[Dataset, Sequence[tuple[int, int]]], Iterable[Batch]],
+    encode: Callable[[Batch], LatentBatch],
+    image_size: int,
+) -> RepeatableClips:
+    """Return the clips at these windows, to be read as often as it takes."""
+    by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
+
+    def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, Pictures]]:
+        wanted = windows if names is None else [by_name[name] for name in names]
+        for batch in batches(dataset, wanted):
+            yield encode(batch), partial(_pictures, dataset, batch, image_size)
+
+    return RepeatableClips(len(windows), read)
+
+
+def _pictures(dataset: Dataset, batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"]:
+    """Return what the encoder sees of a clip; of cached latents, small pictures made large."""
+    return seen_by_the_encoder(torch.from_numpy(pictures_of(dataset, batch, row)), size)
+
+
+def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:
+    data = dataset.config
+    return About(
+        subject=subject,
+        checkpoint=run.chosen if run else "",
+        checkpoint_path=str(run.checkpoint) if run else "",
+        source=data.source,
+        data=data.path,
+        cameras=tuple(data.cameras),
+        split=asked.split,
+        frames=data.frames,
+        stride=data.model_stride,
+        seconds_per_step=data.model_stride / dataset.control_rate_hz,
+        is_pose=data.states == "pose",
+        seed=config.seed,
+        version=__version__,
+        time=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+    )

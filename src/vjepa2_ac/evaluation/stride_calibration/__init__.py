@@ -1,0 +1,1 @@
+"""Stride calibration: at which stride does a model predict this data best?"""

@@ -1,0 +1,67 @@
+"""Which stride does a model choose on the data of a config, outside of a run?"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.clips.windows import Split
+from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.encoding.batch import require_same_encoder, require_widths
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibrate_model, require_learned
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.runs.folder import CONFIG
+from vjepa2_ac.runs.loading import load_run
+
+
+def calibrate_config(
+    config: Config,
+    *,
+    model: str | None = None,
+    split: Split = "validation",
+    clips: int = 64,
+    frames: int | None = None,
+    indexing: Progress | None = None,
+    measuring: Progress | None = None,
+) -> Calibration:
+    """Calibrate the model of a config, or another one, on the config's data.
+
+    A latent cache has the frames of one stride's clips only, so pictures are encoded on the fly.
+
+    Args:
+        config: The data, the model, the device and the precision.
+        model: Another model: what `model.base` takes, or the folder of a run.
+        split: Episodes to measure on.
+        clips: At each stride.
+        frames: Of a clip; None: the config's, but 8 at most.
+        indexing: Told where the data set is looked through.
+        measuring: Told how many clips are measured.
+
+    Raises:
+        InputError: The data or the model cannot be used.
+    """
+    accelerator = make_accelerator(config)
+    dataset = open_dataset(config.data, progress=indexing)
+    world_model = load_named(config, model)
+    require_widths(world_model, dataset.widths, where=model or f"model.base: {config.model.base}")
+    require_same_encoder(world_model, dataset, config)
+    world_model.to(accelerator.device)
+    return calibrate_model(
+        world_model, dataset, config, accelerator, clips=clips, split=split, frames=frames, progress=measuring
+    )
+
+
+def load_named(config: Config, model: str | None) -> WorldModel:
+    """Return the model of a run's folder, or of what `model.base` takes; None: the config's own.
+
+    Raises:
+        InputError: There is none, it cannot be read, or it is drawn at random.
+    """
+    if model is not None and (Path(model) / CONFIG).is_file():
+        return load_run(Path(model)).world_model
+    chosen = config.model if model is None else config.model.model_copy(update={"base": model, "random": None})
+    require_learned(chosen)
+    return load_base(chosen, seed=config.seed)

@@ -1,0 +1,189 @@
+"""How does a trained run leave the house? As one merged model, as Meta's checkpoint, or as an adapter for the Hub."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from safetensors import safe_open
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.episode import POSE_WIDTHS, Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.export.model_card import AdapterFacts, model_card
+from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE
+from vjepa2_ac.model.adapter.adapter_folder import LORA_WEIGHTS
+from vjepa2_ac.model.adapter.lora import trainable_report
+from vjepa2_ac.model.adapter.merging import merge_adapter
+from vjepa2_ac.model.checkpoints.official import to_official
+from vjepa2_ac.model.finite import require_finite
+from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
+from vjepa2_ac.reports.write import PLOT
+from vjepa2_ac.runs.checkpoint import ADAPTER, read_state
+from vjepa2_ac.runs.checkpoint_selection import NEWEST
+from vjepa2_ac.runs.folder import read_run_config
+from vjepa2_ac.runs.loading import TrainedRun, load_run
+from vjepa2_ac.runs.torch_file import write_torch
+from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, user_can_write, write_atomically
+
+Form = Literal["merged", "official", "hub"]
+
+OFFICIAL_NAME = "vjepa2-ac.pt"  # in a folder; a destination that ends in .pt is the file itself
+CARD = "README.md"
+_FILES = frozenset({".bin", ".ckpt", ".h5", ".onnx", ".pt", ".pth", ".safetensors"})  # no names of folders
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What was written."""
+
+    path: Path  # the file or folder
+    checkpoint: str  # which one it was made of, in words
+
+
+def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoint: str = NEWEST) -> Exported:
+    """Write what a run has learnt for others to use, whole or not at all.
+
+    An adapter is merged in float32, then cast to the type of the base's weights (`model.dtype`).
+
+    Args:
+        folder: The run.
+        destination: A new or empty folder; for official also a file ending in `.pt`, which must not be there.
+        form: merged: the model as a folder, which `model.base` takes. official: one `.pt` by Meta's own names, q, k
+            and v fused, for the official code. hub: the adapter in PEFT's format with a model card, ready to upload.
+        checkpoint: newest, best (by validation), or a number of optimizer steps.
+
+    Raises:
+        InputError: As `load_run`; the destination is occupied or cannot be written; official: the model is of another
+            width than Meta's code; hub: the run has no adapter, or its `metrics.json` is damaged; or a weight of the
+            merged model is not finite, whatever the form.
+    """
+    _check_free(destination, form)
+    config = read_run_config(folder)
+    if form == "hub":
+        _check_adapter(folder, config)
+        evaluation = _read_evaluation(folder)
+        run = load_run(folder, checkpoint)
+        _write_hub(run, folder, destination, evaluation)
+        return Exported(destination, run.chosen)
+    run = load_run(folder, checkpoint)
+    if form == "official":
+        _check_widths(folder, widths_of_model(run.world_model.sizes))
+    _merge(run)
+    if form == "merged":
+        run.world_model.save_pretrained(destination)
+        return Exported(destination, run.chosen)
+    path = destination if destination.suffix == ".pt" else destination / OFFICIAL_NAME
+    with user_can_write(path), atomic_writer(path) as file:
+        write_torch(to_official(run.world_model), file)
+    return Exported(path, run.chosen)
+
+
+def _merge(run: TrainedRun) -> None:
+    """Make what was trained part of the model, and see that every weight is then a finite number."""
+    merge_adapter(run.world_model)
+    require_finite(
+        run.world_model.predictor.state_dict(),
+        where=f"{run.checkpoint}, merged into its base",
+        fix="Check lora_alpha in its adapter_config.json, or export another checkpoint: --checkpoint best",
+    )
+
+
+def _check_free(destination: Path, form: Form) -> None:
+    """See that nothing is at a destination, and that it can be written. Changes nothing."""
+    is_own = form == "official" and destination.suffix == ".pt"
+    if destination.suffix in _FILES and not is_own and not destination.is_dir():
+        file = f"a file that ends in .pt, or a folder for {OFFICIAL_NAME}"
+        needed = file if form == "official" else f"a folder, for --to {form}"
+        raise InputError(where=str(destination), found=f"the name of a {destination.suffix} file", needed=needed)
+    with user_can_write(destination):
+        if destination.exists() and not (destination.is_dir() and is_empty(destination)):
+            raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
+        existing = next(path for path in (destination, *destination.absolute().parents) if path.exists())
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+
+
+def _check_adapter(folder: Path, config: Config) -> None:
+    if config.adapter.kind != "lora":
+        raise InputError(
+            where=str(folder),
+            found=f"a run without an adapter (adapter.kind: {config.adapter.kind})",
+            needed="one with adapter.kind: lora, for --to hub",
+            fix="Export the whole model with --to merged or --to official",
+        )
+
+
+def _check_widths(folder: Path, widths: Widths) -> None:
+    if widths != POSE_WIDTHS:
+        raise InputError(
+            where=str(folder),
+            found=f"a model of states of {widths.state} and actions of {widths.action} numbers",
+            needed="7 and 7: Meta's code has one width for both, and makes that of the camera's pose one less",
+            fix="Export it with --to merged, which `model.base` takes",
+        )
+
+
+def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dict[str, Any] | None) -> None:
+    """Copy the adapter of a checkpoint, which load_run has seen to be whole, and put the card beside it."""
+    plot = folder / PLOT if evaluation is not None and (folder / PLOT).is_file() else None
+    adapter = run.checkpoint / ADAPTER
+    try:
+        card = model_card(run.config, _facts(run, folder, evaluation, plot))
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise _damaged(folder, f"figures that cannot be used ({error!r})") from None
+    _merge(run)  # nothing of the merged model is written, but an adapter that spoils it is of no use
+    with folder_writer(destination, ADAPTER_FILE) as fresh:
+        for path in (*sorted(adapter.iterdir()), *([plot] if plot else [])):
+            shutil.copyfile(path, fresh / path.name)
+        if evaluation is not None:
+            write_atomically(fresh / METRICS_FILE, json.dumps(evaluation, indent=1))
+        write_atomically(fresh / CARD, card)
+
+
+def _facts(run: TrainedRun, folder: Path, evaluation: dict[str, Any] | None, plot: Path | None) -> AdapterFacts:
+    adaptation = run.world_model.adaptation
+    if adaptation is None:
+        raise RuntimeError("a run that was loaded has been adapted")
+    with safe_open(run.checkpoint / ADAPTER / LORA_WEIGHTS, framework="pt") as file:
+        shapes = [file.get_slice(name).get_shape() for name in file.keys()]  # noqa: SIM118  # no iterator
+    trained = sum(torch.Size(shape).numel() for shape in shapes)
+    return AdapterFacts(
+        name=folder.resolve().name,
+        steps=read_state(run.checkpoint).step,
+        checkpoint=run.checkpoint.name,
+        chosen=run.chosen,
+        trained=str(trainable_report(run.world_model)._replace(trained=trained)),
+        base_predictor=adaptation.base,
+        base_encoder=adaptation.encoder,
+        evaluation=evaluation,
+        plot=plot.name if plot else None,
+        fresh_heads=None if run.world_model.fresh_heads is None else widths_of_model(run.world_model.sizes),
+    )
+
+
+def _read_evaluation(folder: Path) -> dict[str, Any] | None:
+    """Return what `evaluate` wrote of a run, without paths of this machine; None where it was never run."""
+    if not (folder / METRICS_FILE).exists():
+        return None
+    figures = read_metrics(folder)
+    try:
+        about = {**figures["about"], "subject": folder.resolve().name}
+        return {**figures, "about": {**about, "checkpoint_path": Path(about["checkpoint_path"]).name}}
+    except (TypeError, KeyError) as error:
+        raise _damaged(folder, f"figures that cannot be used ({error!r})") from None
+
+
+def _damaged(folder: Path, found: str) -> InputError:
+    return InputError(
+        where=str(folder / METRICS_FILE),
+        found=found,
+        needed="what `vjepa2-ac evaluate` writes",
+        fix=f"Write it again with `vjepa2-ac evaluate {folder}`, or delete it",
+    )

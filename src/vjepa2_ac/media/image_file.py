@@ -1,0 +1,67 @@
+"""How does a picture in a file become pixels? PNG and JPEG, in RGB."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import simplejpeg
+from jaxtyping import UInt8
+from PIL import Image
+from PIL.PngImagePlugin import PngImageFile
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.image_size import require_bounded, require_few_scans
+from vjepa2_ac.storage import read_bytes, unreadable
+
+_JPEG = b"\xff\xd8"
+_EIGHT_BIT = {"1", "L", "LA", "P", "RGB", "RGBA"}  # Pillow's modes of at most 8 bits a channel
+
+
+def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
+    """Return the RGB pixels of a PNG or JPEG file.
+
+    Raises:
+        InputError: There is no such file, it cannot be read, or it is no such picture.
+    """
+    try:
+        data = read_bytes(path)
+    except OSError as error:
+        raise unreadable(str(path), error, needed="a picture: PNG or JPEG") from None
+    return decode_image(data, str(path))
+
+
+def decode_image(picture: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    """Return the RGB pixels of PNG or JPEG bytes; transparency is left out.
+
+    Raises:
+        InputError: They are neither, damaged, too large, or of more than 8 bits a channel.
+    """
+    try:
+        if picture.startswith(_JPEG):
+            return _jpeg(picture, where)
+        with PngImageFile(io.BytesIO(picture)) as image:  # which reads the header only
+            require_bounded(image.height, image.width, where)
+            return _as_rgb(image)
+    except (OSError, ValueError, SyntaxError, struct.error, zlib.error, EOFError, IndexError) as error:
+        raise InputError(
+            where=where,
+            found=f"{len(picture)} bytes that are no picture, starting with {picture[:4]!r} ({error})",
+            needed="PNG or JPEG",
+        ) from None
+
+
+def _jpeg(picture: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    height, width, _, _ = simplejpeg.decode_jpeg_header(picture)
+    require_bounded(height, width, where)
+    require_few_scans(picture, height, width, where)
+    return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB"))
+
+
+def _as_rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:
+    if image.mode not in _EIGHT_BIT:
+        raise ValueError(f"pixels of the kind {image.mode}, not 8 bits a channel")
+    return np.array(image.convert("RGB"))

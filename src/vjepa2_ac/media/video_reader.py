@@ -1,0 +1,292 @@
+"""Which pictures does a video hold at these places? An MP4 decoded where it must be, and nowhere else.
+
+A picture is known by its presentation time, never by counting at the rate that the header states: the header's rate is
+often wrong (DROID's), and pictures are stored in another order than they are shown (B-frames).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from jaxtyping import UInt8
+
+from vjepa2_ac import storage
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.frame_targets import FrameTargets, QuietFile
+from vjepa2_ac.media.image_size import MOST_PIXELS, require_bounded
+from vjepa2_ac.storage import ByteReader
+from vjepa2_ac.storage.remote import UnreachableError
+
+if TYPE_CHECKING:
+    from av.container import InputContainer
+    from av.packet import Packet
+    from av.video.frame import VideoFrame
+    from av.video.reformatter import VideoReformatter
+    from av.video.stream import VideoStream
+
+_DEMUXER = "mp4"  # by name: libav would otherwise follow play lists to other files
+_STRICT = {
+    "err_detect": "crccheck+bitstream+buffer+explode",  # an error rather than a guessed picture
+    "max_pixels": str(MOST_PIXELS),
+}
+_START = -(1 << 40)  # before every picture
+_FIX = "Copy the file again, or leave the episode out"
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Where an episode's pictures lie in a file that holds many: step k is shown at start_s + k / rate_hz."""
+
+    start_s: float
+    rate_hz: float
+
+
+def read_frames(
+    file: str | Path | ByteReader, steps: Sequence[int], *, where: str, clock: Clock | None = None
+) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return the RGB pictures at these places of a video, in this order; places may repeat.
+
+    From the key frame before a picture, everything up to it must be decoded; only what was asked for becomes RGB.
+
+    Args:
+        file: Local path, URL, or a file that is open to read; an open one stays open.
+        steps: Places in the order in which pictures are shown, the first being 0; with a clock, its steps.
+        where: The file and its episode, as an error names them.
+        clock: The times of the steps, where places do not tell the pictures.
+
+    Raises:
+        InputError: Not a video, damaged, without such pictures, or of a codec that cannot be decoded.
+        OSError: A file behind a URL cannot be read.
+        ValueError: No steps, or one before the first.
+    """
+    if not steps or min(steps) < 0:
+        raise ValueError(f"{where}: steps {list(steps)}")
+    with _opened(file, where) as video:
+        targets = video.targets_at(steps) if clock is None else video.targets_by(clock, steps)
+        frames = video.decode(sorted(set(targets)), clock)
+        if len(sizes := {frame.shape for frame in frames.values()}) > 1:
+            found = f"pictures of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
+            raise InputError(where=where, found=found, needed="pictures of one size", fix=_FIX)
+        return np.stack([frames[target] for target in targets])
+
+
+def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
+    """Return how many pictures a video shows: what its index says, counted packet by packet where it has none.
+
+    Raises:
+        InputError: Not a video, or damaged.
+        OSError: A file behind a URL cannot be read.
+    """
+    with _opened(file, where) as video:
+        return len(video.stored_times() if video.is_indexed else video.shown_times())
+
+
+def frame_size(file: str | Path | ByteReader, *, where: str) -> tuple[int, int]:
+    """Return height and width in pixels, as the header states them.
+
+    Raises:
+        InputError: Not a video, or damaged.
+        OSError: A file behind a URL cannot be read.
+    """
+    with _opened(file, where) as video:
+        return int(video.stream.height), int(video.stream.width)
+
+
+@contextmanager
+def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
+    """Open a video for decoding in one thread: the loader's workers are the parallelism."""
+    av = _library(where)
+    if isinstance(file, (str, Path)) and storage.is_url(file):
+        with closing(storage.open_to_read(file)) as opened, _opened(opened, where) as video:
+            yield video
+        return
+    if isinstance(file, (str, Path)):
+        _require_readable(file, where)
+    source = f"file:{file}" if isinstance(file, (str, Path)) else QuietFile(file)
+    try:
+        with av.open(source, format=_DEMUXER, metadata_errors="replace") as container:
+            yield _video_of(container, av.video.reformatter.VideoReformatter(), where)
+    except (av.FFmpegError, InputError) as error:
+        if isinstance(source, QuietFile) and source.error is not None:
+            raise source.error from None
+        if isinstance(error, InputError):
+            raise
+        found = f"cannot be read as a video: {error.strerror}"
+        raise InputError(where=where, found=found, needed="a whole, undamaged MP4", fix=_FIX) from None
+    if isinstance(source, QuietFile) and source.error is not None:
+        raise source.error
+
+
+def _require_readable(path: str | Path, where: str) -> None:
+    """Let the system say what it has against a local file, before libav says it in words for damage."""
+    try:
+        storage.open_to_read(path).close()
+    except OSError as error:
+        raise storage.unreadable(where, error, needed="a whole, undamaged MP4", fix=_FIX) from None
+
+
+def _video_of(container: InputContainer, converter: VideoReformatter, where: str) -> _Video:
+    stream = container.streams.best("video")
+    if stream is None:
+        raise InputError(where=where, found="no video in the file", needed="an MP4 with pictures", fix=_FIX)
+    if stream.codec_context is None:
+        raise InputError(
+            where=where,
+            found="a video of a codec that this build of PyAV cannot decode",
+            needed="H.264, H.265 or AV1",
+            fix="Install PyAV from PyPI, or convert the video",
+        )
+    stream.codec_context.thread_count = 1
+    stream.codec_context.options = _STRICT
+    return _Video(container, cast("VideoStream", stream), converter, where)
+
+
+@dataclass(frozen=True)
+class _Video:
+    """A video that is open. Times are in units of the stream; its index knows times of decoding, not of showing."""
+
+    container: InputContainer
+    stream: VideoStream
+    converter: VideoReformatter  # one for all pictures: making one takes as long as using it
+    where: str
+
+    @property
+    def is_indexed(self) -> bool:
+        """Whether the file's header lists every picture (a fragmented MP4's does not)."""
+        return 0 < self.stream.frames == len(self.stream.index_entries)
+
+    def stored_times(self) -> list[int]:
+        """Return when each picture is decoded, from the header: when it is shown, too, if no picture is moved."""
+        return [entry.timestamp for entry in self.stream.index_entries if not entry.is_discard]
+
+    def shown_times(self) -> list[int]:
+        """Return when each picture is shown, in order; goes through the whole file, decoding nothing."""
+        return sorted(int(packet.pts) for packet in self.packets() if packet.pts is not None and not packet.is_discard)
+
+    def packets(self, seek_to: int = _START) -> Iterator[Packet[VideoStream]]:
+        """Yield what is stored, from the start or from a key frame."""
+        self.container.seek(seek_to, stream=self.stream, backward=True)
+        yield from (packet for packet in self.container.demux(self.stream) if packet.dts is not None)
+
+    def is_reordered(self) -> bool:
+        """Return whether pictures are shown in another order than they are stored, as far as the start tells."""
+        first = next(self.packets(), None)
+        return bool(self.stream.codec_context.has_b_frames) or first is None or first.pts != first.dts
+
+    def targets_at(self, steps: Sequence[int]) -> list[int]:
+        """Return the times at which the pictures at these places are shown."""
+        in_header = self.is_indexed and not self.is_reordered()
+        times = self.stored_times() if in_header else self.shown_times()
+        if max(steps) >= len(times):
+            raise InputError(
+                where=self.where, found=f"{len(times)} pictures", needed=f"at least {max(steps) + 1}", fix=_FIX
+            )
+        if len(set(times)) < len(times):
+            raise InputError(
+                where=self.where, found="pictures shown at the same time", needed="a time for each", fix=_FIX
+            )
+        return [times[step] for step in steps]
+
+    def targets_by(self, clock: Clock, steps: Sequence[int]) -> list[int]:
+        """Return the times that a clock gives to these steps."""
+        times = {step: round((clock.start_s + step / clock.rate_hz) / self._unit_s) for step in steps}
+        if len(set(times.values())) < len(times):
+            found = f"times in units of {self._unit_s:g} s for {clock.rate_hz:g} pictures a second"
+            raise InputError(where=self.where, found=found, needed="a time for each", fix=_FIX)
+        return [times[step] for step in steps]
+
+    def decode(self, targets: list[int], clock: Clock | None) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
+        """Return the pictures shown at these ascending times; with a clock, the first within half a step of each."""
+        require_bounded(self.stream.height or 1, self.stream.width or 1, self.where, count=len(targets))
+        wanted = FrameTargets(targets, 0 if clock is None else max(0, int(0.49 / clock.rate_hz / self._unit_s)))
+        while (target := wanted.first) is not None:
+            before = len(wanted.frames)
+            self._decode_run(target, wanted)
+            if len(wanted.frames) == before:
+                seconds = target * self._unit_s
+                raise InputError(
+                    where=self.where,
+                    found=f"no picture at {seconds:.3f} s",
+                    needed=f"one for each of {len(targets)} times from {targets[0] * self._unit_s:.3f} s on",
+                    fix=_FIX,
+                )
+        return wanted.frames
+
+    def _decode_run(self, target: int, wanted: FrameTargets) -> None:
+        """Decode from the key frame before a target as long as going on costs less than the next seek."""
+        decoder = self.stream.codec_context
+        delay: int | None = None
+        for packet in self._packets_before(target):
+            decoded = int(packet.dts or 0)
+            shown = decoded if packet.pts is None else int(packet.pts)
+            delay = (
+                shown - decoded if delay is None else delay
+            )  # of the key frame; the others of the file have the same
+            wanted.feed(shown)
+            self._keep(decoder.decode(packet), wanted)
+            if wanted.is_fed(target):
+                following = wanted.next_to_feed
+                if following is None or self._key_frame_before(following - delay) > decoded + int(packet.duration or 0):
+                    break
+        self._keep(decoder.decode(None), wanted)
+
+    def _packets_before(self, target: int) -> Iterator[Packet[VideoStream]]:
+        """Yield packets from the last key frame that is shown no later than the target."""
+        sought = target
+        while sought > _START:
+            packets = self.packets(sought)
+            first = next(packets, None)
+            if first is not None and first.pts is not None and first.pts <= target:
+                yield first
+                yield from packets
+                return
+            sought = _START if first is None else self._key_frame_before(int(first.dts or 0) - 1)
+        yield from self.packets()
+
+    def _key_frame_before(self, time: int) -> int:
+        """Return when the last key frame that is decoded no later than a time is decoded."""
+        place = self.stream.index_entries.search_timestamp(time, backward=True, any_frame=False)
+        return int(self.stream.index_entries[place].timestamp) if place >= 0 else _START
+
+    def _keep(self, frames: Sequence[VideoFrame], wanted: FrameTargets) -> None:
+        for frame in frames:
+            target = None if frame.pts is None else wanted.target_of(int(frame.pts))
+            if target is None or target in wanted.frames:
+                continue
+            if frame.is_corrupt:
+                time = f"{target * self._unit_s:.3f} s"
+                raise InputError(where=self.where, found=f"a damaged picture at {time}", needed="a whole MP4", fix=_FIX)
+            require_bounded(frame.height, frame.width, self.where, count=wanted.count)
+            picture = self.converter.reformat(frame, format="rgb24", threads=1)
+            wanted.frames[target] = np.asarray(picture.to_ndarray())
+
+    @property
+    def _unit_s(self) -> float:
+        return float(self.stream.time_base or 1)
+
+
+def require_decoder(where: str) -> None:
+    """See that videos can be decoded, before anything is done with a set that has some.
+
+    Raises:
+        UnreachableError: PyAV is not installed.
+    """
+    _library(where)
+
+
+def _library(where: str) -> Any:
+    try:
+        import av
+    except ImportError:
+        # Unreachable: it says nothing of the episode, which is not broken.
+        raise UnreachableError(
+            where=where,
+            found="PyAV, which decodes video, is not installed",
+            fix='pip install -c constraints.txt -e ".[video]"',
+        ) from None
+    return av

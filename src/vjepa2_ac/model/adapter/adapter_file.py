@@ -1,0 +1,101 @@
+"""What may stand in an adapter_config.json? What this program writes; PEFT itself would take, and do, far more.
+
+The file is read here, strictly, and becomes the knobs that a config has for it, with their types and ranges. PEFT never
+sees it: not a regular expression that runs for ever, not a layer that is no layer of the predictor, not another method.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from vjepa2_ac.config import AdapterConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.structured import message_of, read_json_object, require_quick, shown
+
+ADAPTER_FILE = "adapter_config.json"  # PEFT's name
+
+_NEEDED = "a LoRA adapter of V-JEPA 2-AC's predictor, as this program writes it in PEFT's format"
+_FIX = "Copy the adapter again, or train it again: other kinds of PEFT's are not read"
+
+_KNOBS = {  # PEFT's names, and ours
+    "r": "rank",
+    "lora_alpha": "alpha",
+    "lora_dropout": "dropout",
+    "target_modules": "targets",
+    "modules_to_save": "modules_to_save",
+    "use_rslora": "rslora",
+    "use_dora": "dora",
+    "init_lora_weights": "init",
+    "rank_pattern": "rank_pattern",
+    "alpha_pattern": "alpha_pattern",
+}
+_FIXED = {"peft_type": "LORA", "bias": "none"}
+_TOLD = frozenset({  # where it comes from, and for what
+    "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_version", "revision",
+    "task_type",
+})  # fmt: skip
+
+
+def read_adapter_file(folder: Path, defaults: Mapping[str, Any]) -> AdapterConfig:
+    """Return the knobs that an adapter was made with.
+
+    Args:
+        folder: Where it lies.
+        defaults: What PEFT writes of settings that nobody chose.
+
+    Raises:
+        InputError: The file is missing or damaged, or of an adapter that this program does not make.
+    """
+    path = folder / ADAPTER_FILE
+    try:
+        values = read_json_object(path, needed=_NEEDED, fix=_FIX)
+    except OSError as error:
+        found = f"cannot be read ({error.strerror or error})"
+        raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX) from None
+    _require_plain_lora(values, defaults, path)
+    try:
+        config = AdapterConfig.model_validate_json(json.dumps({"kind": "lora", **_as_knobs(values)}))
+    except ValidationError as error:
+        said = [f"{_peft_name(detail['loc'])}: {message_of(detail)}" for detail in error.errors()[:4]]
+        raise InputError(where=str(path), found="; ".join(said), needed=_NEEDED, fix=_FIX) from None
+    for pattern in (*config.rank_pattern, *config.alpha_pattern):
+        require_quick(pattern, where=str(path))
+    return config
+
+
+def _require_plain_lora(values: Mapping[str, Any], defaults: Mapping[str, Any], path: Path) -> None:
+    """Refuse settings that change what an adapter does, and that this program has no knob for."""
+    for name, needed in _FIXED.items():
+        if values.get(name) != needed:
+            found = f"an adapter with {name} {shown(values.get(name))}"
+            raise InputError(where=str(path), found=found, needed=f"{name} {needed}", fix=_FIX)
+    for name in ("r", "lora_alpha", "target_modules"):
+        if name not in values:
+            raise InputError(where=str(path), found=f"no {name}", needed=_NEEDED, fix=_FIX)
+    others = {name: value for name, value in values.items() if name not in {*_KNOBS, *_FIXED, *_TOLD}}
+    for name, value in others.items():
+        is_off = value is None or value is False or value in ([], {})
+        if not is_off and (name not in defaults or value != defaults[name]):
+            found = f"an adapter with {shown(name)} {shown(value)}, which is not read here"
+            raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX)
+
+
+def _as_knobs(values: Mapping[str, Any]) -> dict[str, Any]:
+    knobs = {ours: values[peft] for peft, ours in _KNOBS.items() if peft in values}
+    if "rslora" not in knobs:
+        knobs["rslora"] = False  # PEFT's default
+    if knobs.get("init") is True or "init" not in knobs:
+        knobs["init"] = "default"
+    if knobs.get("modules_to_save") is None:
+        knobs.pop("modules_to_save", None)
+    return knobs
+
+
+def _peft_name(location: tuple[Any, ...]) -> str:
+    first = {ours: peft for peft, ours in _KNOBS.items()}.get(str(location[0]), str(location[0]))
+    return ".".join([first, *map(str, location[1:])])

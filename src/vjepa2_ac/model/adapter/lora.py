@@ -1,0 +1,307 @@
+"""What is trained? A LoRA adapter on the predictor, or all of the predictor: add, save, load.
+
+PEFT's home, beside the layer in `lora_linear`. How an adapter becomes part of the base: `merging`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
+from peft.tuners.lora import LoraLayer
+from torch import Tensor, nn
+
+from vjepa2_ac.config import AdapterConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE, read_adapter_file
+from vjepa2_ac.model.adapter.adapter_folder import (
+    FULL_WEIGHTS,
+    LORA_WEIGHTS,
+    PRINCIPAL_PARTS,
+    read_fresh_heads,
+    read_kind,
+    read_weights,
+    write_trained,
+)
+from vjepa2_ac.model.adapter.initialization import (
+    draw_first_matrices,
+    measure_magnitudes,
+    original_weights,
+    principal_parts,
+    start_from,
+)
+from vjepa2_ac.model.adapter.lora_linear import LoraLinear
+from vjepa2_ac.model.adapter.targets import lora_arguments, peft_arguments
+from vjepa2_ac.model.network.input_heads import fit_heads, require_trained
+from vjepa2_ac.model.network.world_model import Adaptation, WorldModel, base_weights
+
+_COMPARED = (
+    "r",
+    "lora_alpha",
+    "use_rslora",
+    "target_modules",
+    "use_dora",
+    "bias",
+    "modules_to_save",
+    "rank_pattern",
+    "alpha_pattern",
+    "init_lora_weights",
+)
+
+
+class TrainableReport(NamedTuple):
+    """How many parameters there are; those of an adapter count as trained only."""
+
+    trained: int
+    predictor: int
+    total: int
+
+    @property
+    def share(self) -> float:
+        """Trained parameters over the predictor's own."""
+        return self.trained / self.predictor
+
+    def __str__(self) -> str:
+        return (
+            f"{self.trained:,} parameters are trained: {self.share:.2%} of the predictor's {self.predictor:,};"
+            f" the model has {self.total:,}"
+        )
+
+
+def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Path | None = None) -> None:
+    """Make a model trainable: its predictor gets an adapter, or all of it is trained. What is trained is float32.
+
+    A fresh adapter changes nothing: its second matrix is zero; the first is decided by the seed. With `init: pissa` it
+    is a part of the weights, taken off them, which comes to the same up to rounding.
+
+    Args:
+        model: The base.
+        config: What is trained.
+        seed: Decides the first matrices.
+        started: What `save_trained` wrote of an adapter that began in the same way. With `init: pissa` the part is read
+            there and not computed, which takes minutes; all else is for `load_trained`.
+
+    Raises:
+        InputError: A target matches no layer, another knob does not fit the predictor, a fresh head (`input_heads`)
+            would not be trained, or `started` is of another adapter.
+        ValueError: The model has been adapted already.
+    """
+    if model.adaptation is not None:
+        raise ValueError("this model has been adapted already: merge_adapter first, or load_trained into it")
+    if config.kind == "none":
+        _train_everything(model)
+        return
+    require_trained(_names_of_fresh_heads(model), config)
+    _wrap(model, LoraConfig(**lora_arguments(model.predictor, config, unused=_unused(model))))
+    layers = lora_layers(model)
+    if config.init == "pissa":
+        parts = principal_parts(layers) if started is None else _read_principal_parts(model, started)
+        _start_from_principal_parts(model, parts)
+    else:
+        draw_first_matrices(layers, config.init, torch.Generator().manual_seed(seed))
+    measure_magnitudes(layers)
+
+
+def trainable_report(model: WorldModel) -> TrainableReport:
+    """Return how many parameters are trained, the predictor's own, and the model's without an adapter."""
+    own = sum(value.numel() for value in base_weights(model.base_predictor).values())
+    encoder = sum(value.numel() for value in model.encoder.parameters())
+    return TrainableReport(sum(p.numel() for p in model.parameters() if p.requires_grad), own, own + encoder)
+
+
+def has_adapter(model: WorldModel) -> bool:
+    """Return whether the model differs from the base it started from: `base_only` brings that back for a while."""
+    return model.adaptation is not None
+
+
+def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tensor] | None = None) -> None:
+    """Write what was trained: an adapter in PEFT's own format, or all of the predictor; and which base it belongs to.
+
+    Args:
+        model: The adapted model.
+        folder: Where to.
+        weights: All of the predictor, where the model itself has but a part of each weight.
+
+    Raises:
+        ValueError: The model has not been adapted.
+    """
+    adaptation, folder = adaptation_of(model), Path(folder)
+    if adaptation.kind == "lora":
+        write_trained(folder, adaptation, _lora_weights(model), _card_of_fresh_heads(model))  # and PiSSA's parts
+        _lora_config(model).save_pretrained(str(folder))
+    else:
+        write_trained(folder, adaptation, weights or model.predictor.state_dict(), _card_of_fresh_heads(model))
+
+
+def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
+    """Put what `save_trained` wrote on the base it was trained on, or into the adapter that is on already.
+
+    Args:
+        model: The base, or a model adapted in the same way; it is never wrapped twice.
+        folder: The folder.
+        trainable: Whether to train on; None leaves an adapter that is on as it is, and freezes a new one.
+
+    Raises:
+        InputError: The folder is not an adapter, is damaged, belongs to another base, or differs from the one that
+            is on.
+    """
+    folder = Path(folder)
+    fresh = model.adaptation is None
+    kind, heads = read_kind(folder, model), read_fresh_heads(folder)
+    if heads is not None and fresh and model.fresh_heads is None:
+        fit_heads(model, *heads)
+    if kind == "lora":
+        _load_lora(model, folder)
+    else:
+        _load_everything(model, folder)
+    if fresh or trainable is not None:
+        _set_trainable(model, bool(trainable))
+
+
+def lora_layers(model: WorldModel) -> dict[str, Any]:
+    """Return the layers of the predictor that have an adapter (PEFT's LoraLayer), by name."""
+    found = model.base_predictor.named_modules()
+    return {name: layer for name, layer in found if isinstance(layer, LoraLayer)}
+
+
+def adaptation_of(model: WorldModel) -> Adaptation:
+    """Return how a model was adapted.
+
+    Raises:
+        ValueError: It was not.
+    """
+    if model.adaptation is None:
+        raise ValueError("this model has not been adapted: add_adapter or load_trained first")
+    return model.adaptation
+
+
+def _names_of_fresh_heads(model: WorldModel) -> tuple[str, ...]:
+    replaced = () if model.fresh_heads is None else model.fresh_heads.replaced
+    return tuple(dict.fromkeys(name.split(".")[0] for name in replaced))
+
+
+def _card_of_fresh_heads(model: WorldModel) -> dict[str, int] | None:
+    if model.fresh_heads is None:
+        return None
+    sizes = model.sizes.predictor
+    return {"action_dim": sizes.action_dim, "state_dim": sizes.state_dim, "seed": model.fresh_heads.seed}
+
+
+def _train_everything(model: WorldModel) -> None:
+    start = {name: value.detach().to("cpu", copy=True) for name, value in model.predictor.state_dict().items()}
+    model.adaptation = Adaptation("none", model.predictor_fingerprint(), model.encoder_fingerprint(), start)
+    model.predictor.float()
+    _set_trainable(model, trainable=True)
+
+
+def _wrap(model: WorldModel, config: LoraConfig) -> None:
+    base = model.predictor_fingerprint()
+    config._register_custom_module({nn.Linear: LoraLinear})
+    checkpointing = model.base_predictor.gradient_checkpointing
+    model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
+    init, config.init_lora_weights = config.init_lora_weights, True  # or PEFT cuts PiSSA out of the base, in its type
+    training = model.predictor.training
+    model.predictor = get_peft_model(model.predictor, config).train(training)  # PEFT's dropout begins switched on
+    config.init_lora_weights = init
+    model.set_gradient_checkpointing(checkpointing)
+    model.adaptation = Adaptation("lora", base, model.encoder_fingerprint())
+    for name, value in model.predictor.named_parameters():
+        if _is_trained(name):
+            value.data = value.data.float()
+
+
+def _is_trained(name: str) -> bool:
+    return ".lora_" in name or ".modules_to_save." in name
+
+
+def _unused(model: WorldModel) -> tuple[str, ...]:
+    return () if model.sizes.predictor.use_extrinsics else ("extrinsics_encoder",)
+
+
+def _start_from_principal_parts(model: WorldModel, parts: dict[str, Tensor]) -> None:
+    adaptation, layers = adaptation_of(model), lora_layers(model)
+    start = adaptation.start or original_weights(layers)
+    start_from(layers, start, parts)
+    model.adaptation = replace(adaptation, start=start, principal=parts)
+
+
+def _read_principal_parts(model: WorldModel, folder: Path) -> dict[str, Tensor]:
+    like = {
+        f"{name}.{matrix}": getattr(layer, matrix)["default"].weight
+        for name, layer in lora_layers(model).items()
+        for matrix in ("lora_A", "lora_B")
+    }
+    return read_weights(folder / PRINCIPAL_PARTS, like)
+
+
+def _lora_weights(model: WorldModel) -> dict[str, Tensor]:
+    return dict(get_peft_model_state_dict(model.predictor, save_embedding_layers=False))
+
+
+def _lora_config(model: WorldModel) -> Any:
+    predictor: Any = model.predictor
+    config = LoraConfig(**{**predictor.peft_config["default"].to_dict(), "inference_mode": True})
+    config.target_modules = sorted(config.target_modules)
+    return config
+
+
+def _set_trainable(model: WorldModel, trainable: bool) -> None:
+    lora = isinstance(model.predictor, PeftModel)
+    for name, value in model.predictor.named_parameters():
+        chosen = _is_trained(name) if lora else name.split(".", 1)[0] not in _unused(model)
+        value.requires_grad_(trainable and chosen)
+
+
+def _load_lora(model: WorldModel, folder: Path) -> None:
+    config = _read_lora_config(folder, model)
+    if model.adaptation is None:
+        _wrap(model, config)
+    else:
+        _check_same_adapter(_lora_config(model), config, where=str(folder))
+    _check_scales(model, where=str(folder / "adapter_config.json"))
+    weights = read_weights(folder / LORA_WEIGHTS, _lora_weights(model))
+    if config.init_lora_weights == "pissa":
+        _start_from_principal_parts(model, _read_principal_parts(model, folder))
+    set_peft_model_state_dict(model.predictor, weights)
+
+
+def _read_lora_config(folder: Path, model: WorldModel) -> Any:
+    """Return what an adapter was made with, as PEFT takes it; on a base it is seen to fit."""
+    knobs = read_adapter_file(folder, LoraConfig().to_dict())
+    if model.adaptation is not None:
+        return LoraConfig(**peft_arguments(knobs, knobs.targets))
+    try:
+        return LoraConfig(**lora_arguments(model.predictor, knobs, unused=_unused(model)))
+    except InputError as error:
+        raise InputError(
+            where=f"{folder / ADAPTER_FILE}: {error.where}", found=error.found, needed=error.needed, fix=error.fix
+        ) from None
+
+
+def _check_scales(model: WorldModel, *, where: str) -> None:
+    for name, layer in lora_layers(model).items():
+        scale, alpha = layer.scaling["default"], layer.lora_alpha["default"]
+        if not math.isfinite(scale):
+            found = f"lora_alpha {alpha} for {name}, a scale of {scale}"
+            raise InputError(where=where, found=found, needed="a finite scale")
+
+
+def _check_same_adapter(own: Any, other: Any, *, where: str) -> None:
+    for key in _COMPARED:
+        found, needed = (
+            sorted(value) if isinstance(value, set | list) else value
+            for value in (getattr(other, key), getattr(own, key))
+        )
+        if found != needed:
+            raise InputError(where=where, found=f"an adapter with {key} {found}", needed=f"{needed}, as the model has")
+
+
+def _load_everything(model: WorldModel, folder: Path) -> None:
+    weights = read_weights(folder / FULL_WEIGHTS, model.predictor.state_dict())
+    if model.adaptation is None:
+        _train_everything(model)
+    model.predictor.load_state_dict(weights)

@@ -1,0 +1,102 @@
+"""How does a model predict without its adapter again, and how does the adapter become part of it for good?"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
+
+import torch
+
+from vjepa2_ac.model.adapter.initialization import set_original_weights
+from vjepa2_ac.model.adapter.lora import adaptation_of, lora_layers
+from vjepa2_ac.model.network.world_model import Adaptation, WorldModel
+
+
+@contextmanager
+def base_only(model: WorldModel) -> Iterator[None]:
+    """Let the model predict as the base it was adapted from, for a while; a model that was not adapted is the base.
+
+    A model with fresh heads goes back to these as they were drawn: not a base that could be compared with.
+    """
+    if model.adaptation is None:
+        yield
+        return
+    trained = [(value, value.requires_grad) for value in model.predictor.parameters()]
+    switch = (
+        _lora_off(model, model.adaptation)
+        if model.adaptation.kind == "lora"
+        else _start_weights(model, model.adaptation)
+    )
+    try:
+        with switch:
+            yield
+    finally:
+        for value, requires_grad in trained:  # PEFT turns gradients on when it turns an adapter on
+            value.requires_grad_(requires_grad)
+
+
+def base_dtype(model: WorldModel) -> torch.dtype:
+    """Return the type of the predictor's weights before anything of it was trained, in float32: `model.dtype`."""
+    if model.adaptation is not None and model.adaptation.kind == "none" and model.adaptation.start:
+        return next(iter(model.adaptation.start.values())).dtype
+    weight: torch.Tensor = model.base_predictor.predictor_norm.weight  # never trained beside an adapter
+    return weight.dtype
+
+
+def merge_adapter(model: WorldModel) -> None:
+    """Make what was trained part of the predictor: added in float32, then cast to the base's type, frozen.
+
+    Autocast around it changes nothing.
+
+    Raises:
+        ValueError: The model has not been adapted.
+    """
+    dtype = base_dtype(model)
+    if adaptation_of(model).kind == "lora":
+        with _without_autocast(model.device.type):  # or the update would be computed in its type
+            model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
+    model.predictor.to(dtype).requires_grad_(False)
+    model.adaptation = model.fresh_heads = None
+
+
+def unadapted_copy(model: WorldModel) -> WorldModel:
+    """Return a model for inference that shares the encoder and has a predictor of its own, what was trained merged.
+
+    The given one stays as it is.
+    """
+    own = WorldModel.empty(model.sizes)
+    own.encoder, own.predictor = model.encoder, copy.deepcopy(model.predictor)
+    own.adaptation, own.fresh_heads = model.adaptation, model.fresh_heads
+    if own.adaptation is not None:
+        merge_adapter(own)
+    return own.eval()
+
+
+def _without_autocast(device: str) -> AbstractContextManager[object]:
+    """Switch autocast off on a kind of device; some, as meta, have none."""
+    return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()
+
+
+@contextmanager
+def _lora_off(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
+    predictor: Any = model.predictor
+    layers = lora_layers(model) if adaptation.start else {}  # PiSSA's: their own weights are not the base's
+    now = {name: layer.get_base_layer().weight.detach().clone() for name, layer in layers.items()}
+    set_original_weights(layers, adaptation.start or {})
+    try:
+        with predictor.disable_adapter():
+            yield
+    finally:
+        set_original_weights(layers, now)
+
+
+@contextmanager
+def _start_weights(model: WorldModel, adaptation: Adaptation) -> Iterator[None]:
+    now = {name: value.detach().clone() for name, value in model.predictor.state_dict().items()}
+    model.predictor.load_state_dict(adaptation.start or {})
+    try:
+        yield
+    finally:
+        model.predictor.load_state_dict(now)

@@ -1,0 +1,117 @@
+"""Which layers of the predictor get an adapter, and of which rank? The knobs, checked, as PEFT wants them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from torch import nn
+
+from vjepa2_ac.config import AdapterConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.structured import require_quick
+
+ATTENTION = ("q", "k", "v", "o")
+MLP = ("fc1", "fc2")
+
+
+def lora_arguments(predictor: nn.Module, config: AdapterConfig, unused: tuple[str, ...] = ()) -> dict[str, Any]:
+    """Return the arguments of PEFT's LoraConfig.
+
+    Args:
+        predictor: The predictor, not adapted.
+        config: The knobs.
+        unused: Layers through which nothing flows, by the last part of their name: they can have no adapter.
+
+    Raises:
+        InputError: A target or pattern matches no layer, a layer is named twice, or a rank is beyond a layer.
+    """
+    layers = {
+        name: layer
+        for name, layer in predictor.named_modules()
+        if isinstance(layer, nn.Linear) and _last(name) not in unused
+    }
+    targets = chosen_targets(config, {_last(name) for name in layers})
+    adapted = {name: layer for name, layer in layers.items() if _last(name) in targets}
+    _check_patterns("rank_pattern", config.rank_pattern, adapted)
+    _check_patterns("alpha_pattern", config.alpha_pattern, adapted)
+    if config.init == "pissa":
+        _check_ranks(config, adapted)
+    return peft_arguments(config, targets)
+
+
+def peft_arguments(config: AdapterConfig, targets: Iterable[str]) -> dict[str, Any]:
+    """Return the arguments of PEFT's LoraConfig for layers of these names; whether they fit is not looked at."""
+    return {
+        "r": config.rank,
+        "lora_alpha": config.alpha,
+        "use_rslora": config.rslora,
+        "lora_dropout": config.dropout,
+        "target_modules": list(targets),
+        "bias": "none",
+        "use_dora": config.dora,
+        "init_lora_weights": True if config.init == "default" else config.init,
+        "rank_pattern": dict(config.rank_pattern),
+        "alpha_pattern": dict(config.alpha_pattern),
+        "modules_to_save": list(config.modules_to_save) or None,
+    }
+
+
+def chosen_targets(config: AdapterConfig, linear: set[str]) -> tuple[str, ...]:
+    """Return the targets with sets replaced by their layers; `all` leaves out what is trained whole.
+
+    Raises:
+        InputError: A target is no layer, there is none, or one is also in modules_to_save.
+    """
+    everything = tuple(sorted(linear - set(config.modules_to_save)))
+    sets = {"attention": ATTENTION, "mlp": MLP, "all": everything}
+    targets = tuple(dict.fromkeys(layer for target in config.targets for layer in sets.get(target, (target,))))
+    unknown = [target for target in targets if target not in linear]
+    if unknown or not targets:
+        raise InputError(
+            where="adapter.targets",
+            found=", ".join(unknown) + " matches no layer of the predictor" if unknown else "no target",
+            needed=f"some of {', '.join(sorted(linear))}; or {', '.join(sets)}",
+        )
+    twice = sorted(set(targets) & set(config.modules_to_save))
+    if twice:
+        raise InputError(
+            where="adapter.modules_to_save",
+            found=f"{', '.join(twice)}, which adapter.targets names too",
+            needed="each layer once: trained whole, or with an adapter",
+        )
+    return targets
+
+
+def _check_patterns(knob: str, patterns: Mapping[str, object], adapted: Iterable[str]) -> None:
+    for pattern in patterns:
+        require_quick(pattern, where=f"adapter.{knob}")
+        if not any(_matches(pattern, name) for name in adapted):
+            raise InputError(
+                where=f"adapter.{knob}",
+                found=f"{pattern!r} matches no layer that gets an adapter",
+                needed="the end of a layer's name, such as fc1 or blocks.0.attn.q, or a regular expression for it",
+            )
+
+
+def _check_ranks(config: AdapterConfig, adapted: Mapping[str, nn.Linear]) -> None:
+    for name, layer in adapted.items():
+        rank = next((rank for key, rank in config.rank_pattern.items() if _matches(key, name)), config.rank)
+        most = min(layer.in_features, layer.out_features)
+        if rank > most:
+            raise InputError(
+                where="adapter.init",
+                found=f"pissa with rank {rank} for {name}, a matrix of {layer.out_features} x {layer.in_features}",
+                needed=f"a rank of at most {most} there: it starts from that many of its singular vectors",
+                fix=f"Set adapter.rank_pattern.{_last(name)}={most}, or leave the layer out of adapter.targets",
+            )
+
+
+def _matches(pattern: str, name: str) -> bool:
+    """Say whether PEFT lets this pattern decide about this layer."""
+    return re.match(rf"(.*\.)?({pattern})$", name) is not None
+
+
+def _last(name: str) -> str:
+    return name.rsplit(".", 1)[-1]

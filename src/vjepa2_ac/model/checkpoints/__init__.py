@@ -1,0 +1,1 @@
+"""Checkpoints of base models: downloaded, read and written by Meta's names."""

@@ -1,0 +1,241 @@
+"""How do official weights come in and go out? Meta's checkpoint, its names and fused layers, in little memory."""
+
+from __future__ import annotations
+
+import logging
+import pickle
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import ValidationError
+from torch import Tensor, nn
+
+from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.checkpoints.foreign_file import foreign_kind
+from vjepa2_ac.model.finite import require_finite
+from vjepa2_ac.model.network.blocks import mlp_ratio_of
+from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.pretrained_folder import check_sizes, check_tensors
+from vjepa2_ac.model.network.world_model import WorldModel
+
+logger = logging.getLogger(__name__)
+
+GROUP_BYTES = 2**29  # of the file that are in memory at once, besides the weights themselves
+IGNORED = {
+    "encoder": ("pos_embed",),
+    "predictor": (),
+}  # may be there: a network with rotary positions has no use for it
+
+_NEEDED = "a checkpoint of V-JEPA 2-AC as Meta publishes it (vjepa2-ac-vitg.pt)"
+_FIX = "`vjepa2-ac download` fetches it, and goes on with a part of it"
+_SPLIT = ("q", "k", "v")
+_DAMAGE = (  # what a pickle that is damaged ends in, beside what torch says of it
+    pickle.UnpicklingError, OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
+    AssertionError, ArithmeticError, MemoryError,
+)  # fmt: skip
+
+
+def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:
+    """Read Meta's checkpoint. Every tensor is matched; only those in `IGNORED` may be left over.
+
+    The file is mapped and read in groups: the peak is the weights in `dtype` plus about 1 GB.
+
+    Args:
+        path: The `.pt` file.
+        sizes: What the tensors cannot say: image size, heads, extrinsics. Another size that is neither the default
+            nor what the tensors say is a contradiction.
+        dtype: Type of the weights in memory.
+
+    Raises:
+        InputError: The file is missing, truncated, of another kind, contradicts the sizes, or a weight is not finite.
+    """
+    path = Path(path)
+    parts = {part: _shapes(weights) for part, weights in _open(path).items()}
+    model = WorldModel.empty(_sizes(parts, sizes or ModelSizes(), where=str(path)))
+    for part, network in (("encoder", model.encoder), ("predictor", model.predictor)):
+        _fill(network, path, part, dtype)
+    logger.info("read %s: %s", path, model.sizes.model_dump())
+    return model
+
+
+def to_official(model: WorldModel) -> dict[str, Any]:
+    """Return the weights by Meta's names, q, k and v fused: what `torch.save` makes an official checkpoint of.
+
+    Raises:
+        ValueError: An adapter is on: merge it first. Or states and actions are not of the widths that Meta's code has.
+    """
+    if model.predictor is not model.base_predictor:
+        raise ValueError("an adapter is on: merge_adapter first")
+    if widths_of_model(model.sizes) != POSE_WIDTHS:
+        raise ValueError(f"Meta's code takes {POSE_WIDTHS}, not {widths_of_model(model.sizes)}")
+    encoder = _to_official(model.present_encoder.state_dict(), "encoder")
+    return {
+        "encoder": encoder,
+        "target_encoder": dict(encoder),
+        "predictor": _to_official(model.predictor.state_dict(), "predictor"),
+        "epoch": 0,
+    }
+
+
+# Ours -> Meta's, as (pattern, replacement), applied in turn.
+_NAMES: dict[str, list[tuple[str, str]]] = {
+    "encoder": [
+        (r"^vit\.embeddings\.patch_embeddings\.", "patch_embed."),
+        (r"^vit\.layernorm\.", "norm."),
+        (r"^vit\.layer\.", "blocks."),
+        (r"\.attention\.(q|k|v)(?:uery|ey|alue)\.", r".attn.\1."),
+        (r"\.attention\.proj\.", ".attn.proj."),
+    ],
+    "predictor": [
+        (r"^blocks\.", "predictor_blocks."),
+        (r"\.attn\.o\.", ".attn.proj."),
+    ],
+}
+
+
+def official_name(name: str, part: str) -> tuple[str, int | None]:
+    """Return Meta's name of one of our tensors, and which third of a fused one it is (None: all of it)."""
+    for pattern, replacement in _NAMES[part]:
+        name = re.sub(pattern, replacement, name)
+    fused = re.sub(r"\.attn\.[qkv]\.", ".attn.qkv.", name)
+    return fused, None if fused == name else _SPLIT.index(name.split(".attn.")[1][0])
+
+
+def _open(path: Path) -> dict[str, dict[str, Tensor]]:
+    """Map a checkpoint and return encoder and predictor by Meta's names without prefixes; nothing is read yet."""
+    if not path.is_file():
+        raise InputError(where=str(path), found="no such file", needed=_NEEDED, fix=_FIX)
+    try:
+        whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except _DAMAGE as error:
+        raise InputError(where=str(path), found=_foreign(path, error), needed=f"{_NEEDED}, 11.7 GB", fix=_FIX) from None
+    if not isinstance(whole, dict):
+        raise InputError(where=str(path), found=f"a {type(whole).__name__}", needed=_NEEDED, fix=_FIX)
+    encoder = whole.get("encoder", whole.get("target_encoder"))
+    parts = {"encoder": encoder, "predictor": whole.get("predictor")}
+    for part, weights in parts.items():
+        if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+            found = f"no weights under {part!r} (keys: {', '.join(map(str, list(whole)[:8]))})"
+            raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX)
+    return {part: _without_prefixes(weights) for part, weights in parts.items() if weights is not None}
+
+
+def _foreign(path: Path, error: Exception) -> str:
+    if (kind := foreign_kind(path, error)) is not None:
+        return kind
+    size, reason = path.stat().st_size / 1e9, str(error).splitlines()[0][:120]
+    return f"{size:.2f} GB that torch cannot read ({reason}): truncated, or of another kind"
+
+
+def _without_prefixes(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {re.sub(r"^(?:(?:module|backbone)\.)+", "", name): value for name, value in weights.items()}
+
+
+def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(value.shape) for name, value in weights.items()}
+
+
+def _sizes(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes, *, where: str) -> ModelSizes:
+    """Return the sizes that the tensors have; heads, image size and extrinsics are those given."""
+    try:
+        found = _sizes_of_tensors(parts, given)
+    except KeyError as missing:
+        raise InputError(where=where, found=f"no tensor {missing} in it", needed=_NEEDED, fix=_FIX) from None
+    except ValidationError as error:
+        raise InputError(
+            where=where,
+            found=f"sizes that do not go with model.sizes ({error.errors()[0]['msg']})",
+            needed="image size and heads of the checkpoint",
+            fix="Set them in model.sizes: the tensors cannot tell",
+        ) from None
+    check_sizes(found, given, where=where)
+    return found
+
+
+def _sizes_of_tensors(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes) -> ModelSizes:
+    encoder, predictor = parts["encoder"], parts["predictor"]
+    width, _, _, _, patch_size = encoder["patch_embed.proj.weight"]
+    predictor_width, action_width = predictor["action_encoder.weight"]
+    if action_width != ACTION_DIM:
+        raise KeyError(f"action_encoder.weight of {ACTION_DIM} columns (it has {action_width})")
+    hidden = encoder["blocks.0.mlp.fc1.weight"][0]
+    predictor_hidden = predictor["predictor_blocks.0.mlp.fc1.weight"][0]
+    return ModelSizes(
+        image_size=given.image_size,
+        patch_size=patch_size,
+        encoder=EncoderSizes(
+            width=width,
+            depth=_depth(encoder, "blocks"),
+            heads=given.encoder.heads,
+            mlp_ratio=mlp_ratio_of(width, hidden, given.encoder.mlp_ratio),
+        ),
+        predictor=PredictorSizes(
+            width=predictor_width,
+            depth=_depth(predictor, "predictor_blocks"),
+            heads=given.predictor.heads,
+            mlp_ratio=mlp_ratio_of(predictor_width, predictor_hidden, given.predictor.mlp_ratio),
+            use_extrinsics=given.predictor.use_extrinsics,
+        ),
+    )
+
+
+def _depth(names: Mapping[str, object], blocks: str) -> int:
+    return 1 + max(int(name.split(".")[1]) for name in names if name.startswith(f"{blocks}."))
+
+
+def _fill(network: nn.Module, path: Path, part: str, dtype: torch.dtype) -> None:
+    """Give a network on the meta device its weights, a group of tensors at a time, dropping the mapped file between."""
+    needed = network.state_dict()
+    _check(_shapes(_open(path)[part]), _shapes(needed), part, where=str(path))
+    for names in _groups(needed):
+        mapped = _open(path)[part]
+        group = {name: _take(mapped, name, part).to(dtype, copy=True) for name in names}
+        require_finite(group, where=f"{path}: {part}", fix=_FIX)
+        network.load_state_dict(group, strict=False, assign=True)
+        del mapped
+    network.requires_grad_(False)
+
+
+def _check(found: dict[str, tuple[int, ...]], ours: dict[str, tuple[int, ...]], part: str, *, where: str) -> None:
+    needed: dict[str, tuple[int, ...]] = {}
+    for name, shape in ours.items():
+        official, third = official_name(name, part)
+        needed[official] = shape if third is None else (3 * shape[0], *shape[1:])
+    check_tensors(
+        {name: shape for name, shape in found.items() if name not in IGNORED[part]}, needed, where=f"{where}: {part}"
+    )
+
+
+def _take(official: Mapping[str, Tensor], name: str, part: str) -> Tensor:
+    fused, third = official_name(name, part)
+    return official[fused] if third is None else official[fused].chunk(3)[third]
+
+
+def _groups(weights: Mapping[str, Tensor]) -> Iterator[list[str]]:
+    group: list[str] = []
+    size = 0
+    for name, value in weights.items():
+        group.append(name)
+        size += value.numel() * 4
+        if size >= GROUP_BYTES:
+            yield group
+            group, size = [], 0
+    if group:
+        yield group
+
+
+def _to_official(weights: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
+    pieces: dict[str, dict[int | None, Tensor]] = {}
+    for name, value in weights.items():
+        fused, third = official_name(name, part)
+        pieces.setdefault(fused, {})[third] = value.detach()
+    return {f"module.{name}": _fuse(thirds) for name, thirds in pieces.items()}
+
+
+def _fuse(thirds: Mapping[int | None, Tensor]) -> Tensor:
+    return thirds[None] if None in thirds else torch.cat([thirds[index] for index in range(3)])

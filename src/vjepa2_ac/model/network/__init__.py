@@ -1,0 +1,1 @@
+"""The network: encoder, predictor, and what they are made of."""

@@ -1,0 +1,176 @@
+"""What is a block of the predictor made of? Attention with rotary positions, MLP, pre-norm residuals."""
+
+from __future__ import annotations
+
+import math
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+
+from vjepa2_ac.model.network.attention import AttentionKind, block_causal_attention
+from vjepa2_ac.model.network.compilation import When, compiled
+from vjepa2_ac.model.network.rotary import RotaryTables, rotate
+
+NORM_EPSILON = 1e-6
+INIT_STD = 0.02
+_PLAIN = "training.compile=off (planning.compile=off)"  # leaves blocks uncompiled
+
+
+class OutputLinear(nn.Linear):
+    """A linear layer whose output is added to the residual stream: starts smaller by sqrt(2 * layer), layer from 1."""
+
+    def __init__(self, inputs: int, outputs: int, layer: int) -> None:
+        super().__init__(inputs, outputs)
+        self.init_std = output_std(layer)
+
+
+class Attention(nn.Module):
+    """Layers around block-causal attention; queries, keys and values keep one type (SDPA refuses a mixture)."""
+
+    def __init__(self, width: int, heads: int, layer: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.q = nn.Linear(width, width)
+        self.k = nn.Linear(width, width)
+        self.v = nn.Linear(width, width)
+        self.o = OutputLinear(width, width, layer)
+
+    def project(
+        self, tokens: Float[Tensor, "batch sequence width"], tables: RotaryTables
+    ) -> tuple[
+        Float[Tensor, "batch heads sequence head_dim"],
+        Float[Tensor, "batch heads sequence head_dim"],
+        Float[Tensor, "batch heads sequence head_dim"],
+    ]:
+        """Return queries and keys, rotated, and values."""
+        query, key, value = (project(tokens).unflatten(-1, (self.heads, -1)) for project in (self.q, self.k, self.v))
+        query, key = rotate(query, tables), rotate(key, tables)
+        return query.transpose(1, 2), key.transpose(1, 2), value.transpose(1, 2)
+
+
+class Mlp(nn.Module):
+    """Two linear layers with the exact (erf) GELU between them."""
+
+    def __init__(self, width: int, hidden: int, layer: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(width, hidden)
+        self.activation = nn.GELU()
+        self.fc2 = OutputLinear(hidden, width, layer)
+
+    def forward(self, tokens: Float[Tensor, "*batch width"]) -> Float[Tensor, "*batch width"]:
+        """Return each token changed on its own."""
+        return self.fc2(self.activation(self.fc1(tokens)))  # type: ignore[no-any-return]  # nn.Module is untyped
+
+
+class Block(nn.Module):
+    """Attention and MLP, each on normalised tokens, each added to what came in.
+
+    A block keeps nothing itself, for gradient checkpointing computes it twice: what it knows of earlier steps is given
+    to it, and what later steps shall know is returned.
+
+    Args:
+        layer: Which block this is, from 1.
+    """
+
+    def __init__(self, width: int, heads: int, hidden: int, layer: int) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width, eps=NORM_EPSILON)
+        self.attn = Attention(width, heads, layer)
+        self.norm2 = nn.LayerNorm(width, eps=NORM_EPSILON)
+        self.mlp = Mlp(width, hidden, layer)
+        self.compiled: When = "never"  # its halves
+
+    def forward(
+        self,
+        tokens: Float[Tensor, "batch sequence width"],
+        tables: RotaryTables,
+        tokens_per_step: int,
+        kind: AttentionKind = "auto",
+        keep: int = 0,
+        *past: Float[Tensor, "2 batch heads _ head_dim"],
+    ) -> tuple[Float[Tensor, "batch sequence width"], Float[Tensor, "2 batch heads keep head_dim"] | None]:
+        """Return the tokens after this block, and a copy of the keys and values of the first `keep` tokens, if any.
+
+        Args:
+            tokens: Tokens of whole steps.
+            tables: Their positions.
+            tokens_per_step: How many make a step.
+            kind: How to compute attention.
+            keep: How many tokens' keys and values to return; keys are rotated already.
+            past: What earlier calls returned, in their order: the tokens come after these, and see them. One argument
+                each, for checkpointing knows of tensors among its arguments only.
+        """
+        before, after = _before_attention, _after_attention
+        if self.compiled == "always" or (self.compiled == "with gradients" and torch.is_grad_enabled()):
+            before, after = compiled(before, way_out=_PLAIN), compiled(after, way_out=_PLAIN)
+        query, key, value = before(self, tokens, tables)
+        kept = torch.stack((key[:, :, :keep], value[:, :, :keep])) if keep else None  # a copy: the rest can be freed
+        if past:
+            key, value = torch.cat((*past, torch.stack((key, value))), dim=3)
+        gathered = block_causal_attention(query, key, value, tokens_per_step, kind)
+        return after(self, tokens, gathered), kept
+
+
+def initialise(module: nn.Module, generator: Generator | None = None) -> None:
+    """Give one module (not its children) fresh weights: truncated normal, std 0.02; biases 0; norms 1.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, src/models/ac_predictor.py, _init_weights and _rescale_blocks.
+    """
+    if isinstance(module, nn.Linear | nn.Conv3d):
+        std = module.init_std if isinstance(module, OutputLinear) else INIT_STD
+        nn.init.trunc_normal_(module.weight, std=std, generator=generator)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+    elif isinstance(module, nn.LayerNorm):
+        nn.init.ones_(module.weight)
+        nn.init.zeros_(module.bias)
+
+
+def output_std(layer: int) -> float:
+    """Return the standard deviation of a fresh output layer of a block, counted from 1."""
+    return INIT_STD / math.sqrt(2 * layer)
+
+
+def _before_attention(block: Block, tokens: Tensor, tables: RotaryTables) -> tuple[Tensor, Tensor, Tensor]:
+    return block.attn.project(normalised(block.norm1, tokens), tables)
+
+
+def _after_attention(block: Block, tokens: Tensor, gathered: Tensor) -> Tensor:
+    tokens = tokens + block.attn.o(gathered.transpose(1, 2).flatten(2))
+    return tokens + block.mlp(normalised(block.norm2, tokens))  # type: ignore[no-any-return]  # nn.Module is untyped
+
+
+def normalised(norm: nn.LayerNorm, tokens: Tensor) -> Tensor:
+    """Return normalised tokens, cast once to the type that all layers after them compute in."""
+    kind = tokens.device.type
+    if not torch.is_autocast_enabled(kind):
+        return norm(tokens)  # type: ignore[no-any-return]  # nn.Module is untyped
+    with without_needless_autocast(tokens, norm.weight):
+        return norm(tokens).to(torch.get_autocast_dtype(kind))  # type: ignore[no-any-return]  # the same
+
+
+def without_needless_autocast(tokens: Tensor, weights: Tensor) -> AbstractContextManager[object]:
+    """Switch autocast off where tokens and weights have the type that it computes in.
+
+    There it only has norms computed from a float32 copy, and their result cast back by each layer after them. Their
+    kernels compute in float32 as it is: the same numbers, in a fifth of the bytes.
+    """
+    kind = tokens.device.type
+    if torch.is_autocast_enabled(kind) and tokens.dtype == weights.dtype == torch.get_autocast_dtype(kind):
+        return torch.autocast(kind, enabled=False)
+    return nullcontext()
+
+
+def hidden_width(width: int, mlp_ratio: float) -> int:
+    """Return the hidden width of an MLP: rounded down, as upstream does."""
+    return int(width * mlp_ratio)
+
+
+def mlp_ratio_of(width: int, hidden: int, expected: float) -> float:
+    """Return a ratio from which `hidden_width` gives `hidden`: the expected one where it does."""
+    if hidden_width(width, expected) == hidden:
+        return expected
+    exact = hidden / width
+    return exact if hidden_width(width, exact) == hidden else (hidden + 0.5) / width

@@ -1,0 +1,147 @@
+"""What does a frame look like to the model? The frozen V-JEPA 2 encoder, one frame at a time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+from torch.nn.functional import layer_norm, linear
+from transformers import VJEPA2Config
+from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
+
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.model.network.blocks import NORM_EPSILON, initialise, output_std, without_needless_autocast
+from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables, rotate
+
+TUBELET = 2  # frames that the encoder sees at once: here the same one twice
+
+
+class Encoder(nn.Module):
+    """Turns frames into features, each frame by itself; frozen, and always in eval mode.
+
+    The network is the encoder of transformers' `VJEPA2Model` (its masked predictor is never built), with rotary
+    tables computed once and in float32 (transformers makes angles in the type of the weights), and with patches
+    embedded by one product of matrices.
+    """
+
+    def __init__(self, sizes: ModelSizes) -> None:
+        super().__init__()
+        self.image_size = sizes.image_size
+        self.vit = VJEPA2Encoder(_config(sizes))
+        self.vit.embeddings.patch_embeddings.proj = _FramePatches(sizes.encoder.width, sizes.patch_size)
+        _share_exact_tables(self.vit, TokenLayout(1, sizes.image_size // sizes.patch_size))
+        self.vit.layernorm = _PreciseNorm(sizes.encoder.width, eps=NORM_EPSILON)
+        self.requires_grad_(False)
+        self.eval()
+
+    @torch.no_grad()
+    def forward(
+        self, frames: Float[Tensor, "frames 3 height width"], chunk: int = 16
+    ) -> Float[Tensor, "frames tokens dim"]:
+        """Return the features of normalised frames, not yet layer-normalised without affine, in float32.
+
+        Args:
+            frames: Frames normalised as in training.
+            chunk: Frames that go through the network at once: bounds the memory.
+
+        Raises:
+            ValueError: The frames have another size than the model's: the positions would be wrong.
+        """
+        if frames.shape[-2:] != (self.image_size, self.image_size):
+            raise ValueError(
+                f"frames of {frames.shape[-2]} x {frames.shape[-1]} px; this encoder needs {self.image_size} x"
+                f" {self.image_size} px (model.sizes.image_size)"
+            )
+        return torch.cat([self._encode(part) for part in torch.split(frames, chunk)])
+
+    def train(self, mode: bool = True) -> Encoder:  # noqa: ARG002  # a frozen encoder has one mode
+        """Stay in eval mode, whatever the model around it does."""
+        return super().train(False)
+
+    def initialise(self, generator: Generator) -> None:
+        """Give every weight a fresh value, decided by the generator alone.
+
+        Source: facebookresearch/vjepa2 @ c2963a4, src/models/vision_transformer.py, _init_weights and _rescale_blocks.
+        """
+        for module in self.modules():
+            initialise(module, generator)
+        for index, block in enumerate(self.vit.layer):
+            for output in (block.attention.proj, block.mlp.fc2):
+                nn.init.trunc_normal_(output.weight, std=output_std(index + 1), generator=generator)
+
+    def _encode(self, frames: Tensor) -> Tensor:
+        weight = next(self.vit.parameters())
+        tubelets = frames.to(weight.dtype)[:, None].expand(-1, TUBELET, -1, -1, -1)
+        with without_needless_autocast(tubelets, weight):
+            features: Tensor = self.vit(tubelets).last_hidden_state
+        return features
+
+
+class _FramePatches(nn.Conv3d):
+    """The patch embedding of a tubelet that is one frame over and over: the kernel is summed over time, once.
+
+    Half the arithmetic of the convolution, and a product of matrices, which every version of cuDNN leaves alone: some
+    have no fast convolution in three dimensions in bfloat16.
+    """
+
+    def __init__(self, width: int, patch_size: int) -> None:
+        kernel = (TUBELET, patch_size, patch_size)
+        super().__init__(3, width, kernel_size=kernel, stride=kernel)
+
+    def forward(
+        self, tubelets: Float[Tensor, "frames 3 time height width"]
+    ) -> Float[Tensor, "frames dim 1 rows columns"]:
+        """Return what the convolution would, of tubelets whose frames are all alike."""
+        side = self.kernel_size[-1]
+        frames = tubelets[:, :, 0]
+        patches = rearrange(frames, "n c (rows p) (columns q) -> n (rows columns) (c p q)", p=side, q=side)
+        embedded = linear(patches, self.weight.sum(dim=2).flatten(1), self.bias)
+        rows = frames.shape[-2] // side
+        return rearrange(embedded, "n (time rows columns) dim -> n dim time rows columns", time=1, rows=rows)
+
+
+class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformers has no types
+    """transformers' attention, turned by tables that are computed once, in float32."""
+
+    def __init__(self, config: Any, layout: TokenLayout) -> None:
+        super().__init__(config, config.hidden_size, config.num_attention_heads)
+        self.layout = layout
+
+    def apply_rotary_embeddings(self, qk: Tensor, pos_ids: Any) -> Tensor:  # noqa: ARG002  # positions are the layout's
+        """Return queries or keys [batch heads sequence head_dim] turned by their position."""
+        tables = rotary_tables(self.layout, qk.shape[-1], qk.device)
+        return rotate(qk.transpose(1, 2), tables).transpose(1, 2)
+
+
+class _PreciseNorm(nn.LayerNorm):
+    """The last norm, in float32: its result is normalised once more, and rounding it before would be for nothing."""
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        return layer_norm(tokens.float(), self.normalized_shape, self.weight.float(), self.bias.float(), self.eps)
+
+
+def _share_exact_tables(vit: Any, layout: TokenLayout) -> None:
+    """Give every layer an attention that uses our tables; the names of the weights stay."""
+    if not hasattr(VJEPA2RopeAttention, "apply_rotary_embeddings"):
+        raise RuntimeError("this version of transformers turns queries and keys elsewhere; 5.17 to 5.23 are tested")
+    for block in vit.layer:
+        block.attention = _ExactAttention(vit.config, layout)
+
+
+def _config(sizes: ModelSizes) -> Any:
+    config = VJEPA2Config(
+        patch_size=sizes.patch_size,
+        crop_size=sizes.image_size,
+        frames_per_clip=TUBELET,
+        tubelet_size=TUBELET,
+        hidden_size=sizes.encoder.width,
+        num_hidden_layers=sizes.encoder.depth,
+        num_attention_heads=sizes.encoder.heads,
+        mlp_ratio=sizes.encoder.mlp_ratio,
+        layer_norm_eps=NORM_EPSILON,
+    )
+    config._attn_implementation = "sdpa"
+    return config

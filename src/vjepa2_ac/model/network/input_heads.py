@@ -1,0 +1,94 @@
+"""What if a robot has other states or actions than the base knows? Fresh encoders for them, which must be trained."""
+
+from __future__ import annotations
+
+import hashlib
+
+import torch
+from torch import Generator, Tensor, nn
+
+from vjepa2_ac.config import AdapterConfig, ModelSizes
+from vjepa2_ac.episode import Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.blocks import initialise
+from vjepa2_ac.model.network.world_model import FreshHeads, WorldModel
+
+
+def heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
+    """Return which input heads of a model of these sizes do not take states and actions of these widths."""
+    fits = {
+        "action_encoder": sizes.predictor.action_dim == widths.action,
+        "state_encoder": sizes.predictor.state_dim == widths.state,
+    }
+    return tuple(name for name, does in fits.items() if not does)
+
+
+def require_trained(heads: tuple[str, ...], config: AdapterConfig) -> None:
+    """Refuse to leave a fresh head as it was drawn.
+
+    Raises:
+        InputError: An adapter is trained and a head is not among its modules_to_save; says what to set.
+    """
+    missing = [name for name in heads if name not in config.modules_to_save]
+    if config.kind == "none" or not missing:
+        return
+    whole = ", ".join([*config.modules_to_save, *missing])
+    raise InputError(
+        where="adapter.modules_to_save",
+        found=f"nothing that trains the {_in_words(missing)}, fresh because the data has other widths than the base",
+        needed="fresh heads are trained whole, beside the adapter",
+        fix=f"Set adapter.modules_to_save=[{whole}]",
+    )
+
+
+def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
+    """Replace the input heads that do not take states and actions of these widths by fresh ones.
+
+    They are drawn as the released recipe draws its weights, each from the seed and its own name. What the base is does
+    not change (`WorldModel.predictor_fingerprint`), but without training the model predicts noise.
+
+    Returns:
+        A line for each that was replaced; none where all fit.
+
+    Raises:
+        ValueError: The model has been adapted, or has fresh heads already.
+    """
+    heads = heads_to_replace(model.sizes, widths)
+    if not heads:
+        return []
+    if model.adaptation is not None or model.fresh_heads is not None:
+        raise ValueError("heads are replaced once, and before the model is adapted")
+    predictor = model.base_predictor
+    replaced: dict[str, Tensor] = {}
+    lines: list[str] = []
+    for name in heads:
+        own, width = getattr(predictor, name), widths.action if name == "action_encoder" else widths.state
+        replaced |= {f"{name}.{key}": value.detach().cpu() for key, value in own.state_dict().items()}
+        setattr(predictor, name, _fresh(own, width, _generator(seed, name)))
+        lines.append(f"{_in_words([name])}: {width} numbers instead of the base's {own.in_features}: initialised anew")
+    dims = {"action_dim": widths.action, "state_dim": widths.state}
+    predictor.config.update(dims)
+    sizes = model.sizes.predictor.model_copy(update=dims)
+    model.sizes = model.sizes.model_copy(update={"predictor": sizes})
+    model.fresh_heads = FreshHeads(replaced, seed)
+    return lines
+
+
+def widths_of_model(sizes: ModelSizes) -> Widths:
+    """Return how many numbers a model's states and actions have."""
+    return Widths(state=sizes.predictor.state_dim, action=sizes.predictor.action_dim)
+
+
+def _fresh(own: nn.Linear, width: int, generator: Generator) -> nn.Linear:
+    head = nn.Linear(width, own.out_features)
+    initialise(head, generator)
+    return head.to(own.weight.device, own.weight.dtype).requires_grad_(False)
+
+
+def _generator(seed: int, name: str) -> Generator:
+    digest = hashlib.blake2b(f"{seed}/{name}".encode(), digest_size=8).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest, "big") >> 1)
+
+
+def _in_words(names: list[str]) -> str:
+    return " and the ".join(name.replace("_", " ") for name in names)

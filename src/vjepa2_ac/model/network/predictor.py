@@ -1,0 +1,227 @@
+"""Where will the scene be after this action? The action-conditioned predictor of V-JEPA 2-AC."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Generator, Tensor, nn
+from torch.utils.checkpoint import checkpoint
+from transformers import PreTrainedConfig, PreTrainedModel
+
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.episode import ACTION_DIM, EXTRINSICS_DIM, STATE_DIM
+from vjepa2_ac.model.network.attention import AttentionKind
+from vjepa2_ac.model.network.blocks import NORM_EPSILON, Block, hidden_width, initialise, normalised
+from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
+
+
+class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
+    """Sizes of the predictor in the form transformers stores them; the defaults are the released ones."""
+
+    model_type = "vjepa2_ac_predictor"
+
+    def __init__(
+        self,
+        *,
+        image_size: int = 256,
+        patch_size: int = 16,
+        latent_dim: int = 1408,
+        hidden_size: int = 1024,
+        num_hidden_layers: int = 24,
+        num_attention_heads: int = 16,
+        mlp_ratio: float = 4.0,
+        use_extrinsics: bool = False,
+        action_dim: int = ACTION_DIM,
+        state_dim: int = STATE_DIM,
+        **common: Any,
+    ) -> None:
+        super().__init__(**common)
+        self.image_size = image_size
+        self.patch_size = patch_size
+        self.latent_dim = latent_dim
+        self.hidden_size = hidden_size
+        self.num_hidden_layers = num_hidden_layers
+        self.num_attention_heads = num_attention_heads
+        self.mlp_ratio = mlp_ratio
+        self.use_extrinsics = use_extrinsics
+        self.action_dim = action_dim
+        self.state_dim = state_dim
+
+    @classmethod
+    def from_sizes(cls, sizes: ModelSizes) -> PredictorConfig:
+        """Return the sizes of the predictor of a world model."""
+        return cls(
+            image_size=sizes.image_size,
+            patch_size=sizes.patch_size,
+            latent_dim=sizes.encoder.width,
+            hidden_size=sizes.predictor.width,
+            num_hidden_layers=sizes.predictor.depth,
+            num_attention_heads=sizes.predictor.heads,
+            mlp_ratio=sizes.predictor.mlp_ratio,
+            use_extrinsics=sizes.predictor.use_extrinsics,
+            action_dim=sizes.predictor.action_dim,
+            state_dim=sizes.predictor.state_dim,
+        )
+
+
+class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # transformers has no types
+    """Predicts, for every step, the latents of the next one from the latents, states and actions up to it.
+
+    The tokens of a step, in order: action, state, (extrinsics), patches. Output: patches only, not normalised.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, src/models/ac_predictor.py, VisionTransformerPredictorAC.
+    """
+
+    config_class = PredictorConfig
+    base_model_prefix = "predictor"
+    main_input_name = "latents"
+    supports_gradient_checkpointing = True
+    _no_split_modules = ["Block"]  # noqa: RUF012  # transformers reads a list
+
+    def __init__(self, config: PredictorConfig) -> None:
+        super().__init__(config)
+        width = config.hidden_size
+        hidden = hidden_width(width, config.mlp_ratio)
+        self.predictor_embed = nn.Linear(config.latent_dim, width)
+        self.action_encoder = nn.Linear(config.action_dim, width)
+        self.state_encoder = nn.Linear(config.state_dim, width)
+        self.extrinsics_encoder = nn.Linear(EXTRINSICS_DIM, width)  # always there, as in the official checkpoint
+        self.blocks = nn.ModuleList(
+            Block(width, config.num_attention_heads, hidden, layer=index + 1)
+            for index in range(config.num_hidden_layers)
+        )
+        self.predictor_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
+        self.predictor_proj = nn.Linear(width, config.latent_dim)
+        self.attention: AttentionKind = "auto"
+        self.gradient_checkpointing = False  # the name transformers switches
+        self.has_dropout = False  # in its blocks: then a block computed again draws the same masks again
+        self.post_init()
+
+    @property
+    def grid(self) -> int:
+        """Patches along one side of a frame."""
+        return int(self.config.image_size // self.config.patch_size)
+
+    def forward(
+        self,
+        latents: Float[Tensor, "batch time tokens dim"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
+        keep: int | None = None,
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return, at each step, the prediction of the next step's latents, not yet normalised.
+
+        Inputs of any float type are cast to the weights' type.
+
+        Args:
+            latents: Latents of consecutive steps.
+            actions: The action of each.
+            states: The state of each.
+            extrinsics: The camera of each, where the model uses it.
+            cache: The given steps come after those in the cache, and see them; then they are added to it.
+            keep: How many of the given steps are added, from the first; None: all of them.
+
+        Raises:
+            ValueError: The tokens do not belong to the image size, or extrinsics are missing or unasked for.
+        """
+        tokens, layout = self._assemble(latents, actions, states, extrinsics, cache)
+        tokens = self._through_blocks(tokens, layout, cache, keep)
+        patches = rearrange(tokens, "batch (time token) width -> batch time token width", time=layout.steps)[
+            :, :, layout.conditioning :
+        ]
+        return _in_own_type(self.predictor_proj, normalised(self.predictor_norm, patches), self._dtype)
+
+    def initialise(self, generator: Generator) -> None:
+        """Give every weight a fresh value, decided by the generator alone."""
+        for module in self.modules():
+            initialise(module, generator)
+
+    def start_at_persistence(self, generator: Generator) -> None:
+        """Make a fresh predictor begin close to copying: read latents through a rotation, write through its inverse.
+
+        The network has no path from its input to its output but these two layers; a tiny one that starts at random
+        spends most of its training on learning to copy. Exact where the predictor is as wide as a latent.
+        """
+        shape = self.predictor_embed.weight.shape
+        drawn = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)
+        drawn = drawn.double()  # or threads would change last bits
+        rotation, triangle = torch.linalg.qr(drawn)
+        rotation = rotation * triangle.diagonal().sign()
+        with torch.no_grad():
+            self.predictor_embed.weight.copy_(rotation if shape[0] >= shape[1] else rotation.T)
+            self.predictor_proj.weight.copy_(self.predictor_embed.weight.T)
+
+    def _assemble(
+        self,
+        latents: Tensor,
+        actions: Tensor,
+        states: Tensor,
+        extrinsics: Tensor | None,
+        cache: KeyValueCache | None = None,
+    ) -> tuple[Tensor, TokenLayout]:
+        """Return the sequence of tokens, step by step, and how it is laid out."""
+        if latents.shape[2] != self.grid**2:
+            raise ValueError(
+                f"{latents.shape[2]} tokens a step do not make a frame of {self.config.image_size} px with patches of"
+                f" {self.config.patch_size} px ({self.grid} x {self.grid} = {self.grid**2} tokens)"
+            )
+        if self.config.use_extrinsics != (extrinsics is not None):
+            raise ValueError(
+                f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
+            )
+        given = [(self.action_encoder, actions), (self.state_encoder, states)]
+        given += [] if extrinsics is None else [(self.extrinsics_encoder, extrinsics)]
+        conditions = [_in_own_type(layer, values, self._dtype) for layer, values in given]
+        patches = _in_own_type(self.predictor_embed, latents, self._dtype)
+        tokens = torch.cat([torch.stack(conditions, dim=2), patches], dim=2)
+        start = 0 if cache is None else cache.tokens // tokens.shape[2]
+        return tokens.flatten(1, 2), TokenLayout(latents.shape[1], self.grid, len(conditions), start)
+
+    def _through_blocks(
+        self, tokens: Tensor, layout: TokenLayout, cache: KeyValueCache | None, keep: int | None
+    ) -> Tensor:
+        """Return the tokens after all blocks, which see the cache; what they leave for later steps goes into it."""
+        tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
+        how = (tables, layout.tokens_per_step, self.attention)
+        steps = layout.steps if keep is None else min(keep, layout.steps)
+        kept_tokens = 0 if cache is None else steps * layout.tokens_per_step
+        added: list[Tensor] = []
+        for index, block in enumerate(self.blocks):
+            past = () if cache is None else cache.layer(index)
+            if self.gradient_checkpointing and torch.is_grad_enabled():
+                given = (tokens, *how, kept_tokens, *past)
+                tokens, kept = checkpoint(block, *given, use_reentrant=False, preserve_rng_state=self.has_dropout)
+            else:
+                tokens, kept = block(tokens, *how, kept_tokens, *past)
+            if kept is not None:
+                added.append(kept)
+        if cache is not None and added:
+            cache.append(added)
+        return tokens
+
+    def _init_weights(self, module: nn.Module) -> None:
+        """Initialise one module: what transformers calls for weights that a checkpoint lacks."""
+        initialise(module)
+
+    @property
+    def _dtype(self) -> torch.dtype:
+        """The base's type; a head that is trained whole may have another."""
+        return self.predictor_norm.weight.dtype
+
+    @property
+    def is_gradient_checkpointing(self) -> bool:
+        """Whether blocks are computed again in the backward pass; PEFT asks, and transformers' own answer warns."""
+        return self.gradient_checkpointing
+
+
+def _in_own_type(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:
+    """Apply a layer that may be trained, and so be float32, in a predictor of another type; autocast knows its own."""
+    if torch.is_autocast_enabled(values.device.type):
+        return layer(values)  # type: ignore[no-any-return]  # PEFT may be around it, untyped
+    return layer(values.to(layer.weight.dtype)).to(dtype)  # type: ignore[no-any-return]  # the same

@@ -1,0 +1,285 @@
+"""What will be seen after these actions? Encoder and predictor together: encode, predict, roll out, save and load."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import layer_norm
+
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.model.network.attention import AttentionKind
+from vjepa2_ac.model.network.compilation import When
+from vjepa2_ac.model.network.encoder import Encoder
+from vjepa2_ac.model.network.kv_cache import KeyValueCache
+from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
+from vjepa2_ac.model.network.pretrained_folder import ENCODER, PREDICTOR, load_safetensors, read_sizes, write_folder
+
+
+@dataclass(frozen=True)
+class Adaptation:
+    """What `model.adapter.lora` did to the predictor."""
+
+    kind: str  # as in config.AdapterConfig: lora, or none when every weight is trained
+    base: str  # fingerprint of the predictor it started from
+    encoder: str  # fingerprint of the encoder whose latents it learns from
+    start: dict[str, Tensor] | None = None  # weights it started from: all (kind none), or the adapted ones (PiSSA)
+    principal: dict[str, Tensor] | None = None  # PiSSA: the matrices that were taken off those weights
+
+
+@dataclass(frozen=True)
+class FreshHeads:
+    """What `input_heads` did to the predictor: encoders for states or actions of other widths than the base's."""
+
+    replaced: dict[str, Tensor]  # the base's own, by their names in the predictor
+    seed: int  # that decided the new ones
+
+
+class AbsentEncoder(nn.Module):
+    """Stands where an encoder was that is not needed any more."""
+
+    def __init__(self, fingerprint: str) -> None:
+        super().__init__()
+        self.fingerprint = fingerprint  # of the one that was here
+
+
+class WorldModel(nn.Module):
+    """A frozen encoder and an action-conditioned predictor.
+
+    Latents and predictions are layer-normalised over `dim` without affine, and float32 whatever the weights' type:
+    inputs are cast inside. What trains is decided by `model.adapter.lora.add_adapter`; until then nothing does.
+
+    Build one with `random`, `from_pretrained` or `model.checkpoints.official.load_official`.
+    """
+
+    def __init__(self, sizes: ModelSizes) -> None:
+        super().__init__()
+        self.sizes = sizes
+        self.encoder: Encoder | AbsentEncoder = Encoder(sizes)
+        self.predictor: nn.Module = ActionConditionedPredictor(PredictorConfig.from_sizes(sizes))
+        self.predictor.requires_grad_(False)
+        self.adaptation: Adaptation | None = None
+        self.fresh_heads: FreshHeads | None = None
+
+    @classmethod
+    def random(
+        cls,
+        sizes: ModelSizes,
+        seed: int,
+        dtype: torch.dtype = torch.float32,
+        *,
+        at_persistence: bool = False,
+        device: torch.device | str = "cpu",
+    ) -> WorldModel:
+        """Return a freshly initialised model: the same weights for the same sizes, seed and kind of device.
+
+        Weights are drawn as in the released recipe; `at_persistence` lets the predictor begin close to copying. They
+        are drawn where they are to be: the full size takes half a minute of one CPU core, and no time on a GPU.
+        """
+        model = cls.empty(sizes).to_empty(device=device)
+        generator = torch.Generator(device).manual_seed(seed)
+        model.present_encoder.initialise(generator)
+        model.base_predictor.initialise(generator)
+        if at_persistence:
+            model.base_predictor.start_at_persistence(generator)
+        return model.to(dtype)
+
+    @classmethod
+    def empty(cls, sizes: ModelSizes) -> WorldModel:
+        """Return a model without weights (on the meta device), for loaders to fill; in eval mode."""
+        with torch.device("meta"):
+            return cls(sizes).eval()
+
+    @classmethod
+    def from_pretrained(cls, folder: str | Path, dtype: torch.dtype | None = None) -> WorldModel:
+        """Read a folder written by `save_pretrained`; `dtype` None keeps the type of each file.
+
+        Raises:
+            InputError: The folder is not a world model, is incomplete or damaged.
+        """
+        folder = Path(folder)
+        model = cls.empty(read_sizes(folder))
+        load_safetensors(model.encoder, folder / ENCODER, dtype)
+        load_safetensors(model.predictor, folder / PREDICTOR, dtype)
+        return model
+
+    def save_pretrained(self, folder: str | Path) -> None:
+        """Write config.json, encoder.safetensors and predictor/ (which transformers can load by itself).
+
+        Raises:
+            InputError: The folder cannot be written.
+            ValueError: An adapter is on: merge it first, or save it with `lora.save_trained`. Or the encoder was
+                set aside.
+        """
+        if self.predictor is not self.base_predictor:
+            raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_trained saves it alone")
+        write_folder(Path(folder), self.sizes, self.present_encoder, self.predictor)
+
+    @property
+    def image_size(self) -> int:
+        """Height and width of a frame in pixels."""
+        return self.sizes.image_size
+
+    @property
+    def num_tokens(self) -> int:
+        """Tokens of one frame."""
+        return (self.sizes.image_size // self.sizes.patch_size) ** 2
+
+    @property
+    def latent_dim(self) -> int:
+        """Width of a latent."""
+        return self.sizes.encoder.width
+
+    @property
+    def device(self) -> torch.device:
+        """Where the predictor's weights are."""
+        return next(self.predictor.parameters()).device
+
+    @property
+    def present_encoder(self) -> Encoder:
+        """The encoder.
+
+        Raises:
+            ValueError: It was set aside.
+        """
+        if isinstance(self.encoder, Encoder):
+            return self.encoder
+        raise ValueError("the encoder was set aside: latents come from a cache")
+
+    def set_encoder_aside(self) -> None:
+        """Let go of the encoder's weights, for good: latents come from a cache. Its fingerprint stays known."""
+        if isinstance(self.encoder, Encoder):
+            self.encoder = AbsentEncoder(self.encoder_fingerprint())
+
+    @property
+    def base_predictor(self) -> Any:
+        """The predictor itself, out of whatever adapter is around it."""
+        wrapped = getattr(self.predictor, "get_base_model", None)  # PEFT's
+        return wrapped() if wrapped else self.predictor
+
+    @torch.no_grad()
+    def encode(
+        self, frames: Float[Tensor, "batch time 3 height width"], chunk: int = 16
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return the latents of normalised frames, each frame encoded by itself.
+
+        Args:
+            frames: Frames normalised as in training (ImageNet mean and std).
+            chunk: Frames that go through the encoder at once: bounds the memory.
+
+        Raises:
+            ValueError: The frames have another size than `image_size`; or the encoder was set aside.
+        """
+        features = _normalise(self.present_encoder(frames.flatten(0, 1), chunk))
+        return rearrange(features, "(batch time) tokens dim -> batch time tokens dim", batch=len(frames))
+
+    def predict(
+        self,
+        latents: Float[Tensor, "batch time tokens dim"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
+        keep: int | None = None,
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return, at each step, the prediction of the next step's latents from the given ones (teacher forcing).
+
+        With a cache the given steps come after those in it; the first `keep` of them are added to it (None: all).
+        """
+        if cache is None:
+            return _normalise(self.predictor(latents, actions, states, extrinsics))
+        return _normalise(self.predictor(latents, actions, states, extrinsics, cache=cache, keep=keep))
+
+    def rollout(
+        self,
+        context: Float[Tensor, "batch context tokens dim"],
+        actions: Float[Tensor, "batch time action_dim"],
+        states: Float[Tensor, "batch time state_dim"],
+        extrinsics: Float[Tensor, "batch time 6"] | None = None,
+        cache: KeyValueCache | None = None,
+    ) -> Float[Tensor, "batch steps tokens dim"]:
+        """Return predictions of the steps after the context, each fed back to make the next.
+
+        With frames counted from 0, the context holds frames 0 .. context-1 and the result frames context .. time: the
+        first is predicted from the context alone, so index h - 1 is horizon h, and there are time - context + 1 of
+        them. Actions and states are the true ones throughout. A context need not be true: to go on from a
+        prediction that is already known, append it to the context.
+
+        The context is computed at once, then one step at a time: keys and values are kept. With a cache, context,
+        actions and states come after the steps in it; it is left as it is, so that many rollouts can start from it.
+
+        Raises:
+            ValueError: There are fewer actions than context latents.
+        """
+        first, last = context.shape[1], actions.shape[1]
+        if last < first:
+            raise ValueError(f"{last} actions do not reach the end of a context of {first} latents")
+        cache = KeyValueCache() if cache is None else cache.copy()
+        latents, start = context, 0
+        predicted = []
+        for end in range(first, last + 1):
+            camera = None if extrinsics is None else extrinsics[:, start:end]
+            keep = None if end < last else 0  # nothing comes after the last
+            following = self.predict(latents, actions[:, start:end], states[:, start:end], camera, cache, keep)
+            latents, start = following[:, -1:], end
+            predicted.append(latents)
+        return torch.cat(predicted, dim=1)
+
+    def set_gradient_checkpointing(self, enabled: bool) -> None:
+        """Choose whether predictor blocks are computed again in the backward pass instead of being kept."""
+        predictor = self.base_predictor
+        predictor.gradient_checkpointing = enabled
+        predictor.has_dropout = any(isinstance(one, nn.Dropout) and one.p > 0 for one in predictor.blocks.modules())
+
+    def set_compiled(self, when: When) -> None:
+        """Choose when predictor blocks are compiled (see `model.network.compilation`)."""
+        for block in self.base_predictor.blocks:
+            block.compiled = when
+
+    def set_attention(self, kind: AttentionKind) -> None:
+        """Choose how the predictor computes block-causal attention (see `model.network.attention`)."""
+        self.base_predictor.attention = kind
+
+    def encoder_fingerprint(self) -> str:
+        """Return a hash that says which encoder made a latent: key cached latents by it."""
+        if isinstance(self.encoder, AbsentEncoder):
+            return self.encoder.fingerprint
+        return fingerprint(self.encoder.state_dict())
+
+    def predictor_fingerprint(self) -> str:
+        """Return a hash of the predictor's own weights; neither an adapter on them nor fresh heads change it."""
+        replaced = {} if self.fresh_heads is None else self.fresh_heads.replaced
+        return fingerprint(base_weights(self.base_predictor) | replaced)
+
+
+def fingerprint(weights: Mapping[str, Tensor]) -> str:
+    """Return the SHA-256 of names, shapes and values rounded to bfloat16.
+
+    Rounding makes it the same whether a checkpoint was loaded in float32 or in bfloat16.
+    """
+    digest = hashlib.sha256()
+    for name, value in sorted(weights.items()):
+        digest.update(f"{name} {tuple(value.shape)}\n".encode())
+        rounded = value.detach().to("cpu", torch.bfloat16).contiguous()
+        digest.update(rounded.view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def base_weights(predictor: nn.Module) -> dict[str, Tensor]:
+    """Return the weights of a predictor by their plain names, without those of an adapter."""
+    return {
+        name.replace(".base_layer.", ".").replace(".original_module.", "."): value
+        for name, value in predictor.state_dict().items()
+        if ".lora_" not in name and ".modules_to_save." not in name
+    }
+
+
+def _normalise(features: Float[Tensor, "*batch dim"]) -> Float[Tensor, "*batch dim"]:
+    return layer_norm(features.float(), features.shape[-1:])

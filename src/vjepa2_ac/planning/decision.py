@@ -1,0 +1,104 @@
+"""What would the robot do here, and why? One decision, with all that is needed to judge it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from vjepa2_ac.planning.action_space import ActionSpace
+from vjepa2_ac.planning.controller import Controller, Decision
+from vjepa2_ac.planning.energy_slices import EnergySlice, energy_slices
+
+
+@dataclass(frozen=True, eq=False)
+class PlanRequest:
+    """What is seen, and what is wanted."""
+
+    start: UInt8[np.ndarray, "height width 3"]
+    state: Float[np.ndarray, " numbers"]  # measured; a pose is refused or taken by the controller
+    goals: tuple[np.ndarray, ...]
+    durations: tuple[int, ...] = ()  # model steps of each goal but the last
+    mask: np.ndarray | None = None  # what of the picture counts: height x width
+
+    def with_equal_durations(self, horizon: int) -> PlanRequest:
+        """Return the same, every goal counting for an equal share of so many model steps, the last for the rest."""
+        return replace(self, durations=(max(1, horizon // len(self.goals)),) * (len(self.goals) - 1))
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """What took how long."""
+
+    goals: float  # encoding them
+    decision: float  # encoding the start, and planning
+    slices: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlanResult:
+    """A decision, and what else could have been decided."""
+
+    question: PlanRequest
+    controller: Controller
+    decision: Decision
+    actions: Float[np.ndarray, "steps 7"]  # zero where the decision is to do nothing
+    states: Float[np.ndarray, "steps+1 7"]  # where they lead, as far as poses tell
+    doing_nothing: float  # energy that the model predicts for no motion; not a number where it was not asked
+    slices: tuple[EnergySlice, ...]  # empty where there is no plan, or none were asked for
+    seconds: Seconds
+
+    @property
+    def space(self) -> ActionSpace:
+        """What was allowed."""
+        return self.controller.space
+
+    @property
+    def unused_goals(self) -> tuple[int, ...]:
+        """Goals that have no part in the plan: their time comes after its end, or only its last step counts."""
+        ahead = self.decision.goals
+        counted = set(ahead[-1:] if self.controller.config.energy.steps == "last" else ahead)
+        return tuple(place for place in range(len(self.question.goals)) if place not in counted)
+
+
+def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0) -> PlanResult:
+    """Decide once, and look around the decision.
+
+    Args:
+        controller: Which plans; it is reset.
+        question: What is seen, and what is wanted.
+        nodes: Of an energy slice along each axis; below 3: no slices.
+
+    Raises:
+        InputError: A picture, the state or the mask cannot be used.
+        ValueError: There is not one duration for each goal but the last.
+    """
+    began = time.perf_counter()
+    controller.reset(*question.goals, durations=question.durations, mask=question.mask)
+    ready = time.perf_counter()
+    controller.act(question.start, question.state)
+    decided = time.perf_counter()
+    decision = controller.decision
+    if decision is None:
+        raise ValueError("a controller that acted has decided")
+    still = np.nan
+    slices: tuple[EnergySlice, ...] = ()
+    if decision.plan is not None and decision.cost is not None:
+        with torch.no_grad():
+            still = float(decision.cost(torch.zeros_like(decision.plan.actions)[None])[0])
+        if nodes >= 3 and decision.why != "no finite energy":
+            slices = energy_slices(decision.cost, decision.plan.actions, controller.space, nodes=nodes)
+    steps = controller.space.steps
+    return PlanResult(
+        question=question,
+        controller=controller,
+        decision=decision,
+        actions=np.zeros((steps, 7)) if decision.plan is None else decision.plan.actions.double().numpy(),
+        states=np.tile(question.state, (steps + 1, 1)) if decision.states is None else decision.states,
+        doing_nothing=still,
+        slices=slices,
+        seconds=Seconds(ready - began, decided - ready, time.perf_counter() - decided),
+    )

@@ -1,0 +1,89 @@
+"""What is asked of a planner, and what does it answer? A cost in, a plan out.
+
+Axes: samples (action sequences), decisions (actions that are chosen), steps (of the model; a decision is repeated for
+`ActionSpace.repeat` of them), dim (numbers of an action). All on the CPU.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import torch
+from einops import reduce
+from jaxtyping import Float
+from torch import Tensor
+
+Stopped = Literal["finished", "out of time", "no finite energy"]
+
+
+@runtime_checkable
+class Cost(Protocol):
+    """All that a planner knows of a model: what action sequences cost. Lower is better; not a number is not allowed."""
+
+    def __call__(self, actions: Float[Tensor, "samples steps dim"]) -> Float[Tensor, " samples"]:
+        """Return the energy of each action sequence; for `gradient`, as a differentiable function of it."""
+        ...
+
+
+@dataclass(frozen=True)
+class PlanStart:
+    """Where a search begins, if not from nothing: at what the last decision left."""
+
+    mean: Float[Tensor, "decisions dim"]
+    elites: Float[Tensor, "elites decisions dim"]
+
+
+@dataclass(frozen=True)
+class Iteration:
+    """One round of trying and learning, for a picture of it later."""
+
+    samples: int
+    finite: int  # of these, how many have an energy
+    lowest: float  # energy of this iteration's best; infinite where there is none
+    elite_energy: float  # mean of the elites' energies; infinite where there are none
+    elites: Float[Tensor, "elites decisions dim"]  # best first
+    elite_energies: Float[Tensor, " elites"]
+    mean: Float[Tensor, "decisions dim"]  # of the distribution after it
+    std: Float[Tensor, "decisions dim"]
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to do, and how it was found."""
+
+    actions: Float[Tensor, "steps dim"]  # within the limits, always
+    energy: float  # of these actions; not a number where the plan is to do nothing
+    stopped: Stopped  # with "no finite energy" the actions are zero
+    iterations: tuple[Iteration, ...]
+    mean: Float[Tensor, "decisions dim"]  # where the search ended, before the gripper is rounded
+    repeat: int  # model steps of a decision
+    planner: str
+    seed: int
+    evaluations: int  # action sequences that were tried
+    seconds: float
+
+    def start_after(self, done: int) -> PlanStart:
+        """Return where the next decision begins when some model steps of this plan were done.
+
+        A decision of the next plan begins at the mean of what this one would have done in its model steps: within an
+        action that is repeated, a decision begins between two of this plan's. The last decision is repeated for what
+        the plan did not reach.
+
+        Raises:
+            ValueError: A negative number of steps.
+        """
+        if done < 0:
+            raise ValueError(f"{done} steps were done")
+        elites = self.iterations[-1].elites if self.iterations else self.mean[None][:0]
+        return PlanStart(_later(self.mean[None], done, self.repeat)[0], _later(elites, done, self.repeat))
+
+
+def _later(
+    decisions: Float[Tensor, "samples decisions dim"], by: int, repeat: int
+) -> Float[Tensor, "samples decisions dim"]:
+    steps = decisions.shape[1] * repeat
+    places = (torch.arange(steps) + by).clamp(max=steps - 1) // repeat
+    at_steps = decisions[:, places]
+    return reduce(at_steps, "samples (decisions repeat) dim -> samples decisions dim", "mean", repeat=repeat)

@@ -1,0 +1,94 @@
+"""What stands in plan.json? A decision as plain values, by a schema that docs/planning.md explains."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vjepa2_ac.planning.decision import PlanResult
+from vjepa2_ac.planning.energy_slices import AXES, EnergySlice
+from vjepa2_ac.planning.interfaces import Iteration
+from vjepa2_ac.planning.summary import summarize
+from vjepa2_ac.storage import write_atomically
+
+PLAN_FILE = "plan.json"
+FORMAT = 1  # goes up when a reader of the file would have to change
+
+_NUMBERS = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null),?\s+)+)\]")  # a list of numbers, over lines
+
+
+def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
+    """Write a decision as JSON; the file appears whole or not at all.
+
+    Args:
+        answer: The decision.
+        about: What answered, and where the pictures came from: plain values.
+        path: The file.
+    """
+    text = json.dumps(plan_as_dict(answer, about), indent=1, allow_nan=False)
+    write_atomically(path, _NUMBERS.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n")
+    return path
+
+
+def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what stands in the file; numbers that are not finite are null."""
+    decision, plan, config = answer.decision, answer.decision.plan, answer.controller.config
+    return {
+        "format": FORMAT,
+        "in_words": summarize(answer),
+        **about,
+        "state": _plain(answer.question.state),
+        "durations": list(answer.question.durations),
+        "settings": config.model_dump(mode="json"),
+        "seed": answer.controller.seed,
+        "crop": answer.controller.crop,
+        "why": decision.why,
+        "actions": _plain(answer.actions),
+        "states": _plain(answer.states),
+        "goal_of_each_step": list(decision.goals),
+        "energy": {
+            "now": _number(decision.energy_now),
+            "doing_nothing": _number(answer.doing_nothing),
+            "plan": None if plan is None else _number(plan.energy),
+        },
+        "evaluations": 0 if plan is None else plan.evaluations,
+        "iterations": [] if plan is None else [_iteration(one) for one in plan.iterations],
+        "slices": [_slice(one) for one in answer.slices],
+        "seconds": {
+            "goals": answer.seconds.goals,
+            "decision": answer.seconds.decision,
+            "search": 0.0 if plan is None else plan.seconds,
+            "slices": answer.seconds.slices,
+        },
+    }
+
+
+def _iteration(one: Iteration) -> dict[str, Any]:
+    return {
+        "samples": one.samples,
+        "finite": one.finite,
+        "lowest": _number(one.lowest),
+        "elites_mean": _number(one.elite_energy),
+        "mean": _plain(one.mean.double().numpy()),
+        "std": _plain(one.std.double().numpy()),
+        "seconds": one.seconds,
+    }
+
+
+def _slice(one: EnergySlice) -> dict[str, Any]:
+    across, up = (AXES[axis] for axis in one.axes)
+    return {"across": across, "up": up, across: _plain(one.across), up: _plain(one.up), "energy": _plain(one.energy)}
+
+
+def _plain(values: np.ndarray) -> Any:
+    return [_plain(row) if row.ndim else _number(float(row)) for row in np.asarray(values, dtype=np.float64)]
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,191 @@
+"""What is planned with? A model of its own or what a run has learned, and the settings that go with it."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from vjepa2_ac import __version__
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_from, load_config
+from vjepa2_ac.distributed.device import has_bf16, is_on_cpu, require_type_of_weights
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.merging import merge_adapter
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
+from vjepa2_ac.model.quantization import require_8_bits
+from vjepa2_ac.places import literal
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.runs.checkpoint_selection import NEWEST
+from vjepa2_ac.runs.folder import CONFIG
+from vjepa2_ac.runs.loading import is_run, load_run
+
+# Settings that planning heeds; the others are of training, and changing them here would do nothing.
+_HEEDED = ("planning.", "seed", "data.crop", "data.stride", "model.dtype", "model.sizes.", "training.device")
+_ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
+
+
+class Fingerprints(NamedTuple):
+    """Hashes of a model's weights."""
+
+    encoder: str
+    base: str  # of the predictor before it was adapted
+    predictor: str  # with what was trained
+
+    @classmethod
+    def of(cls, model: WorldModel) -> Fingerprints:
+        """Hash a model, an adapter apart from its base."""
+        known, whole = model.adaptation, fingerprint(model.predictor.state_dict())
+        if known is not None:
+            return cls(known.encoder, known.base, whole)
+        return cls(model.encoder_fingerprint(), model.predictor_fingerprint(), whole)
+
+
+@dataclass(frozen=True)
+class PlanningSession:
+    """A world model on its device, in eval mode, what was trained merged into it; and how to plan with it."""
+
+    world_model: WorldModel
+    config: Config  # of it: planning, seed, data.crop and data.stride count
+    subject: str  # what was named
+    checkpoint: str  # which one, in words; "" of a model
+    fingerprints: Fingerprints | None = None  # of a run's weights before they were merged; None: of the world model
+
+    def controller(
+        self,
+        *,
+        seed: int | None = None,
+        extrinsics: Float[np.ndarray, " 6"] | None = None,
+        progress: Progress | None = None,
+    ) -> Controller:
+        """Return a controller with these settings.
+
+        Args:
+            seed: Of all decisions; None: the config's.
+            extrinsics: Pose of the camera, where the model uses it.
+            progress: Is told how many iterations of a decision are done.
+
+        Raises:
+            InputError: The model's states are no poses, or it needs a camera pose and there is none.
+        """
+        return Controller(
+            self.world_model,
+            self.config.planning,
+            seed=self.config.seed if seed is None else seed,
+            crop=self.config.data.crop,
+            extrinsics=extrinsics,
+            progress=progress,
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return which model this is, as plain values: what was named, and hashes of the weights."""
+        model = self.world_model
+        dtype = next(model.parameters()).dtype
+        return {
+            "version": __version__,
+            "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "model": {
+                "subject": self.subject,
+                "checkpoint": self.checkpoint or None,
+                **(self.fingerprints or Fingerprints.of(model))._asdict(),
+                "dtype": str(dtype).removeprefix("torch."),
+                "device": model.device.type,
+                "image_size": model.image_size,
+            },
+            "control_steps_of_a_model_step": self.config.data.stride,
+            "frame_of_states": self.config.data.pose_frame,
+        }
+
+
+def load_to_plan(
+    subject: str, *, checkpoint: str = NEWEST, config: str | Path | None = None, overrides: Sequence[str] = ()
+) -> PlanningSession:
+    """Load what to plan with.
+
+    The settings of a run are those of its config: planning, seed, crop, stride, type of the weights. Those of a model
+    are the given config's; without one the defaults, and float32 weights where the device has no bfloat16, or is a CPU.
+    What a run has trained is merged before it is on the device (see `planning.model_setup`): it is there once.
+
+    Args:
+        subject: The folder of a run; or a model: what `model.base` takes.
+        checkpoint: Of a run: newest, best, or a number of optimizer steps.
+        config: A config file, for a model.
+        overrides: Such as planning.horizon=2.
+
+    Raises:
+        InputError: There is no such thing, it cannot be planned with, or a setting is wrong or does not matter.
+    """
+    _require_heeded(overrides)
+    its = _run_config(subject, config, overrides) if is_run(subject) else _model_config(subject, config, overrides)
+    if its.data.states == "vector":
+        raise InputError(
+            where=subject, found="data.states: vector", needed="a model of poses: actions are limited in metres"
+        )
+    device = _device_to_plan_on(its)
+    if is_run(subject):
+        run = load_run(Path(subject), checkpoint, its)
+        known = Fingerprints.of(run.world_model)
+        merge_adapter(run.world_model)
+        return PlanningSession(run.world_model.to(device).eval(), its, subject, run.chosen, known)
+    if checkpoint != NEWEST:
+        raise InputError(
+            where=f"--checkpoint {checkpoint}",
+            found=f"{subject}, which is not the folder of a run",
+            needed="a run: a model has no checkpoints to choose from",
+        )
+    return PlanningSession(load_base(its.model, seed=its.seed).to(device).eval(), its, subject, "")
+
+
+def _device_to_plan_on(config: Config) -> torch.device:
+    """Return the device, once it is certain that it computes in the type that planning does: without autocast.
+
+    Raises:
+        InputError: It does not, or not in the 8 bits that are asked for.
+    """
+    device = torch.device("cpu" if is_on_cpu(config.training) else "cuda")
+    require_type_of_weights(config.model, device)
+    kind = config.planning.quantize
+    if kind != "off":
+        require_8_bits(kind, getattr(torch, config.model.dtype), device, where="planning.quantize")
+    return device
+
+
+def _run_config(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
+    if config is not None:
+        raise InputError(
+            where=f"--config {config}",
+            found=f"{subject}, a run, which has a config of its own",
+            needed="one config",
+            fix="Change single settings behind the run's name, such as planning.horizon=2",
+        )
+    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(literal(Path(subject)))}", _ANY_TYPE])
+
+
+def _model_config(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
+    if config is None:
+        dtype = "bfloat16" if torch.cuda.is_available() and has_bf16() else "float32"
+        plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
+        return config_from(plain, overrides, where="command line")
+    its = load_config(config, [*overrides, _ANY_TYPE])
+    return its.model_copy(update={"model": its.model.model_copy(update={"base": subject, "random": None})})
+
+
+def _require_heeded(overrides: Sequence[str]) -> None:
+    for override in overrides:
+        key = override.partition("=")[0]
+        is_heeded = any(key == known or (known.endswith(".") and key.startswith(known)) for known in _HEEDED)
+        if key.split(".")[0] in Config.model_fields and not is_heeded:  # of others the config says what is wrong
+            raise InputError(
+                where=f"command line: {override}",
+                found="a setting that planning does not heed",
+                needed=f"one of {', '.join(known + '…' * known.endswith('.') for known in _HEEDED)}",
+            )

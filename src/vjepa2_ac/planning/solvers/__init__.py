@@ -1,0 +1,1 @@
+"""Solvers: which actions cost least? CEM, iCEM, MPPI, gradient descent."""

@@ -1,0 +1,67 @@
+"""How does a planner try and learn? What all of them share: samples, their energies, the best of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from vjepa2_ac.planning.action_space import ActionSpace
+
+
+@dataclass(frozen=True)
+class EvaluatedPlans:
+    """Decisions with their energies; those without a finite one are left out, so there may be none at all."""
+
+    decisions: Float[Tensor, "finite decisions dim"]
+    energies: Float[Tensor, " finite"]
+    gradients: Float[Tensor, "samples decisions dim"] | None = None  # of all samples, 0 where not finite
+
+    def best(self, count: int) -> EvaluatedPlans:
+        """Return the few of lowest energy, best first; fewer where there are no more."""
+        order = self.energies.sort(stable=True).indices[:count]
+        return EvaluatedPlans(self.decisions[order], self.energies[order])
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """One decision's search, from its first samples to its answer."""
+
+    elites: int  # how many of the best are recorded
+    uses_gradients: bool
+
+    @property
+    def mean(self) -> Float[Tensor, "decisions dim"]:
+        """Where it looks."""
+        ...
+
+    @property
+    def std(self) -> Float[Tensor, "decisions dim"]:
+        """How far around."""
+        ...
+
+    def sample(self) -> Float[Tensor, "samples decisions dim"]:
+        """Return what to try next: allowed decisions."""
+        ...
+
+    def update(self, tried: EvaluatedPlans) -> None:
+        """Take what came of it into account. Without any finite energy, everything stays as it is."""
+        ...
+
+    def result(self) -> Float[Tensor, "decisions dim"] | None:
+        """Return the decisions it stands for now; None: the best that was tried."""
+        ...
+
+
+def white_noise(space: ActionSpace, samples: int, generator: Generator) -> Float[Tensor, "samples decisions dim"]:
+    """Return independent standard normal numbers, zero on axes that are held throughout.
+
+    Drawn decision by decision and for free axes only, in upstream's order: the same seed gives upstream's samples.
+    """
+    noise = torch.zeros(samples, space.decisions, space.dim)
+    for decision in range(space.decisions):
+        noise[:, decision, space.free] = torch.randn(samples, len(space.free), generator=generator)
+    return noise

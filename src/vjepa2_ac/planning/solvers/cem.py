@@ -1,0 +1,61 @@
+"""Cross-entropy method: draw from a normal distribution, move it to the best, again."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from vjepa2_ac.config.planning import CemConfig
+from vjepa2_ac.planning.action_space import ActionSpace
+from vjepa2_ac.planning.interfaces import PlanStart
+from vjepa2_ac.planning.solvers.base import EvaluatedPlans, white_noise
+
+
+class CemSolver:
+    """Upstream's: samples are clipped, mean and standard deviation keep a share of their old values.
+
+    Differs from upstream in that a warm start is possible, in that samples without a finite energy are no elites, and
+    in that a held gripper is exact in the answer, too.
+
+    Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, cem.
+    """
+
+    uses_gradients = False
+
+    def __init__(
+        self, space: ActionSpace, config: CemConfig, samples: int, generator: Generator, start: PlanStart | None = None
+    ) -> None:
+        self.elites = config.elites
+        self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
+        self.std = space.first_std
+        self._space, self._samples, self._generator = space, samples, generator
+        self._answers_mean, self._tries_mean = config.answer == "mean", config.try_mean
+        self._keep_mean = _momentum(space, config.momentum_mean, config.momentum_mean_gripper)
+        self._keep_std = _momentum(space, config.momentum_std, config.momentum_std_gripper)
+
+    def sample(self) -> Float[Tensor, "samples decisions dim"]:
+        """Return samples of the distribution, cut back to what is allowed."""
+        noise = white_noise(self._space, self._samples, self._generator)
+        if self._tries_mean:
+            noise[0] = 0.0
+        return self._space.allowed(self.mean + self.std * noise)
+
+    def update(self, tried: EvaluatedPlans) -> None:
+        """Move the distribution towards the best; one alone says nothing of the standard deviation."""
+        best = tried.best(self.elites).decisions
+        if len(best):
+            self.mean = self._keep_mean * self.mean + (1 - self._keep_mean) * best.mean(dim=0)
+        if len(best) > 1:
+            self.std = self._keep_std * self.std + (1 - self._keep_std) * best.std(dim=0)
+
+    def result(self) -> Float[Tensor, "decisions dim"] | None:
+        """Return the mean, or ask for the best."""
+        return self.mean if self._answers_mean else None
+
+
+def _momentum(space: ActionSpace, others: float, gripper: float) -> Float[Tensor, " dim"]:
+    momentum = torch.full((space.dim,), others)
+    if space.gripper is not None:
+        momentum[space.gripper] = gripper
+    return momentum

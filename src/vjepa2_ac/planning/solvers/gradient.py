@@ -1,0 +1,72 @@
+"""Gradient descent through the model: several action sequences go downhill at once."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from vjepa2_ac.config.planning import GradientConfig
+from vjepa2_ac.planning.action_space import ActionSpace
+from vjepa2_ac.planning.interfaces import PlanStart
+from vjepa2_ac.planning.solvers.base import EvaluatedPlans, white_noise
+
+
+class GradientSolver:
+    """Adam on decisions measured in their limits, cut back to what is allowed after every step.
+
+    Each start descends by itself. The best of all that was tried is taken.
+    """
+
+    uses_gradients = True
+
+    def __init__(
+        self, space: ActionSpace, config: GradientConfig, iterations: int, generator: Generator, start: PlanStart | None
+    ) -> None:
+        self.elites = config.starts
+        noise = white_noise(space, config.starts, generator)
+        noise[0] = 0.0
+        origin = torch.zeros_like(space.lower) if start is None else _best_of(start)
+        self._space = space
+        half = (space.upper - space.lower) / 2
+        self._unit = torch.where(half > 0, half, 1.0)
+        self._place = space.allowed(origin + space.first_std * noise) / self._unit
+        self._adam = torch.optim.Adam([self._place], lr=config.learning_rate)
+        self._fall = torch.optim.lr_scheduler.LambdaLR(self._adam, lambda step: max(0.0, 1 - step / iterations))
+
+    @property
+    def mean(self) -> Float[Tensor, "decisions dim"]:
+        """The middle of all descents."""
+        return self.sample().mean(dim=0)
+
+    @property
+    def std(self) -> Float[Tensor, "decisions dim"]:
+        """How far apart they are."""
+        return self.sample().std(dim=0, correction=0)
+
+    def sample(self) -> Float[Tensor, "samples decisions dim"]:
+        """Return where each descent is."""
+        return self._space.allowed(self._place * self._unit)
+
+    def update(self, tried: EvaluatedPlans) -> None:
+        """Take a step downhill.
+
+        Raises:
+            ValueError: There are no gradients.
+        """
+        if tried.gradients is None:
+            raise ValueError("the cost has no gradients")
+        self._place.grad = tried.gradients * self._unit
+        self._adam.step()
+        self._fall.step()
+        with torch.no_grad():
+            self._place.copy_(self.sample() / self._unit)
+
+    def result(self) -> Float[Tensor, "decisions dim"] | None:
+        """Ask for the best that was tried."""
+        return None
+
+
+def _best_of(start: PlanStart) -> Float[Tensor, "decisions dim"]:
+    """Return the last best descent: the middle of several that lead to different places leads nowhere."""
+    return start.elites[0] if len(start.elites) else start.mean

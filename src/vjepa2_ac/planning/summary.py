@@ -1,0 +1,74 @@
+"""How is a decision said in a few sentences? How far it goes, what it is worth, and what a reader should beware of."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vjepa2_ac.planning.decision import PlanResult
+from vjepa2_ac.planning.energy_slices import AXES
+from vjepa2_ac.planning.interfaces import Plan
+
+_AT_LIMIT = 0.98  # share of a limit from which an action is said to be at it
+
+
+def summarize(answer: PlanResult) -> str:
+    """Return what was decided, in a sentence or more."""
+    plan, why = answer.decision.plan, answer.decision.why
+    if why == "at the goal" or plan is None:
+        return "Does nothing: what the model sees now is what it sees in the goal's picture."
+    if why == "no finite energy":
+        return (
+            "Does nothing: the model gives no finite energy for any of"
+            f" {plan.evaluations:,} action sequences. It is broken; another checkpoint may not be."
+        )
+    return " ".join([_motion(answer), _energy(answer, plan), _effort(answer, plan), *_warnings(answer, plan)])
+
+
+def _motion(answer: PlanResult) -> str:
+    way = (answer.states[-1] - answer.states[0])[:3] * 100
+    steps = len(answer.actions)
+    parts = ", ".join(f"{axis} {value:+.1f}" for axis, value in zip(AXES, way, strict=True))
+    gripper = answer.states[-1, 6] - answer.states[0, 6]
+    grips = f", gripper {gripper:+.2f}" if gripper else ""
+    return f"Goes {np.linalg.norm(way):.1f} cm in {steps} model step{'s' * (steps > 1)} ({parts} cm{grips})."
+
+
+def _energy(answer: PlanResult, plan: Plan) -> str:
+    now = answer.decision.energy_now
+    change = f" ({plan.energy / now - 1:+.0%})" if now else ""
+    return (
+        f"Energy {now:.4f} now, {plan.energy:.4f} predicted{change};"
+        f" {answer.doing_nothing:.4f} predicted when doing nothing."
+    )
+
+
+def _effort(answer: PlanResult, plan: Plan) -> str:
+    rounds = len(plan.iterations)
+    return (
+        f"Planner {plan.planner}, seed {plan.seed}: {plan.evaluations:,} action sequences in {rounds}"
+        f" iteration{'s' * (rounds > 1)}, {answer.seconds.decision:.2f} s."
+    )
+
+
+def _warnings(answer: PlanResult, plan: Plan) -> list[str]:
+    found = []
+    if plan.stopped == "out of time":
+        most = answer.controller.config.iterations
+        found.append(f"Time was up after {len(plan.iterations)} of {most} iterations: the best so far.")
+    if not plan.energy < answer.doing_nothing:
+        found.append("Nothing that was tried is predicted to be better than doing nothing.")
+    if at_limit := axes_at_limit(answer):
+        found.append(f"The first action is at its limit along {', '.join(at_limit)} (planning.limits.xyz).")
+    if answer.unused_goals:
+        unused = ", ".join(str(place + 1) for place in answer.unused_goals)
+        found.append(f"No part in this plan has goal {unused}: see durations, planning.horizon, planning.energy.steps.")
+    return found
+
+
+def axes_at_limit(answer: PlanResult) -> list[str]:
+    """Return along which of dx, dy, dz the first action goes as far as it may."""
+    upper = answer.space.upper[0].numpy()
+    return [
+        axis for number, axis in enumerate(AXES)
+        if upper[number] > 0 and abs(answer.actions[0, number]) >= _AT_LIMIT * upper[number]
+    ]  # fmt: skip

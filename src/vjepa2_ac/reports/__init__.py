@@ -1,0 +1,1 @@
+"""Reports: how are results written down? metrics.json, HTML, figures, comparisons."""

@@ -1,0 +1,1 @@
+"""Figures: what do results, data and plans look like? Drawn with matplotlib."""

@@ -1,0 +1,83 @@
+"""What is in these clips? A row each: some of its frames, and below them its states and actions over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from vjepa2_ac.reports.figures.page import Page
+from vjepa2_ac.storage import atomic_writer
+
+_WIDTH, _SIDE, _TITLE = 16.0, 0.3, 0.6  # inches, as all below
+_NAME, _FILM, _LABEL, _PLOT, _BETWEEN = 0.25, 1.4, 0.3, 0.9, 0.35
+_MOST_FRAMES = 8
+_BAD = "#c0392b"
+
+
+@dataclass(frozen=True, eq=False)
+class ClipFigure:
+    """One clip, as it is shown."""
+
+    name: str
+    frames: UInt8[np.ndarray, "time height width 3"]
+    numbers: dict[str, Float[np.ndarray, "_ _"]]  # by what they are: a row per model step
+
+
+def plot_clips(title: str, clips: Sequence[ClipFigure], path: Path) -> Path:
+    """Write a picture of some clips as PNG; numbers that are not finite are marked. It appears whole or not at all.
+
+    Raises:
+        ValueError: There is no clip.
+    """
+    if not clips:
+        raise ValueError("no clip to show")
+    row = _NAME + _FILM + _LABEL + _PLOT + _BETWEEN
+    height = _TITLE + row * len(clips)
+    with mpl.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(_WIDTH, height), facecolor="white")
+        FigureCanvasAgg(figure)
+        page = Page(figure, _WIDTH, height)
+        page.text(_SIDE, 0.2, title, size=12.0)
+        for number, clip in enumerate(clips):
+            _draw(page, clip, top=_TITLE + row * number)
+        with atomic_writer(path) as file:
+            figure.savefig(file, format="png", dpi=80)
+    return path
+
+
+def _draw(page: Page, clip: ClipFigure, top: float) -> None:
+    page.text(_SIDE, top, clip.name, size=9.0)
+    film = page.axes(_SIDE, top + _NAME, _WIDTH - 2 * _SIDE, _FILM)
+    film.imshow(_film(clip.frames))
+    film.set_anchor("W")
+    film.set_axis_off()
+    across = (_WIDTH - _SIDE) / len(clip.numbers)
+    for column, (what, values) in enumerate(clip.numbers.items()):
+        left = _SIDE + 0.3 + column * across
+        _plot(page.axes(left, top + _NAME + _FILM + _LABEL, across - 0.6, _PLOT), what, values)
+
+
+def _film(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "height _ 3"]:
+    """Return some frames side by side, with a little white between them."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, num=_MOST_FRAMES).round().astype(int))
+    gap = max(1, frames.shape[2] // 50)
+    spaced = np.pad(frames[chosen], ((0, 0), (0, 0), (0, gap), (0, 0)), constant_values=255)
+    return np.concatenate(list(spaced), axis=1)
+
+
+def _plot(axes: Any, what: str, values: Float[np.ndarray, "_ _"]) -> None:
+    axes.plot(values, linewidth=1)
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    for step in bad:
+        axes.axvspan(step - 0.5, step + 0.5, color=_BAD, alpha=0.3, linewidth=0)
+    label = f"{what}: not finite in {len(bad)} of {len(values)} steps" if len(bad) else what
+    axes.set_title(label, loc="left", fontsize=8, color=_BAD if len(bad) else "black")
+    axes.set_xlim(-0.5, len(values) - 0.5)

@@ -1,0 +1,134 @@
+"""What does it look like? One picture: error by horizon, use of the actions, and where predictions are wrong."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Example
+from vjepa2_ac.evaluation.verdict import verdict
+from vjepa2_ac.reports.comparison import Comparison
+from vjepa2_ac.storage import atomic_writer
+
+_COLOURS = {"persistence": "#8a8a8a", "base": "#d1762a", "adapter": "#1f6fb4", "model": "#1f6fb4"}
+_RUNS = ("#1f6fb4", "#d1762a", "#2b8a3e", "#8f5bb0", "#b3246b", "#0b7f8a", "#8a6d0b", "#333333")
+_DASHES = ("-", "--", ":")  # after all colours
+# What people call things is shown as it is: a dollar sign begins no formula.
+_STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False}
+_OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
+
+
+def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
+    """Write the picture of an evaluation as PNG; it appears whole or not at all."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(13, 6.2), layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.suptitle("\n".join(textwrap.wrap(verdict(evaluation), 150)), fontsize=10.5, x=0.01, ha="left")
+        halves: Any = figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
+        upper, lower = halves[0].subplots(2, 1, height_ratios=[3, 2])
+        _curves(upper, evaluation)
+        _use_of_actions(lower, evaluation)
+        if evaluation.examples:
+            _filmstrip(halves[1], evaluation.examples[0], evaluation.about.seconds_per_step)
+        with atomic_writer(path) as file:
+            figure.savefig(file, format="png", dpi=110)
+    return path
+
+
+def plot_comparison(comparison: Comparison, path: Path) -> Path:
+    """Write the curves of several runs as PNG; it appears whole or not at all."""
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(9.5, 4.5), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots()
+        drawn = [axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--")]
+        for number, curve in enumerate(comparison.curves.values()):
+            colour, dashes = _RUNS[number % len(_RUNS)], _DASHES[number // len(_RUNS) % len(_DASHES)]
+            low, high = [one.low for one in curve], [one.high for one in curve]
+            axes.fill_between(comparison.seconds, low, high, color=colour, alpha=0.13, linewidth=0)
+            values = [one.value for one in curve]
+            drawn += axes.plot(comparison.seconds, values, marker="o", color=colour, linestyle=dashes)
+        names = ["persistence (doing nothing)", *(textwrap.fill(name, 34) for name in comparison.curves)]
+        axes.set(xlabel="seconds ahead (open loop)", ylabel="latent error / persistence", ylim=(0, None))
+        axes.set_title(f"{comparison.title} (band: 95 % over episodes)", loc="left", fontsize=9)
+        figure.legend(drawn, names, frameon=False, loc="outside right upper")
+        with atomic_writer(path) as file:
+            figure.savefig(file, format="png", dpi=110)
+    return path
+
+
+def _curves(axes: Any, evaluation: Evaluation) -> None:
+    axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--", label="persistence (doing nothing)")
+    seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
+    shown = seconds[:: -(-len(seconds) // 8)]
+    for name, colour in _colours(evaluation).items():
+        ratios = over_persistence(evaluation, name, "rollout")
+        axes.plot(seconds, [r.value for r in ratios], "o-", color=colour, label=name)
+        axes.fill_between(
+            seconds, [r.low for r in ratios], [r.high for r in ratios], color=colour, alpha=0.2, linewidth=0
+        )
+    axes.set(xlabel="seconds ahead (open loop)", ylabel="latent error / persistence", ylim=(0, None))
+    axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
+    axes.legend(frameon=False, loc="lower right")
+    axes.set_title("Prediction error by horizon (band: 95 % over episodes)", loc="left", fontsize=9)
+
+
+def _use_of_actions(axes: Any, evaluation: Evaluation) -> None:
+    width = 0.8 / len(evaluation.models)
+    for i, (name, colour) in enumerate(_colours(evaluation).items()):
+        ratios = {actions: one_step_over_persistence(evaluation, name, actions=actions) for actions in ACTIONS}
+        places = np.arange(len(ratios)) + (i - (len(evaluation.models) - 1) / 2) * width
+        values = [r.value for r in ratios.values()]
+        spread = np.array([_reach(r) for r in ratios.values()]).T
+        axes.bar(places, values, width, color=colour, yerr=spread, error_kw={"elinewidth": 1}, label=name)
+    axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--")
+    axes.set_xticks(range(3), ["true", "zero", "shuffled"])
+    axes.set(xlabel="actions given", ylabel="one-step error / persistence")
+    axes.set_title("Does it use the actions?", loc="left", fontsize=9)
+
+
+def _colours(evaluation: Evaluation) -> dict[str, str]:
+    """Return a colour for each model."""
+    others = iter(_OTHERS * len(evaluation.models))
+    return {name: _COLOURS.get(name) or next(others) for name in evaluation.models}
+
+
+def _reach(value: Estimate) -> tuple[float, float]:
+    """How far an error bar reaches down and up; never negative, which rounding could make it."""
+    if not value.has_interval:
+        return 0.0, 0.0
+    return max(0.0, value.value - value.low), max(0.0, value.high - value.value)
+
+
+def _filmstrip(figure: Any, example: Example, seconds_per_step: float) -> None:
+    """Show one clip: the first frame and some later ones, and under each where a prediction of it is wrong."""
+    horizons = np.unique(np.linspace(1, len(example.true_colours) - 1, num=4).round().astype(int))
+    grid = figure.subplots(1 + len(example.errors), 1 + len(horizons), squeeze=False)
+    figure.suptitle("One held-out clip, and the error of each patch (brighter is worse)", x=0.02, ha="left", fontsize=9)
+    largest = max(float(errors.max()) for errors in example.errors.values())
+    for axes in grid.ravel():
+        axes.set_axis_off()
+    for column, time in enumerate([0, *horizons]):
+        grid[0][column].imshow(example.true_colours[time] if example.frames is None else example.frames[time])
+        grid[0][column].set_title("now" if time == 0 else f"+{time * seconds_per_step:.2f} s", fontsize=8)
+    for row, (name, errors) in enumerate(example.errors.items(), start=1):
+        grid[row][0].text(0.5, 0.5, f"{name}\nerror", ha="center", va="center", transform=grid[row][0].transAxes)
+        for column, time in enumerate(horizons, start=1):
+            frame = example.true_colours[time] if example.frames is None else example.frames[time]
+            _overlay(grid[row][column], frame, errors[time - 1], largest)
+
+
+def _overlay(axes: Any, frame: UInt8[np.ndarray, "size size 3"], errors: Any, largest: float) -> None:
+    size = len(frame)
+    axes.imshow(frame.mean(axis=-1), cmap="gray", vmin=-100, vmax=255)
+    axes.imshow(errors, cmap="inferno", vmin=0, vmax=largest, alpha=0.65, extent=(0, size, size, 0))
+    axes.set(xlim=(0, size), ylim=(size, 0))

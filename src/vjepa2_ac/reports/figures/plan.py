@@ -1,0 +1,147 @@
+"""How did a planner come to its plan? One picture: what was seen, where it searched, what else would have cost."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from vjepa2_ac.data.clips.transforms import crop_box
+from vjepa2_ac.planning.decision import PlanResult
+from vjepa2_ac.planning.energy_slices import AXES, EnergySlice
+from vjepa2_ac.planning.interfaces import Plan
+from vjepa2_ac.planning.summary import summarize
+from vjepa2_ac.storage import atomic_writer
+
+PLAN_IMAGE = "plan.png"
+
+_STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False}
+_CM = 100.0
+_GREY, _BLUE, _RED, _FRAME = "#8a8a8a", "#1f6fb4", "#b3246b", "#e8b10c"
+_MOST_GOALS = 3  # that are shown: the first ones, and the last
+_STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": _RED, "edgecolors": "white", "zorder": 5}
+
+
+def plot_plan(answer: PlanResult, path: Path) -> Path:
+    """Write the picture of a decision as PNG; it appears whole or not at all."""
+    with mpl.rc_context(_STYLE):
+        plan = answer.decision.plan
+        rows = 1 if plan is None else 3 if answer.slices else 2
+        figure = Figure(figsize=(13, 0.9 + 3.4 * rows), layout="constrained")
+        FigureCanvasAgg(figure)
+        figure.suptitle("\n".join(textwrap.wrap(summarize(answer), 165)), fontsize=10.5, x=0.01, ha="left")
+        parts: Any = figure.subfigures(rows, 1, squeeze=False)[:, 0]
+        _pictures(parts[0], answer)
+        if plan is not None:
+            _search(parts[1], answer, plan)
+            if answer.slices:
+                _slices(parts[2], answer)
+        with atomic_writer(path) as file:
+            figure.savefig(file, format="png", dpi=100)
+    return path
+
+
+def _pictures(part: Any, answer: PlanResult) -> None:
+    goals = answer.question.goals
+    shown = sorted({*range(len(goals))[: _MOST_GOALS - 1], len(goals) - 1})
+    named = {"start": answer.question.start}
+    named |= {f"goal {place + 1} of {len(goals)}" if len(goals) > 1 else "goal": goals[place] for place in shown}
+    for axes, (name, picture) in zip(part.subplots(1, len(named), squeeze=False)[0], named.items(), strict=True):
+        axes.imshow(picture)
+        if answer.question.mask is not None and name != "start":
+            hidden = np.where(answer.question.mask > 0, np.nan, 1.0)
+            axes.imshow(hidden, cmap="gray", vmin=0, vmax=2, alpha=0.6)
+        box = crop_box(picture.shape[0], picture.shape[1], answer.controller.crop)
+        axes.add_patch(
+            Rectangle((box.left - 0.5, box.top - 0.5), box.width, box.height, fill=False, color=_FRAME, linewidth=1.2)
+        )
+        axes.set_title(f"{name} (frame: what the model sees)", loc="left", fontsize=9)
+        axes.set_axis_off()
+
+
+def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
+    elites, heights, energies, path = part.subplots(1, 4, width_ratios=[3, 3, 3, 3])
+    colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
+    first, upper = answer.actions[0] * _CM, answer.space.upper[0].double().numpy() * _CM
+    for number, (one, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
+        tried = one.elites[:, 0].double().numpy() * _CM
+        elites.scatter(tried[:, 0], tried[:, 1], s=9, color=colour, alpha=0.8)
+        heights.scatter(np.full(len(tried), number), tried[:, 2], s=9, color=colour, alpha=0.8)
+    _limits(elites, upper[0], upper[1])
+    elites.scatter(first[0], first[1], **_STAR)
+    elites.set(xlabel="dx (cm)", ylabel="dy (cm)", aspect="equal")
+    elites.set_title("Best of each iteration,\nfirst action (dark: last)", loc="left", fontsize=9)
+    heights.axhspan(-upper[2], upper[2], color=_GREY, alpha=0.12, linewidth=0)
+    heights.scatter(len(plan.iterations) + 1, first[2], **_STAR)
+    heights.set(xlabel="iteration (star: chosen)", ylabel="dz (cm)")
+    heights.set_title("Their height", loc="left", fontsize=9)
+    _energies(energies, answer, plan)
+    _path(path, answer)
+
+
+def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
+    numbers = np.arange(1, len(plan.iterations) + 1)
+    elites, lowest = ([getattr(one, kind) for one in plan.iterations] for kind in ("elite_energy", "lowest"))
+    axes.plot(numbers, elites, "o-", color=_BLUE, markersize=3, label="mean of the best")
+    axes.plot(numbers, lowest, "o--", color=_BLUE, markersize=3, label="lowest")
+    levels = {
+        "now": (answer.decision.energy_now, _GREY, "-"),
+        "doing nothing": (answer.doing_nothing, _GREY, ":"),
+        "the plan": (plan.energy, _RED, "--"),
+    }
+    for name, (level, colour, dashes) in levels.items():
+        if np.isfinite(level):
+            axes.axhline(level, color=colour, linestyle=dashes, label=f"{name}: {level:.4f}")
+    seen = np.array([*elites, *lowest, plan.energy])
+    seen = seen[np.isfinite(seen)]
+    if len(seen):  # the lines of the present may lie beyond: the legend has their numbers
+        room = max(0.15 * float(np.ptp(seen)), 1e-4)
+        axes.set_ylim(seen.min() - room, seen.max() + 3 * room)
+    axes.set(xlabel="iteration", ylabel=f"energy ({answer.controller.config.energy.distance})")
+    axes.legend(frameon=False, fontsize=7.5, loc="upper right")
+    axes.set_title("Energy", loc="left", fontsize=9)
+
+
+def _path(axes: Any, answer: PlanResult) -> None:
+    way = (answer.states[:, :3] - answer.states[0, :3]) * _CM
+    axes.plot(way[:, 0], way[:, 1], "o-", color=_RED, markersize=4, label="x, y (from above)")
+    axes.plot(way[:, 0], way[:, 2], "s:", color=_BLUE, markersize=4, label="x, z (from the side)")
+    axes.plot(0, 0, "o", color="black", markersize=6, zorder=6)
+    reach = 1.2 * max(float(np.abs(way).max()), 1.0)
+    axes.set(xlabel="x from here (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    axes.legend(frameon=False, fontsize=7.5)
+    axes.set_title("Planned path of the flange,\nrobot base frame", loc="left", fontsize=9)
+
+
+def _slices(part: Any, answer: PlanResult) -> None:
+    lowest = min(np.nanmin(one.energy) for one in answer.slices)
+    highest = max(np.nanmax(one.energy) for one in answer.slices)
+    all_axes = part.subplots(1, len(answer.slices))
+    for axes, one in zip(all_axes, answer.slices, strict=True):
+        image = _slice(axes, one, answer, lowest, highest)
+    part.colorbar(image, ax=list(all_axes), label="energy", shrink=0.85)
+
+
+def _slice(axes: Any, one: EnergySlice, answer: PlanResult, lowest: float, highest: float) -> Any:
+    first, second = one.axes
+    across, up = one.across * _CM, one.up * _CM
+    image = axes.pcolormesh(across, up, one.energy, shading="nearest", cmap="viridis", vmin=lowest, vmax=highest)
+    upper = answer.space.upper[0].double().numpy() * _CM
+    _limits(axes, upper[first], upper[second])
+    axes.plot(0, 0, "+", color="white", markersize=9)
+    axes.scatter(answer.actions[0, first] * _CM, answer.actions[0, second] * _CM, **_STAR)
+    axes.set(xlabel=f"{AXES[first]} (cm)", ylabel=f"{AXES[second]} (cm)", aspect="equal")
+    title = "Energy around the first action\n(star; +: no motion; box: limits)" if one.axes == (0, 1) else "\n"
+    axes.set_title(title, loc="left", fontsize=9)
+    return image
+
+
+def _limits(axes: Any, across: float, up: float) -> None:
+    axes.add_patch(Rectangle((-across, -up), 2 * across, 2 * up, fill=False, color=_GREY, linewidth=1))
+    axes.margins(0.08)

@@ -1,0 +1,51 @@
+"""The report of an evaluation: measured, and written as metrics.json, report.html and evaluation.png."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions, measure_subject
+from vjepa2_ac.evaluation.result import Evaluation
+from vjepa2_ac.evaluation.verdict import verdict
+from vjepa2_ac.reports.figures.evaluation import plot_evaluation
+from vjepa2_ac.reports.html.page import write_report
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
+
+PLOT, REPORT = "evaluation.png", "report.html"
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """What was measured."""
+
+    evaluation: Evaluation
+    checkpoint: str  # which one, in words; "" of a model
+    files: tuple[Path, ...]  # that were written
+
+
+def evaluate_subject(
+    subject: str, asked: EvaluationOptions | None = None, *, stage: Callable[[str], Progress] | None = None
+) -> Evaluated:
+    """Measure a run or a model on held-out episodes; write metrics.json, report and figure. Cheap failures first.
+
+    Args:
+        subject: The folder of a run; or a model: what `model.base` takes.
+        asked: How.
+        stage: Gives a bar for a part of the work, by its title.
+
+    Raises:
+        InputError: The subject, the data, or what to compare with cannot be used; the split is empty.
+    """
+    measured = measure_subject(subject, asked, stage=stage)
+    return Evaluated(measured.evaluation, measured.checkpoint, _written(measured.evaluation, measured.folder))
+
+
+def _written(evaluation: Evaluation, folder: Path) -> tuple[Path, ...]:
+    return (
+        plot_evaluation(evaluation, folder / PLOT),
+        write_metrics(evaluation, folder / METRICS_FILE),
+        write_report(evaluation, verdict(evaluation), folder / REPORT),
+    )

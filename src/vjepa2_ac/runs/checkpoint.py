@@ -1,0 +1,234 @@
+"""What is kept of a run, so that it can go on exactly? Adapter, optimizer and step; never the frozen base.
+
+A checkpoint is a folder `step-00001000` with `manifest.json`, which holds the SHA-256 of every other file. It is
+written under a temporary name and renamed, so a folder that carries the final name is whole or was damaged later;
+the manifest tells. What is called otherwise, `step-00001000.bak` for one, is somebody's own and is left alone.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import re
+import shutil
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from vjepa2_ac.config import CheckpointConfig
+from vjepa2_ac.config.section import PositiveInt
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.manifest import verify_manifest, write_manifest
+from vjepa2_ac.storage import sync
+from vjepa2_ac.storage.structured import read_json_object, record_of, shown
+
+logger = logging.getLogger(__name__)
+
+STATE = "state.json"
+ADAPTER = "adapter"  # a folder: what `model.adapter.lora.save_trained` writes
+OPTIMIZER = "optimizer.pt"
+FETCHING = ".fetching-"  # a checkpoint that comes from elsewhere, see `runs.mirror.fetch`
+
+_WRITING = ".writing-"
+_NAME = re.compile(r"step-([0-9]{8,})")
+_NEEDED = "where a run stood, as this program wrote it"
+_FIX = "Delete this checkpoint, to use an older one"
+
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+
+
+@dataclass(frozen=True)
+class RunState:
+    """Where a run stands. Data order, learning rate and random numbers are functions of the step."""
+
+    step: Count  # optimizer steps done
+    run_id: str = ""  # a random name that stays with the run for good, wherever it goes on
+    clips_done: Count = 0  # place in the row of clips of the whole run
+    clips_per_step: PositiveInt | None = None  # of all processes together
+    clips_asked: PositiveInt | None = None  # of one process, by the config: batch_size * accumulation
+    processes: PositiveInt = 1
+    broken: Mapping[str, str] = field(default_factory=dict)  # episodes that clips could not be read from, and why
+    windows: Count | None = None  # clips of an epoch: with another number, their order is another
+    best_step: Count | None = None  # the validation that went best, where checkpoint.keep_best is set
+    best_error: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    measured_on: Mapping[str, str] | None = None  # what validation errors are of, see `training.best_checkpoint`
+    loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
+
+    def measured(self, error: float) -> RunState:
+        """Return the state after a validation at its step: another one only where that went better than any before."""
+        if not math.isfinite(error) or (self.best_error is not None and error >= self.best_error):
+            return self
+        return replace(self, best_step=self.step, best_error=error)
+
+
+class CheckpointClock:
+    """Says when the next checkpoint is due: by optimizer steps, and by minutes since the last one.
+
+    Args:
+        config: How often.
+        now_s: Tells the time, in seconds since whenever.
+    """
+
+    def __init__(self, config: CheckpointConfig, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._config, self._now_s, self._last_s = config, now_s, now_s()
+
+    def is_due(self, step: int) -> bool:
+        """Return whether a checkpoint is due after a step."""
+        minutes = self._config.every_minutes
+        by_time = minutes is not None and self._now_s() - self._last_s >= 60.0 * minutes
+        return by_time or step % self._config.every == 0
+
+    def restart(self) -> None:
+        """A checkpoint was written now."""
+        self._last_s = self._now_s()
+
+
+def checkpoint_name(step: int) -> str:
+    """Return the folder name of a step's checkpoint."""
+    return f"step-{step:08d}"
+
+
+def step_of(name: str) -> int | None:
+    """Return the step of a checkpoint by the name of its folder; None where checkpoints are called otherwise."""
+    found = _NAME.fullmatch(name)
+    return int(found[1]) if found and name == checkpoint_name(int(found[1])) else None
+
+
+def listed(folder: Path) -> list[Path]:
+    """Return the checkpoints in a folder by their steps, the newest last, whole or damaged; of no folder, none."""
+    there = folder.iterdir() if folder.is_dir() else ()
+    found = [path for path in there if step_of(path.name) is not None and path.is_dir()]
+    return sorted(found, key=lambda path: step_of(path.name) or 0)
+
+
+def remove_leavings(folder: Path) -> None:
+    """Remove what starts of this run that were killed left by halves. Nobody else may be at work there."""
+    for beginning in (_WRITING, FETCHING):
+        for path in folder.glob(f"{beginning}*"):
+            if step_of(path.name.removeprefix(beginning)) is not None:
+                shutil.rmtree(path, ignore_errors=True)
+
+
+def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path], None], *, keep: int) -> Path:
+    """Write a checkpoint whole or not at all, then remove all but the newest `keep` and the best.
+
+    Args:
+        folder: The run's checkpoint folder.
+        state: Where the run stands.
+        write_files: Writes weights and optimizer state into the folder it is given.
+        keep: How many of the newest checkpoints stay; that of `state.best_step` stays besides.
+
+    Raises:
+        InputError: The folder cannot be written (full disk, no permission). Older checkpoints stay as they are.
+    """
+    final = folder / checkpoint_name(state.step)
+    temporary = folder / f"{_WRITING}{final.name}"
+    try:
+        remove_leavings(folder)  # they need the room
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        write_files(temporary)
+        (temporary / STATE).write_text(json.dumps(asdict(state)))
+        write_manifest(temporary)
+        for stale in listed(folder):  # damaged ones that were passed over; those steps are being done again
+            if (step_of(stale.name) or 0) >= state.step:
+                _remove(stale)
+        temporary.rename(final)
+        sync(folder)
+        _prune(folder, keep, state.best_step)
+    except OSError as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise InputError(
+            where=str(final),
+            found=f"the checkpoint cannot be written ({error.strerror or error})",
+            fix="Older checkpoints are untouched: make room or pass another run_dir, then resume",
+        ) from error
+    return final
+
+
+def newest_checkpoint(folder: Path) -> Path | None:
+    """Return the newest checkpoint that is whole, None where there are none; damaged ones are named in a warning.
+
+    Raises:
+        InputError: There are checkpoints, and every one is damaged.
+    """
+    found = listed(folder)
+    for path in reversed(found):
+        problem = find_damage(path)
+        if problem is None:
+            return path
+        logger.warning("%s: %s; passed over", path, problem)
+    if found:
+        raise InputError(
+            where=str(folder),
+            found=f"none of {len(found)} checkpoints is whole",
+            fix="To start the run anew, delete this folder",
+        )
+    return None
+
+
+def find_damage(checkpoint: Path, name: str | None = None) -> str | None:
+    """Return what is wrong with a checkpoint, or None when every file is what the manifest says.
+
+    Args:
+        checkpoint: Its folder.
+        name: What it is called, where its folder is called otherwise.
+    """
+    return verify_manifest(checkpoint, needed={STATE}) or _another_step(checkpoint, name or checkpoint.name)
+
+
+def read_state(checkpoint: Path) -> RunState:
+    """Return where the run stood when the checkpoint was written; a best one that is gone or damaged is no best."""
+    state = written_state(checkpoint)
+    if (
+        state.best_step in {None, state.step}
+        or find_damage(checkpoint.parent / checkpoint_name(state.best_step)) is None
+    ):
+        return state
+    return replace(state, best_step=None, best_error=None)
+
+
+def written_state(checkpoint: Path) -> RunState:
+    """Return where the run stood, as it was written, whatever became of the best checkpoint since.
+
+    Raises:
+        InputError: The file is missing or damaged, or of an older version of this program.
+    """
+    path = checkpoint / STATE
+    try:
+        values = read_json_object(path, needed=_NEEDED, fix=_FIX, allow_nan=True)  # a loss scale may be infinite
+    except OSError as error:
+        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED, fix=_FIX) from None
+    if "clips_done" not in values:  # or the run would begin the row of clips again
+        found = "of an older version of this program, without clips_done"
+        raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX)
+    return record_of(RunState, values, where=str(path), needed=_NEEDED, fix=_FIX)
+
+
+def _another_step(checkpoint: Path, name: str) -> str | None:
+    """Return that a checkpoint is the copy of another one, whose name says another step than its state does."""
+    try:
+        step = read_json_object(checkpoint / STATE, allow_nan=True).get("step")
+    except (OSError, InputError) as error:
+        return f"no readable {STATE} ({error})"
+    if type(step) is not int:
+        return f"no readable {STATE} (step: {shown(step)})"
+    return None if step_of(name) in {None, step} else f"a copy of another one, of step {step}"
+
+
+def _prune(folder: Path, keep: int, best_step: int | None) -> None:
+    for path in listed(folder)[:-keep]:
+        if step_of(path.name) != best_step:
+            _remove(path)
+
+
+def _remove(checkpoint: Path) -> None:
+    if checkpoint.is_symlink():
+        checkpoint.unlink()  # what it leads to is not this run's
+    else:
+        shutil.rmtree(checkpoint)

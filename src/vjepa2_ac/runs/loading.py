@@ -1,0 +1,48 @@
+"""What has a run learned? Load the model of one of its checkpoints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.model.adapter.lora import load_trained
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.runs.checkpoint import ADAPTER
+from vjepa2_ac.runs.checkpoint_selection import NEWEST, select_checkpoint
+from vjepa2_ac.runs.folder import CONFIG, read_run_config
+from vjepa2_ac.runs.relative_paths import BASE, with_paths_from_start
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """A run's config and the model of one of its checkpoints, on the CPU."""
+
+    config: Config
+    world_model: WorldModel
+    checkpoint: Path
+    chosen: str  # which checkpoint it is, in words
+
+
+def is_run(subject: str) -> bool:
+    """Return whether this is the folder of a run; otherwise it names a model."""
+    return (Path(subject) / CONFIG).is_file()
+
+
+def load_run(folder: Path, checkpoint: str = NEWEST, config: Config | None = None) -> TrainedRun:
+    """Load the model of a run: its base with the trained weights of a whole checkpoint.
+
+    Args:
+        folder: The run.
+        checkpoint: newest, best, or a number of optimizer steps; see `runs.checkpoint_selection`.
+        config: Its own with other settings of how it is loaded; None: its own.
+
+    Raises:
+        InputError: Not the folder of a run, no such checkpoint, or its base cannot be loaded.
+    """
+    config = with_paths_from_start(config or read_run_config(folder), folder, needed=[BASE])
+    chosen = select_checkpoint(folder, checkpoint)
+    world_model = load_base(config.model, seed=config.seed)
+    load_trained(world_model, chosen.path / ADAPTER, trainable=False)
+    return TrainedRun(config, world_model, chosen.path, str(chosen))

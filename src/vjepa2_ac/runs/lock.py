@@ -1,0 +1,118 @@
+"""Is another process training in this run's folder right now? Two would write over each other's checkpoints.
+
+The lock is on `RUN/.lock` and the kernel's (flock): it is gone when its process is, however that ended. The file stays,
+and says who was there last. It is never opened through a link: what that leads to would be cut off.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import logging
+import os
+import platform
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import TextIO
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.own_files import refused_link
+from vjepa2_ac.storage import user_can_write
+from vjepa2_ac.storage.structured import json_object
+
+logger = logging.getLogger(__name__)
+
+LOCK = ".lock"
+_MOST_CHARACTERS = 10_000
+
+_TAKEN = frozenset({errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES})
+
+
+class RunLock:
+    """The right to write into a run's folder, held from `take` to the end of the `with` block.
+
+    Args:
+        folder: The run's folder; `take` makes it where it is not there.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / LOCK
+        self._file: TextIO | None = None
+
+    def take(self) -> None:
+        """Take the lock; nothing happens where it is held already.
+
+        On a file system that has no such locks the run goes on without one, with a warning.
+
+        Raises:
+            InputError: Another process holds it, which is named; or the folder cannot be written.
+        """
+        if self._file is not None:
+            return
+        with user_can_write(self.path):
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self._opened()
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno in _TAKEN:
+                holder = _holder(self._file)
+                self.release()
+                raise _occupied(self.path.parent, holder) from None
+            logger.warning(
+                "%s: this file system has no locks (%s): see that no other process trains in this folder",
+                self.path, error.strerror,
+            )  # fmt: skip
+        with user_can_write(self.path):
+            self._sign()
+
+    def _opened(self) -> TextIO:
+        if self.path.is_symlink():
+            raise refused_link(self.path)
+        handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+        return os.fdopen(handle, "a+", encoding="utf-8")
+
+    def release(self) -> None:
+        """Let others have it."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def __enter__(self) -> RunLock:
+        """Return the lock, not yet taken."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Let others have it."""
+        self.release()
+
+    def _sign(self) -> None:
+        if self._file is None:
+            raise ValueError("the lock is not held")
+        self._file.truncate(0)
+        now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        self._file.write(json.dumps({"process": os.getpid(), "host": platform.node(), "since": now}))
+        self._file.flush()
+
+
+def _holder(file: TextIO) -> str:
+    """Return who signed the lock, in words."""
+    try:
+        file.seek(0)
+        who = json_object(file.read(_MOST_CHARACTERS), where=LOCK)
+        return f"process {who['process']} on {who['host']}, since {who['since']}"
+    except (OSError, ValueError, KeyError, InputError):  # it is signing just now
+        return "another process"
+
+
+def _occupied(folder: Path, holder: str) -> InputError:
+    return InputError(
+        where=str(folder),
+        found=f"a run that is being trained right now, by {holder}",
+        needed="a folder that no other process writes to",
+        fix="Wait until it ends, stop it, or set another run_dir",
+    )

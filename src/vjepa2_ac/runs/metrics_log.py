@@ -1,0 +1,158 @@
+"""Where do the figures of a run go? Into metrics.jsonl always, and on to its trackers.
+
+`metrics.jsonl` is the run's own record. Where it cannot be written, a full disk for one, rows wait, and are tried again
+at each further one. They have to be on the disk before the run is said to stand behind them: at the next checkpoint at
+the latest, which is due at once then. If even so they cannot be written the run ends, and says of what.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.folder import METRICS
+from vjepa2_ac.runs.slow_disk import said_if_stalled
+from vjepa2_ac.runs.trackers import Trackers
+from vjepa2_ac.storage import read_bounded, user_can_write, write_atomically
+from vjepa2_ac.storage.structured import json_object
+
+WARNING = "warning"  # kind of a row in metrics.jsonl, which has a `text`
+logger = logging.getLogger(__name__)
+
+_MOST_BYTES = 1 << 28
+
+
+class MetricsLog:
+    """Appends rows to `metrics.jsonl`, a JSON object per line, and hands them on to trackers.
+
+    Args:
+        run_dir: The run's folder.
+        first_step: Rows after this step are from a part of the run that is now done again; they are dropped.
+        trackers: Closed with the journal; None: there are none.
+
+    Raises:
+        InputError: The file cannot be written.
+    """
+
+    def __init__(self, run_dir: Path, *, first_step: int, trackers: Trackers | None = None) -> None:
+        self.path = run_dir / METRICS
+        kept = [row for row in read_metrics_log(self.path) if row["step"] <= first_step] if first_step > 0 else []
+        with user_can_write(self.path):
+            write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in kept).encode())
+            self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
+        self._waiting = b""  # rows that could not be written yet; the first may be there by halves
+        self._trackers = trackers or Trackers({})
+
+    def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
+        """Append one row: its kind (train, validation), its optimizer step, and figures (numbers or lists of them)."""
+        row = {"kind": kind, "step": step, **{key: _plain(value) for key, value in figures.items()}}
+        self._waiting += (json.dumps(row) + "\n").encode()
+        self._write()
+        self._trackers.log(kind, step, figures)
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether rows wait that could not be written."""
+        return bool(self._waiting)
+
+    @contextmanager
+    def before_a_checkpoint(self) -> Iterator[None]:
+        """Make the rows survive a power cut before the block does a checkpoint, which would go on without them.
+
+        The block runs in any case: the work of hours is worth more than a row. An older checkpoint that it removes may
+        make the room that a row needs.
+
+        Raises:
+            InputError: Rows can be written neither before nor after the block, or its own error.
+        """
+        error = self._sync()
+        try:
+            yield
+        except InputError as other:
+            if error is None:
+                raise
+            raise _unwritable(self.path, error, f"{other.where}: {other.found}") from other
+        if error and self._waiting:
+            error = self._sync()
+        if error:  # also of a flush, after which the system may have forgotten what it was to write
+            raise _unwritable(self.path, error, "The checkpoint of this step is written")
+
+    def _write(self) -> OSError | None:
+        if not self._waiting:
+            return None
+        try:
+            with said_if_stalled(self.path):
+                while self._waiting:
+                    self._waiting = self._waiting[os.write(self._handle, self._waiting) :]
+        except OSError as error:
+            return error
+        return None
+
+    def _sync(self) -> OSError | None:
+        if error := self._write():
+            return error
+        try:
+            with said_if_stalled(self.path):
+                os.fsync(self._handle)
+        except OSError as error:
+            return error
+        return None
+
+    def __enter__(self) -> MetricsLog:
+        """Return the journal, open."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Close the file, and the trackers."""
+        self._write()
+        os.close(self._handle)
+        self._trackers.close()
+
+
+def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a metrics.jsonl; a last line that a killed process left by halves is passed over.
+
+    Raises:
+        InputError: The file is too large to be one.
+    """
+    if not path.exists():
+        return
+    for line in read_bounded(path, _MOST_BYTES).decode(errors="replace").splitlines():
+        try:
+            row = json_object(line, where=str(path), allow_nan=True)
+        except InputError:
+            row = {}
+        if type(row.get("step")) is int and isinstance(row.get("kind"), str):
+            yield row
+        else:
+            logger.warning("%s: a line is not a row of figures, or was left by halves; it is dropped", path)
+
+
+def _unwritable(path: Path, error: OSError, checkpoint: str) -> InputError:
+    return InputError(
+        where=str(path),
+        found=f"the latest figures cannot be written ({error.strerror or error}), and are lost",
+        fix=f"{checkpoint}. Make room on the disk of the run, then resume: the same command goes on",
+    )
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None  # JSON has no NaN
+    return value
+
+
+def warnings_of(journal: Path) -> list[str]:
+    """Return what was said of a run, by its metrics.jsonl."""
+    rows = (row for row in read_metrics_log(journal) if row.get("kind") == WARNING)
+    return [row["text"] for row in rows if isinstance(row.get("text"), str)]

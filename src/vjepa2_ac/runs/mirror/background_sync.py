@@ -1,0 +1,200 @@
+"""How does a run get to `checkpoint.remote` while it goes on?
+
+A thread brings the place up to date (`runs.mirror.upload`); the loop only tells it, step by step, that time passes.
+Nothing that happens there stops the run. An outage is warned of once, however long it is; and what is only on this
+machine in the end, once more.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Collection
+from pathlib import Path
+from types import TracebackType
+
+from vjepa2_ac.config import CheckpointConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.folder import CHECKPOINTS
+from vjepa2_ac.runs.mirror.remote_checkpoints import RemoteCheckpoints
+from vjepa2_ac.runs.mirror.upload import ForeignRunError, OvertakenError, RemoteUpdate
+from vjepa2_ac.storage.remote import RefusedError, UnreachableError, quietly
+
+logger = logging.getLogger(__name__)
+
+LONGEST_WAIT_S = 3600.0  # for the mirror at the end of a run
+_LOOK_EVERY_S = 0.1  # whether the machine wants to be gone
+
+
+class Mirror:
+    """Keeps a place elsewhere like a run's folder: in the background, never twice at once.
+
+    Args:
+        place: What `storage.place` returned.
+        folder: The run's folder.
+        run_id: Whose checkpoints may be there.
+        config: How often, and how many are kept there, as here.
+        damaged: Names of checkpoints that were found damaged there; they are removed.
+        outage_said: Whether the user was told that the place cannot be reached.
+        now_s: Tells the time, in seconds since whenever.
+    """
+
+    def __init__(
+        self,
+        place: str,
+        folder: Path,
+        run_id: str,
+        config: CheckpointConfig,
+        *,
+        damaged: Collection[str] = (),
+        outage_said: bool = False,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._place, self._folder = place, folder
+        self._every_minutes, self._wait_s = config.remote_every_minutes, config.remote_wait_seconds
+        self._update = RemoteUpdate(RemoteCheckpoints(place), folder, run_id, config.keep, damaged)
+        self._outage_said, self._now_s = outage_said, now_s
+        self._thread: threading.Thread | None = None
+        self._hurry, self._stop = threading.Event(), threading.Event()
+        self._begun_s, self._is_off = -float("inf"), False
+        self._aim: str | None = None  # the newest checkpoint of this machine when the thread began
+        self._sent: str | None = None  # the newest one that is there
+
+    def tick(self) -> None:
+        """Begin to send where it is time to and there is something new; costs next to nothing.
+
+        The first checkpoint of a start does not wait.
+        """
+        due = self._now_s() - self._begun_s >= 60.0 * self._every_minutes
+        if due and not self.is_sending and self._update.newest_here() != self._sent:
+            self._begin()
+
+    @property
+    def is_sending(self) -> bool:
+        """Whether something is being sent right now."""
+        return self._thread is not None and self._thread.is_alive()
+
+    def finish(self, is_asked_to_stop: Callable[[], bool]) -> None:
+        """Send what is newest, and wait for that; warn where the place is not up to date then.
+
+        Args:
+            is_asked_to_stop: Whether the machine wants to be gone: from then on `checkpoint.remote_wait_seconds` are
+                waited, and else an hour.
+        """
+        patience = _Patience(is_asked_to_stop, self._wait_s)
+        self._hurry.set()
+        self._wait(patience)
+        if not self.is_sending:
+            self._begin()
+            self._wait(patience)
+        in_time = not self.is_sending
+        self._stop.set()
+        if not self._is_off and not (in_time and self._sent == self._update.newest_here()):
+            logger.warning(
+                "%s has checkpoints up to %s; what %s has after that is on this machine only%s. A next start sends it",
+                self._place, self._sent or "those of earlier starts", self._folder / CHECKPOINTS,
+                "" if in_time else ": there was no more time",
+            )  # fmt: skip
+
+    def __enter__(self) -> Mirror:
+        """Return the mirror."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Stop sending; but first send what there is where the run ends with an error."""
+        if isinstance(error, Exception) and not self._stop.is_set():
+            self.finish(lambda: True)
+        self._stop.set()
+
+    def _wait(self, patience: _Patience) -> None:
+        while self._thread is not None and self._thread.is_alive() and patience.lasts():
+            self._thread.join(_LOOK_EVERY_S)
+
+    def _begin(self) -> None:
+        self._begun_s, self._aim = self._now_s(), self._update.newest_here()
+        if not self._is_off:
+            self._thread = threading.Thread(target=self._send, name="mirror", daemon=True)
+            self._thread.start()
+
+    def _send(self) -> None:
+        try:
+            with quietly():
+                self._sent = self._update(self._go_on)
+            self._outage_said = False
+        except _BrokenOffError:
+            pass
+        except ForeignRunError as error:
+            self._is_off = True
+            logger.warning(
+                "checkpoint.remote: %s holds a checkpoint of another run, %s. Nothing was written there, and nothing"
+                " will be: this run is on this machine alone. Name another place when you start it again",
+                self._place, error,
+            )  # fmt: skip
+        except OvertakenError as error:
+            self._is_off = True
+            logger.warning(
+                "checkpoint.remote: %s is kept by a later start of this run, %s. This one goes on here alone;"
+                " stop one of the two",
+                self._place, error,
+            )  # fmt: skip
+        except (InputError, OSError) as error:
+            say = logger.info if self._outage_said else logger.warning
+            say(
+                "checkpoint.remote is not up to date: %s. Training goes on; tried again in %g minutes, and in the end",
+                reason_of(error), self._every_minutes,
+            )  # fmt: skip
+            self._outage_said = True
+        except Exception:  # whatever it is, the run is worth more
+            logger.exception("checkpoint.remote: %s is not up to date; training goes on", self._place)
+        finally:
+            self._update.release()
+
+    def _go_on(self) -> None:
+        """Break off where the run has ended, or is about to and has a newer checkpoint."""
+        if self._stop.is_set() or (self._hurry.is_set() and self._update.newest_here() != self._aim):
+            raise _BrokenOffError
+
+
+def reason_of(error: Exception) -> str:
+    """Return why a place is not up to date; the way out only where it does not pass by itself."""
+    if isinstance(error, UnreachableError) and not isinstance(error, RefusedError):
+        return f"{error.where}: {error.found}"
+    return str(error).rstrip(".")
+
+
+class NoMirror:
+    """Does nothing: there is no `checkpoint.remote`, or another process sees to it."""
+
+    def tick(self) -> None:
+        """Do nothing."""
+
+    def finish(self, is_asked_to_stop: Callable[[], bool]) -> None:
+        """Do nothing."""
+
+    def __enter__(self) -> NoMirror:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing."""
+
+
+class _Patience:
+    """Says how long to wait: long, but no longer than `then_s` from when a machine wants to be gone."""
+
+    def __init__(self, is_asked_to_stop: Callable[[], bool], then_s: float) -> None:
+        self._is_asked_to_stop, self._then_s = is_asked_to_stop, then_s
+        self._until_s, self._is_short = time.monotonic() + LONGEST_WAIT_S, False
+
+    def lasts(self) -> bool:
+        """Return whether to wait on."""
+        if not self._is_short and self._is_asked_to_stop():
+            self._is_short, self._until_s = True, time.monotonic() + self._then_s
+        return time.monotonic() < self._until_s
+
+
+class _BrokenOffError(Exception):
+    """What is being sent need not be sent any more."""

@@ -1,0 +1,127 @@
+"""How does a machine get a run from `checkpoint.remote`, to go on with it?
+
+The newest checkpoint there whose every file is what its manifest says; those that are damaged are named and passed
+over. The best one comes, too, and the run's small files. The checkpoint comes last, so that whoever is killed on the
+way begins again.
+"""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.checkpoint import FETCHING, checkpoint_name, remove_leavings, written_state
+from vjepa2_ac.runs.folder import CHECKPOINTS, check_run_folder, with_settled_stride
+from vjepa2_ac.runs.mirror.remote_checkpoints import RemoteCheckpoints
+from vjepa2_ac.runs.mirror.upload import SMALL_FILES
+from vjepa2_ac.storage import download, join, sync, write_atomically
+
+logger = logging.getLogger(__name__)
+
+
+def fetch_newest(
+    remote: RemoteCheckpoints,
+    names: Sequence[str],
+    config: Config,
+    note: Callable[[str], None],
+    *,
+    claim: Callable[[], None],
+    allow_config_change: bool = False,
+) -> list[str]:
+    """Download a run into `run_dir`, from the first of its checkpoints that is whole.
+
+    Args:
+        remote: Where it lies.
+        names: Its checkpoints that are further on than this machine's, the newest first.
+        config: The run.
+        note: Told what a person should know.
+        claim: Called before the first file is written; raises where the folder is somebody else's.
+        allow_config_change: The run there may have another config.
+
+    Returns:
+        The checkpoints that were found damaged; all of `names` where none is whole.
+
+    Raises:
+        InputError: The run there has another config; nothing has come then.
+        UnreachableError: The place cannot be reached.
+    """
+    folder, damaged = Path(config.run_dir), []
+    with tempfile.TemporaryDirectory() as temporary:
+        small = Path(temporary)
+        _fetch_small_files(remote.place, small)
+        _require_this_config(config, small, remote.place, allow_config_change=allow_config_change)
+        claim()
+        for name in SMALL_FILES:  # config.yaml first: without it the folder would be no run's
+            if (small / name).is_file():
+                write_atomically(folder / name, (small / name).read_bytes())
+    for name in names:
+        fetched = _fetch(remote, name, folder)
+        if fetched is not None:
+            _fetch_best(remote, fetched, folder)
+            _give_name(fetched, folder / CHECKPOINTS / name)
+            note(f"Fetched {name} from {remote.place}.")
+            break
+        damaged.append(name)
+    return damaged
+
+
+def _fetch_small_files(place: str, folder: Path) -> None:
+    for name in SMALL_FILES:
+        with suppress(FileNotFoundError):
+            download(join(place, name), folder / name)
+
+
+def _require_this_config(config: Config, fetched: Path, place: str, *, allow_config_change: bool) -> None:
+    """See that the run there is the one that is asked for, as if its folder were on this machine."""
+    try:
+        there = with_settled_stride(config.model_copy(update={"run_dir": str(fetched)}))
+        check_run_folder(there, allow_config_change=allow_config_change)
+    except InputError as error:
+        raise InputError(
+            where=f"checkpoint.remote {place}",
+            found=error.found,
+            needed=error.needed,
+            fix="Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change",
+        ) from None
+
+
+def _fetch(remote: RemoteCheckpoints, name: str, folder: Path) -> Path | None:
+    """Download a checkpoint under a temporary name; None, and a warning, where it is damaged."""
+    remove_leavings(folder / CHECKPOINTS)
+    fetched = folder / CHECKPOINTS / f"{FETCHING}{name}"
+    problem = remote.fetch(name, fetched)
+    if problem is None:
+        return fetched
+    shutil.rmtree(fetched)
+    logger.warning("%s: %s: %s; passed over", remote.place, name, problem)
+    return None
+
+
+def _fetch_best(remote: RemoteCheckpoints, newest: Path, folder: Path) -> None:
+    """Download the best checkpoint, if the newest names one that is there and is not on this machine."""
+    step = written_state(newest).best_step
+    if step is None or newest.name == f"{FETCHING}{checkpoint_name(step)}":
+        return
+    best = folder / CHECKPOINTS / checkpoint_name(step)
+    if best.is_dir():
+        return
+    fetched = best.with_name(f"{FETCHING}{best.name}")
+    problem = remote.fetch(best.name, fetched)
+    if problem is None:
+        _give_name(fetched, best)
+        return
+    shutil.rmtree(fetched)
+    logger.warning("%s: the best checkpoint, %s: %s; passed over", remote.place, best.name, problem)
+
+
+def _give_name(fetched: Path, name: Path) -> None:
+    if name.is_dir():  # a damaged one of this machine
+        shutil.rmtree(name)
+    fetched.rename(name)
+    sync(name.parent)

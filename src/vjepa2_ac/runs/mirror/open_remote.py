@@ -1,0 +1,167 @@
+"""What does a run do with `checkpoint.remote` before its first step? Try it, see whose it is, and go on from there.
+
+Where the place cannot be reached, that is a warning. Where it can never be written, or is another run's, it is an
+error.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.checkpoint import newest_checkpoint, step_of, written_state
+from vjepa2_ac.runs.folder import CHECKPOINTS
+from vjepa2_ac.runs.mirror.background_sync import Mirror, reason_of
+from vjepa2_ac.runs.mirror.fetch import fetch_newest
+from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
+from vjepa2_ac.storage import is_url, place, try_writing
+from vjepa2_ac.storage.remote import RefusedError, UnreachableError, quietly
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Remote:
+    """What is known of `checkpoint.remote` before the first step."""
+
+    place: str
+    config: Config  # its run_dir has what is to be gone on from
+    is_reachable: bool = True
+    damaged: tuple[str, ...] = ()  # checkpoints there
+
+    def mirror(self, run_id: str) -> Mirror:
+        """Return what keeps the place up to date from now on."""
+        folder, checkpoint = Path(self.config.run_dir), self.config.checkpoint
+        return Mirror(self.place, folder, run_id, checkpoint, damaged=self.damaged, outage_said=not self.is_reachable)
+
+
+def open_remote(
+    config: Config,
+    note: Callable[[str], None],
+    *,
+    claim: Callable[[], None] = lambda: None,
+    allow_config_change: bool = False,
+    into: Path | None = None,
+) -> Remote | None:
+    """Try `checkpoint.remote`, and fetch what is further on there; None where there is none.
+
+    A small file is written there and removed again.
+
+    Args:
+        config: The run.
+        note: Told what a person should know.
+        claim: Called before the first file is fetched; raises where the folder is somebody else's.
+        allow_config_change: The run there may have another config.
+        into: The folder to fetch into, new or empty, where it is not to be the run's own.
+
+    Raises:
+        InputError: It cannot be written and that will not pass, it has another run's checkpoints or another config, or
+            what is there is damaged or cannot be fetched and this machine has nothing to go on from.
+    """
+    if config.checkpoint.remote is None:
+        return None
+    remote = Remote(place(config.checkpoint.remote), config)
+    _refuse_own_folder(remote.place, Path(config.run_dir))
+    step, run_id = _where_this_machine_stands(Path(config.run_dir))
+    checkpoints = RemoteCheckpoints(remote.place)
+    try:
+        with quietly():
+            listing, owner = _look(checkpoints, run_id)
+    except UnreachableError as error:
+        stand = "without a checkpoint" if step is None else f"after step {step}"
+        _warn(f"{reason_of(error)}. Training begins with what is on this machine, {stand}, and tries again later")
+        return replace(remote, is_reachable=False)
+    minutes = config.checkpoint.remote_every_minutes
+    note(f"{remote.place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
+    further = [name for name in complete(listing) if step is None or (step_of(name) or 0) > step]
+    is_begun_there = step is None and owner is not None  # a machine was killed in its first upload, at the latest
+    if not further and not is_begun_there:
+        return remote
+    target = config if into is None else config.model_copy(update={"run_dir": str(into)})
+    try:
+        damaged = fetch_newest(checkpoints, further, target, note, claim=claim, allow_config_change=allow_config_change)
+    except UnreachableError as error:
+        if step is None:
+            raise
+        _warn(f"{reason_of(error)}. Training goes on after step {step}, though {further[0]} is there")
+        return remote
+    if further and damaged == further:
+        _refuse_all_damaged(remote.place, damaged, step)
+        return replace(remote, damaged=tuple(damaged))
+    return replace(remote, config=target, damaged=tuple(damaged))
+
+
+def _look(checkpoints: RemoteCheckpoints, run_id: str | None) -> tuple[Listing, str | None]:
+    """Return what is at the place and which run we are, as far as known; having written there and seen that it is ours.
+
+    Raises:
+        InputError: It cannot be written for good, or holds checkpoints of another run.
+        UnreachableError: It cannot be reached now.
+    """
+    try:
+        try_writing(checkpoints.place)
+        listing = checkpoints.listing()
+        owner = _refuse_foreign(checkpoints, listing, run_id)
+    except RefusedError as error:
+        raise InputError(
+            where="checkpoint.remote",
+            found=f"{checkpoints.place}: {error.found}",
+            needed="a place where files can be written and removed",
+            fix=f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out",
+        ) from error
+    return listing, owner
+
+
+def _refuse_foreign(checkpoints: RemoteCheckpoints, listing: Listing, run_id: str | None) -> str | None:
+    """Refuse checkpoints, and halves of them, of another run than this machine's or each other's; return that run."""
+    for name in sorted(listing, reverse=True):
+        owner = checkpoints.run_id(name)
+        run_id = owner if run_id is None else run_id
+        if owner is not None and owner != run_id:
+            raise InputError(
+                where="checkpoint.remote",
+                found=f"{checkpoints.place} holds a checkpoint of another run, {name}",
+                needed="an empty place, or the one of this run",
+                fix="Set another checkpoint.remote; nothing was written there",
+            )
+    return run_id
+
+
+def _refuse_own_folder(remote: str, run_dir: Path) -> None:
+    own = run_dir.resolve()
+    if not is_url(remote) and (Path(remote) == own or own in Path(remote).parents):
+        raise InputError(
+            where="checkpoint.remote",
+            found=f"{remote}, and run_dir is {own}",
+            needed="a place outside the run's folder",
+            fix="Set checkpoint.remote to a folder on another disk, or a URL such as gs://bucket/run",
+        )
+
+
+def _refuse_all_damaged(remote: str, damaged: list[str], step: int | None) -> None:
+    if step is None:
+        raise InputError(
+            where="checkpoint.remote",
+            found=f"{remote}: none of {len(damaged)} checkpoints is whole",
+            fix="To start the run anew, remove them, or set another checkpoint.remote",
+        )
+
+
+def _where_this_machine_stands(run_dir: Path) -> tuple[int | None, str | None]:
+    """Return step and run of the newest whole checkpoint of this machine."""
+    try:
+        checkpoint = newest_checkpoint(run_dir / CHECKPOINTS)
+    except InputError:  # none is whole: what is elsewhere may be
+        return None, None
+    if checkpoint is None:
+        return None, None
+    state = written_state(checkpoint)
+    return state.step, state.run_id
+
+
+def _warn(text: str) -> None:
+    logger.warning("checkpoint.remote: %s", text)

@@ -1,0 +1,186 @@
+"""What is done to bring `checkpoint.remote` up to date, once?
+
+First whose it is: where another run's checkpoints lie, nothing is written. Then halves of older checkpoints go, which
+take the room of what comes: the run's small files, the newest checkpoint that is whole, the best one. Last, what is
+kept no longer goes. What is being sent is held by hard links, so that training may remove it meanwhile.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from collections.abc import Callable, Collection
+from pathlib import Path
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.checkpoint import checkpoint_name, find_damage, listed, step_of, written_state
+from vjepa2_ac.runs.folder import CALIBRATION, CHECKPOINTS, CONFIG, ENVIRONMENT, HELD, METRICS, RUN_ID
+from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
+from vjepa2_ac.storage import join, read_bounded, upload
+from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown
+
+SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, RUN_ID, METRICS)
+
+GoOn = Callable[[], None]
+"""Called before each file; raises to break off."""
+
+
+class ForeignRunError(Exception):
+    """Another run's checkpoints are there; the argument is the name of one."""
+
+
+class OvertakenError(Exception):
+    """A later start of the same run keeps the place; the argument says which."""
+
+
+class RemoteUpdate:
+    """Brings a place up to date, and remembers what it found there. One call at a time.
+
+    Args:
+        remote: The place.
+        folder: The run's folder.
+        run_id: Whose checkpoints may be there.
+        keep: How many of the newest stay there, besides the best.
+        damaged: Names of checkpoints that were found damaged there; they are removed.
+    """
+
+    def __init__(
+        self, remote: RemoteCheckpoints, folder: Path, run_id: str, keep: int, damaged: Collection[str] = ()
+    ) -> None:
+        self._remote, self._folder, self._run_id, self._keep = remote, folder, run_id, keep
+        self._damaged = set(damaged)
+        self._ours: set[str] = set()  # checkpoints there that are known to be of this run
+        self._small: dict[str, tuple[int, int]] = {}  # sizes and times of the small files that were sent
+        self._starts: bytes | None = None  # the list of starts as it was sent: another one there is a later start's
+        self.release()  # what a process that was killed held
+
+    def __call__(self, go_on: GoOn) -> str | None:
+        """Send what is not there; return the newest checkpoint that now is, None where there is none to send.
+
+        Raises:
+            ForeignRunError: The place is another run's.
+            OvertakenError: Another machine began to go on with this run, and keeps the place.
+            UnreachableError: It cannot be reached.
+            OSError: The run's folder cannot be read, or written for the links.
+        """
+        listing = self._remote.listing()
+        self._require_ours(listing)
+        self._require_not_overtaken()
+        for name in self._damaged & set(listing):
+            self._remote.remove(name)
+            listing = {other: files for other, files in listing.items() if other != name}
+        self._damaged.clear()
+        newest = self._hold_newest()
+        if newest is None:
+            return None
+        best_name = _best_of(newest)
+        best = self._hold(best_name) if best_name not in {None, newest.name} else None
+        self._remove_halves(listing, newest.name, best_name, go_on)
+        self._send_small_files(go_on)
+        for checkpoint in (newest, best):
+            if checkpoint is not None:
+                self._remote.send(checkpoint, listing.get(checkpoint.name, {}), before_each=go_on)
+                self._ours.add(checkpoint.name)
+        self._rotate(newest.name, best_name, go_on)
+        return newest.name
+
+    def release(self) -> None:
+        """Let go of what was held."""
+        shutil.rmtree(self._folder / HELD, ignore_errors=True)
+
+    def newest_here(self) -> str | None:
+        """Return the newest checkpoint of this machine."""
+        return next(iter(self._names_here()), None)
+
+    def _require_ours(self, listing: Listing) -> None:
+        for name in sorted(set(listing) - self._ours):
+            owner = self._remote.run_id(name)
+            if owner is not None and owner != self._run_id:
+                raise ForeignRunError(name)
+            if owner is not None:
+                self._ours.add(name)
+
+    def _require_not_overtaken(self) -> None:
+        """Leave the place to whoever started last: two that send by turns would undo each other's."""
+        if self._starts is None:
+            return
+        path = join(self._remote.place, ENVIRONMENT)
+        try:
+            there = read_bounded(path, MOST_BYTES)
+        except FileNotFoundError:
+            self._small.pop(ENVIRONMENT, None)
+            return
+        if there != self._starts:
+            raise OvertakenError(_last_start(there, path))
+
+    def _send_small_files(self, go_on: GoOn) -> None:
+        """Send the files of the run's folder that have changed, as they are now: they may grow meanwhile."""
+        for name in SMALL_FILES:
+            source, copy = self._folder / name, self._folder / HELD / name
+            if not source.is_file():
+                continue
+            version = (source.stat().st_size, source.stat().st_mtime_ns)
+            if self._small.get(name) != version:
+                go_on()
+                shutil.copyfile(source, copy)
+                upload(copy, join(self._remote.place, name))
+                if name == ENVIRONMENT:
+                    self._starts = copy.read_bytes()
+                self._small[name] = version
+
+    def _hold_newest(self) -> Path | None:
+        return next(filter(None, map(self._hold, self._names_here())), None)
+
+    def _hold(self, name: str | None) -> Path | None:
+        """Link a checkpoint's files into a folder of our own; None where it is not whole, or just being removed."""
+        held = self._folder / HELD / str(name)
+        shutil.rmtree(held, ignore_errors=True)
+        try:
+            shutil.copytree(self._folder / CHECKPOINTS / str(name), held, copy_function=_link)
+        except (FileNotFoundError, shutil.Error):
+            return None
+        return held if find_damage(held) is None else None
+
+    def _remove_halves(self, listing: Listing, newest: str, best: str | None, go_on: GoOn) -> None:
+        """Remove older ones that were left by halves: a full place would never have room again; later ones stay."""
+        for name in sorted(set(listing) - {*complete(listing), newest, best}):
+            if (step_of(name) or 0) < (step_of(newest) or 0):
+                go_on()
+                self._remote.remove(name)
+
+    def _rotate(self, newest: str, best: str | None, go_on: GoOn) -> None:
+        """Remove what is not kept any more."""
+        whole = complete(self._remote.listing())
+        for name in sorted(set(whole) - {*whole[: self._keep], newest, best}):
+            go_on()
+            self._remote.remove(name)
+
+    def _names_here(self) -> list[str]:
+        """Return the checkpoints of this machine, the newest first."""
+        with contextlib.suppress(FileNotFoundError):
+            return [path.name for path in reversed(listed(self._folder / CHECKPOINTS))]
+        return []
+
+
+def _best_of(checkpoint: Path) -> str | None:
+    step = written_state(checkpoint).best_step
+    return None if step is None else checkpoint_name(step)
+
+
+def _last_start(starts: bytes, where: str) -> str:
+    """Return where and when a run was started last, in words."""
+    try:
+        last = json_list(starts, where=where)[-1]
+        return f"on {shown(last['host'])}, at {shown(last['time'])}"
+    except (InputError, LookupError, TypeError):
+        return "elsewhere"
+
+
+def _link(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except FileNotFoundError:
+        raise
+    except OSError:  # a file system without hard links
+        shutil.copyfile(source, target)

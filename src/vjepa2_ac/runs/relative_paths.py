@@ -1,0 +1,91 @@
+"""From where are the relative paths in a run's config meant? From the folder that the run was started in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_as_dict, config_as_flat_dict, parse_config
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.places import BUILTIN, is_url
+from vjepa2_ac.runs.folder import start_folders
+
+DATA, BASE, RANGES = "data.path", "model.base", "data.idle.ranges"
+_PATHS = (DATA, RANGES, "data.cache_dir", "data.disk_cache.dir", BASE)
+
+
+def with_paths_from_start(config: Config, run: Path, *, needed: Sequence[str]) -> Config:
+    """Return a run's config in which paths that lead nowhere from here are seen from where the run was started.
+
+    The config in the run's folder stays as it is: to go on with a run is another matter, see `require_start_folder`.
+
+    Args:
+        config: What `read_run_config` gave.
+        run: The run's folder.
+        needed: Paths that have to lead somewhere.
+
+    Raises:
+        InputError: One of these leads nowhere from there either.
+    """
+    flat, elsewhere = config_as_flat_dict(config), _seen_from_start(config, run)
+    for key in needed:
+        if _leads_nowhere(flat[key]) and key not in elsewhere:
+            starts = " or ".join(dict.fromkeys(map(str, start_folders(run))))
+            raise InputError(
+                where=f"{run}: {key}",
+                found=f"{flat[key]}: a relative path that leads nowhere from {Path.cwd()}"
+                + (f", nor from {starts}, where the run was started" if starts else ""),
+                fix=("Go to the folder in which it does" if starts else "Go to the folder in which the run was started")
+                + (", or name the data with --data CONFIG and a folder with --out" if key == DATA else ""),
+            )
+    return parse_config(_replaced(config_as_dict(config), elsewhere), where=str(run)) if elsewhere else config
+
+
+def require_start_folder(config: Config, run: Path) -> None:
+    """Refuse to go on with a run from another folder than its own, where its relative paths lead nowhere.
+
+    Raises:
+        InputError: Names the folder.
+    """
+    for key, path in _seen_from_start(config, run).items():
+        if key in {DATA, BASE}:
+            raise InputError(
+                where=f"{run}: {key}",
+                found=f"{config_as_flat_dict(config)[key]}: a relative path that leads nowhere from {Path.cwd()}",
+                needed=f"the folder in which the run was started: there it is {path}",
+                fix=f"Go to that folder: vjepa2-ac train {run.absolute()} --resume",
+            )
+
+
+def _seen_from_start(config: Config, run: Path) -> dict[str, str]:
+    """Return the paths, by their keys, that are there when seen from a folder in which the run was started."""
+    found: dict[str, str] = {}
+    flat = config_as_flat_dict(config)
+    for key in _PATHS:
+        unread = key == RANGES and config.data.source == "latents"  # there it is but a name, part of the cache's key
+        if unread or not _leads_nowhere(flat[key]):
+            continue
+        there = next((start / flat[key] for start in start_folders(run) if (start / flat[key]).exists()), None)
+        if there is not None:
+            found[key] = str(there)
+    return found
+
+
+def _leads_nowhere(path: str | None) -> bool:
+    """Return whether this is a relative path, and there is nothing at it."""
+    if path is None or is_url(path) or path.startswith(BUILTIN):
+        return False
+    here = Path(path)
+    return not here.is_absolute() and not here.exists()
+
+
+def _replaced(values: dict[str, Any], changes: dict[str, str]) -> dict[str, Any]:
+    for key, value in changes.items():
+        *sections, name = key.split(".")
+        inside = values
+        for section in sections:
+            inside = inside[section]
+        inside[name] = value
+    return values

@@ -1,0 +1,107 @@
+"""How does a tracker get the figures of a run and never hold it up? In a thread of its own, out of a queue."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Protocol, runtime_checkable
+
+logger = logging.getLogger(__name__)
+
+MOST_ROWS = 10_000  # that wait: some 15 MB
+
+
+@runtime_checkable
+class Tracker(Protocol):
+    """Takes figures; may raise anything, and take any time."""
+
+    def log(self, figures: Mapping[str, float], step: int) -> None:
+        """Take the figures of a row, named kind/figure, and its optimizer step."""
+        ...
+
+    def close(self) -> None:
+        """Write what is left."""
+        ...
+
+
+Opening = Callable[[], Tracker]
+
+
+class TrackerThread:
+    """A tracker in its thread, which opens it, hands it row after row and closes it; it is warned of once.
+
+    Args:
+        name: What a person knows it by.
+        opening: Opens it.
+        patience_s: After which it is said that it does not answer.
+    """
+
+    def __init__(self, name: str, opening: Opening, *, patience_s: float) -> None:
+        self._name, self._opening, self._patience_s = name, opening, patience_s
+        self._rows: queue.SimpleQueue[tuple[Mapping[str, float], int] | None] = queue.SimpleQueue()
+        self._trouble, self._since_s = "cannot be opened", time.monotonic()  # of the call that is under way
+        self._warned, self._dropped = False, 0
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
+
+    def log(self, figures: Mapping[str, float], step: int) -> None:
+        """Let a row wait for its turn."""
+        if not self._thread.is_alive():
+            return
+        if self._rows.qsize() < MOST_ROWS:
+            self._rows.put((figures, step))
+        else:
+            self._dropped += 1
+        if time.monotonic() - self._since_s > self._patience_s:
+            self._warn(f"no answer within {self._patience_s:g} s", "its figures wait")
+
+    def end(self) -> None:
+        """Let it close when it has all rows; does not wait."""
+        self._rows.put(None)
+
+    def wait(self, within_s: float, limit_s: float) -> None:
+        """Wait until it is closed, but no longer than that.
+
+        Args:
+            within_s: What is left of the limit.
+            limit_s: What to call it.
+        """
+        self._thread.join(within_s)
+        if self._thread.is_alive():
+            self._warn(f"no answer within {limit_s:g} s", "its last figures may be missing there")
+        if self._dropped:
+            logger.warning("%s was too slow for %d rows, which are missing there", self._name, self._dropped)
+
+    def _work(self) -> None:
+        after = "going on without it"
+        try:
+            tracker = self._opening()
+            self._idle()
+            while (row := self._rows.get()) is not None:
+                self._call("failed")
+                tracker.log(*row)
+                self._idle()
+            after = "its last figures may be missing there"
+            self._call("did not close")
+            tracker.close()
+        except BaseException as error:  # also what would end the program: a tracker never stops training
+            self._warn(_words(error), after)
+
+    def _call(self, trouble: str) -> None:
+        self._trouble, self._since_s = trouble, time.monotonic()
+
+    def _idle(self) -> None:
+        self._since_s = float("inf")
+
+    def _warn(self, reason: str, after: str) -> None:
+        if not self._warned:
+            self._warned = True
+            logger.warning("%s %s (%s); %s", self._name, self._trouble, reason, after)
+
+
+def _words(error: BaseException) -> str:
+    lines = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

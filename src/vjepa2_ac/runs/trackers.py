@@ -1,0 +1,176 @@
+"""Who draws curves of a run? TensorBoard, Weights & Biases and trackio, as the config asks.
+
+A tracker has a thread of its own (`tracker_thread`): one that cannot be opened, fails or hangs is left
+out with one warning, and training goes on as if it were not there. Only a library that is not installed is an error,
+before the first step.
+`metrics.jsonl` (`runs.metrics_log`) has all figures whatever becomes of trackers. A run that goes on, on whatever
+machine, goes on in the same W&B or trackio run.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vjepa2_ac.config import Config, TrackingConfig
+from vjepa2_ac.config.loading import config_as_flat_dict
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.folder import TENSORBOARD
+from vjepa2_ac.runs.tracker_thread import Opening, TrackerThread
+
+PATIENCE_S = 60.0  # after which it is said that a tracker does not answer
+CLOSING_S = 30.0  # how long the end of a run waits for all of them
+
+_INSTALL = {
+    "tensorboard": "Run pip install -c constraints.txt -e .",
+    "wandb": 'Run pip install -c constraints.txt -e ".[wandb]"',
+    "trackio": 'Run pip install -c constraints.txt -e ".[trackio]"',
+}
+
+
+class Trackers:
+    """Those trackers of a run that work.
+
+    Args:
+        openings: By the name that a person knows it by, what opens a tracker.
+        opening_s: After which it is said that one does not answer; training does not wait for it.
+        closing_s: Longer than this none is waited for in the end, all together.
+    """
+
+    def __init__(
+        self, openings: Mapping[str, Opening], *, opening_s: float = PATIENCE_S, closing_s: float = CLOSING_S
+    ) -> None:
+        self._closing_s = closing_s
+        self._guests = [TrackerThread(name, opening, patience_s=opening_s) for name, opening in openings.items()]
+
+    def log(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
+        """Hand on a row: its numbers; lists, such as errors by horizon, number by number from 1."""
+        numbers = {f"{kind}/{key}": value for key, value in _numbers(figures).items()}
+        for guest in self._guests:
+            guest.log(numbers, step)
+
+    def close(self) -> None:
+        """Close all; a second call does nothing."""
+        guests, self._guests = self._guests, []
+        until_s = time.monotonic() + self._closing_s
+        for guest in guests:
+            guest.end()
+        for guest in guests:
+            guest.wait(max(0.0, until_s - time.monotonic()), self._closing_s)
+
+
+def require_installed(tracking: TrackingConfig) -> None:
+    """See that the libraries of the trackers are there.
+
+    Raises:
+        InputError: One that was asked for is not installed.
+    """
+    asked = {
+        "tensorboard": tracking.tensorboard,
+        "wandb": tracking.wandb != "disabled",
+        "trackio": tracking.trackio,
+    }
+    for library, is_asked in asked.items():
+        if is_asked and importlib.util.find_spec(library) is None:
+            off = "disabled" if library == "wandb" else "false"
+            raise InputError(
+                where=f"tracking.{library}",
+                found=f"asked for, but {library} is not installed",
+                fix=f"{_INSTALL[library]}, or set tracking.{library}={off}",
+            )
+
+
+def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int) -> Trackers:
+    """Open the trackers that a config asks for; where one cannot be opened, say so and do without it.
+
+    Args:
+        config: The run.
+        folder: Its folder, where TensorBoard and W&B write.
+        run_id: What the run is called for good, there too.
+        first_step: Steps that are done; TensorBoard forgets those after it, which are done again.
+    """
+    tracking = config.tracking
+    openings: dict[str, Opening] = {}
+    if tracking.tensorboard:
+        openings["TensorBoard"] = lambda: _TensorBoard(folder / TENSORBOARD, first_step)
+    if tracking.wandb != "disabled":
+        openings["Weights & Biases"] = lambda: _WeightsAndBiases(config, folder, run_id)
+    if tracking.trackio:
+        openings["trackio"] = lambda: _Trackio(config, run_id)
+    return Trackers(openings)
+
+
+class _TensorBoard:
+    def __init__(self, folder: Path, first_step: int) -> None:
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._writer: Any = SummaryWriter(str(folder), purge_step=first_step + 1)
+
+    def log(self, figures: Mapping[str, float], step: int) -> None:
+        for name, value in figures.items():
+            self._writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class _WeightsAndBiases:
+    """W&B drops rows of steps that it has already: what a resumed run does again are the same figures."""
+
+    def __init__(self, config: Config, folder: Path, run_id: str) -> None:
+        import wandb
+
+        # Output is not taken over: the console's bar would end up in there. Times are bounded where W&B can.
+        bounds: dict[str, Any] = {"init_timeout": 20.0, "login_timeout": 30.0, "finish_timeout": 20.0, "console": "off"}
+        known = getattr(wandb.Settings, "model_fields", {})
+        self._run: Any = wandb.init(
+            project=config.tracking.project,
+            id=run_id,
+            name=folder.resolve().name,
+            resume="allow",
+            mode=config.tracking.wandb,
+            dir=os.environ.get("WANDB_DIR") or str(folder),
+            config=config_as_flat_dict(config),
+            allow_val_change=True,
+            settings=wandb.Settings(**{name: value for name, value in bounds.items() if name in known}),
+        )
+
+    def log(self, figures: Mapping[str, float], step: int) -> None:
+        self._run.log(dict(figures), step=step)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+class _Trackio:
+    """trackio finds a run again by its name, which is therefore the run's id."""
+
+    def __init__(self, config: Config, run_id: str) -> None:
+        import trackio
+
+        self._run: Any = trackio.init(
+            project=config.tracking.project,
+            name=run_id,
+            resume="allow",
+            config=config_as_flat_dict(config),
+            embed=False,
+        )
+
+    def log(self, figures: Mapping[str, float], step: int) -> None:
+        self._run.log(dict(figures), step=step)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+def _numbers(figures: Mapping[str, Any]) -> dict[str, float]:
+    numbers: dict[str, float] = {}
+    for key, value in figures.items():
+        values = {f"{key}/{n}": v for n, v in enumerate(value, start=1)} if isinstance(value, list) else {key: value}
+        numbers |= {name: float(v) for name, v in values.items() if isinstance(v, int | float) and math.isfinite(v)}
+    return numbers

@@ -1,0 +1,1 @@
+"""Closed loop: how well does a policy steer the simulated arm?"""

@@ -1,0 +1,183 @@
+"""How does a model steer beside doing nothing, chance and an oracle? The same problems for all, and files of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vjepa2_ac import __version__
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.video_writer import video_library
+from vjepa2_ac.planning.session import PlanningSession
+from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
+from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
+from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
+from vjepa2_ac.simulation.closed_loop.rollout import run_task
+from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M, TaskName, arm_for
+from vjepa2_ac.simulation.closed_loop.video import write_film
+from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
+from vjepa2_ac.simulation.world.domains import named_domain
+from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
+from vjepa2_ac.storage import user_can_write, write_atomically
+
+FILE, FILM = "closed_loop.json", "closed_loop.mp4"
+FORMAT = 1  # goes up when a reader of the file would have to change
+
+
+@dataclass(frozen=True)
+class BenchmarkOptions:
+    """What is to be done, how often, and what is kept of it."""
+
+    task: TaskName = "reach"
+    domain: str = "A"
+    episodes: int = 50
+    steps: int | None = None  # model steps of an episode; None: as many as the task has by default
+    seed: int = 0  # which problems
+    films: int = 6  # episodes in the video; 0: no video
+    renderer: Renderer = "rays"
+
+
+@dataclass(frozen=True)
+class ClosedLoopBenchmark:
+    """The results of a model (first), doing nothing, chance and the oracle, on the same problems."""
+
+    subject: str
+    checkpoint: str  # which one, in words; "" of a model
+    asked: BenchmarkOptions
+    planning: dict[str, Any]  # settings, as plain values
+    planning_seed: int
+    results: tuple[ClosedLoopResult, ...]
+
+    @property
+    def seconds_per_step(self) -> float:
+        """How long a model step is."""
+        return self.results[0].stride / CONTROL_RATE_HZ
+
+
+def run_benchmark(
+    steering: PlanningSession, asked: BenchmarkOptions, folder: Path, *, stage: Callable[[str], Progress] | None = None
+) -> tuple[ClosedLoopBenchmark, tuple[Path, ...]]:
+    """Let all four do the same problems; write closed_loop.json and the film. What can fail cheaply does so first.
+
+    Args:
+        steering: The model and how it plans; its `data.stride` is the length of a model step.
+        asked: What to do.
+        folder: Where the files go; made where it is missing.
+        stage: Gives a bar for a part of the work, by its title.
+
+    Raises:
+        InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, or a folder nobody can write.
+    """
+    stride = steering.config.data.stride
+    if stride == "auto":
+        raise InputError(
+            where="data.stride",
+            found="auto",
+            needed="a number of control steps, to steer",
+            fix="Say which, as data.stride=4",
+        )
+    if steering.config.data.pose_frame != "base":
+        raise InputError(
+            where=f"data.pose_frame: {steering.config.data.pose_frame}",
+            found="a model of states in another frame",
+            needed="base: the simulated arm is steered in the frame of its base",
+        )
+    if asked.films:
+        video_library()
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    arm = arm_for(asked.task, named_domain(asked.domain), renderer=asked.renderer)
+    results = []
+    for policy in _policies(steering, asked, arm):
+        result = run_task(
+            asked.task,
+            arm.domain,
+            policy,
+            episodes=asked.episodes,
+            seed=asked.seed,
+            steps=asked.steps,
+            stride=stride,
+            keep_pictures=asked.films if isinstance(policy, Planning) else 0,
+            arm=arm,
+            progress=stage(f"{asked.task}: {policy.name}") if stage else None,
+        )
+        results.append(result)
+    contest = ClosedLoopBenchmark(
+        steering.subject,
+        steering.checkpoint,
+        asked,
+        steering.config.planning.model_dump(mode="json"),
+        steering.config.seed,
+        tuple(results),
+    )
+    return contest, _written(contest, folder)
+
+
+def benchmark_as_dict(contest: ClosedLoopBenchmark) -> dict[str, Any]:
+    """Return every figure as plain values; docs tell what each is."""
+    return {
+        "format": FORMAT,
+        "about": {
+            "subject": contest.subject,
+            "checkpoint": contest.checkpoint,
+            **{key: value for key, value in dataclasses.asdict(contest.asked).items() if key != "films"},
+            "steps": contest.results[0].steps,
+            "stride": contest.results[0].stride,
+            "seconds_per_step": contest.seconds_per_step,
+            "success_below_cm": 100 * SUCCESS_M[contest.asked.task],
+            "planning": contest.planning,
+            "planning_seed": contest.planning_seed,
+            "version": __version__,
+            "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        },
+        "policies": {result.policy: _figures(result) for result in contest.results},
+    }
+
+
+def _policies(steering: PlanningSession, asked: BenchmarkOptions, arm: SimulatedArm) -> Sequence[Policy]:
+    limits = steering.config.planning.limits
+    uses_camera = steering.world_model.sizes.predictor.use_extrinsics
+    controller = steering.controller(extrinsics=arm.extrinsics() if uses_camera else None)
+    name = Path(steering.subject).name or steering.subject
+    taken = {DoNothing.name, RandomActions.name, Oracle.name}
+    model = Planning(controller, name if name not in taken else f"model {name}")
+    return model, DoNothing(), RandomActions(limits, seed=asked.seed), oracle_for(asked.task, limits, arm)
+
+
+def _figures(result: ClosedLoopResult) -> dict[str, Any]:
+    return {
+        "success": result.success_rate.as_dict(),
+        "success_ever": result.success_ever_rate.as_dict(),
+        "final_distance_cm": result.final_distance_cm.as_dict(),
+        "steps_needed": None if result.steps_needed is None else result.steps_needed.as_dict(),
+        "seconds_per_decision": result.seconds_per_decision.as_dict(),
+        "why_counts": result.why_counts,
+        "unreachable_commands": int(result.unreachable.sum()),
+        "by_episode": {
+            "success": result.successes.tolist(),
+            "steps_needed": [episode.steps_needed for episode in result.episodes],
+            "distance_cm": [[_rounded(one) for one in row] for row in result.distance_cm.tolist()],
+            "seconds": [[_rounded(one) for one in row] for row in result.seconds.tolist()],
+            "unreachable_commands": result.unreachable.tolist(),
+        },
+    }
+
+
+def _rounded(number: float) -> float:
+    if not math.isfinite(number):
+        raise ValueError(f"{number} among the figures of episodes")
+    return round(number, 4)
+
+
+def _written(contest: ClosedLoopBenchmark, folder: Path) -> tuple[Path, ...]:
+    path = folder / FILE
+    write_atomically(path, json.dumps(benchmark_as_dict(contest), indent=1, allow_nan=False) + "\n")
+    model = contest.results[0]
+    return (path, write_film(folder / FILM, [model])) if contest.asked.films else (path,)

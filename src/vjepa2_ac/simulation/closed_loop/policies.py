@@ -1,0 +1,155 @@
+"""Who drives the simulated robot? A planner, and those it is compared with: nothing, chance, and one who knows all."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.episode import ACTION_DIM
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem
+
+_ALMOST = 1 - 1e-9  # of a limit: rounding must not lead beyond it
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Something that chooses the action of the next model step (legend of actions: episode.py)."""
+
+    name: str
+    why: str  # of the last action, in a few words that can be counted
+
+    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Begin an episode. Only a policy that is to know more than the pictures looks into the problem."""
+
+    def act(
+        self, picture: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
+    ) -> Float[np.ndarray, " 7"]:
+        """Return the action of the next model step from what the camera sees and the measured state, in base frame."""
+
+
+class DoNothing:
+    """Leaves the arm where it is."""
+
+    name, why = "do nothing", "nothing"
+
+    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Need nothing."""
+
+    def act(
+        self,
+        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        state: Float[np.ndarray, " 7"],  # noqa: ARG002
+    ) -> Float[np.ndarray, " 7"]:
+        """Return no motion."""
+        return np.zeros(ACTION_DIM)
+
+
+class RandomActions:
+    """Draws every action evenly from what is allowed; the same problem gets the same actions.
+
+    Args:
+        limits: What is allowed: `xyz`, `rotation` and `gripper` of each axis, and the ball.
+        seed: Decides the actions, with the problem's number.
+    """
+
+    name, why = "random", "random"
+
+    def __init__(self, limits: LimitsConfig, seed: int = 0) -> None:
+        self._limits, self._seed = limits, seed
+        self._rng = np.random.default_rng(seed)
+
+    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+        """Begin the draws of this problem."""
+        self._rng = np.random.default_rng([self._seed, problem.index])
+
+    def act(
+        self,
+        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        state: Float[np.ndarray, " 7"],  # noqa: ARG002
+    ) -> Float[np.ndarray, " 7"]:
+        """Return the next draw."""
+        return shortened(self._rng.uniform(-1.0, 1.0, size=ACTION_DIM) * farthest(self._limits), self._limits)
+
+
+class Oracle:
+    """Knows the goal's state and goes straight there, as fast as is allowed. Rotation stays (`reach` needs none).
+
+    Args:
+        limits: What is allowed.
+    """
+
+    name, why = "oracle", "scripted"
+
+    def __init__(self, limits: LimitsConfig) -> None:
+        self._limits = limits
+        self._problem: TaskProblem | None = None
+
+    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+        """Learn the goal."""
+        self._problem = problem
+
+    def act(
+        self,
+        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        state: Float[np.ndarray, " 7"],
+    ) -> Float[np.ndarray, " 7"]:
+        """Return the next step towards the goal.
+
+        Raises:
+            ValueError: There is no problem yet.
+        """
+        if self._problem is None:
+            raise ValueError("no problem: call reset first")
+        way = np.zeros(ACTION_DIM)
+        way[:3], way[6] = (self._problem.goal - state)[:3], (self._problem.goal - state)[6]
+        return shortened(way, self._limits)
+
+
+class Planning:
+    """A world model that plans: sees the pictures and the measured state, nothing else.
+
+    Args:
+        controller: Plans with the model; its last `decision` can be looked at after every action.
+        name: Of the model, as tables show it.
+    """
+
+    def __init__(self, controller: Controller, name: str = "model") -> None:
+        self.controller, self.name, self.why = controller, name, ""
+
+    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+        """Give the planner the goal's picture."""
+        self.controller.reset(goal_picture)
+
+    def act(
+        self, picture: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
+    ) -> Float[np.ndarray, " 7"]:
+        """Return the first action of a plan."""
+        action = self.controller.act(picture, state)
+        self.why = self.controller.decision.why if self.controller.decision else ""
+        return action
+
+
+def farthest(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
+    """Return the largest size of each number of an action, whatever the ball says; 0 where it is held."""
+    gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
+    return np.array([*limits.xyz, *[limits.rotation] * 3, gripper])
+
+
+def shortened(way: Float[np.ndarray, " 7"], limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
+    """Return the way of a model step, in its direction, no farther than is allowed.
+
+    Position, rotation and gripper are shortened each by itself; a held axis is left out.
+    """
+    reach = farthest(limits)
+    way = np.where(reach > 0, way, 0.0)
+    for part in (slice(0, 3), slice(3, 6), slice(6, 7)):
+        beyond = np.abs(way[part]) / np.where(reach[part] > 0, reach[part], 1.0)
+        way[part] *= min(1.0, _ALMOST / max(float(beyond.max()), 1e-12))
+    if limits.ball != "none":
+        length = float(np.linalg.norm(way[:3], ord=1 if limits.ball == "l1" else 2))
+        way[:3] *= min(1.0, _ALMOST * limits.radius / max(length, 1e-12))
+    return way

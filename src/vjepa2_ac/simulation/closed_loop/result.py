@@ -1,0 +1,118 @@
+"""What came of episodes in closed loop? What happened in each, and the figures of all together."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from vjepa2_ac.evaluation.intervals import Estimate, mean_of, share_of
+from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M, TaskName, TaskProblem
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """What happened. Index 0 of `states`, `distances_m` and `pictures` is before the first action."""
+
+    problem: TaskProblem
+    states: Float[np.ndarray, "time 7"]  # measured, in the robot base frame
+    actions: Float[np.ndarray, "steps 7"]  # as the policy named them
+    blocks: Float[np.ndarray, "time 4"] | None  # where the block was, as `TaskProblem` tells it; None: there is none
+    distances_m: Float[np.ndarray, " time"]  # of what the task moves, to its goal
+    seconds: Float[np.ndarray, " steps"]  # that the policy took
+    whys: tuple[str, ...]  # of each action
+    unreachable: int  # commands that the arm could not follow to their end
+    goal_picture: UInt8[np.ndarray, "height width 3"]
+    pictures: UInt8[np.ndarray, "time height width 3"] | None  # where they are kept
+
+    @property
+    def success(self) -> bool:
+        """Whether it is done at the end."""
+        return bool(self.distances_m[-1] < SUCCESS_M[self.problem.task])
+
+    @property
+    def steps_needed(self) -> int | None:
+        """Model steps after which it was done for good; None: it is not done at the end."""
+        if not self.success:
+            return None
+        not_done = np.flatnonzero(self.distances_m >= SUCCESS_M[self.problem.task])
+        return int(not_done[-1]) + 1 if len(not_done) else 0
+
+    @property
+    def success_ever(self) -> bool:
+        """Whether it was done after any of the steps, perhaps in passing."""
+        return bool(self.distances_m[1:].min() < SUCCESS_M[self.problem.task])
+
+
+@dataclass(frozen=True)
+class ClosedLoopResult:
+    """A policy's episodes of a task; arrays hold one row per episode, estimates have 95 % intervals over episodes."""
+
+    task: TaskName
+    domain: str
+    policy: str
+    seed: int
+    steps: int  # model steps of an episode
+    stride: int  # control steps of a model step
+    episodes: tuple[EpisodeResult, ...]
+
+    @property
+    def distance_cm(self) -> Float[np.ndarray, "episodes time"]:
+        """Distance to the goal before the first step and after each."""
+        return np.stack([episode.distances_m for episode in self.episodes]) * 100
+
+    @property
+    def final_distances_cm(self) -> Float[np.ndarray, " episodes"]:
+        """Distance to the goal at the end."""
+        return self.distance_cm[:, -1]
+
+    @property
+    def successes(self) -> Bool[np.ndarray, " episodes"]:
+        """Whether it is done at the end."""
+        return np.array([episode.success for episode in self.episodes])
+
+    @property
+    def seconds(self) -> Float[np.ndarray, "episodes steps"]:
+        """What each decision took."""
+        return np.stack([episode.seconds for episode in self.episodes])
+
+    @property
+    def unreachable(self) -> Int[np.ndarray, " episodes"]:
+        """Commands that the arm could not follow to their end."""
+        return np.array([episode.unreachable for episode in self.episodes])
+
+    @property
+    def success_rate(self) -> Estimate:
+        """Share of episodes that are done at the end."""
+        return share_of(int(self.successes.sum()), len(self.episodes))
+
+    @property
+    def success_ever_rate(self) -> Estimate:
+        """Share that was done after any step: the flattering number, to compare with others' only."""
+        return share_of(sum(episode.success_ever for episode in self.episodes), len(self.episodes))
+
+    @property
+    def final_distance_cm(self) -> Estimate:
+        """Mean distance to the goal at the end."""
+        return self._mean(self.final_distances_cm)
+
+    @property
+    def steps_needed(self) -> Estimate | None:
+        """Mean model steps until it is done for good, of episodes that are done at the end; None: there are none."""
+        needed = [episode.steps_needed for episode in self.episodes if episode.steps_needed is not None]
+        return self._mean(np.array(needed, dtype=np.float64)) if needed else None
+
+    @property
+    def seconds_per_decision(self) -> Estimate:
+        """Mean time of a decision."""
+        return self._mean(self.seconds.mean(axis=1))
+
+    @property
+    def why_counts(self) -> dict[str, int]:
+        """How often each reason was given for an action, the commonest first."""
+        return dict(Counter(why for episode in self.episodes for why in episode.whys).most_common())
+
+    def _mean(self, values: Float[np.ndarray, " episodes"]) -> Estimate:
+        return mean_of(values, [f"{number:06d}" for number in range(len(values))])

@@ -1,0 +1,175 @@
+"""How well does a policy do what it is asked, when it sees what its actions lead to? Episodes and their figures.
+
+Every model step the policy sees a picture and the measured state and names an action; the state it leads to is sent as
+the command for `stride` control steps. What counts is where things are at the *end*: "once on the way" flatters.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from vjepa2_ac.episode import ACTION_DIM, Progress
+from vjepa2_ac.geometry import apply_action
+from vjepa2_ac.simulation.closed_loop.policies import Policy
+from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult, EpisodeResult
+from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for, make_problem
+from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.world.domains import Domain, named_domain
+from vjepa2_ac.simulation.world.kinematics import OutOfReachError
+from vjepa2_ac.simulation.world.motion import rest_joints
+
+_PARTS = 8  # of a way that cannot be gone to its end
+
+
+def run_task(
+    task: TaskName,
+    domain: str | Domain,
+    policy: Policy,
+    *,
+    episodes: int = 50,
+    seed: int = 0,
+    steps: int | None = None,
+    stride: int = 4,
+    keep_pictures: int = 0,
+    arm: SimulatedArm | None = None,
+    progress: Progress | None = None,
+) -> ClosedLoopResult:
+    """Let a policy do a task again and again. Every policy gets the same problems, so figures can be paired by row.
+
+    Args:
+        task: What to do.
+        domain: Where: A, B, or a domain.
+        policy: Who does it.
+        episodes: How many problems, from number 0 on.
+        seed: Which problems. Settings that were chosen on one seed are to be reported on another.
+        steps: Model steps of an episode; None: as many as the task has by default.
+        stride: Control steps of a model step (15 per second).
+        keep_pictures: Of so many episodes, the first ones, for a video.
+        arm: In this domain, from `arm_for` of this task, to be used again; None: a new one.
+        progress: Told how many episodes are done.
+
+    Raises:
+        InputError: MuJoCo is not installed, or no such domain.
+        ValueError: No episodes, or an action that is no action.
+    """
+    if isinstance(domain, str):
+        domain = named_domain(domain)
+    if episodes < 1:
+        raise ValueError(f"{episodes} episodes")
+    arm, steps = arm or arm_for(task, domain), steps or STEPS[task]
+    done: list[EpisodeResult] = []
+    for index in range(episodes):
+        problem = make_problem(task, domain, seed, index)
+        kept = index < keep_pictures
+        done.append(run_episode(arm, policy, problem, steps=steps, stride=stride, keep_pictures=kept))
+        if progress:
+            progress(index + 1, episodes)
+    return ClosedLoopResult(task, domain.name, policy.name, seed, steps, stride, tuple(done))
+
+
+def run_episode(
+    arm: SimulatedArm,
+    policy: Policy,
+    problem: TaskProblem,
+    *,
+    steps: int = 8,
+    stride: int = 4,
+    keep_pictures: bool = False,
+) -> EpisodeResult:
+    """Let a policy solve a problem, and return what happened.
+
+    A command that no joint angles lead to takes the arm as far on the straight way there as they do; it is counted.
+
+    Args:
+        arm: In the problem's domain; where it stands does not matter.
+        policy: Who does it.
+        problem: What is to be done.
+        steps: Model steps.
+        stride: Control steps of each.
+        keep_pictures: Whether the result holds what the camera saw.
+
+    Raises:
+        UnreachableError: The problem's own start or goal cannot be reached.
+        ValueError: No steps, an action that is not 7 finite numbers, or a block to be moved that the arm has not.
+    """
+    if min(steps, stride) < 1:
+        raise ValueError(f"{steps} model steps of {stride} control steps")
+    goal_picture = put(arm, problem.goal, problem.block_goal).picture()
+    put(arm, problem.start, problem.block_start)
+    policy.reset(problem, goal_picture)
+    states, blocks, pictures = [arm.state], [arm.block], [arm.picture()]
+    actions, seconds, whys, unreachable = [], [], [], 0
+    for _ in range(steps):
+        began = time.perf_counter()
+        action = np.asarray(policy.act(pictures[-1], states[-1]), dtype=np.float64)
+        seconds.append(time.perf_counter() - began)
+        actions.append(_checked(action, policy))
+        whys.append(policy.why)
+        unreachable += not _send(arm, action, stride)
+        states.append(arm.state)
+        blocks.append(arm.block)
+        pictures.append(arm.picture())
+    return EpisodeResult(
+        problem=problem,
+        states=np.stack(states),
+        actions=np.stack(actions),
+        blocks=None if problem.block_goal is None else np.stack([block for block in blocks if block is not None]),
+        distances_m=np.array([problem.distance_m(*seen) for seen in zip(states, blocks, strict=True)]),
+        seconds=np.array(seconds),
+        whys=tuple(whys),
+        unreachable=unreachable,
+        goal_picture=goal_picture,
+        pictures=np.stack(pictures) if keep_pictures else None,
+    )
+
+
+def put(arm: SimulatedArm, state: Float[np.ndarray, " 7"], block: Float[np.ndarray, " 4"] | None) -> SimulatedArm:
+    """Put arm and block somewhere, by way of the arm's rest: its spare joint must not depend on what was before."""
+    arm.set_joints(rest_joints(arm.domain), 0.0)
+    arm.set_state(state)
+    if block is not None:
+        arm.place_block(block)
+    return arm
+
+
+def ways_along(
+    state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], parts: int = _PARTS
+) -> Sequence[Float[np.ndarray, " 7"]]:
+    """Return states at even distances on the straight way of an action, the nearest first."""
+    shares = np.arange(1, parts + 1)[:, None] / parts
+    return list(apply_action(np.tile(state, (parts, 1)), shares * action))
+
+
+def _checked(action: Float[np.ndarray, " dim"], policy: Policy) -> Float[np.ndarray, " 7"]:
+    if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
+        raise ValueError(f"{policy.name}: {action.tolist()} is no action of {ACTION_DIM} finite numbers")
+    return action
+
+
+def _send(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int) -> bool:
+    """Command the state that an action leads to, its closedness within 0 .. 1; return whether it can be reached."""
+    target = _with_real_gripper(apply_action(arm.state, action))
+    try:
+        arm.command(target, stride)
+    except OutOfReachError:
+        pass
+    else:
+        return True
+    reachable = None
+    for way in ways_along(arm.state, action):
+        if not arm.can_reach(way):
+            break
+        reachable = way
+    if reachable is None:
+        arm.command_joints(arm.joints, target[6], stride)
+    else:
+        arm.command(np.append(reachable[:6], target[6]), stride)
+    return False
+
+
+def _with_real_gripper(state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+    return np.append(state[:6], np.clip(state[6], 0.0, 1.0))

@@ -1,0 +1,192 @@
+"""What is the simulated robot to do? Problems: where arm and block begin, where they shall be, and what counts as done.
+
+They are drawn in the world frame: a problem looks the same in every domain, however the robot is mounted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
+from vjepa2_ac.simulation.world.block_arm import ContactArm
+from vjepa2_ac.simulation.world.camera import FRAME_HEIGHT, FRAME_WIDTH
+from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
+from vjepa2_ac.simulation.world.scene import (
+    BLOCK_M,
+    FINGER_HALF_M,
+    FINGER_INSIDE_M,
+    FINGER_OUTSIDE_M,
+    FINGER_TRAVEL_M,
+    FINGERTIP_M,
+)
+
+TaskName = Literal["reach", "push", "pick"]
+
+SUCCESS_M: dict[TaskName, float] = {"reach": 0.05, "push": 0.04, "pick": 0.05}
+"""Closer than this at the end is a success: the flange to its goal (reach), or the block's middle to its own."""
+
+STEPS: dict[TaskName, int] = {"reach": 8, "push": 8, "pick": 12}
+"""Model steps of an episode, where nothing else is asked for."""
+
+REACH_WAY_M, PUSH_WAY_M, LIFT_M = (0.12, 0.25), (0.10, 0.16), (0.10, 0.14)
+"""How far start and goal lie apart: of the flange (reach), of the block (push), of the block upwards (pick)."""
+
+GRASP_M = FINGERTIP_M - 0.02
+"""Height of the flange over the middle of a block that is to be grasped."""
+
+HOLDING = 1.0 - (BLOCK_M / 2 - FINGER_INSIDE_M) / FINGER_TRAVEL_M
+"""Closedness of a gripper that holds the block."""
+
+_NUMBER: dict[TaskName, int] = {"reach": 0, "push": 1, "pick": 2}  # of the random stream
+_FLANGE_AREA = np.array([[0.32, -0.26], [0.62, 0.26]])  # low and high (x, y) in the world
+_BLOCK_AREA = np.array([[0.36, -0.26], [0.64, 0.26]])
+_PUSHING_M = 0.17  # height of the flange while pushing: the fingertips are 2 cm over the table
+_MOST_TURNED_RAD = 0.4  # of block and hand, from straight ahead
+
+
+@dataclass(frozen=True)
+class TaskProblem:
+    """One start and one goal. All is in the robot base frame of the domain (legend: episode.py).
+
+    A block is told by the middle of it and its turn about z: x, y, z in metres, radians.
+    """
+
+    task: TaskName
+    index: int
+    start: Float[np.ndarray, " 7"]
+    goal: Float[np.ndarray, " 7"]  # of the arm in the goal picture
+    block_start: Float[np.ndarray, " 4"] | None = None  # None: there is no block
+    block_goal: Float[np.ndarray, " 4"] | None = None
+
+    def distance_m(self, state: Float[np.ndarray, " 7"], block: Float[np.ndarray, " 4"] | None = None) -> float:
+        """Return how far what the task moves is from its goal: the block where there is one, else the flange.
+
+        Rotations and the gripper do not count.
+
+        Raises:
+            ValueError: The problem has a block, and none is given.
+        """
+        if self.block_goal is None:
+            return float(np.linalg.norm(state[:3] - self.goal[:3]))
+        if block is None:
+            raise ValueError(f"{self.task} is done by a block, and there is none")
+        return float(np.linalg.norm(block[:3] - self.block_goal[:3]))
+
+
+def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskProblem:
+    """Return a problem: a pure function of its arguments, and the same in the world in every domain.
+
+    reach: both ends in the box of `MotionRecipe`, gripper pointing down, the same turn and gripper at both.
+    push: the closed gripper stands behind the block, low; the goal lies straight ahead, the gripper still behind it.
+    pick: the open gripper is over the block; in the goal it holds it in the air.
+
+    Args:
+        task: What to do.
+        domain: Where; decides only in which frame the problem is told.
+        seed: Which problems.
+        index: Which of them.
+
+    Raises:
+        ValueError: No such task, or a negative seed or index.
+    """
+    if task not in _NUMBER:
+        raise ValueError(f"no task {task!r}: {', '.join(_NUMBER)}")
+    rng = np.random.default_rng([seed, index, _NUMBER[task]])
+    draw: dict[TaskName, Callable[[np.random.Generator], _Drawn]] = {"reach": _reach, "push": _push, "pick": _pick}
+    drawn = draw[task](rng)
+    first, last = _states(drawn, domain)
+    if drawn.blocks is None:
+        return TaskProblem(task, index, first, last)
+    block_start, block_goal = _blocks_in_base(drawn.blocks, domain)
+    return TaskProblem(task, index, first, last, block_start, block_goal)
+
+
+@dataclass(frozen=True)
+class _Drawn:
+    """Start and goal in the world frame."""
+
+    flange: Float[np.ndarray, "2 3"]
+    turn: float  # of the hand about the vertical, at both
+    closedness: tuple[float, float]
+    blocks: Float[np.ndarray, "2 4"] | None = None
+
+
+def _reach(rng: np.random.Generator) -> _Drawn:
+    recipe = MotionRecipe()
+    low, high = np.array(recipe.low_m), np.array(recipe.high_m)
+    start = rng.uniform(low, high)
+    while not REACH_WAY_M[0] <= np.linalg.norm((goal := rng.uniform(low, high)) - start) <= REACH_WAY_M[1]:
+        pass
+    turn, closedness = rng.uniform(-recipe.max_turn_rad, recipe.max_turn_rad), float(rng.integers(2))
+    return _Drawn(np.stack([start, goal]), turn, (closedness, closedness))
+
+
+def _push(rng: np.random.Generator) -> _Drawn:
+    """Push ahead with the fingers' broad side, or to the left or right with a finger's outer side."""
+    while True:
+        turn = rng.uniform(-_MOST_TURNED_RAD, _MOST_TURNED_RAD)
+        side = int(rng.integers(-1, 2))  # right, ahead, left
+        angle = turn + side * np.pi / 2
+        ahead = np.array([np.cos(angle), np.sin(angle)])
+        touching = BLOCK_M / 2 + (FINGER_OUTSIDE_M if side else FINGER_HALF_M)
+        before, way = rng.uniform(0.03, 0.07), rng.uniform(*PUSH_WAY_M)
+        block = rng.uniform(*_BLOCK_AREA)
+        blocks = np.stack([block, block + way * ahead])
+        flange = blocks - ahead * np.array([[touching + before], [touching]])
+        if _inside(blocks, _BLOCK_AREA) and _inside(flange, _FLANGE_AREA):
+            return _Drawn(_at(flange, _PUSHING_M), turn, (1.0, 1.0), _turned(_at(blocks, BLOCK_M / 2), turn))
+
+
+def _pick(rng: np.random.Generator) -> _Drawn:
+    turn = rng.uniform(-_MOST_TURNED_RAD, _MOST_TURNED_RAD)
+    block = np.append(rng.uniform(*(_FLANGE_AREA * 0.8 + 0.2 * _FLANGE_AREA.mean(axis=0))), BLOCK_M / 2)
+    lifted = block + np.append(rng.uniform(-0.03, 0.03, size=2), rng.uniform(*LIFT_M))
+    above = block + np.append(rng.uniform(-0.04, 0.04, size=2), GRASP_M + rng.uniform(0.07, 0.12))
+    flange = np.stack([above, lifted + np.array([0.0, 0.0, GRASP_M])])
+    return _Drawn(flange, turn, (0.0, HOLDING), _turned(np.stack([block, lifted]), turn))
+
+
+def _inside(places: Float[np.ndarray, "places 2"], area: Float[np.ndarray, "2 2"]) -> bool:
+    return bool(((places >= area[0]) & (places <= area[1])).all())
+
+
+def _at(places: Float[np.ndarray, "places 2"], height_m: float) -> Float[np.ndarray, "places 3"]:
+    return np.concatenate([places, np.full((len(places), 1), height_m)], axis=1)
+
+
+def _turned(places: Float[np.ndarray, "places 3"], turn: float) -> Float[np.ndarray, "places 4"]:
+    return np.concatenate([places, np.full((len(places), 1), turn)], axis=1)
+
+
+def _states(drawn: _Drawn, domain: Domain) -> Float[np.ndarray, "2 7"]:
+    """Return start and goal of the arm in the base frame: pointing down, turned about z."""
+    poses = poses_in_base(downward_poses(_turned(drawn.flange, drawn.turn)), domain)
+    return np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
+
+
+def _blocks_in_base(blocks: Float[np.ndarray, "blocks 4"], domain: Domain) -> Float[np.ndarray, "blocks 4"]:
+    turns = blocks[:, 3:] - np.deg2rad(domain.base_yaw_deg)
+    return np.concatenate([blocks[:, :3] @ domain.base_pose()[:3, :3], turns], axis=1)
+
+
+def arm_for(
+    task: TaskName,
+    domain: Domain,
+    *,
+    renderer: Renderer = "rays",
+    height: int = FRAME_HEIGHT,
+    width: int = FRAME_WIDTH,
+) -> SimulatedArm:
+    """Return an arm that can do a task: `reach` needs no contacts.
+
+    Raises:
+        InputError: MuJoCo is not installed, or OpenGL does not work here.
+    """
+    kind = SimulatedArm if task == "reach" else ContactArm
+    return kind(domain, renderer=renderer, height=height, width=width)

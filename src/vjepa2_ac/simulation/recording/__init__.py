@@ -1,0 +1,1 @@
+"""Recording: how are demonstrations of the simulated arm made?"""

@@ -1,0 +1,212 @@
+"""How is a data set of the simulated arm recorded? Random reaching, filmed, written as RLDS in DROID's schema."""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from vjepa2_ac.data.sources.rlds.writing.droid_writer import (
+    CAMERAS,
+    DroidCommands,
+    DroidEpisode,
+    DroidMeasurements,
+    encode_jpeg,
+    write_droid_rlds,
+)
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
+from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
+from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
+from vjepa2_ac.simulation.world.scene import load_mujoco
+
+SUCCESS_SHARE = 0.9
+JPEG_QUALITY = 85  # some 11 KB a picture, as in DROID
+_INSTRUCTIONS = {None: "reach around over the table", "push": "push the block", "pick": "pick up the block"}
+_SIMULATED_CAMERAS = dict(zip(CAMERAS, ("exterior_1", "exterior_2", "wrist"), strict=True))
+
+
+def record_dataset(
+    folder: str | Path,
+    *,
+    domain: str | Domain | DomainRanges,
+    episodes: int,
+    steps: int = 41,
+    seed: int = 0,
+    shards: int | None = None,
+    cameras: Literal[1, 3] = 1,
+    workers: int = 1,
+    renderer: Renderer = "rays",
+    recipe: MotionRecipe | None = None,
+    task: Literal["push", "pick"] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Record episodes and write them as a data set; the same arguments give the same bytes, whatever `workers`.
+
+    Other versions of MuJoCo, NumPy or the JPEG library may change last digits and bytes, not the episodes.
+
+    Args:
+        folder: Where the data set shall stand; must not hold anything yet.
+        domain: A `Domain`, or the name of one. For another world in every episode, `DomainRanges` to draw it from, or
+            `random`.
+        episodes: How many.
+        steps: Control steps of each (15 per second).
+        seed: Decides motion, outcome and, for `random`, the worlds.
+        shards: TFRecord files; one for every 32 episodes by default.
+        cameras: 1: the three pictures of a step are the same one. 3: each camera sees its own.
+        workers: Processes. More than one needs `if __name__ == "__main__":` in a script that calls this.
+        renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
+        recipe: How the arm moves, without a task.
+        task: With a block on the table: half of the episodes push or pick it by script, half play around it at random.
+        progress: Called with (episodes done, episodes in all).
+
+    Raises:
+        InputError: MuJoCo or OpenGL is missing, an unknown domain, a number out of range, or a folder that is in use or
+            cannot be written.
+    """
+    load_mujoco()
+    if min(episodes, steps - 1, workers, 1 if shards is None else shards, seed + 1) < 1:
+        raise InputError(
+            where="simulate record",
+            found=f"episodes {episodes}, steps {steps}, shards {shards}, workers {workers}, seed {seed}",
+            needed="at least 1 episode, 2 steps, 1 shard, 1 worker, seed 0",
+        )
+    if isinstance(domain, str):
+        domain = DomainRanges() if domain == "random" else named_domain(domain)
+    record = partial(
+        record_episode,
+        domain=domain,
+        steps=steps,
+        seed=seed,
+        cameras=cameras,
+        renderer=renderer,
+        recipe=recipe,
+        task=task,
+    )
+    stream = _watched(_recorded(record, episodes, workers), episodes, progress)
+    return write_droid_rlds(folder, stream, shards=shards or -(-episodes // 32))
+
+
+def record_episode(
+    index: int,
+    *,
+    domain: Domain | DomainRanges,
+    steps: int,
+    seed: int,
+    cameras: Literal[1, 3] = 1,
+    renderer: Renderer = "rays",
+    recipe: MotionRecipe | None = None,
+    task: Literal["push", "pick"] | None = None,
+) -> DroidEpisode:
+    """Return one episode, in a domain or in a world drawn from ranges: a pure function of its arguments.
+
+    Raises:
+        InputError: MuJoCo or OpenGL is missing.
+    """
+    motion_rng, world_rng = (np.random.default_rng([seed, index, purpose]) for purpose in range(2))
+    world = domain if isinstance(domain, Domain) else sample_domain(world_rng, domain)
+    if task is None:
+        motion = random_reaching(world, steps, motion_rng, recipe)
+        images = _film(world, motion, cameras, renderer)
+    else:
+        from vjepa2_ac.simulation.recording.scripted_play import (
+            play,  # torch comes with it, which reaching around does without
+        )
+
+        images = {}
+        motion = play(
+            task,
+            world,
+            steps,
+            motion_rng,
+            script=index % 2 == 0,
+            renderer=renderer,
+            look=lambda arm: _take(arm, images, cameras),
+        )
+    folder = episode_folder(index, seed, world.name)
+    return DroidEpisode(
+        file_path=f"{folder}/trajectory.h5",
+        recording_folderpath=f"{folder}/recordings/MP4",
+        action=np.concatenate([motion.commanded_poses, motion.commanded_gripper[:, None]], axis=1),
+        action_dict=_commands(motion),
+        observation=DroidMeasurements(
+            cartesian_position=motion.poses, gripper_position=motion.gripper[:, None], joint_position=motion.joints
+        ),
+        images={feature: images.get(feature, images[CAMERAS[0]]) for feature in CAMERAS},
+        language_instruction=_INSTRUCTIONS[task],
+    )
+
+
+def episode_folder(index: int, seed: int, domain_name: str) -> str:
+    """Return the folder that an episode pretends to come from; as in DROID, only it says success or failure."""
+    succeeded = np.random.default_rng([seed, index, 2]).uniform() < SUCCESS_SHARE
+    minute, hour, day = index % 60, index // 60 % 24, 1 + index // 1440 % 28
+    place = f"{domain_name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"
+    return f"/simulated/SIM/{'success' if succeeded else 'failure'}/2026-01-{day:02d}/{place}"
+
+
+def _film(world: Domain, motion: Motion, cameras: int, renderer: Renderer) -> dict[str, list[bytes]]:
+    arm = SimulatedArm(world, renderer=renderer)
+    films: dict[str, list[bytes]] = {}
+    for joints, closedness in zip(motion.joints, motion.gripper, strict=True):
+        arm.set_joints(joints, float(closedness))
+        _take(arm, films, cameras)
+    return films
+
+
+def _take(arm: SimulatedArm, films: dict[str, list[bytes]], cameras: int) -> None:
+    """Add what the cameras see now to their films."""
+    for feature in CAMERAS[:cameras]:
+        picture = arm.picture(_SIMULATED_CAMERAS[feature])
+        films.setdefault(feature, []).append(encode_jpeg(picture, quality=JPEG_QUALITY))
+
+
+def _commands(motion: Motion) -> DroidCommands:
+    """Return DROID's `action_dict`; velocities are what the commands ask for, in units per second."""
+    poses = motion.commanded_poses
+    angles = np.concatenate([poses[:, :3], np.unwrap(poses[:, 3:], axis=0)], axis=1)
+    gripper = motion.commanded_gripper[:, None]
+    return DroidCommands(
+        cartesian_position=poses,
+        cartesian_velocity=_velocity(angles),
+        gripper_position=gripper,
+        gripper_velocity=_velocity(gripper),
+        joint_position=motion.commanded_joints,
+        joint_velocity=_velocity(motion.commanded_joints),
+    )
+
+
+def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "steps dim"]:
+    """Return the velocity that led to each position; the first is that of the second."""
+    ways = np.diff(positions, axis=0)
+    return np.concatenate([ways[:1], ways]) * CONTROL_RATE_HZ
+
+
+def _recorded(record: Callable[[int], DroidEpisode], episodes: int, workers: int) -> Iterator[DroidEpisode]:
+    """Yield the episodes in order; a few at a time are under way."""
+    if workers == 1:
+        yield from map(record, range(episodes))
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context) as pool:
+        indices = iter(range(episodes))
+        waiting = [pool.submit(record, index) for index in itertools.islice(indices, 3 * workers)]
+        while waiting:
+            yield waiting.pop(0).result()
+            waiting += [pool.submit(record, index) for index in itertools.islice(indices, 1)]
+
+
+def _watched(
+    stream: Iterator[DroidEpisode], episodes: int, progress: Callable[[int, int], None] | None
+) -> Iterator[DroidEpisode]:
+    for done, episode in enumerate(stream, start=1):
+        yield episode
+        if progress:
+            progress(done, episodes)

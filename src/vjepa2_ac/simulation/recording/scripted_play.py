@@ -1,0 +1,116 @@
+"""How is a demonstration with a block made? An oracle with unsteady hands, or random play around the block.
+
+Commands are those of the closed loop: every model step one state is sent, and held for the step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.episode import ACTION_DIM
+from vjepa2_ac.geometry import apply_action
+from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
+from vjepa2_ac.simulation.closed_loop.policies import shortened
+from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
+from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, arm_for, make_problem
+from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
+from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.simulation.world.kinematics import OutOfReachError, inverse_kinematics
+from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, rest_joints
+
+_UNSTEADY_M = 0.008  # standard deviation of what is added to each axis of an oracle's step
+_LOWEST_M, _HIGHEST_M = 0.155, 0.34  # of the flange while playing
+_TO_BLOCK = 0.5  # chance that a step of play goes for the block, or through it
+_AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # of the flange while playing, in the world
+
+
+def play(
+    task: Literal["push", "pick"],
+    domain: Domain,
+    steps: int,
+    rng: np.random.Generator,
+    *,
+    script: bool,
+    renderer: Renderer = "rays",
+    look: Callable[[SimulatedArm], None] | None = None,
+) -> Motion:
+    """Return a demonstration of `steps` control steps with an arm that touches the block.
+
+    Args:
+        task: Which problem is begun with, and whether the gripper is used.
+        domain: Where.
+        steps: Control steps.
+        rng: Decides everything.
+        script: Whether an oracle solves the problem, with unsteady hands; otherwise, random play.
+        renderer: Of the arm's cameras.
+        look: Called at every control step, when its measurements are taken.
+
+    Raises:
+        InputError: MuJoCo or OpenGL is missing.
+    """
+    recipe = MotionRecipe()
+    arm = arm_for(task, domain, renderer=renderer)
+    problem = make_problem(task, domain, int(rng.integers(2**31)), 0)
+    limits = LimitsConfig(xyz=(recipe.reach_m,) * 3)
+    oracle = oracle_for(task, limits, arm)
+    put(arm, problem.start, problem.block_start)
+    oracle.reset(problem, np.zeros((1, 1, 3), dtype=np.uint8))
+    rows: list[tuple[np.ndarray, float, np.ndarray, float]] = []
+    joints, grip = arm.joints, float(problem.start[6])
+    for step in range(steps):
+        if step % recipe.stride == 0:
+            if script:
+                action = _unsteady(oracle.act(np.zeros((1, 1, 3), dtype=np.uint8), arm.state), limits, rng)
+            else:
+                action = _playful(arm, problem, limits, rng)
+            joints, grip = _sent(arm, action)
+        rows.append((joints, grip, arm.joints, arm.closedness))
+        if look:
+            look(arm)
+        arm.command_joints(joints, grip)
+    commanded, commanded_grip, measured, measured_grip = zip(*rows, strict=True)
+    return Motion(np.array(commanded), np.array(commanded_grip), np.array(measured), np.array(measured_grip))
+
+
+def _unsteady(action: Float[np.ndarray, " 7"], limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
+    return shortened(action + np.append(rng.normal(0.0, _UNSTEADY_M, size=3), np.zeros(4)), limits)
+
+
+def _playful(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
+    """Return a step to or through the block, or anywhere; for `pick`, now and then the gripper opens or closes."""
+    state, block = arm.state, arm.block
+    if block is None:
+        raise ValueError("there is no block to play with")
+    turn = arm.domain.base_pose()[:3, :3]
+    way = np.zeros(ACTION_DIM)
+    if rng.uniform() < _TO_BLOCK:
+        height = GRASP_M if problem.task == "pick" else problem.goal[2] - block[2]
+        way[:3] = block[:3] - state[:3] + np.append(rng.normal(0.0, 0.03, size=2), height)
+        way[:2] *= rng.uniform(0.6, 1.8)
+    else:
+        way[:3] = rng.uniform(-1.0, 1.0, size=3) * limits.xyz
+    if problem.task == "pick" and rng.uniform() < 0.25:
+        way[6] = rng.choice([-1.0, 1.0]) * limits.gripper
+    way = shortened(way, limits)
+    place = turn @ (state[:3] + way[:3])
+    low, high = np.append(_AREA[0], _LOWEST_M), np.append(_AREA[1], _HIGHEST_M)
+    way[:3] = turn.T @ np.clip(place, low, high) - state[:3]
+    return shortened(way, limits)
+
+
+def _sent(arm: SimulatedArm, action: Float[np.ndarray, " 7"]) -> tuple[np.ndarray, float]:
+    """Return the joints and closedness that a step is sent to, as far on its way as they lead."""
+    rest, joints = rest_joints(arm.domain), arm.joints
+    target = apply_action(arm.state, action)
+    for way in [target, *reversed(ways_along(arm.state, action)[:-1])]:
+        try:
+            joints = inverse_kinematics(way[:6], arm.joints, rest=rest)
+        except OutOfReachError:
+            continue
+        break
+    return joints, float(np.clip(target[6], 0.0, 1.0))

@@ -1,0 +1,94 @@
+"""What happens where the arm touches things? The same arm with servos in MuJoCo's dynamics, and a block to move.
+
+Its joints follow the same commands with the same lag as those of `SimulatedArm`, as long as nothing is in the way.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
+from vjepa2_ac.simulation.world.block_scene import SUBSTEPS, compile_contact_scene
+from vjepa2_ac.simulation.world.camera import FRAME_HEIGHT, FRAME_WIDTH
+from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.simulation.world.motion import GRIPPER_LAG_S
+from vjepa2_ac.simulation.world.scene import FINGER_TRAVEL_M
+
+_GRIP_STAYS = 0.05  # a gripper told to change by less keeps its last command, and so its force
+_MOVED, _FINGERS, _BLOCK = slice(0, 9), slice(7, 9), slice(9, 16)  # of qpos
+
+
+class ContactArm(SimulatedArm):
+    """A Franka-like arm that pushes and grasps a block. States are measured, in the robot base frame.
+
+    A gripper that is stopped by what it holds is measured where it stands, as on a real robot; told to stay there, it
+    goes on holding.
+
+    Args:
+        domain: The world it stands in.
+        renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
+        height, width: Size of the pictures.
+
+    Raises:
+        InputError: MuJoCo is not installed, or OpenGL does not work here.
+    """
+
+    def __init__(
+        self, domain: Domain, *, renderer: Renderer = "rays", height: int = FRAME_HEIGHT, width: int = FRAME_WIDTH
+    ) -> None:
+        super().__init__(domain, renderer=renderer, height=height, width=width)
+        lags = np.array([domain.lag_s] * 7 + [GRIPPER_LAG_S] * 2)
+        self._share = 1.0 - np.exp(-self._model.opt.timestep / lags)
+        self._ahead = (
+            -self._model.actuator_biasprm[:, 2] / self._model.actuator_gainprm[:, 0] / self._model.opt.timestep
+        )
+
+    @property
+    def closedness(self) -> float:
+        """Measured closedness of the gripper, from where its fingers are."""
+        return float(np.clip(1.0 - self._data.qpos[_FINGERS].mean() / FINGER_TRAVEL_M, 0.0, 1.0))
+
+    @property
+    def block(self) -> Float[np.ndarray, " 4"]:
+        """Where the block's middle is and how it is turned about z, in the robot base frame: metres, radians."""
+        turn, place = self.domain.base_pose()[:3, :3], self._data.qpos[_BLOCK]
+        rotation = turn.T @ Rotation.from_quat(place[3:], scalar_first=True).as_matrix()
+        return np.append(turn.T @ place[:3], np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+    def place_block(self, block: Float[np.ndarray, " 4"]) -> None:
+        """Put the block there at once, upright and at rest."""
+        turn = Rotation.from_matrix(self.domain.base_pose()[:3, :3])
+        rotation = turn * Rotation.from_euler("z", block[3])
+        self._data.qpos[_BLOCK] = [*turn.apply(block[:3]), *rotation.as_quat(scalar_first=True)]
+        self._data.qvel[9:] = 0.0
+        self._mujoco.mj_kinematics(self._model, self._data)
+
+    def set_joints(self, joints: Float[np.ndarray, " 7"], closedness: float) -> None:
+        """Put the arm there at once, at rest; what it held stays behind."""
+        super().set_joints(joints, closedness)
+        self._data.qvel[_MOVED] = 0.0
+        self._data.qacc_warmstart[:] = 0.0
+        self._wanted = self._data.qpos[_MOVED].copy()
+        self._grip = closedness
+
+    def command_joints(
+        self, goal: Float[np.ndarray, " 7"], closedness: float, control_steps: int = 1
+    ) -> Float[np.ndarray, " 7"]:
+        """Send the joints (radians) and the gripper there for some control steps; return the state measured then."""
+        if abs(closedness - self.closedness) > _GRIP_STAYS:
+            self._grip = closedness
+        ends = np.append(goal, [FINGER_TRAVEL_M * (1.0 - self._grip)] * 2)
+        for _ in range(control_steps * SUBSTEPS):
+            way = self._share * (ends - self._wanted)
+            self._wanted += way
+            self._data.ctrl[:] = self._wanted + self._ahead * way  # servos follow without a lag of their own
+            self._mujoco.mj_step(self._model, self._data)
+        self._mujoco.mj_kinematics(self._model, self._data)
+        return self.state
+
+    def _compiled(self, domain: Domain) -> Any:
+        return compile_contact_scene(domain)

@@ -1,0 +1,106 @@
+"""How does the scene become one in which things touch? A block on the table, friction, fingers that hold, servos."""
+
+from __future__ import annotations
+
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.simulation.world.kinematics import JOINTS
+from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
+from vjepa2_ac.simulation.world.scene import ARM_GROUP, BLOCK_M, as_text, load_mujoco, scene_tree
+
+WORK_AREA_M = ((0.28, 0.74), (-0.38, 0.38))
+"""Ranges of x and y in the world that are kept clear of other things, for the block."""
+SUBSTEPS = 32
+"""Steps of physics per control step."""
+
+_BLOCK_KG = 0.15
+_GREEN = (0.10, 0.72, 0.22)  # which nothing else in domains A and B has
+_SLIDING, _HOLDING = "1.0 0.01 0.001", "1.5 0.05 0.001"  # friction: sliding, about the normal, rolling
+_HARD = "0.005 1"  # time constant (s) and damping of contacts: the servos must not press fingers into the table
+_ARM_STIFFNESS = (4000.0,) * 4 + (1500.0,) * 3  # N m / rad
+_FINGER_STIFFNESS, _FINGER_FORCE = 1500.0, 40.0  # N / m, N
+
+
+def compile_contact_scene(domain: Domain) -> Any:
+    """Return the compiled `mujoco.MjModel` of a domain with a free body `block`, behind all other coordinates.
+
+    Servos `joint1` .. `joint7`, `finger1`, `finger2` drive the arm, on which gravity does not act. The fingers and the
+    hand touch block, table and things; the links do not. Things in the work area are left out.
+
+    Raises:
+        InputError: MuJoCo is not installed.
+    """
+    return load_mujoco().MjModel.from_xml_string(contact_scene_xml(domain))
+
+
+def contact_scene_xml(domain: Domain) -> str:
+    """Return the scene as MJCF."""
+    root = scene_tree(domain)
+    timestep = 1.0 / CONTROL_RATE_HZ / SUBSTEPS
+    ET.SubElement(root, "option", timestep=repr(timestep), integrator="implicitfast", cone="elliptic", impratio="10")
+    world = root.find("worldbody")
+    assert world is not None  # noqa: S101 - scene_tree makes it
+    _clear_work_area(world)
+    for geom in world.findall("geom"):
+        geom.attrib.update(contype="1", conaffinity="3", friction=_SLIDING)
+    for body in world.iter("body"):
+        _drive(body)
+    _add_block(world)
+    _add_servos(ET.SubElement(root, "actuator"))
+    return ET.tostring(root, encoding="unicode")
+
+
+def _clear_work_area(world: ET.Element) -> None:
+    for geom in world.findall("geom"):
+        place = [float(number) for number in geom.get("pos", "0 0 0").split()]
+        inside = all(low <= value <= high for value, (low, high) in zip(place, WORK_AREA_M, strict=False))
+        if geom.get("name", "").startswith("thing") and inside:
+            world.remove(geom)
+
+
+def _drive(body: ET.Element) -> None:
+    """Free a body of the arm from gravity; let it touch what is no arm if it is part of the gripper."""
+    is_gripper = body.get("name") in {"hand", "finger1", "finger2"}
+    body.set("gravcomp", "1")
+    for geom in body.findall("geom"):
+        if is_gripper:
+            geom.attrib.update(contype="2", conaffinity="0", priority="1", condim="4", friction=_HOLDING, solref=_HARD)
+        else:
+            geom.attrib.update(contype="0", conaffinity="0")
+    for joint in body.findall("joint"):
+        joint.set("armature", "0.05" if is_gripper else "0.3")
+
+
+def _add_block(world: ET.Element) -> None:
+    half = BLOCK_M / 2
+    body = ET.SubElement(world, "body", name="block", pos=as_text([0.5, 0.0, half]))
+    ET.SubElement(body, "freejoint", name="block")
+    ET.SubElement(
+        body,
+        "geom",
+        name="block",
+        type="box",
+        size=as_text([half] * 3),
+        mass=repr(_BLOCK_KG),
+        rgba=as_text([*_GREEN, 1.0]),
+        group=str(ARM_GROUP),  # what moves
+        contype="1",
+        conaffinity="3",
+        condim="4",
+        friction=_SLIDING,
+    )
+
+
+def _add_servos(actuators: ET.Element) -> None:
+    for index, stiffness in enumerate(_ARM_STIFFNESS[: len(JOINTS)], start=1):
+        name = f"joint{index}"
+        ET.SubElement(actuators, "position", name=name, joint=name, kp=repr(stiffness), dampratio="1")
+    for name in ("finger1", "finger2"):
+        force = as_text(np.array([-_FINGER_FORCE, _FINGER_FORCE]))
+        ET.SubElement(
+            actuators, "position", name=name, joint=name, kp=repr(_FINGER_STIFFNESS), dampratio="1", forcerange=force
+        )

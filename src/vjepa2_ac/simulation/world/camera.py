@@ -1,0 +1,164 @@
+"""What does a camera see? Pictures by ray casting: no OpenGL, no display.
+
+MuJoCo says which geom each pixel's ray meets, and where; colour, light and shadow are numpy. What never moves is cast
+and lit once per camera; per picture only the arm is cast, and its shadow, and only where they can be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.simulation.world.ray_renderer import Caster, Hits, View, lamp_view
+from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, light_position, load_mujoco
+
+FRAME_HEIGHT, FRAME_WIDTH = 180, 320
+"""Size of DROID's pictures in RLDS."""
+
+_SHADOW = 0.35  # share of the lamp's light that reaches a shadowed spot all the same
+_FAR_M = 20.0  # where the background of a ray that meets nothing is taken to be
+
+
+@dataclass(frozen=True)
+class _Background:
+    """What does not move, as one camera sees it; pixels are flat."""
+
+    lit: UInt8[np.ndarray, "pixels 3"]
+    shaded: UInt8[np.ndarray, "pixels 3"]  # as it is where the arm's shadow falls
+    distance_m: Float[np.ndarray, " pixels"]
+    spots: Float[np.ndarray, "pixels 3"]
+    from_camera: View
+    from_lamp: View
+
+
+class RayCamera:
+    """A camera in the world that sees by casting one ray per pixel.
+
+    Args:
+        model: The scene as `scene.compile_scene` gives it.
+        domain: Its look.
+        pose: The camera's frame in the world: x right, y down, z into the picture.
+        vertical_fov_deg: Angle from the upper to the lower edge of the picture.
+        height, width: Size of the picture.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        domain: Domain,
+        pose: Float[np.ndarray, "4 4"],
+        *,
+        vertical_fov_deg: float,
+        height: int = FRAME_HEIGHT,
+        width: int = FRAME_WIDTH,
+    ) -> None:
+        self._caster, self._colours = Caster(model), _Colours(model)
+        self._lamp, self._ambient = light_position(domain.look), domain.look.ambient
+        self._size = (width, height)
+        self._half_view = np.tan(np.deg2rad(vertical_fov_deg) / 2) * np.array([width / height, 1.0])
+        self._pose = pose
+        self._background: _Background | None = None
+
+    def move(self, pose: Float[np.ndarray, "4 4"]) -> None:
+        """Put the camera elsewhere; the next picture is cast anew, walls and table included."""
+        self._pose = pose
+        self._background = None
+
+    def picture(self, data: Any) -> UInt8[np.ndarray, "height width 3"]:
+        """Return what the camera sees of this `mujoco.MjData`, whose kinematics must be up to date."""
+        behind = self._background = self._background or self._see_background(data)
+        pixels = behind.lit.copy()
+        near = behind.from_lamp.near_arm(self._caster, data)
+        dark = near[self._caster.shaded(data, self._lamp, behind.spots[near], ARM_GROUP)]
+        pixels[dark] = behind.shaded[dark]
+        view = behind.from_camera
+        near = view.near_arm(self._caster, data)
+        hits = self._caster.cast(data, view.origin, view.rays[near], ARM_GROUP)
+        front = np.flatnonzero((hits.geoms >= 0) & (hits.distance_m < behind.distance_m[near]))
+        near, hits = near[front], Hits(*(part[front] for part in hits))
+        spots = view.origin + view.rays[near] * hits.distance_m[:, None]
+        ambient, direct = self._light(data, spots, hits, ARM_GROUP)
+        pixels[near] = _as_bytes(ambient + direct)
+        return pixels.reshape(*self._size[::-1], 3)
+
+    def _see_background(self, data: Any) -> _Background:
+        view = View(
+            self._pose, _pixel_rays(self._size, self._half_view) @ self._pose[:3, :3].T, self._half_view, self._size
+        )
+        hits = self._caster.cast(data, view.origin, view.rays, STATIC_GROUP)
+        distance = np.where(hits.geoms >= 0, hits.distance_m, _FAR_M)
+        spots = view.origin + view.rays * distance[:, None]
+        ambient, direct = self._light(data, spots, hits, STATIC_GROUP)
+        lit, shaded = _as_bytes(ambient + direct), _as_bytes(ambient + _SHADOW * direct)
+        return _Background(lit, shaded, distance, spots, view, lamp_view(self._lamp, spots))
+
+    def _light(self, data: Any, spots: Any, hits: Hits, group: int) -> tuple[Any, Any]:
+        """Return the colour of spots in the light from everywhere, and what the lamp adds; the group shades itself."""
+        colour = self._colours.at(hits.geoms, spots)
+        to_lamp = self._lamp - spots
+        to_lamp /= np.maximum(np.linalg.norm(to_lamp, axis=1, keepdims=True), 1e-9)
+        shine = np.einsum("ij,ij->i", hits.normals, to_lamp).clip(0.0, 1.0)
+        facing = np.flatnonzero(shine > 0.0)
+        shine[facing[self._caster.shaded(data, self._lamp, spots[facing], group)]] *= _SHADOW
+        sky = 0.8 + 0.2 * hits.normals[:, 2:]
+        return colour * (self._ambient * sky), colour * ((1.15 - self._ambient) * shine[:, None])
+
+
+class _Colours:
+    """Colours by geom, and by place for those that carry a pattern, so that pictures have texture."""
+
+    def __init__(self, model: Any) -> None:
+        mujoco = load_mujoco()
+        self._colours = model.geom_rgba[:, :3].astype(np.float32)
+        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, index) or "" for index in range(model.ngeom)]
+        self._table = np.array([name == "table" for name in names])
+        self._floor = np.array([name == "floor" for name in names])
+        self._wall = np.array([name.startswith("wall") for name in names])
+
+    def at(self, geoms: Any, spots: Any) -> Any:
+        colour = self._colours[geoms]
+        for chosen, pattern in ((self._table, _planks), (self._floor, _tiles), (self._wall, _panels)):
+            index = np.flatnonzero(chosen[geoms])
+            if len(index):
+                colour[index] *= pattern(spots[index])[:, None]
+        return colour
+
+
+def _planks(spots: Any) -> Any:
+    """Boards along x, each of its own tone, with a faint grain."""
+    board = np.floor(spots[:, 1] / 0.125)
+    tone = 0.93 + 0.07 * np.sin(board * 12.9898)
+    grain = 0.03 * np.sin(60.0 * spots[:, 1] + 2.0 * np.sin(5.0 * spots[:, 0] + board))
+    seam = np.abs(spots[:, 1] / 0.125 - board - 0.5) > 0.48
+    return np.where(seam, 0.78, tone + grain).astype(np.float32)
+
+
+def _tiles(spots: Any) -> Any:
+    """A chequered floor."""
+    odd = (np.floor(spots[:, 0] / 0.4) + np.floor(spots[:, 1] / 0.4)) % 2
+    return (0.85 + 0.3 * odd).astype(np.float32)
+
+
+def _panels(spots: Any) -> Any:
+    """Wide upright panels over a dark skirting, brighter to the top."""
+    along = spots[:, 0] + spots[:, 1]
+    panel = np.floor(along / 0.6) % 2
+    shade = 0.86 + 0.10 * panel + 0.08 * np.clip(spots[:, 2], -0.7, 1.5)
+    return np.where(spots[:, 2] < -0.6, 0.5, shade).astype(np.float32)
+
+
+def _pixel_rays(size: tuple[int, int], half_view: Float[np.ndarray, " 2"]) -> Float[np.ndarray, "pixels 3"]:
+    """Return unit rays through the middle of each pixel in the camera's frame, row by row."""
+    across, down = (
+        ((np.arange(count) + 0.5) / count * 2 - 1) * half for count, half in zip(size, half_view, strict=True)
+    )
+    rays = np.stack(np.broadcast_arrays(across[None, :], down[:, None], 1.0), axis=-1).reshape(-1, 3)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _as_bytes(colour: Any) -> UInt8[np.ndarray, "pixels 3"]:
+    return np.asarray((colour.clip(0.0, 1.0) * 255.0 + 0.5).astype(np.uint8))

@@ -1,0 +1,249 @@
+"""What stands in the simulated room? The arm from primitives, a table with things on it, walls: our own MJCF."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.simulation.world.domains import Domain, Look
+from vjepa2_ac.simulation.world.kinematics import FLANGE_OFFSET_M, JOINTS
+
+STATIC_GROUP, ARM_GROUP = 0, 1
+"""Geom groups: what never moves, and what does."""
+FINGER_TRAVEL_M = 0.04
+FINGER_INSIDE_M, FINGER_OUTSIDE_M, FINGER_HALF_M = 0.004, 0.028, 0.014
+"""Of a closed finger: from the middle of the hand to its inner and outer side, and half its width across."""
+FINGERTIP_M = 0.15
+"""How far the fingers reach beyond the flange."""
+BLOCK_M = 0.06
+"""Edge of the block, a cube, in scenes that have one."""
+
+Coordinate = float | int
+Point = tuple[Coordinate, Coordinate, Coordinate]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A primitive in the frame of its link. Boxes span the corners `start` and `end`, the others run between."""
+
+    kind: str
+    start: Point
+    end: Point
+    radius_m: float
+    colour: str  # which colour of the Look
+
+
+LINK_SHAPES: tuple[tuple[Shape, ...], ...] = (
+    (  # the base
+        Shape("cylinder", (0, 0, 0), (0, 0, 0.03), 0.11, "joints"),
+        Shape("capsule", (-0.11, 0, 0.06), (0, 0, 0.06), 0.058, "arm"),
+        Shape("cylinder", (0, 0, 0.03), (0, 0, 0.14), 0.075, "arm"),
+        Shape("cylinder", (0, 0, 0.14), (0, 0, 0.17), 0.068, "joints"),
+    ),
+    (
+        Shape("capsule", (0, 0, -0.14), (0, 0, -0.02), 0.066, "arm"),
+        Shape("cylinder", (0, -0.07, 0), (0, 0.07, 0), 0.06, "arm"),
+    ),
+    (
+        Shape("cylinder", (0, 0, -0.082), (0, 0, 0.082), 0.056, "joints"),
+        Shape("capsule", (0, -0.03, 0), (0, -0.17, 0), 0.062, "arm"),
+    ),
+    (
+        Shape("cylinder", (0, 0, -0.135), (0, 0, -0.115), 0.055, "joints"),
+        Shape("capsule", (0, 0, -0.09), (0.02, 0, -0.02), 0.06, "arm"),
+        Shape("capsule", (0.02, 0, -0.02), (0.0825, 0, 0), 0.055, "arm"),
+    ),
+    (
+        Shape("cylinder", (0, 0, -0.075), (0, 0, 0.075), 0.05, "joints"),
+        Shape("capsule", (0, 0, 0), (-0.0825, 0.09, 0), 0.056, "arm"),
+    ),
+    (
+        Shape("cylinder", (0, 0, -0.275), (0, 0, -0.25), 0.053, "joints"),
+        Shape("capsule", (0, 0, -0.235), (0, 0.015, -0.12), 0.055, "arm"),
+        Shape("capsule", (0, 0.015, -0.12), (0, 0.0, -0.01), 0.046, "arm"),
+    ),
+    (
+        Shape("cylinder", (0, 0, -0.068), (0, 0, 0.068), 0.044, "joints"),
+        Shape("capsule", (0, 0, 0), (0.088, 0, 0), 0.047, "arm"),
+    ),
+    (
+        Shape("cylinder", (0, 0, -0.05), (0, 0, 0.07), 0.046, "arm"),
+        Shape("cylinder", (0, 0, 0.07), (0, 0, FLANGE_OFFSET_M), 0.04, "joints"),
+    ),
+)
+"""The base and the seven links, each in its own Denavit-Hartenberg frame."""
+
+HAND_SHAPES = (
+    Shape("box", (-0.034, -0.102, 0.0), (0.034, 0.102, 0.068), 0.0, "hand"),
+    Shape("box", (-0.028, -0.075, 0.068), (0.028, 0.075, 0.078), 0.0, "joints"),
+)
+"""In the flange frame, turned by -45 degrees as Franka mounts it."""
+
+_WALL_M = 2.4
+_FLOOR_M = -0.75
+
+
+def load_mujoco() -> ModuleType:
+    """Return the mujoco module.
+
+    Raises:
+        InputError: MuJoCo is not installed.
+    """
+    try:
+        import mujoco
+    except ImportError:
+        raise InputError(
+            where="simulation",
+            found="MuJoCo is not installed",
+            needed="the extra `sim`",
+            fix='Run `pip install -c constraints.txt -e ".[sim]"`',
+        ) from None
+    return mujoco  # type: ignore[no-any-return]
+
+
+def compile_scene(domain: Domain) -> Any:
+    """Return the compiled `mujoco.MjModel` of a domain.
+
+    Raises:
+        InputError: MuJoCo is not installed.
+    """
+    return load_mujoco().MjModel.from_xml_string(scene_xml(domain))
+
+
+def scene_xml(domain: Domain) -> str:
+    """Return the scene as MJCF: seven hinges `joint1`..`joint7`, two slides `finger1`, `finger2`, the site `flange`."""
+    return ET.tostring(scene_tree(domain), encoding="unicode")
+
+
+def scene_tree(domain: Domain) -> ET.Element:
+    """Return the scene as the tree of its MJCF, for others to add to."""
+    root = ET.Element("mujoco", model="arm")
+    ET.SubElement(root, "compiler", angle="radian", autolimits="true")
+    visual = ET.SubElement(root, "visual")
+    ET.SubElement(visual, "global", fovy=str(domain.camera.vertical_fov_deg), offwidth="1280", offheight="720")
+    look = domain.look
+    ET.SubElement(visual, "headlight", ambient=as_text([look.ambient] * 3), diffuse="0 0 0", specular="0 0 0")
+    world = ET.SubElement(root, "worldbody")
+    light = light_position(look)
+    ET.SubElement(
+        world,
+        "light",
+        pos=as_text(light),
+        dir=as_text(-light),
+        diffuse=as_text([1 - look.ambient] * 3),
+        castshadow="true",
+    )
+    _add_room(world, look)
+    _add_clutter(world, np.random.default_rng(domain.clutter_seed))
+    _add_arm(world, domain)
+    return root
+
+
+def light_position(look: Look) -> np.ndarray:
+    """Return where the lamp hangs in the world."""
+    azimuth, elevation = np.deg2rad(look.light_azimuth_deg), np.deg2rad(look.light_elevation_deg)
+    outward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    return 2.2 * np.array(outward)
+
+
+def _add_room(world: ET.Element, look: Look) -> None:
+    _add_box(world, "table", (0.25, 0.0, -0.02), (0.75, 0.75, 0.02), look.table)
+    for x in (-0.45, 0.95):
+        for y in (-0.7, 0.7):
+            _add_box(world, f"leg{x}{y}", (x, y, -0.39), (0.03, 0.03, 0.35), look.table)
+    _add_box(world, "floor", (0, 0, _FLOOR_M - 0.05), (3, 3, 0.05), look.floor)
+    for name, centre, half in (
+        ("wall_back", (-_WALL_M, 0, 0.5), (0.05, 3, 2)),
+        ("wall_front", (_WALL_M, 0, 0.5), (0.05, 3, 2)),
+        ("wall_right", (0, -_WALL_M, 0.5), (3, 0.05, 2)),
+        ("wall_left", (0, _WALL_M, 0.5), (3, 0.05, 2)),
+    ):
+        _add_box(world, name, centre, half, look.wall)
+
+
+def _add_clutter(world: ET.Element, rng: np.random.Generator) -> None:
+    """Put five things on the table, outside the robot's foot."""
+    for index in range(5):
+        x, y = rng.uniform(0.25, 0.8), rng.uniform(-0.5, 0.5)
+        size, height = rng.uniform(0.02, 0.04), rng.uniform(0.02, 0.05)
+        colour = [float(channel) for channel in rng.uniform(0.15, 0.9, size=3)]
+        ET.SubElement(
+            world,
+            "geom",
+            name=f"thing{index}",
+            type="box" if index % 2 else "cylinder",
+            pos=as_text([x, y, height]),
+            size=as_text([size, size, height] if index % 2 else [size, height]),
+            euler=as_text([0.0, 0.0, rng.uniform(0, np.pi)]),
+            rgba=as_text([*colour, 1.0]),
+            group=str(STATIC_GROUP),
+        )
+
+
+def _add_arm(world: ET.Element, domain: Domain) -> None:
+    body = ET.SubElement(world, "body", name="link0", euler=as_text([0, 0, np.deg2rad(domain.base_yaw_deg)]))
+    _add_shapes(body, LINK_SHAPES[0], domain.look)
+    for index, joint in enumerate(JOINTS, start=1):
+        twist = np.deg2rad(joint.twist_deg)
+        offset = [joint.length_m, -np.sin(twist) * joint.offset_m, np.cos(twist) * joint.offset_m]
+        body = ET.SubElement(body, "body", name=f"link{index}", pos=as_text(offset), euler=as_text([twist, 0, 0]))
+        ET.SubElement(
+            body,
+            "joint",
+            name=f"joint{index}",
+            type="hinge",
+            axis="0 0 1",
+            range=as_text([joint.low_rad, joint.high_rad]),
+        )
+        _add_shapes(body, LINK_SHAPES[index], domain.look)
+    ET.SubElement(body, "site", name="flange", pos=as_text([0, 0, FLANGE_OFFSET_M]))
+    hand = ET.SubElement(
+        body, "body", name="hand", pos=as_text([0, 0, FLANGE_OFFSET_M]), euler=as_text([0, 0, -np.pi / 4])
+    )
+    _add_shapes(hand, HAND_SHAPES, domain.look)
+    for index, side in enumerate((1, -1), start=1):
+        _add_finger(hand, f"finger{index}", side, domain.look)
+
+
+def _add_finger(hand: ET.Element, name: str, side: int, look: Look) -> None:
+    finger = ET.SubElement(hand, "body", name=name)
+    ET.SubElement(
+        finger, "joint", name=name, type="slide", axis=as_text([0, side, 0]), range=as_text([0, FINGER_TRAVEL_M])
+    )
+    low, high = sorted((side * FINGER_INSIDE_M, side * FINGER_OUTSIDE_M))
+    ends = (-FINGER_HALF_M, low, 0.07), (FINGER_HALF_M, high, FINGERTIP_M)
+    _add_shapes(finger, (Shape("box", *ends, 0.0, "hand"),), look)
+
+
+def _add_shapes(body: ET.Element, shapes: tuple[Shape, ...], look: Look) -> None:
+    for shape in shapes:
+        start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
+        if shape.kind == "box":
+            place: dict[str, Any] = {"pos": as_text((start + end) / 2), "size": as_text((end - start) / 2)}
+        else:
+            place = {"fromto": as_text([*start, *end]), "size": as_text([shape.radius_m])}
+        rgba = as_text([*getattr(look, shape.colour), 1.0])
+        ET.SubElement(body, "geom", type=shape.kind, rgba=rgba, group=str(ARM_GROUP), **place)
+
+
+def _add_box(world: ET.Element, name: str, centre: Point, half: Point, colour: tuple[float, ...]) -> None:
+    ET.SubElement(
+        world,
+        "geom",
+        name=name,
+        type="box",
+        pos=as_text(centre),
+        size=as_text(half),
+        rgba=as_text([*colour, 1.0]),
+        group=str(STATIC_GROUP),
+    )
+
+
+def as_text(numbers: Any) -> str:
+    """Return numbers as an attribute of MJCF, to the last digit."""
+    return " ".join(repr(float(number)) for number in numbers)

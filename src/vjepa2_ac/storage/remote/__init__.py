@@ -1,0 +1,34 @@
+"""How is data read and written elsewhere, when networks fail? `files`, `uploads`; `retries` does not give up."""
+
+from vjepa2_ac.storage.remote.ranged_reads import (
+    Entry,
+    bytes_fetched,
+    exists,
+    file_size,
+    file_version,
+    list_folder,
+    open_to_read,
+    read_range,
+    read_ranges,
+)
+from vjepa2_ac.storage.remote.retries import RefusedError, RetryPolicy, UnreachableError, quietly
+from vjepa2_ac.storage.remote.uploads import file_sizes, remove_file, upload_file
+
+__all__ = [
+    "Entry",
+    "RefusedError",
+    "RetryPolicy",
+    "UnreachableError",
+    "bytes_fetched",
+    "exists",
+    "file_size",
+    "file_sizes",
+    "file_version",
+    "list_folder",
+    "open_to_read",
+    "quietly",
+    "read_range",
+    "read_ranges",
+    "remove_file",
+    "upload_file",
+]

@@ -1,0 +1,192 @@
+"""Which file system of fsspec serves a URL, and as whom does it ask?"""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+from typing import Any
+
+from vjepa2_ac.errors import InputError
+
+GOOGLE = frozenset({"gs", "gcs"})
+
+_LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
+_EXTRAS = {"gs": "gcs", "hf": "lerobot"}
+_KNOWN = "a folder of this machine, or gs://, hf://, s3://"
+_NO_PLACES = frozenset({  # they lead to files of any other kind, some by templates that are executed
+    "async_wrapper", "asyncwrapper", "blockcache", "cached", "dask", "data", "dir", "filecache", "generic",
+    "libarchive", "reference", "simplecache", "tar", "zip",
+})  # fmt: skip
+_EMULATOR = "STORAGE_EMULATOR_HOST"
+_MACHINE = Path("/sys/class/dmi/id/product_name")
+_PIECE_BYTES = 16 << 20  # of an upload; it is read while reads of others wait
+
+
+def ask(url: str, method: str, timeout_s: float, **arguments: Any) -> Any:
+    """Call a method of the URL's file system with the URL's path, once; cut it off in time where that is possible.
+
+    Raises:
+        Exception: Whatever the library raises.
+        InputError: The library is not installed, or there is none.
+    """
+    filesystem = _filesystem(url)
+    return _once(filesystem, method, timeout_s, filesystem._strip_protocol(url), **arguments)
+
+
+def send(source: Path, url: str, timeout_s: float) -> None:
+    """Write a file of this machine to a URL, once; folders are made where the place has such things.
+
+    Raises:
+        Exception: Whatever the library raises.
+        InputError: As `ask`.
+    """
+    filesystem = _filesystem(url, writing=True)
+    pieces = {"chunksize": _PIECE_BYTES} if _protocol(url) == "gs" else {}
+    _once(filesystem, "put_file", timeout_s, str(source), filesystem._strip_protocol(url), **pieces)
+
+
+def discard(url: str, timeout_s: float) -> None:
+    """Remove the file of a URL, once.
+
+    Raises:
+        Exception: Whatever the library raises.
+        InputError: As `ask`.
+    """
+    filesystem = _filesystem(url, writing=True)
+    _once(filesystem, "rm_file", timeout_s, filesystem._strip_protocol(url))
+
+
+def sizes_below(url: str, timeout_s: float) -> dict[str, int]:
+    """Return the sizes of all files below a folder by their paths from there, asked once and not remembered.
+
+    Raises:
+        Exception: Whatever the library raises.
+        InputError: As `ask`.
+    """
+    filesystem = _filesystem(url)
+    filesystem.invalidate_cache()
+    root = filesystem._strip_protocol(url).rstrip("/") + "/"
+    found = _once(filesystem, "find", timeout_s, root, detail=True)
+    return {name.removeprefix(root): int(about.get("size") or 0) for name, about in found.items() if name != root}
+
+
+def _once(filesystem: Any, method: str, timeout_s: float, *arguments: Any, **options: Any) -> Any:
+    if not filesystem.async_impl:
+        return getattr(filesystem, method)(*arguments, **options)
+    from fsspec.asyn import sync
+
+    return sync(filesystem.loop, getattr(filesystem, f"_{method}"), *arguments, timeout=timeout_s, **options)
+
+
+def size_of(url: str, timeout_s: float) -> int:
+    """Ask for the size of a file, once; of Google without looking, too, whether it is a folder.
+
+    Raises:
+        Exception: Whatever the library raises.
+    """
+    method = "get_object" if hasattr(_filesystem(url), "_get_object") else "info"
+    return int(ask(url, method, timeout_s)["size"])
+
+
+def is_asynchronous(url: str) -> bool:
+    """Return whether the URL's file system reads ranges as they are asked for, and can be cut off."""
+    return bool(_filesystem(url).async_impl)
+
+
+def login_hint(url: str) -> str:
+    """Return what to do where permission is missing, as a sentence."""
+    protocol = _protocol(url)
+    log_in = f"Log in with `{_LOG_IN[protocol]}`, or check the name" if protocol in _LOG_IN else "Check the login"
+    if protocol == "hf":
+        log_in += ". Or set HF_TOKEN. A gated data set must be asked for on its page first"
+    return f"You are not logged in. {log_in}" if protocol == "gs" and google_token() == "anon" else log_in
+
+
+def google_token() -> str:
+    """Return as whom Google is asked: the user's default login where there is one, else the machine's, else nobody.
+
+    DROID needs no login. A local emulator is never shown one.
+    """
+    if os.environ.get(_EMULATOR):
+        return "anon"
+    folder = Path(os.environ.get("CLOUDSDK_CONFIG") or Path.home() / ".config" / "gcloud")
+    if os.environ.get("GOOGLE_APPLICATION_CREDENTIALS") or (folder / "application_default_credentials.json").is_file():
+        return "google_default"
+    return "cloud" if _is_google_machine() else "anon"
+
+
+def _is_google_machine() -> bool:
+    """Look at what the firmware says: asking the network for it takes seconds everywhere else."""
+    try:
+        return _MACHINE.read_text().startswith("Google")
+    except OSError:
+        return False
+
+
+_filesystems: dict[tuple[object, ...], Any] = {}
+_opening = threading.Lock()
+
+
+def _filesystem(url: str, *, writing: bool = False) -> Any:
+    """Return the file system of a URL: one for all threads of a process, where fsspec would give one to each.
+
+    Who only reads asks for no more than that: there are logins that may not write.
+
+    Raises:
+        InputError: The library for it is not installed, or there is none.
+    """
+    protocol = _protocol(url)
+    with _opening:
+        kind = _kind(url, protocol)
+        options: dict[str, Any] = kind._get_kwargs_from_urls(url)
+        if protocol == "gs":
+            options["access"] = "read_write" if writing else "read_only"
+        key = (os.getpid(), protocol, repr(sorted(options.items())), os.environ.get(_EMULATOR))
+        if key not in _filesystems:
+            _filesystems[key] = _google(kind, options) if protocol == "gs" else _plain(kind, options, url)
+        return _filesystems[key]
+
+
+def _protocol(url: str) -> str:
+    protocol = url.partition("://")[0]
+    return "gs" if protocol in GOOGLE else protocol
+
+
+def _kind(url: str, protocol: str) -> Any:
+    # Before gcsfs is imported: its support for zonal buckets, on by default, makes the first call to each bucket wait
+    # for a minute where the Storage Control API does not answer.
+    os.environ.setdefault("GCSFS_EXPERIMENTAL_ZB_HNS_SUPPORT", "false")
+    import fsspec
+
+    if protocol in _NO_PLACES:
+        raise InputError(where=url, found=f"{protocol}://, which is no place but a way to another", needed=_KNOWN)
+    try:
+        return fsspec.get_filesystem_class(protocol)
+    except ImportError as error:
+        extra = _EXTRAS.get(protocol)
+        fix = f'Install it: pip install -c constraints.txt -e ".[{extra}]"' if extra else str(error)
+        raise InputError(where=url, found=f"the library for {protocol}:// is not installed", fix=fix) from None
+    except ValueError:
+        raise InputError(where=url, found=f"nothing reads {protocol}://", needed=_KNOWN) from None
+
+
+def _plain(kind: Any, options: dict[str, Any], url: str) -> Any:
+    try:
+        return kind(**options, skip_instance_cache=True)
+    except TypeError as error:  # it wants more than an address
+        raise InputError(where=url, found=f"an address alone does not do ({error})", needed=_KNOWN) from None
+
+
+def _google(kind: Any, options: dict[str, Any]) -> Any:
+    """Open Google's without its own retries: six for each of ours, of up to half a minute together."""
+    once = getattr(kind._request, "__wrapped__", kind._request)
+    kind = type(kind.__name__, (kind,), {"_request": once})
+    options = {"use_listings_cache": False, **options}
+    who = google_token()
+    if who == "cloud":  # a machine may have no account of its own
+        try:
+            return kind(token=who, **options)
+        except (ValueError, OSError):
+            who = "anon"
+    return kind(token=who, **options)

@@ -1,0 +1,185 @@
+"""What is done again when a network fails: which failures pass by themselves, how long to wait, and when to give up?"""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import secrets
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import TypeVar
+
+from vjepa2_ac.errors import InputError
+
+logger = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
+
+_NETWORK_LIBRARIES = frozenset({"aiohttp", "requests", "httpx", "httpx2", "httpcore", "httpcore2", "urllib3"})
+# 499 is Google's answer to giving up an upload of which a piece failed; gcsfs shows it in place of that failure.
+_PASSING_STATUS = frozenset({408, 425, 429, 499, *range(500, 600)})
+_NO_ACCESS = frozenset({401, 403, 407})
+_ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
+_LONGEST_WORDS = 300
+_FAILURES_UNSAID = 3
+_SAID_EVERY_S = 30.0
+
+
+@dataclass(frozen=True)
+class RetryPolicy:
+    """How long something is tried: at most `attempts` times `timeout_s`, and the waits between.
+
+    The waits double from the first to the longest. Half of each is chance, so that many processes do not come back at
+    the same moment. A library that cannot be cut off, or tries again by itself (huggingface_hub: six times), takes
+    longer over an attempt: none begins after `total_s`.
+    """
+
+    attempts: int = 8
+    first_wait_s: float = 0.5
+    longest_wait_s: float = 16.0
+    timeout_s: float = 30.0
+    total_s: float = 300.0
+
+    def __post_init__(self) -> None:
+        if self.attempts < 1 or self.timeout_s <= 0:
+            raise ValueError(f"{self} never tries")
+
+    def wait_s(self, failures: int) -> float:
+        """Return how long to wait after so many failures."""
+        longest: float = min(self.first_wait_s * 2 ** (failures - 1), self.longest_wait_s)
+        return longest * (1 + secrets.randbelow(1001) / 1000) / 2  # chance of its own: no generator of a run is touched
+
+
+DEFAULT = RetryPolicy()  # fails within a minute where errors come at once, within five where nothing answers
+
+
+class UnreachableError(InputError):
+    """Data cannot be had now. Nothing is known of the data itself: never call it broken."""
+
+
+class RefusedError(UnreachableError):
+    """A server, or a disk, says no, and will say no again: no permission, no such bucket."""
+
+
+def with_retries(
+    where: str, action: Callable[[float], _T], *, policy: RetryPolicy, access: str, doing: str = "read"
+) -> _T:
+    """Return what an action returns, trying again while its failures are of a kind that passes.
+
+    Args:
+        where: What is read or written, for messages.
+        action: Called with the seconds that it may take.
+        policy: How often to try, and how long.
+        access: The way out where permission is missing, as a sentence.
+        doing: "read" or "written", for messages.
+
+    Raises:
+        OSError: There is no such file, or it is a folder, or the other way round.
+        UnreachableError: What failed did not pass in time; a RefusedError where permission is missing, or it does not
+            pass.
+    """
+    begin = time.monotonic()
+    for failures in range(1, policy.attempts + 1):
+        try:
+            return action(policy.timeout_s)
+        except (*_ABSENT, UnreachableError):
+            raise
+        except Exception as error:
+            if not _comes_from_outside(error):
+                raise
+            if not _passes(error):
+                raise _refused(where, error, access, doing) from error
+            wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
+            if failures == policy.attempts or seconds + wait_s > policy.total_s:
+                raise _given_up(where, error, failures, seconds) from error
+            _say(failures, "%s: %s; trying again in %.1f s", where, _words(error), wait_s)
+        time.sleep(wait_s)
+    raise AssertionError("the last attempt returns or raises")
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Log failures that are tried again below warnings, in this thread: for whoever can do without what he asks for."""
+    token = _quiet.set(True)
+    try:
+        yield
+    finally:
+        _quiet.reset(token)
+
+
+_quiet = ContextVar("_quiet", default=False)
+
+
+def _say(failures: int, text: str, *arguments: object) -> None:
+    """Log a failure; aloud when it is the third of a call, and no more than once in half a minute."""
+    now = time.monotonic()
+    aloud = failures >= _FAILURES_UNSAID and now - _last_said[0] > _SAID_EVERY_S and not _quiet.get()
+    if aloud:
+        _last_said[0] = now
+    logger.log(logging.WARNING if aloud else logging.INFO, text, *arguments)
+
+
+_last_said = [-_SAID_EVERY_S]
+
+
+def status_of(error: BaseException) -> int | None:
+    """Return the HTTP status that an error of any library tells of, or None."""
+    for holder in (error, getattr(error, "response", None)):
+        for name in ("code", "status", "status_code"):
+            found = getattr(holder, name, None)
+            if isinstance(found, int | str) and str(found).isdigit():
+                return int(found)
+    return 403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None  # as gcsfs says it
+
+
+def _comes_from_outside(error: Exception) -> bool:
+    """Tell failures of the world from mistakes of ours."""
+    is_of_a_library = _is_of_network(error) or _is_of_google_login(error)
+    return isinstance(error, OSError | ValueError | EOFError) or status_of(error) is not None or is_of_a_library
+
+
+def _is_of_network(error: Exception) -> bool:
+    return any(kind.__module__.split(".")[0] in _NETWORK_LIBRARIES for kind in type(error).__mro__)
+
+
+def _is_of_google_login(error: Exception) -> bool:
+    return any(kind.__module__.startswith("google.auth") for kind in type(error).__mro__)
+
+
+def _passes(error: Exception) -> bool:
+    status = status_of(error)
+    if status is not None:
+        return status in _PASSING_STATUS
+    if _is_of_google_login(error):
+        return type(error).__name__ == "TransportError" or bool(getattr(error, "retryable", False))
+    # JSON: a listing that was cut short. What is wrong with JSON of the user's is found elsewhere.
+    kinds = TimeoutError | ConnectionError | EOFError | socket.gaierror | json.JSONDecodeError
+    return isinstance(error, kinds) or _is_of_network(error)
+
+
+def _refused(where: str, error: Exception, access: str, doing: str) -> RefusedError:
+    if status_of(error) in _NO_ACCESS or _is_of_google_login(error):
+        return RefusedError(where=where, found=f"no permission ({_words(error)})", fix=access)
+    return RefusedError(where=where, found=f"cannot be {doing} ({_words(error)})", fix="Check the address")
+
+
+def _given_up(where: str, error: Exception, attempts: int, seconds: float) -> UnreachableError:
+    return UnreachableError(
+        where=where,
+        found=f"not reached in {attempts} attempts over {seconds:.0f} s; the last: {_words(error)}",
+        fix="Check the network, and start again: a run goes on from its last checkpoint",
+    )
+
+
+def _words(error: Exception) -> str:
+    """Say in one line what a library says in many, or not at all."""
+    status = status_of(error)
+    text = re.sub(r"\s+", " ", str(getattr(error, "message", "") or error)).strip()
+    text = text if len(text) <= _LONGEST_WORDS else f"{text[:_LONGEST_WORDS]}…"
+    name = "time-out" if isinstance(error, TimeoutError) else type(error).__name__
+    return ": ".join(part for part in (f"HTTP {status}" if status else name, text) if part)

@@ -1,0 +1,80 @@
+"""How are files written that lie elsewhere: `gs://`, `s3://` and whatever else fsspec can write?
+
+As in `files`, failures that pass are tried again. Of an object store a file is there whole or not at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+from vjepa2_ac.storage.remote import retries
+from vjepa2_ac.storage.remote.filesystems import discard, login_hint, send, sizes_below
+from vjepa2_ac.storage.remote.retries import RefusedError, RetryPolicy
+
+_T = TypeVar("_T")
+
+_SLOWEST_BYTES_PER_S = 1 << 20  # an upload may take this long, besides the time-out of any request
+
+
+def upload_file(source: Path, url: str) -> None:
+    """Write a file of this machine to a URL, over whatever is there.
+
+    An attempt has the policy's time-out, and a second for each MB.
+
+    Raises:
+        FileNotFoundError: The file of this machine is not there.
+        RefusedError: No permission, no such bucket, or the place cannot be written at all.
+        UnreachableError: It cannot be reached.
+    """
+    allowed_s = source.stat().st_size / _SLOWEST_BYTES_PER_S
+    policy = replace(retries.DEFAULT, timeout_s=retries.DEFAULT.timeout_s + allowed_s)
+    try:
+        _persist(url, lambda timeout_s: send(source, url, timeout_s), policy)
+    except FileNotFoundError:
+        if not source.is_file():
+            raise
+        raise _no_place(url) from None
+
+
+def remove_file(url: str) -> None:
+    """Remove the file of a URL; it may be gone already.
+
+    Raises:
+        RefusedError: No permission.
+        UnreachableError: It cannot be reached.
+    """
+    try:
+        _persist(url, lambda timeout_s: discard(url, timeout_s), retries.DEFAULT)
+    except FileNotFoundError:
+        return
+
+
+def file_sizes(url: str) -> dict[str, int]:
+    """Return the sizes of all files below a folder by their paths from there; none where there is no such folder.
+
+    Raises:
+        RefusedError: No permission, or there is no such bucket.
+        UnreachableError: It cannot be reached.
+    """
+    try:
+        return _persist(url, lambda timeout_s: sizes_below(url, timeout_s), retries.DEFAULT, doing="read")
+    except FileNotFoundError:
+        if url.startswith(("gs://", "gcs://")):  # which has no folders: only buckets can be absent
+            raise _no_place(url) from None
+        return {}
+
+
+def _persist(url: str, action: Callable[[float], _T], policy: RetryPolicy, doing: str = "written") -> _T:
+    try:
+        return retries.with_retries(url, action, policy=policy, access=login_hint(url), doing=doing)
+    except NotImplementedError:
+        found = f"{url.partition('://')[0]}:// cannot be written"
+        raise RefusedError(where=url, found=found, needed="a folder of this machine, gs:// or s3://") from None
+
+
+def _no_place(url: str) -> RefusedError:
+    bucket = url.partition("://")[2].split("/", 1)[0]
+    return RefusedError(where=url, found=f"there is no bucket {bucket}", fix="Make it, or check its name")

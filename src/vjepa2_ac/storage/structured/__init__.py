@@ -1,0 +1,30 @@
+"""How is JSON and YAML read that anybody may have written? Within bounds, each key once, every value of its type."""
+
+from vjepa2_ac.storage.structured.json_text import (
+    MOST_BYTES,
+    json_list,
+    json_object,
+    read_json_list,
+    read_json_object,
+)
+from vjepa2_ac.storage.structured.messages import message_of, shown
+from vjepa2_ac.storage.structured.nesting import MOST_DEPTH, require_shallow
+from vjepa2_ac.storage.structured.patterns import require_quick
+from vjepa2_ac.storage.structured.records import record_of
+from vjepa2_ac.storage.structured.yaml_text import MOST_VALUES, parse_yaml
+
+__all__ = [
+    "MOST_BYTES",
+    "MOST_DEPTH",
+    "MOST_VALUES",
+    "json_list",
+    "json_object",
+    "message_of",
+    "parse_yaml",
+    "read_json_list",
+    "read_json_object",
+    "record_of",
+    "require_quick",
+    "require_shallow",
+    "shown",
+]

@@ -1,0 +1,56 @@
+"""How do plain values of a file become a record? A dataclass whose annotations say what may be in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import fields
+from functools import cache
+from typing import Any, TypeVar, cast
+
+from pydantic import TypeAdapter, ValidationError
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.structured.messages import message_of
+
+T = TypeVar("T")
+
+_SAID = 5  # problems of one file
+
+
+def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: str = "", fix: str = "") -> T:
+    """Return a dataclass of values as JSON gives them: nothing is taken for another type than it is.
+
+    Args:
+        kind: The dataclass; its annotations may have pydantic's bounds.
+        values: Of its fields; those with a default may be left out.
+        where: The file, for messages.
+        needed: What it should be.
+        fix: The way out.
+
+    Raises:
+        InputError: A value is missing, unknown, of another type or beyond its bounds.
+    """
+    known = {field.name for field in fields(kind)}  # type: ignore[arg-type] # that is what `kind` is
+    problems = [f"{key}: unknown" for key in values if key not in known]
+    try:
+        record: T = _adapter(cast("Any", kind)).validate_json(json.dumps(dict(values)), strict=True)
+    except ValidationError as error:
+        problems += [f"{_place(detail)}: {_said(detail)}" for detail in error.errors()]
+    if problems:
+        more = f"; and {len(problems) - _SAID} more" if len(problems) > _SAID else ""
+        raise InputError(where=where, found="; ".join(problems[:_SAID]) + more, needed=needed, fix=fix)
+    return record
+
+
+@cache
+def _adapter(kind: Any) -> Any:
+    return TypeAdapter(kind)
+
+
+def _place(detail: Any) -> str:
+    return ".".join(str(part) for part in detail["loc"])
+
+
+def _said(detail: Any) -> str:
+    return "missing" if detail["type"] == "missing" else message_of(detail)

@@ -1,0 +1,46 @@
+"""Which validation went best? Only errors of the same clips, over the same time, of the same latents compare."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_as_flat_dict
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.clips.loader import validation_windows
+from vjepa2_ac.runs.checkpoint import RunState
+
+# Where the data lie does not matter, nor what decides which clips are held out: the clips themselves are looked at.
+_DECIDE = (
+    *("frames", "stride", "camera", "states", "actions", "join_actions", "pose_frame", "crop"),
+    *("fields.", "lerobot.", "droid_raw."),
+)
+
+
+def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
+    """Return what decides what a validation measures, by names that a person knows."""
+    decide = tuple(f"data.{key}" for key in _DECIDE)
+    settings = {key: json.dumps(value) for key, value in config_as_flat_dict(config).items() if key.startswith(decide)}
+    windows = validation_windows(dataset, "validation", clips=config.validation.clips)
+    clips = [(dataset.table.identity(episode), int(start)) for episode, start in windows]
+    return {**settings, "its clips": hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}
+
+
+def best_so_far(state: RunState, now: Mapping[str, str], note: Callable[[str], None]) -> RunState:
+    """Return the state that a run goes on from: a best error of other measurements is none, which is said.
+
+    States of earlier versions do not tell what they were measured on, and are taken at their word.
+    """
+    before = state.measured_on
+    differing = [] if before is None else sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
+    state = replace(state, measured_on=dict(now))
+    if not differing or state.best_error is None:
+        return state
+    note(
+        f"Validation measures something else than before (other: {', '.join(differing)}): the error"
+        f" {state.best_error:.4g} of step {state.best_step}, the best so far, does not compare and no longer counts."
+    )
+    return replace(state, best_step=None, best_error=None)

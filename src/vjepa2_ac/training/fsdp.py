@@ -1,0 +1,117 @@
+"""How do processes share the weights that they train, and not only the clips? FSDP2, for a predictor trained whole.
+
+`accelerate launch --use_fsdp --fsdp_version 2` asks for it: it sets ACCELERATE_USE_FSDP and FSDP_VERSION for each
+process. A process then keeps a part of each weight, gradient and moment; a block's weights are put together where it
+computes. Gradients are summed over the processes after every micro-batch, so no process may be without a clip. The
+frozen encoder stays whole, and a checkpoint is what one process alone writes: it goes on shared or not.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from torch import Tensor, nn
+from torch.distributed.device_mesh import init_device_mesh
+from torch.distributed.fsdp import FSDPModule, fully_shard
+from torch.distributed.tensor import DTensor, distribute_tensor
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.distributed.launch import shares_weights
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.training.optim import make_optimizer
+
+
+def shard_predictor(
+    world_model: WorldModel,
+    optimizer: torch.optim.Optimizer,
+    config: Config,
+    accelerator: Accelerator,
+    note: Callable[[str], None],
+) -> torch.optim.Optimizer:
+    """Leave each process its part of the predictor's weights and of the moments, where the launch asks for that.
+
+    All processes have to bring the same weights and moments.
+
+    Returns:
+        The optimizer of this process's part; the given one where nothing is shared.
+    """
+    if not shares_weights() or accelerator.num_processes == 1:
+        return optimizer
+    # The predictor ends in a view, which nobody changes in place.
+    warnings.filterwarnings("ignore", message="FSDP2-wrapped module .* returned a view tensor", category=UserWarning)
+    mesh = init_device_mesh(accelerator.device.type, (accelerator.num_processes,))
+    predictor = world_model.base_predictor
+    for module in (*predictor.blocks, predictor):
+        # The outermost, too, or its weights would be whole after a validation, when the optimizer looks for its parts.
+        part = fully_shard(module, mesh=mesh, reshard_after_forward=True)
+        part.set_gradient_divide_factor(1.0)  # a sum, as without shards: `step` makes means
+        part.set_force_sum_reduction_for_comms(True)  # or it is scaled on the way, which gloo cannot do
+    of_part = make_optimizer(world_model, config.training)
+    of_part.load_state_dict(_parted(optimizer.state_dict(), of_part))
+    note(
+        f"{accelerator.num_processes} processes share the predictor's weights, gradients and moments (FSDP2):"
+        f" {_own_numbers(predictor):,} weights are in this one."
+    )
+    return of_part
+
+
+def full_state_dict(world_model: WorldModel, *, keep: bool) -> dict[str, Tensor] | None:
+    """Return the predictor's weights, put together on the CPU; None where they are not shared.
+
+    All processes have to call.
+
+    Args:
+        world_model: The model.
+        keep: Whether this process wants them: the others help to put them together, and get empty ones.
+    """
+    if not isinstance(world_model.predictor, FSDPModule):
+        return None
+    weights: dict[str, Tensor] = _whole(world_model.predictor.state_dict(), keep)
+    return weights
+
+
+def full_optimizer_state_dict(optimizer: torch.optim.Optimizer, *, keep: bool) -> dict[str, Any]:
+    """Return the state of an optimizer, what is shared of it put together on the CPU. All processes have to call.
+
+    Args:
+        optimizer: The optimizer.
+        keep: As with `full_state_dict`.
+    """
+    state: dict[str, Any] = _whole(optimizer.state_dict(), keep)
+    return state
+
+
+def _own_numbers(predictor: nn.Module) -> int:
+    return sum(p.to_local().numel() for p in predictor.parameters() if isinstance(p, DTensor))
+
+
+def _parted(state: dict[str, Any], optimizer: torch.optim.Optimizer) -> dict[str, Any]:
+    """Return the state of an optimizer over whole weights as that of one over parts; nothing is sent."""
+    parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    parted = {
+        index: {name: _like(parameters[index], value) for name, value in values.items()}
+        for index, values in state["state"].items()
+    }
+    return {**state, "state": parted}
+
+
+def _like(parameter: DTensor, value: Tensor) -> Tensor:
+    if value.shape != parameter.shape:  # the count of steps
+        return value
+    return distribute_tensor(value, parameter.device_mesh, parameter.placements, src_data_rank=None)
+
+
+def _whole(value: Any, keep: bool) -> Any:
+    """Put together every tensor in nested dicts and lists, one after the other, in the same order in all processes."""
+    if isinstance(value, DTensor):
+        together = value.full_tensor()
+        return together.cpu() if keep else together.new_empty(0)
+    if isinstance(value, Mapping):
+        return {key: _whole(inner, keep) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_whole(inner, keep) for inner in value]
+    return value

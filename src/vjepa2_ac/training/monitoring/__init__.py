@@ -1,0 +1,1 @@
+"""Monitoring: how fast is training, and is it going wrong?"""

@@ -1,0 +1,129 @@
+"""Has training made the model worse? Said once for each cause, in metrics.jsonl and to the person who watches.
+
+What is looked at is the journal's rows alone, so that a run that goes on says neither less nor the same once more.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, read_metrics_log
+from vjepa2_ac.runs.trackers import Trackers
+
+_MEASURES = {
+    "error_over_persistence": "one-step error",
+    "rollout_over_persistence_last": "rollout error at the last horizon",
+}
+_NOISE = 1.01  # validation clips are always the same ones; as much changes without meaning anything
+_LOSSES = 10  # rows of `train` whose median is compared, and as few as
+_FEWEST_LOSSES = 5
+_FAR_ABOVE = 2.0  # the lowest such median
+
+
+class WatchedMetricsLog(MetricsLog):
+    """A journal that says when its rows tell that training goes wrong.
+
+    Args:
+        run_dir: The run's folder.
+        config: Its config, for what to turn.
+        note: Told what a person should know.
+        first_step: As of `MetricsLog`.
+        trackers: As of `MetricsLog`.
+    """
+
+    def __init__(
+        self,
+        run_dir: Path,
+        *,
+        config: Config,
+        note: Callable[[str], None],
+        first_step: int,
+        trackers: Trackers | None = None,
+    ) -> None:
+        super().__init__(run_dir, first_step=first_step, trackers=trackers)
+        self._watch, self._note = Watch(config), note
+        for row in read_metrics_log(self.path):
+            self._watch(str(row.get("kind")), row["step"], row)
+
+    def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
+        """Append a row, and behind it what it warns of."""
+        super().write(kind, step, figures)
+        for text in self._watch(kind, step, figures):
+            super().write(WARNING, step, {"text": text})
+            self._note(f"Warning: {text}")
+
+
+class Watch:
+    """Looks at row after row of a journal.
+
+    Args:
+        config: Of the run.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._said: set[str] = set()
+        self._at_start: dict[str, float] = {}
+        self._losses: deque[float] = deque(maxlen=_LOSSES)
+        self._lowest = math.inf
+
+    def __call__(self, kind: str, step: int, figures: Mapping[str, Any]) -> list[str]:
+        """Return what is to be said of a row: nothing where all is well or it was said before."""
+        found = {"validation": self._of_validation, "train": self._of_loss}.get(kind)
+        new = {cause: text for cause, text in found(step, figures) if cause not in self._said} if found else {}
+        self._said |= set(new)
+        return [f"at step {step:,} {text}. {way_out(self._config)}" for text in new.values()]
+
+    def _of_validation(self, step: int, figures: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        now = {name: _number(figures.get(key)) for key, name in _MEASURES.items()}
+        if step == 0:
+            self._at_start = now
+            return
+        if not all(map(math.isfinite, now.values())):
+            yield "not finite", "an error of the validation is not a finite number"
+        starts = {name: self._at_start.get(name, math.nan) for name in now}
+        worse = [name for name, value in now.items() if value > _NOISE * starts[name]]
+        if not worse:
+            return
+        told = " and ".join(f"the {name} is {now[name]:.3f} (before training {starts[name]:.3f})" for name in worse)
+        beyond = any(now[name] > 1.0 > starts[name] for name in worse)
+        copying = "; copying the last frame would be better" if beyond else ""
+        last = step == self._config.training.steps
+        yield f"{worse} {beyond} {last}", f"{told} of persistence's in the validation{copying}"
+
+    def _of_loss(self, step: int, figures: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        del step
+        loss = _number(figures.get("loss"))
+        if not math.isfinite(loss):  # a step without clips, or one that was refused
+            return
+        self._losses.append(loss)
+        if len(self._losses) < _FEWEST_LOSSES:
+            return
+        typical = statistics.median(self._losses)
+        self._lowest = min(self._lowest, typical)
+        if typical > _FAR_ABOVE * self._lowest:
+            yield "loss", f"the loss is {typical:.4g}, and was {self._lowest:.4g} (medians of {_LOSSES} rows)"
+
+
+def way_out(config: Config) -> str:
+    """Return what to turn in a config whose training has made the model worse."""
+    training, adapter = config.training, config.adapter
+    knobs = [f"lower training.learning_rate ({training.learning_rate:g})"]
+    if adapter.kind == "lora":
+        knobs.append(f"lower adapter.alpha ({adapter.alpha:g}) or adapter.rank ({adapter.rank})")
+    if training.max_grad_norm is None:
+        knobs.append("set training.max_grad_norm=1")
+    knobs.append(f"raise training.warmup_steps ({training.warmup_steps:,})")
+    best = "; the best checkpoint is kept: --checkpoint best" if config.checkpoint.keep_best else ""
+    return f"If it stays so: {', '.join(knobs)}{best}"
+
+
+def _number(value: Any) -> float:
+    """Return a figure; NaN for one that JSON could not hold."""
+    return float(value) if isinstance(value, int | float) else math.nan

@@ -1,0 +1,180 @@
+"""Is a run well, and is the machine busy? Figures of one optimizer step, for the journal and for the console.
+
+update_to_weight    norm of the update over the norm of the weights before it, of all that is trained together
+data_wait_share     share of the step's wall time that was spent waiting for the loader; on CUDA only what the device
+                    stood idle, since it computes what it has while the host waits
+samples_per_second  clips, of all processes
+tokens_per_second   patch tokens of the frames of these clips
+mfu                 model FLOPs per second (`training.cost.flops`) over the ceiling: what this device does in a large
+                    product of matrices in the run's precision, measured for a fraction of a second at the start
+memory_gb           peak so far in 10^9 bytes: of PyTorch's allocator on CUDA, resident elsewhere
+"""
+
+from __future__ import annotations
+
+import math
+import resource
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+from torch.distributed.tensor import DTensor
+
+from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.data.clips.prefetch import fetch_ahead
+from vjepa2_ac.distributed.device import PRECISIONS
+from vjepa2_ac.episode import Batch
+from vjepa2_ac.training.cost.flops import clip_flops
+from vjepa2_ac.training.monitoring.stopwatch import HostStopwatch, Stopwatch
+
+MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "memory_gb"})
+"""Figures of the machine: two runs that are the same differ in them."""
+
+_CEILING_S = 0.2
+_CUDA_MATRIX, _CPU_MATRIX = 8192, 512
+
+
+class TimedBatches:
+    """Hands on batches, and knows how long it was waited for them, also when they are fetched ahead.
+
+    Args:
+        batches: The loader's.
+        stopwatch: Measures the waiting; None: by the host's clock.
+    """
+
+    def __init__(self, batches: Iterator[Batch], stopwatch: Stopwatch | None = None) -> None:
+        self._batches, self._stopwatch = batches, stopwatch or HostStopwatch()
+
+    @property
+    def waited_s(self) -> float:
+        """Seconds of all waiting so far."""
+        return self._stopwatch.seconds
+
+    def __iter__(self) -> TimedBatches:
+        """Return itself."""
+        return self
+
+    def __next__(self) -> Batch:
+        """Return the next batch."""
+        with self._stopwatch.running():
+            return next(self._batches)
+
+    def fetch_ahead(self) -> None:
+        """Fetch the next batch where that can be done ahead."""
+        with self._stopwatch.running():
+            fetch_ahead(self._batches)
+
+
+@dataclass(frozen=True)
+class Throughput:
+    """Turns a step's clips and seconds into figures."""
+
+    flops_per_clip: int
+    tokens_per_clip: int
+    ceiling: float  # FLOPs per second of all processes together
+    device: torch.device
+
+    @classmethod
+    def of(
+        cls, config: Config, sizes: ModelSizes, device: torch.device, processes: int, *, encodes: bool = True
+    ) -> Throughput:
+        """Measure the ceiling, once per device, precision and program.
+
+        Args:
+            config: The run.
+            sizes: Of its model.
+            device: Of this process.
+            processes: Of the run.
+            encodes: Whether the encoder's work counts; latents from a cache need none.
+        """
+        tokens = config.data.frames * (sizes.image_size // sizes.patch_size) ** 2
+        ceiling = processes * matmul_speed(device, PRECISIONS[config.training.precision])
+        flops = clip_flops(config, sizes)
+        return cls(flops.total if encodes else flops.predictor, tokens, ceiling, device)
+
+    def figures(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
+        """Return the figures of one step.
+
+        Args:
+            clips: Of all processes.
+            seconds: The step's wall time.
+            waited_s: Of which this process waited for the loader.
+        """
+        return {
+            "samples_per_second": clips / seconds,
+            "tokens_per_second": clips * self.tokens_per_clip / seconds,
+            "data_wait_share": min(1.0, waited_s / seconds),
+            "mfu": clips * self.flops_per_clip / seconds / self.ceiling,
+            "memory_gb": peak_memory_gb(self.device),
+        }
+
+    def __str__(self) -> str:
+        return (
+            f"A clip takes {self.flops_per_clip / 1e12:.3g} TFLOP; the ceiling for mfu is {self.ceiling / 1e12:.3g}"
+            f" TFLOP/s, measured on {self.device.type} now"
+        )
+
+
+class Update:
+    """How far does an optimizer step move the weights? Keeps a copy of them until it is asked.
+
+    Where weights are sharded over processes, each of them has to make one and to ask.
+
+    Args:
+        parameters: What the optimizer moves, before it does.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor]) -> None:
+        self._parameters = list(parameters)
+        self._before = [parameter.detach().clone() for parameter in self._parameters]
+
+    def to_weight(self) -> float:
+        """Return the norm of the update over the norm of the weights before it, of all tensors together; ask once."""
+        weight = _norm(self._before)
+        for before, parameter in zip(self._before, self._parameters, strict=True):
+            before -= parameter.detach()  # in the copy's own memory
+        return _norm(self._before) / weight if weight else math.nan
+
+
+def peak_memory_gb(device: torch.device) -> float:
+    """Return the peak so far: of PyTorch's allocator on CUDA, of this process's resident memory elsewhere."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e9
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9  # Linux counts in KiB
+
+
+@lru_cache(maxsize=8)
+def matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
+    """Return the FLOPs per second of a large product of matrices, the best of what a fraction of a second allows.
+
+    Measured once for each device and type in a program: what other programs do meanwhile counts, too.
+    """
+    size = _CUDA_MATRIX if device.type == "cuda" else _CPU_MATRIX
+    generator = torch.Generator(device).manual_seed(0)  # of its own: training's numbers stay what they are
+    matrix = torch.randn(size, size, device=device, generator=generator).to(dtype)
+    _product_s(matrix)  # a first one pays for what is set up once
+    best, ends = math.inf, time.perf_counter() + _CEILING_S
+    while best == math.inf or time.perf_counter() < ends:
+        best = min(best, _product_s(matrix))
+    return 2 * size**3 / best
+
+
+def _product_s(matrix: Tensor) -> float:
+    _wait_for(matrix.device)
+    started = time.perf_counter()
+    torch.mm(matrix, matrix)
+    _wait_for(matrix.device)
+    return time.perf_counter() - started
+
+
+def _wait_for(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def _norm(tensors: list[Tensor]) -> float:
+    norm = torch.nn.utils.get_total_norm(tensors)
+    return float(norm.full_tensor() if isinstance(norm, DTensor) else norm)

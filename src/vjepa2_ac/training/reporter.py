@@ -1,0 +1,81 @@
+"""The reporter of a run: what is a person shown while it trains, and what do processes use that show nothing?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Protocol, runtime_checkable
+
+from vjepa2_ac.evaluation.metrics import PredictionErrors
+
+
+@runtime_checkable
+class Reporter(Protocol):
+    """Shows a run to a person."""
+
+    def note(self, text: str) -> None:
+        """Say something once."""
+        ...
+
+    def indexed(self, done: int, total: int) -> None:
+        """So much of a data set that was not known before is looked through."""
+        ...
+
+    def encoded(self, done: int, total: int) -> None:
+        """So many frames are encoded into the latent cache."""
+        ...
+
+    def started(self, done: int, total: int) -> None:
+        """The loop begins after `done` of `total` optimizer steps."""
+        ...
+
+    def stepped(self, step: int, figures: dict[str, float]) -> None:
+        """An optimizer step is done."""
+        ...
+
+    def validated(self, step: int, errors: PredictionErrors) -> None:
+        """Held-out clips were measured after `step` optimizer steps."""
+        ...
+
+
+class NullReporter:
+    """Shows nothing."""
+
+    def note(self, text: str) -> None:
+        """Say nothing."""
+
+    def indexed(self, done: int, total: int) -> None:
+        """Show nothing."""
+
+    def encoded(self, done: int, total: int) -> None:
+        """Show nothing."""
+
+    def started(self, done: int, total: int) -> None:
+        """Show nothing."""
+
+    def stepped(self, step: int, figures: dict[str, float]) -> None:
+        """Show nothing."""
+
+    def validated(self, step: int, errors: PredictionErrors) -> None:
+        """Show nothing."""
+
+
+class NullMetricsLog:
+    """Writes nothing."""
+
+    def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
+        """Write nothing."""
+
+    is_behind = False
+
+    @contextmanager
+    def before_a_checkpoint(self) -> Iterator[None]:
+        """Do nothing."""
+        yield
+
+    def __enter__(self) -> NullMetricsLog:
+        """Return the journal."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close nothing."""

@@ -1,0 +1,241 @@
+"""What must stand before the first step? Device, data, model, adapter, optimizer and the newest checkpoint, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from accelerate import Accelerator
+from torch import nn
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.clips.loader import training_loader, validation_batches
+from vjepa2_ac.data.clips.prefetch import Batches
+from vjepa2_ac.data.clips.streams import Copies, copies_for
+from vjepa2_ac.data.clips.windows import Split
+from vjepa2_ac.data.inspection.duplicates import find_duplicates
+from vjepa2_ac.distributed.collectives import all_gather_object, broadcast_object
+from vjepa2_ac.distributed.device import PRECISIONS
+from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.distributed.shared_memory import say_if_shared_memory_is_small
+from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for
+from vjepa2_ac.encoding.training_cache import with_latents
+from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, require_learned
+from vjepa2_ac.model.adapter.lora import add_adapter, save_trained, trainable_report
+from vjepa2_ac.model.adapter.lora_linear import CastMatrices
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.runs.checkpoint import (
+    ADAPTER,
+    OPTIMIZER,
+    RunState,
+    checkpoint_name,
+    newest_checkpoint,
+    write_checkpoint,
+)
+from vjepa2_ac.runs.folder import CHECKPOINTS, with_stride
+from vjepa2_ac.runs.slow_disk import said_if_stalled
+from vjepa2_ac.runs.torch_file import write_torch
+from vjepa2_ac.training.best_checkpoint import best_so_far, measured_on
+from vjepa2_ac.training.fsdp import full_optimizer_state_dict, full_state_dict, shard_predictor
+from vjepa2_ac.training.loss import Objective
+from vjepa2_ac.training.micro_step import CapturedMicroStep, MicroStep, captured_on_cuda
+from vjepa2_ac.training.new_embodiment import check_heads, fit_to_data
+from vjepa2_ac.training.optim import make_optimizer, trained_parameters
+from vjepa2_ac.training.resume import micro_batches_of, restore, restore_loss_scale, say_what_is_new
+from vjepa2_ac.training.stride_choice import choose_stride
+
+_CLIPS_TRIED = 8  # one is read; the others are for where data.broken_episodes passes over it
+
+
+@dataclass
+class Run:
+    """Everything the loop needs, assembled and checked."""
+
+    config: Config  # its stride is a number
+    accelerator: Accelerator  # device, precision, and the place among processes
+    world_model: WorldModel
+    objective: Objective
+    optimizer: torch.optim.Optimizer
+    scaler: torch.amp.GradScaler  # does nothing but with fp16
+    dataset: Dataset
+    state: RunState
+    micro_batches: int  # of this process, per optimizer step
+    calibration: Calibration | None = None  # where data.stride was auto and is now chosen
+
+    @property
+    def encodes(self) -> bool:
+        """Whether clips are pictures that go through the encoder, not latents of a cache."""
+        return self.dataset.config.source != "latents"
+
+    @cached_property
+    def trained(self) -> list[nn.Parameter]:
+        """What the optimizer moves."""
+        return list(trained_parameters(self.objective))
+
+    @cached_property
+    def cast_matrices(self) -> CastMatrices:
+        """The adapter in the type that a step computes in."""
+        return CastMatrices(self.world_model.predictor, PRECISIONS[self.config.training.precision])
+
+    @property
+    def micro_step(self) -> MicroStep | CapturedMicroStep:
+        """What adds the gradients of some clips."""
+        return self.captured or self._plain_micro_step
+
+    @cached_property
+    def captured(self) -> CapturedMicroStep | None:
+        """The same as a graph, where that is asked for."""
+        if not self.config.training.cuda_graph:
+            return None
+        return CapturedMicroStep(self._plain_micro_step, self.trained, captured_on_cuda)
+
+    @property
+    def _plain_micro_step(self) -> MicroStep:
+        return MicroStep(self.objective, self.accelerator, self.scaler)
+
+    @property
+    def copies(self) -> Copies:
+        """How batches get to the run's device."""
+        return copies_for(self.accelerator.device)
+
+    @property
+    def clips_per_step(self) -> int:
+        """Clips of an optimizer step, of all processes together."""
+        return self.micro_batches * self.config.training.batch_size * int(self.accelerator.num_processes)
+
+
+def set_up(
+    config: Config,
+    note: Callable[[str], None],
+    indexed: Progress | None = None,
+    accelerator: Accelerator | None = None,
+    encoding: Progress | None = None,
+    *,
+    check_only: bool = False,
+) -> Run:
+    """Open the data, load the model, attach the adapter, and take up the newest checkpoint. Cheap failures first.
+
+    Args:
+        config: The run.
+        note: Told what a person should know.
+        indexed: Told how far the data set is looked through, where that was not done before.
+        accelerator: What `make_accelerator` gave for this config; None: it is made here.
+        encoding: Told how many frames are encoded, where `data.cache` is auto and they are not there yet.
+        check_only: Leave such a cache alone, and say how large it would be.
+
+    Raises:
+        InputError: Something cannot be used.
+    """
+    accelerator = accelerator or make_accelerator(config)
+    if config.data.stride == "auto":
+        require_learned(config.model)
+    with accelerator.local_main_process_first():  # the others find the index of the first one on this machine
+        dataset = open_dataset(config.data, progress=indexed)
+    if (duplicates := find_duplicates(dataset)).episodes:
+        note(f"Warning: {duplicates}.")
+    check_heads(config, dataset)
+    world_model, calibration = None, None
+    if config.data.stride == "auto":
+        world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
+        calibration = broadcast_object(accelerator, choose_stride(world_model, dataset, config, accelerator, note))
+        config, dataset = with_stride(config, calibration.best.stride), dataset.with_stride(calibration.best.stride)
+    first_clip = _read_one_clip_of_each_split(dataset)
+    world_model = world_model or load_base(config.model, seed=config.seed)
+    extrinsics_for(world_model, first_clip)
+    dataset = with_latents(config, dataset, world_model, accelerator, note, encoding=encoding, check_only=check_only)
+    say_if_shared_memory_is_small(config, dataset, first_clip, accelerator, note)
+    fit_to_data(world_model, config, dataset, note)
+    add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
+    note(str(trainable_report(world_model)))
+    world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
+    world_model.set_attention(config.training.attention)
+    world_model.set_compiled("with gradients" if config.training.compile == "blocks" else "never")
+    if dataset.config.source == "latents":
+        world_model.set_encoder_aside()
+    world_model.to(accelerator.device)
+    optimizer = make_optimizer(world_model, config.training)
+    scaler = torch.amp.GradScaler(accelerator.device.type, enabled=config.training.precision == "fp16")
+    state = restore(config, accelerator, world_model, optimizer, note)
+    optimizer = shard_predictor(world_model, optimizer, config, accelerator, note)
+    restore_loss_scale(scaler, state)
+    dataset.broken.recall(state.broken)
+    say_what_is_new(dataset, state, note)
+    state = best_so_far(state, measured_on(config, dataset), note)
+    micro_batches = micro_batches_of(config, state, accelerator.num_processes, note)
+    objective = Objective(world_model, config.training)
+    return Run(
+        config, accelerator, world_model, objective, optimizer, scaler, dataset, state, micro_batches, calibration
+    )
+
+
+def batches_from(run: Run) -> Batches:
+    """Yield the micro-batches of this process from where the run stands."""
+    return training_loader(
+        run.dataset,
+        seed=run.config.seed,
+        batch_size=run.config.training.batch_size,
+        start_position=run.state.clips_done,
+        rank=run.accelerator.process_index,
+        world_size=run.accelerator.num_processes,
+        copies=run.copies,
+    )
+
+
+def encode(run: Run, batch: Batch) -> LatentBatch:
+    """Return the latents of a batch on the run's device, in its precision."""
+    with run.accelerator.autocast():
+        return encode_batch(run.world_model, batch, device=run.accelerator.device, chunk=run.config.model.encode_chunk)
+
+
+def save_checkpoint(run: Run, folder: Path) -> None:
+    """Write where the run stands into its folder (see `runs.checkpoint`): all processes call, the first writes."""
+    writes = run.accelerator.is_main_process
+    weights, moments = (
+        full_state_dict(run.world_model, keep=writes),
+        full_optimizer_state_dict(run.optimizer, keep=writes),
+    )
+
+    def write(inner: Path) -> None:
+        save_trained(run.world_model, inner / ADAPTER, weights)
+        with (inner / OPTIMIZER).open("wb") as file:
+            write_torch(moments, file)
+
+    broken = {
+        name: why
+        for reasons in all_gather_object(run.accelerator, run.dataset.broken.reasons)
+        for name, why in reasons.items()
+    }
+    run.state = replace(
+        run.state,
+        broken=broken,
+        windows=len(run.dataset.windows("train")),
+        clips_per_step=run.clips_per_step,
+        clips_asked=run.config.training.batch_size * run.config.training.accumulation,
+        processes=run.accelerator.num_processes,
+        loss_scale=run.scaler.state_dict() if run.scaler.is_enabled() else None,
+    )
+    if writes:
+        with said_if_stalled(folder / CHECKPOINTS / checkpoint_name(run.state.step)):
+            write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
+
+
+def _started(config: Config) -> Path | None:
+    """Return the adapter that the run goes on with, where knowing it saves minutes: PiSSA starts where that one did."""
+    if config.adapter.init != "pissa":
+        return None
+    checkpoint = newest_checkpoint(Path(config.run_dir) / CHECKPOINTS)
+    return checkpoint / ADAPTER if checkpoint else None
+
+
+def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:
+    """Fail early: an empty split, a broken clip. A test split of share 0 is nobody's mistake."""
+    splits: tuple[Split, ...] = ("train", "validation", "test")
+    splits = splits if dataset.config.test_share else splits[:2]
+    firsts = [next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1)) for split in splits]
+    return firsts[0]

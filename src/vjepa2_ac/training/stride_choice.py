@@ -1,0 +1,54 @@
+"""Which stride does a run take where `data.stride` is auto? The one that its model chose before the first step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from accelerate import Accelerator
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibrate_model
+from vjepa2_ac.model.network.world_model import WorldModel
+
+
+def choose_stride(
+    world_model: WorldModel, dataset: Dataset, config: Config, accelerator: Accelerator, note: Callable[[str], None]
+) -> Calibration:
+    """Let the model of a run, before it is changed, choose among the candidates on the validation episodes.
+
+    Raises:
+        InputError: As `calibrate`.
+    """
+    note("data.stride is auto: measuring the model at each candidate stride")
+    strides = strides_that_fit(dataset)
+    for stride in set(dataset.config.strides_to_try(dataset.control_rate_hz)).difference(strides):
+        note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
+    calibration = calibrate_model(
+        world_model, dataset, config, accelerator, clips=config.validation.clips, strides=strides
+    )
+    for line in calibration.lines():
+        note(line)
+    return calibration
+
+
+def strides_that_fit(dataset: Dataset) -> list[int]:
+    """Return the candidates at which a run's own clips, which may be longer than a calibration's, fit into episodes.
+
+    Raises:
+        InputError: There is none.
+    """
+    fitting, first_error = [], None
+    for stride in dataset.config.strides_to_try(dataset.control_rate_hz):
+        view = dataset.with_stride(stride)
+        try:
+            view.windows("train")
+            view.windows("validation")
+        except InputError as error:
+            first_error = first_error or error
+        else:
+            fitting.append(stride)
+    if not fitting and first_error is not None:
+        raise first_error
+    return fitting

@@ -1,0 +1,79 @@
+"""Validation: how does the run do on held-out clips, and is its base worth adapting?"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vjepa2_ac.data.clips.loader import validation_batches
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, prediction_errors, ratios_by_horizon
+from vjepa2_ac.runs.metrics_log import MetricsLog
+from vjepa2_ac.training.new_embodiment import NOT_ASKED
+from vjepa2_ac.training.reporter import NullMetricsLog, Reporter
+from vjepa2_ac.training.setup import Run, encode
+
+BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: the longest look ahead is what planning leans on
+
+
+def validate_if_due(run: Run, journal: MetricsLog | NullMetricsLog, reporter: Reporter) -> bool:
+    """Measure and note, where it is time to; return whether no earlier measurement was as good."""
+    step, config = run.state.step, run.config
+    if step % config.validation.every != 0 and step != config.training.steps:
+        return False
+    figures = validation_metrics(validate(run, reporter))
+    journal.write("validation", step, figures)
+    if not config.checkpoint.keep_best:
+        return False
+    before = run.state
+    run.state = before.measured(figures[BEST_BY])
+    return run.state != before
+
+
+def validation_metrics(errors: PredictionErrors) -> dict[str, Any]:
+    """Return what a validation writes into the journal."""
+    by_horizon, one_step = ratios_by_horizon(errors), one_step_ratios(errors)
+    return {
+        "error_over_persistence": one_step["true"].value,
+        "error_over_persistence_zero_actions": one_step["zero"].value,
+        "error_over_persistence_shuffled_actions": one_step["shuffled"].value,
+        "rollout_over_persistence": [r.value for r in by_horizon],
+        "rollout_over_persistence_last": by_horizon[-1].value,
+    }
+
+
+def validate(run: Run, reporter: Reporter) -> PredictionErrors:
+    """Measure the held-out clips."""
+    config = run.config
+    run.world_model.eval()
+    batches = validation_batches(
+        run.dataset,
+        "validation",
+        clips=config.validation.clips,
+        batch_size=config.validation.batch_size,
+        copies=run.copies,
+    )
+    with run.accelerator.autocast():
+        errors = prediction_errors(run.world_model, (encode(run, batch) for batch in batches))
+    reporter.validated(run.state.step, errors)
+    return errors
+
+
+def refuse_weak_base(run: Run, errors: PredictionErrors, reporter: Reporter) -> None:
+    """Refuse to adapt a base that is no better than copying the last frame.
+
+    Raises:
+        InputError: It is not, and `training.allow_weak_base` is off.
+    """
+    config, error = run.config, one_step_ratios(errors)["true"].value
+    if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:
+        return
+    if run.world_model.fresh_heads is not None:
+        reporter.note(NOT_ASKED)
+        return
+    raise InputError(
+        where="model.base",
+        found=f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame",
+        needed="a base that is better than doing nothing (below 1)",
+        fix="Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction;"
+        " to adapt it all the same, set training.allow_weak_base=true",
+    )

@@ -1,0 +1,426 @@
+"""Benchmarks that nobody runs every day still run, and compare only what computes the same."""
+
+import json
+import math
+import re
+import sys
+import weakref
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from benches import ELSEWHERE, drawn_on, imported
+from vjepa2_ac.errors import InputError
+
+
+@pytest.fixture
+def train_step(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The benchmark of a training step."""
+    yield from imported("train_step", monkeypatch)
+
+
+def rows(printed: str) -> list[tuple[str, float, str]]:
+    """Return way, milliseconds and ratio of each line of the table."""
+    line = r"^ +\d+ +\d+ +(?:yes|no) +(?:cache|pixels) +(\S+) +(\S+) +(\S+) +\S+ +\S+% +0 +(\S+)"
+    found = re.findall(line, printed, re.MULTILINE)
+    assert all(float(least) <= float(median) for _, median, least, _ in found)
+    return [(way, float(median), ratio) for way, median, _, ratio in found]
+
+
+def test_quick_benchmark_of_a_training_step_completes_without_the_official_code(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train_step.main(
+        ["--quick", "--no-memory", "--encoder", "--checkpointing", "off", "on", "--official", str(tmp_path)]
+    )
+    printed = capsys.readouterr().out
+    assert f"official: skipped, for there is no {tmp_path}" in printed
+    assert [way for way, _, _ in rows(printed)] == ["dense", "auto"] * 2
+    assert [ratio for _, _, ratio in rows(printed)][::2] == ["1.00", "1.00"]
+
+
+def test_all_rows_of_a_training_step_come_from_one_command_and_what_runs_out_of_memory_says_so(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = sys.modules["train_step_variants"].Bench
+    usual = bench.step
+
+    def step(self: Any, setting: Any, way: str) -> Any:
+        if setting.encoder and way == "per_step":
+            raise torch.OutOfMemoryError
+        return usual(self, setting, way)
+
+    monkeypatch.setattr(bench, "step", step)
+    file = tmp_path / "results" / "steps.json"
+    train_step.main([
+        "--quick", "--no-memory", "--official", str(tmp_path), "--source", "cache", "pixels", "--attention", "per_step",
+        "--profile", "--cap-gb", "24", "--json", str(file),
+    ])  # fmt: skip
+    printed = capsys.readouterr().out
+    assert re.search(r"^ +4 +1 +no +pixels +per_step +out of memory$", printed, re.MULTILINE)
+    found = [(row["encoder"], row["way"], row["problem"]) for row in json.loads(file.read_text())["rows"]]
+    assert found == [
+        (False, "dense", None), (False, "per_step", None), (True, "dense", None), (True, "per_step", "out of memory"),
+    ]  # fmt: skip
+    first = json.loads(file.read_text())["rows"][0]
+    assert first["repeats"] == 1
+    assert first["min_s"] == first["s"] > 0
+    assert first["waits"] > 0
+    assert first["first_s"] > 0
+    assert first["compiled_after"] == 0
+
+
+def test_a_way_that_fails_is_a_row_and_the_others_are_measured_all_the_same(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, done = sys.modules["train_step_variants"].Bench, Counter[str]()
+    usual = bench._our_step
+
+    def step(self: Any, run: Any, batches: Any, latents: Any, way: str) -> None:
+        done[way] += 1
+        if way == "per_step" or (way == "auto" and done[way] > 2):  # at once; or when it is timed
+            raise RuntimeError(f"no {way} today\nand no more")
+        usual(self, run, batches, latents, way)
+
+    monkeypatch.setattr(bench, "_our_step", step)
+    file = tmp_path / "steps.json"
+    ways = ["--attention", "per_step", "auto", "dense", "--profile"]
+    with pytest.raises(SystemExit, match="2 of 3 rows failed"):
+        train_step.main(["--quick", "--no-memory", "--official", str(tmp_path), *ways, "--json", str(file)])
+    found = {row["way"]: row["problem"] for row in json.loads(file.read_text())["rows"]}
+    failed = {way: f"failed: RuntimeError: no {way} today" for way in ("per_step", "auto")}
+    assert found == {"dense": None, **failed}
+    printed = capsys.readouterr().out
+    for way, said in failed.items():
+        assert re.search(rf"^ +4 +1 +no +cache +{way} +{said}$", printed, re.MULTILINE)
+    assert [way for way, _, _ in rows(printed)] == ["dense"]
+
+
+def test_what_ends_the_program_leaves_the_rows_that_were_there(
+    train_step: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, done = sys.modules["train_step_variants"].Bench, Counter[bool]()
+    usual = bench._our_step
+
+    def step(self: Any, run: Any, batches: Any, latents: Any, way: str) -> None:
+        done[latents is None] += 1
+        if (
+            done[True] > 9
+        ):  # ways take 2 steps each, and 2 of a round to warm up: this is in the third round that counts
+            raise KeyboardInterrupt
+        usual(self, run, batches, latents, way)
+
+    monkeypatch.setattr(bench, "_our_step", step)
+    monkeypatch.setitem(train_step.QUICK, "repeats", 5)
+    file = tmp_path / "steps.json"
+    with pytest.raises(KeyboardInterrupt):
+        train_step.main([
+            "--quick", "--no-memory", "--official", str(tmp_path), "--source", "cache", "pixels", "--json", str(file),
+        ])  # fmt: skip
+    found = json.loads(file.read_text())["rows"]
+    assert [(row["encoder"], row["repeats"], row.get("finished", True)) for row in found] == [
+        (False, 5, True), (False, 5, True), (True, 1, False), (True, 1, False),
+    ]  # fmt: skip
+
+
+def test_the_official_code_draws_its_weights_on_the_device_and_brings_its_mask_in_every_pass(
+    train_step: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Predictor(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer, self.attn_mask = torch.nn.Linear(2, 2), torch.ones(3)
+
+    monkeypatch.setattr(torch.Tensor, "cpu", lambda value: torch.ones(value.shape, device="cpu"))  # what meta cannot
+    built = sys.modules[train_step.Bench._kind_of_official.__module__].built_on(torch.device("meta"), Predictor)
+    assert built.layer.weight.device.type == "meta"
+    assert built.attn_mask.device.type == "cpu"
+
+
+def test_an_official_code_that_fails_is_a_row_and_ours_is_measured_without_it(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "src" / "models").mkdir(parents=True)
+    (tmp_path / "src" / "models" / "ac_predictor.py").write_text("raise OSError('not today')")
+    with pytest.raises(SystemExit, match="1 of 3 rows failed"):
+        train_step.main(["--quick", "--no-memory", "--official", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert "official, failed: OSError: not today" in printed
+    assert [way for way, _, _ in rows(printed)] == ["dense", "auto"]
+
+
+def test_memory_is_measured_after_all_times_and_a_process_that_fails_is_a_row(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    models: list[weakref.ref[Any]] = []
+    draw = sys.modules["train_step_variants"].random_model
+
+    def drawn(*given: Any) -> Any:
+        model = draw(*given)
+        models.append(weakref.ref(model))
+        return model
+
+    def in_own_process(command: list[str]) -> float:
+        assert not any(model() for model in models)  # or the parent would hold memory meanwhile
+        assert Path(command[0]).name == "train_step.py"
+        way = command[command.index("--memory-of") + 1]
+        if way == "dense":
+            raise RuntimeError("a process of its own ended with -9: it says nothing")
+        return 1.25
+
+    monkeypatch.setattr("train_step_variants.random_model", drawn)
+    monkeypatch.setattr("memory.in_own_process", in_own_process)
+    file = tmp_path / "steps.json"
+    with pytest.raises(SystemExit, match="1 of 6 rows failed"):
+        train_step.main([
+            "--quick", "--official", str(tmp_path), "--checkpointing", "on", "--attention", "auto", "per_step",
+            "--json", str(file),
+        ])  # fmt: skip
+    assert len(models) == 1
+    found = json.loads(file.read_text())["rows"]
+    assert [(row["measured"], row["way"]) for row in found] == [
+        (measured, way) for measured in ("time", "memory") for way in ("dense", "auto", "per_step")
+    ]
+    assert [row.get("peak_gb") for row in found] == [None] * 4 + [1.25, 1.25]
+    printed = capsys.readouterr().out
+    assert re.search(r"^ +4 +1 +yes +cache +dense +failed: RuntimeError: .* -9", printed, re.MULTILINE)
+    assert re.search(r"^ +4 +1 +yes +cache +auto +1\.25 +- +-$", printed, re.MULTILINE)
+
+
+def test_memory_alone_is_measured_where_no_time_is_asked_for(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("memory.in_own_process", lambda _: 1.25)
+    monkeypatch.delattr(train_step, "matmul_speed")
+    train_step.main(["--quick", "--no-time", "--official", str(tmp_path)])
+    assert re.search(r"^ +4 +1 +no +cache +auto +1\.25 +- +-$", capsys.readouterr().out, re.MULTILINE)
+
+
+@pytest.fixture
+def step_memory(train_step: Any) -> Any:
+    """What measures the memory of a training step."""
+    return sys.modules[train_step.memory_row.__module__]
+
+
+def test_on_cuda_a_peak_stands_beside_doctors_estimate(
+    step_memory: Any, train_step: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = train_step.parse(["--device", "cuda", "--frames", "16", "--batch", "2", "--cap-gb", "24"])
+    (setting,) = step_memory.asked(options)
+    asked: list[tuple[list[str], str, float]] = []
+
+    def peak_alone(_: object, command: list[str], *given: Any) -> dict[str, Any]:
+        asked.append((command, *given))
+        return {"peak_gb": 10.0, "problem": None}
+
+    monkeypatch.setattr(step_memory, "peak_alone", peak_alone)
+    monkeypatch.setattr(step_memory.Bench, "estimated_gb", lambda *_: 11.5)
+    row = step_memory.memory_row(options, [], "bfloat16", setting, "auto")
+    assert asked[0][1:] == ("cuda", 24.0)
+    assert step_memory.memory_line(row).split() == ["16", "2", "no", "cache", "auto", "10.00", "11.50", "+15%"]
+    whole = step_memory.memory_row(options, [], "bfloat16", setting, "official_full")
+    assert step_memory.memory_line(whole).split()[-3:] == ["10.00", "-", "-"]
+
+
+def test_the_largest_batch_is_the_last_that_fits(step_memory: Any) -> None:
+    for fitting in (0, 1, 2, 19, 128, 500):
+        assert step_memory.largest_batch(lambda batch, fitting=fitting: batch <= fitting) == min(fitting, 128)
+
+
+def test_ways_are_crossed_as_asked(train_step: Any) -> None:
+    ours = train_step.our_ways
+    assert ours(["auto", "dense"], compiled=False, graphs=False) == ["auto", "dense"]
+    assert ours(["auto"], compiled=True, graphs=False) == ["auto", "auto+compile"]
+    assert ours(["auto"], compiled=True, graphs=True) == ["auto", "auto+graph", "auto+compile", "auto+compile+graph"]
+
+
+def test_a_way_as_a_graph_is_a_run_that_asks_for_one_and_its_clips_are_pinned_on_a_gpu(
+    train_step: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    timed = sys.modules["train_step_variants"]
+    options = train_step.parse(["--quick", "--frames", "4", "--batch", "1", "--attention", "dense"])
+    bench, setting = timed.Bench(options, "float32"), timed.Setting(4, 1, checkpointing=False)
+    assert not bench.step(setting, "dense").args[0].config.training.cuda_graph
+    with pytest.raises(InputError, match=r"training\.cuda_graph: true, on a CPU"):
+        bench.step(setting, "dense+graph")
+    pinned: list[str] = []
+    monkeypatch.setattr(timed.Batch, "pin_memory", lambda batch: pinned.append("pinned") or batch)
+    bench.batch(setting)
+    assert pinned == []
+    bench.device = torch.device("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    bench.batch(setting)
+    assert pinned == ["pinned"]
+
+
+def test_the_largest_batch_is_looked_for_under_the_cap_and_what_fits_not_is_no_failure(
+    step_memory: Any, train_step: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caps: list[float] = []
+
+    @contextmanager
+    def capped(gigabytes: float, device: str) -> Iterator[None]:
+        assert device == "cuda"
+        caps.append(gigabytes)
+        yield
+        caps.append(0.0)
+
+    class Bench:
+        at_six = "out of memory"
+
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def start(self, setting: Any, way: str) -> Any:
+            assert caps == [24.0]
+            assert way == "auto+compile"
+            problem = None if setting.batch <= 5 else self.at_six if setting.batch == 6 else "out of memory"
+            return SimpleNamespace(problem=problem)
+
+    monkeypatch.setattr(step_memory, "capped", capped)
+    monkeypatch.setattr(step_memory, "Bench", Bench)
+    options = train_step.parse(["--device", "cuda", "--frames", "16", "--batch", "largest", "--cap-gb", "24"])
+    (asked,) = step_memory.asked(options)
+    assert step_memory.find_largest(options, "bfloat16", asked, "auto+compile", train_step.Rows(None)) == 5
+    assert caps == [24.0, 0.0]
+    caps.clear()
+    Bench.at_six = "failed: RuntimeError: nothing of the kind"
+    with pytest.raises(RuntimeError, match="batch 6: failed: RuntimeError: nothing of the kind"):
+        step_memory.find_largest(options, "bfloat16", asked, "auto+compile", train_step.Rows(None))
+
+
+def test_the_batch_that_was_found_is_a_row_and_is_timed(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(train_step.QUICK, "batch", ["largest"])  # on a CPU: 2
+    file = tmp_path / "steps.json"
+    train_step.main(["--quick", "--no-memory", "--official", str(tmp_path), "--json", str(file)])
+    assert re.search(r"^ +4 +2 +no +cache +auto +is the largest batch", capsys.readouterr().out, re.MULTILINE)
+    found = [(row["measured"], row["batch"]) for row in json.loads(file.read_text())["rows"]]
+    assert found == [("largest batch", 2), ("time", 2), ("time", 2)]
+
+
+def test_weights_are_drawn_on_the_device_and_nobody_takes_their_fingerprints(
+    train_step: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(sys.modules["vjepa2_ac.model.network.world_model"], "hashlib")
+    bench, given = sys.modules["train_step_variants"].Bench, ["--quick", "--official", str(tmp_path)]
+    assert bench(train_step.parse(given), "bfloat16").model.adaptation is not None
+    with drawn_on(monkeypatch) as devices:
+        _ = bench(train_step.parse([*given, "--device", "cuda"]), "bfloat16").model
+    assert devices == [torch.device("cuda")]
+
+
+def test_doctor_is_asked_about_the_setting_that_is_measured(train_step: Any, tmp_path: Path) -> None:
+    timed = sys.modules["train_step_variants"]
+    bench = timed.Bench(train_step.parse(["--quick", "--official", str(tmp_path)]), "bfloat16")
+    small, large = (bench.estimated_gb(timed.Setting(4, batch, False)) for batch in (1, 64))
+    again = bench.estimated_gb(timed.Setting(4, 64, True))
+    assert 0 < small < again < large
+
+
+def test_peak_memory_of_one_way_is_told_as_a_number_alone(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train_step.main(["--quick", "--official", str(tmp_path), "--memory-of", "auto"])
+    assert 0.01 < float(capsys.readouterr().out) < 100
+
+
+def test_no_ratio_is_printed_to_a_predictor_that_computes_something_else(
+    train_step: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "src" / "models").mkdir(parents=True)
+    (tmp_path / "src" / "models" / "ac_predictor.py").write_text(ELSEWHERE)
+    train_step.main(["--quick", "--no-memory", "--official", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert "official: NO RATIO" in printed
+    assert [way for way, _, _ in rows(printed)] == ["dense", "auto"]
+
+
+@pytest.fixture
+def numerics(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The comparison of what ways learn."""
+    yield from imported("numerics", monkeypatch)
+
+
+def test_ways_learn_the_same_and_one_that_does_not_is_found(
+    numerics: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    numerics.main(["--steps", "12"])
+    printed = capsys.readouterr().out
+    assert re.search(r"^per_step: strays by \S+ in 3 steps", printed, re.MULTILINE)
+    assert re.search(r"^bfloat16: \S+ after 16 predictions", printed, re.MULTILINE)
+    from vjepa2_ac.model.network import attention
+
+    wrong = {**attention._IMPLEMENTATIONS, "per_step": lambda *given: attention._dense(*given) * 1.1}
+    monkeypatch.setattr(attention, "_IMPLEMENTATIONS", wrong)
+    with pytest.raises(SystemExit, match="beyond its tolerance"):
+        numerics.main(["--steps", "12"])
+
+
+def test_a_way_that_cannot_learn_is_a_row_and_a_loss_that_is_no_number_strays(
+    numerics: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vjepa2_ac.model.network import attention
+
+    def fails(*_: object) -> None:
+        raise TypeError("no such thing")
+
+    monkeypatch.setattr(attention, "_IMPLEMENTATIONS", {**attention._IMPLEMENTATIONS, "flex": fails})
+    file = tmp_path / "curves.json"
+    with pytest.raises(SystemExit, match="1 of 4 rows failed"):
+        numerics.main(["--quick", "--ways", "flex", "per_step", "--json", str(file)])
+    found = json.loads(file.read_text())["rows"]
+    assert [row["way"] for row in found] == ["dense", "flex", "per_step", "bfloat16"]
+    assert [row.get("problem") for row in found] == [None, "failed: TypeError: no such thing", None, None]
+    assert numerics.strays([1.0, 1.0], [1.0, math.nan]) == math.inf
+
+
+@pytest.fixture
+def latents(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The benchmark of the latent cache."""
+    yield from imported("latents", monkeypatch)
+
+
+def test_latents_that_cannot_be_timed_are_a_row_and_sizes_and_errors_follow(
+    latents: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(latents, "record_dataset", fails)
+    file = tmp_path / "latents.json"
+    with pytest.raises(SystemExit, match="2 of 5 rows failed"):
+        latents.main(["--quick", "--json", str(file)])
+    found = json.loads(file.read_text())["rows"]
+    assert [row["measured"] for row in found] == ["speed", "size", "size", "size", "added error"]
+    assert {row.get("problem") for row in found} == {None, "failed: OSError: disk full"}
+
+
+def test_quick_benchmark_of_latents_tells_speed_size_and_added_error(
+    latents: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("mujoco", reason="the arm is simulated")
+    file = tmp_path / "latents.json"
+    latents.main(["--quick", "--json", str(file)])
+    printed = capsys.readouterr().out
+    kinds = [row["measured"] for row in json.loads(file.read_text())["rows"]]
+    assert kinds == ["encoder alone", "speed", *["size"] * 3, *["added error"] * 3]
+    speed = r"^ +4 +\d+\.\d+ +\d+\.\d% +\d+\.\d+ +\d+%( +\d+ +\d+ +\d+ +\d+) +\d+\.\d\dx$"
+    (times,) = re.findall(speed, printed, re.MULTILINE)
+    pictures, least, latents, least_of_latents = map(int, times.split())
+    assert 0 < least <= pictures
+    assert 0 < least_of_latents <= latents
+    hours = [float(hour) for hour in re.findall(r"^ +(?:int8|bf16|fp32) +\S+ +(\d\.\d\d) +\S+$", printed, re.MULTILINE)]
+    bf16, fp32, int8 = hours
+    assert int8 < bf16 < fp32
+    added = re.findall(r"^ +random +(\w+) +\S+ +(\S+)% +\S+ +(\S+)%", printed, re.MULTILINE)
+    assert [kind for kind, *_ in added] == ["fp32", "bf16", "int8"]
+    assert all(float(one) == 0 for kind, *percent in added if kind == "fp32" for one in percent)
+    assert all(abs(float(one)) < 2 for _, *percent in added for one in percent)

@@ -1,0 +1,177 @@
+"""The evidence compares what it says it compares, and its table says what was measured."""
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from paths import ROOT
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.simulation.world.domains import DOMAIN_A
+
+pytest.importorskip("mujoco")
+
+
+@pytest.fixture
+def evidence(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The modules of benchmarks/evidence."""
+    names = ("cells", "prepare", "measure", "results", "plot", "table")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks/evidence"))
+    yield SimpleNamespace(**{name: import_module(name) for name in names})
+    for name in names:
+        sys.modules.pop(name)
+
+
+def test_cells_have_names_of_their_own_and_hold_all_that_is_to_be_compared(evidence: Any) -> None:
+    cells = list(evidence.cells.all_cells(seeds=3))
+    assert len({cell.name for cell in cells}) == len(set(cells)) == len(cells)
+    for base in ("one camera", "many cameras"):
+        main = {
+            cell.method for cell in cells if cell.shift == "look" and cell.base == base and cell.episodes in (0, 20)
+        }
+        assert main == {name for name in evidence.cells.METHODS if not name.startswith("scratch")}
+    assert {cell.episodes for cell in cells if cell.method == evidence.cells.BEST} == {10, 20, 40}
+    assert {cell.seed for cell in cells if cell.method == "full"} == {0, 1, 2}
+
+
+def test_methods_differ_only_in_what_is_trained_and_how_fast(evidence: Any) -> None:
+    def rest(name: str) -> Any:
+        return evidence.cells.METHODS[name].training.model_copy(update={"learning_rate": 1.0})
+
+    assert rest("LoRA r4") == rest("LoRA r32 + in/out") == rest("full") == rest("scratch")
+    assert rest("scratch, 3x steps").steps == 3 * rest("scratch").steps
+
+
+def test_the_looks_differ_and_the_motion_does_not_and_the_other_way_round(evidence: Any) -> None:
+    look, motion = evidence.cells.SHIFTS["look"], evidence.cells.SHIFTS["motion"]
+    assert look.base_yaw_deg == DOMAIN_A.base_yaw_deg
+    assert look.camera != DOMAIN_A.camera
+    assert look.look != DOMAIN_A.look
+    assert motion.base_yaw_deg != DOMAIN_A.base_yaw_deg
+    assert (motion.camera, motion.look) == (
+        DOMAIN_A.camera,
+        DOMAIN_A.look,
+    )
+
+
+def test_every_table_has_who_needs_no_model_and_time_that_other_work_does_not_lengthen(evidence: Any) -> None:
+    def figures(shift: str, base: str, method: str, **more: Any) -> dict[str, Any]:
+        reach = {"distance_cm": [[20.0, 3.0], [20.0, 9.0]]}
+        cell = {"shift": shift, "base": base, "method": method, "episodes": 20, "seed": 0}
+        errors = {"rollout_over_persistence": [0.5], "one_step_zero_actions": 1.0, "one_step_shuffled_actions": 1.0}
+        trained = {"trained_share": 0.1, "adapter_mb": 0.3, "minutes": 77.0, "cpu_minutes": 5.0}
+        return {"cell": cell, "shifted": errors, "reach": {"l1": reach}, **trained, **more}
+
+    reach = {"distance_cm": [[20.0, 20.0], [20.0, 20.0]]}
+    alone = {"baselines": dict.fromkeys(("do nothing", "random", "oracle"), reach)}
+    results = [figures("motion", "one camera", "zero-shot", **alone), figures("motion", "one camera", "full")]
+    lines = evidence.table._motion(results).splitlines()
+    assert [line.split(" | ")[0] for line in lines[4:]] == [
+        "| do nothing", "| random", "| oracle", "| zero-shot (one camera)", "| full (one camera)",
+    ]  # fmt: skip
+    assert " 5.0 " in lines[-1]
+    assert "77" not in lines[-1]
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Everything at its smallest: two steps, one goal; the figures mean nothing."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(ROOT / "benchmarks/evidence"))
+        names = ("cells", "prepare", "measure", "results", "plot", "table")
+        modules = SimpleNamespace(**{name: import_module(name) for name in names})
+        cells, prepare, measure = modules.cells, modules.prepare, modules.measure
+        patch.setattr(cells, "STEPS", 2)
+        patch.setattr(cells, "TRAINING", cells.TRAINING.model_copy(update={"warmup_steps": 1, "batch_size": 2}))
+        for module in (cells, measure):
+            patch.setattr(module, "PLANNING", cells.PLANNING.model_copy(update={"samples": 12, "iterations": 1}))
+        patch.setattr(measure, "CLIPS", 6)
+        patch.setattr(measure, "base_model", lambda *_: prepare.BUILTIN)
+        patch.setattr(prepare, "record_dataset", partial(record_dataset, steps=14))
+        modules.folder = tmp_path_factory.mktemp("evidence")
+        for name, make in (("data_a", prepare.data_a), ("data_shifted", prepare.data_shifted)):
+            for module in (prepare, measure):
+                patch.setattr(module, name, partial(_held_out, make))
+        for data, domain in (
+            (prepare.data_a(modules.folder), "A"),
+            (prepare.data_shifted(modules.folder, "look"), "look"),
+        ):
+            prepare._record(data, domain, 14, 3)
+            prepare.encode(data, prepare.BUILTIN)
+        yield modules
+    for name in names:
+        sys.modules.pop(name)
+
+
+def _held_out(make: Any, *arguments: Any) -> Any:
+    """Return a data config of which few episodes give something to every split."""
+    return make(*arguments).model_copy(update={"validation_share": 0.2, "test_share": 0.3})
+
+
+def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_path: Path) -> None:
+    cell = small.cells.Cell("look", "many cameras", "LoRA r4 + in/out", 4, 0)
+    figures = small.measure.measure(cell, small.folder, goals=1)
+    assert figures["forgetting"]["off_is_base_bit_for_bit"] is True
+    assert figures["forgetting"]["on"] != figures["forgetting"]["off"]
+    assert 0 < figures["trained_share"] < 0.2
+    assert figures["adapter_mb"] > 0
+    assert len(figures["reach"]["l1"]["distance_cm"][0]) == 9
+
+    zero = replace(cell, method="zero-shot", episodes=0)
+    before = small.measure.measure(zero, small.folder, goals=1)
+    assert set(small.measure.made_with()) == {"torch", "commit"}
+    before["baselines"] = small.measure.baselines(zero, goals=1)
+    assert before["trained_share"] == 0
+    assert before["shifted"] != figures["shifted"]
+    assert (
+        before["baselines"]["oracle"]["distance_cm"][0][-1]
+        < 1
+        < before["baselines"]["do nothing"]["distance_cm"][0][-1]
+    )
+
+    results = tmp_path / "results"
+    results.mkdir()
+    for one in (figures, before):
+        one["cell"]["episodes"] = one["cell"]["episodes"] and 20
+        (results / f"{one['cell']['name']}.json").write_text(json.dumps(one))
+    readme = tmp_path / "README.md"
+    readme.write_text(f"before\n{small.table._BEGIN}\nold\n{small.table._END}\nafter\n")
+    small.table.write_tables(tmp_path, tmp_path / "out", readme)
+    text = (tmp_path / "out" / "evidence.md").read_text()
+    assert "LoRA r4 + in/out" in text
+    assert "the base's, bit for bit" in text
+    assert "Made with not recorded (2 cells)" in text
+    assert "oracle" in text
+    assert (tmp_path / "out" / "evidence.png").stat().st_size > 5_000
+    new = readme.read_text()
+    assert new.startswith("before\n")
+    assert new.endswith("\nafter\n")
+    assert "old" not in new
+    assert "zero-shot" in new
+
+
+def test_exactly_so_many_demonstrations_are_trained_on_and_seeds_draw_others(small: Any) -> None:
+    drawn = []
+    for seed in (0, 1):
+        config = small.measure.config_of(small.cells.Cell("look", "many cameras", "full", 4, seed), small.folder)
+        dataset = open_dataset(config.data)
+        windows = dataset.windows("train")
+        drawn.append({windows[place][0] for place in range(len(windows))})
+        assert len(drawn[-1]) == 4
+    assert drawn[0] != drawn[1]
+
+
+def test_a_readme_without_a_place_for_the_table_is_left_alone(small: Any, tmp_path: Path) -> None:
+    readme = tmp_path / "README.md"
+    readme.write_text("nothing")
+    with pytest.raises(ValueError, match="made by"):
+        small.table.write_summary([], readme)
+    assert readme.read_text() == "nothing"

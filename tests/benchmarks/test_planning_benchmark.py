@@ -1,0 +1,245 @@
+"""The benchmark of decisions times what decides alike, each in the type and with the goal that were asked for."""
+
+import json
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch._dynamo.utils import counters
+
+from benches import ELSEWHERE, drawn_on, imported
+from tracing import tracing
+
+
+@pytest.fixture
+def planning(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """The benchmark; its name is that of a folder of tests, too."""
+    monkeypatch.delitem(sys.modules, "planning", raising=False)
+    yield from imported("planning", monkeypatch)
+
+
+DECISION = re.compile(r"^ +(\d+)  (\S+) +(\S+) +(\S+) +\S+ +(\S+)% +0 +(\S+) +(\S+)(?:  \[.*)?$", re.MULTILINE)
+"""Horizon, way, seconds, the least, MFU, ratio to plain, ratio to official."""
+
+
+def test_quick_benchmark_of_a_decision_completes_without_the_official_code(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--profile"])
+    printed = capsys.readouterr().out
+    assert f"official: skipped, for there is no {tmp_path}" in printed
+    assert "aten::addmm" in printed
+    lines = DECISION.findall(printed)
+    ways = ["plain", "ours/4", "ours/1", "ours/4+adapter"]
+    assert [(horizon, way) for horizon, way, *_ in lines] == [("3", way) for way in ways]
+    for _, _, seconds, least, mfu, of_plain, of_official in lines:
+        assert 0 < float(least) <= float(seconds) < 60
+        assert 0 < float(mfu) < 150
+        assert 0 < float(of_plain) < 100
+        assert of_official == "-"
+    assert lines[0][5] == "1.00"
+
+
+@pytest.mark.usefixtures("traced")
+@tracing[0]
+@tracing[1]
+def test_decisions_with_compiled_blocks_are_timed_beside_those_without(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--compile"])
+    ways = [way for _, way, *_ in DECISION.findall(capsys.readouterr().out)]
+    assert ways == [
+        "plain", "ours/4", "ours/4+compiled", "ours/1", "ours/1+compiled", "ours/4+adapter", "ours/4+adapter+compiled",
+    ]  # fmt: skip
+    assert counters["stats"]["unique_graphs"]
+
+
+def test_decisions_in_8_bits_are_timed_and_say_what_they_cost(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("torchao", reason="the extra quantize is not installed")
+    planning.main(["--quick", "--no-memory", "--no-adapter", "--official", str(tmp_path), "--quantize", "int8"])
+    printed = capsys.readouterr().out
+    ways = [way for _, way, *_ in DECISION.findall(printed)]
+    assert ways == ["plain", "ours/4", "ours/4+int8", "ours/1", "ours/1+int8"]
+    changes = re.findall(r"ours/[41]\+int8 .*\[the plan's energy: changes by (\S+)%", printed)
+    assert len(changes) == 2
+    assert all(abs(float(change)) < 10 for change in changes)
+
+
+def test_8_bits_are_made_of_bfloat16_only_and_never_compared(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decisions = sys.modules["planning_variants"]
+    usual, types = decisions.prepare_for_planning, []
+
+    def prepare_for_planning(model: Any, config: Any) -> Any:
+        if config.quantize != "off":
+            types.append(model.predictor.dtype)
+        return usual(model, config.model_copy(update={"quantize": "off"}))
+
+    monkeypatch.setattr(decisions, "prepare_for_planning", prepare_for_planning)
+    given = ["--quick", "--no-memory", "--no-adapter", "--official", str(tmp_path), "--quantize", "fp8"]
+    planning.main([*given, "--dtype", "float32", "bfloat16"])
+    assert types == [torch.bfloat16] * 2  # once for each type that is timed
+    assert "ours/4+fp8: not compared" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("changed", ["ready", "failing"])
+def test_what_becomes_of_an_adapter_must_decide_as_the_others_do(
+    planning: Any, changed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decisions = sys.modules["planning_variants"]
+    usual = decisions.prepare_for_planning
+
+    def prepare_for_planning(model: Any, config: Any) -> Any:
+        if model.adaptation is None:
+            return usual(model, config)
+        if changed == "failing":
+            raise NotImplementedError("adapters")
+        for layer in decisions.lora_layers(model).values():
+            layer.set_scale("default", 0.0)
+        return usual(model, config)
+
+    monkeypatch.setattr(decisions, "prepare_for_planning", prepare_for_planning)
+    given = ["--quick", "--no-memory", "--official", str(tmp_path)]
+    if changed == "failing":
+        with pytest.raises(SystemExit, match="1 of 7 rows failed"):
+            planning.main(given)
+        expected = r"ours/4\+adapter, failed: NotImplementedError: adapters"
+    else:
+        planning.main(given)
+        expected = r"ours/4\+adapter: actions differ by .*: NO RATIO"
+    printed = capsys.readouterr().out
+    assert re.search(expected, printed)
+    assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/1"]
+
+
+def test_an_adapter_is_float32_over_a_base_of_the_type_that_is_timed(planning: Any, tmp_path: Path) -> None:
+    decisions = sys.modules["planning_variants"]
+    bench = decisions.Bench(planning.parse(["--quick", "--official", str(tmp_path)]), "bfloat16")
+    way = decisions.Way.ours(4, adapter=True)
+    assert bench.difference(way, 3).is_none
+    bench.decision(way, 3)()
+    types = {".lora_" in name: one.dtype for name, one in bench.adapted.predictor.named_parameters()}
+    assert types == {True: torch.float32, False: torch.bfloat16}
+    assert not any(one.requires_grad for one in bench.adapted.parameters())
+
+
+def test_a_decision_that_fails_is_a_row_and_memory_of_the_others_follows(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decisions = sys.modules["planning_variants"]
+    usual = decisions.Bench.decision
+
+    def decision(self: Any, way: Any, horizon: int) -> Any:
+        return usual(self, way, horizon) if way.name != "plain" else [].pop
+
+    monkeypatch.setattr(decisions.Bench, "decision", decision)
+    monkeypatch.setattr("memory.in_own_process", lambda _: 1.25)
+    file = tmp_path / "decisions.json"
+    with pytest.raises(SystemExit, match="1 of 9 rows failed"):
+        planning.main(["--quick", "--official", str(tmp_path), "--no-adapter", "--json", str(file)])
+    printed = capsys.readouterr().out
+    assert re.search(r"^ +3  plain +failed: IndexError: pop from empty list$", printed, re.MULTILINE)
+    assert re.findall(r"^ +3  (\S+) +1\.25$", printed, re.MULTILINE) == ["plain", "ours/4", "ours/1"]
+    found = json.loads(file.read_text())["rows"]
+    assert [row["measured"] for row in found] == ["same actions"] * 3 + ["time"] * 3 + ["memory"] * 3
+    assert [row["ratio_to_plain"] for row in found[3:6]] == [None] * 3
+
+
+def test_peak_memory_of_a_decision_is_told_as_a_number_alone(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    planning.main(["--quick", "--official", str(tmp_path), "--memory-of", "ours/4", "4"])
+    assert 0.01 < float(capsys.readouterr().out) < 100
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_no_ratio_is_printed_to_a_decision_that_comes_out_otherwise(
+    planning: Any, dtype: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    poses = sys.modules["planning_variants"]._poses_one_by_one
+    monkeypatch.setattr("planning_variants._poses_one_by_one", lambda states, actions: poses(states, -3 * actions))
+    planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--dtype", dtype])
+    printed = capsys.readouterr().out
+    assert re.search(r"plain: actions differ by .*: NO RATIO", printed)
+    assert [(way, of_plain) for _, way, _, _, _, of_plain, _ in DECISION.findall(printed)] == [
+        ("ours/4", "-"), ("ours/1", "-"), ("ours/4+adapter", "-"),
+    ]  # fmt: skip
+
+
+NOTEBOOK = """
+import torch
+
+class WorldModel:
+    def __init__(self, mpc_args, device, **_):
+        self.asked = mpc_args
+
+    def infer_next_action(self, rep, pose, goal_rep):
+        assert rep.shape == goal_rep.shape == (1, 4, 128)
+        assert pose.shape == (1, 1, 7)
+        assert not torch.is_grad_enabled()
+        assert torch.initial_seed() == 0
+        assert sorted(self.asked) == [
+            "cem_steps", "maxnorm", "momentum_mean", "momentum_mean_gripper", "momentum_std", "momentum_std_gripper",
+            "rollout", "samples", "topk",
+        ]
+        return torch.zeros(self.asked["rollout"], 7) if torch.randn(3, device="cpu").any() else None
+"""
+
+
+def test_no_ratio_is_printed_to_a_notebook_that_plans_otherwise(
+    planning: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "src" / "models").mkdir(parents=True)
+    (tmp_path / "src" / "models" / "ac_predictor.py").write_text(ELSEWHERE)
+    (tmp_path / "notebooks" / "utils").mkdir(parents=True)
+    (tmp_path / "notebooks" / "utils" / "world_model_wrapper.py").write_text(NOTEBOOK)
+    planning.main(["--quick", "--no-memory", "--official", str(tmp_path)])
+    printed = capsys.readouterr().out
+    assert re.search(r"official: actions differ by .*: NO RATIO", printed)
+    assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/1", "ours/4+adapter"]
+
+
+def test_a_decision_is_counted_and_timed_in_the_type_and_towards_the_goal_that_were_asked_for(
+    planning: Any, tmp_path: Path
+) -> None:
+    decisions = sys.modules["planning_variants"]
+    options = planning.parse(["--quick", "--official", str(tmp_path)])
+    bench = decisions.Bench(options, "bfloat16")
+    for horizon in (1, 3):
+        cost = decisions.WorldModelCost(bench.model, bench._scene, bench._goal(horizon), decisions.EnergyConfig())
+        with torch.no_grad():
+            assert float(cost(torch.tensor(decisions.WANTED).expand(1, horizon, -1))) < 1e-5
+            assert float(cost(torch.zeros(1, horizon, 7))) > 1e-3
+    assert bench.model.predictor.dtype == torch.float32  # until all were compared
+    plan = bench.decision(decisions.Way.ours(2), 3)()
+    assert bench.model.predictor.dtype == torch.bfloat16
+    assert len(plan.actions) == 3
+    assert plan.evaluations == bench.sequences
+    assert bench.flops(3) == bench.sequences * decisions.plan_flops(bench.sizes, 3)
+
+
+def test_weights_are_drawn_on_the_device_and_nobody_takes_their_fingerprints(
+    planning: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(sys.modules["vjepa2_ac.model.network.world_model"], "hashlib")
+    bench, given = sys.modules["planning_variants"].Bench, ["--quick", "--official", str(tmp_path)]
+    assert bench(planning.parse(given), "bfloat16").adapted.adaptation is not None
+    with drawn_on(monkeypatch) as devices:
+        bench(planning.parse([*given, "--device", "cuda"]), "bfloat16")
+    assert devices == [torch.device("cuda")]
+
+
+def test_on_cuda_the_papers_setting_is_measured(planning: Any) -> None:
+    options = planning.parse(["--device", "cuda"])
+    assert (options.samples, options.iterations, options.horizon, options.layers) == (800, 10, [1, 2], 24)
+    assert (options.width, options.latent_dim, options.image_size, options.dtype) == (1024, 1408, 256, ["bfloat16"])
+    assert (options.repeats, options.warm_up) == (10, 3)
+    given = planning.parse(["--device", "cuda", "--samples", "9", "--repeats", "4", "--warm-up", "0"])
+    assert (given.samples, given.repeats, given.warm_up) == (9, 4, 0)

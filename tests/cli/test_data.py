@@ -1,0 +1,142 @@
+"""The data commands: what they print, what they write, and their exit status."""
+
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from synthetic import write_synthetic_droid
+from vjepa2_ac.cli import main
+
+
+@pytest.fixture(scope="module")
+def droid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_synthetic_droid(tmp_path_factory.mktemp("set") / "1.0.0", episodes=8, steps=40, size=(36, 64))
+
+
+@pytest.fixture
+def config(droid: Path, tmp_path: Path) -> str:
+    values = {
+        "run_dir": str(tmp_path / "run"),
+        "data": {
+            "path": str(droid), "frames": 3, "stride": 4, "validation_share": 0.4, "test_share": 0.0, "workers": 0,
+            "disk_cache": {"dir": str(tmp_path / "cache")},
+        },
+        "model": {"base": "builtin:sim-tiny", "dtype": "float32"},
+        "training": {"precision": "fp32", "device": "cpu", "batch_size": 2},
+    }  # fmt: skip
+    path = tmp_path / "config.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return str(path)
+
+
+Printed = pytest.CaptureFixture[str]
+
+
+def test_check_prints_a_line_for_everything_and_ends_with_0(config: str, capsys: Printed) -> None:
+    assert main(["data", "check", config, "--limit", "4"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    about = [line.split()[1] for line in lines if line.startswith(("ok", "warning", "error"))]
+    assert about[:2] == ["source", "index"]
+    assert {"train", "validation", "batch", "pixels", "position", "rotation", "gripper", "actions", "timing"} <= {
+        *about
+    }
+
+
+def test_check_ends_with_1_where_training_could_not_begin(config: str, capsys: Printed) -> None:
+    assert main(["data", "check", config, "data.validation_share=0", "--limit", "2"]) == 1
+    assert "error    validation" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["check", "index", "inspect", "calibrate"])
+@pytest.mark.parametrize(
+    ("wrong", "words"), [("data.path=nowhere", "nowhere"), ("data.strid=3", "unknown key"), ("data.stride=0", "stride")]
+)
+def test_wrong_input_is_one_error_and_status_2(
+    config: str, tmp_path: Path, capsys: Printed, command: str, wrong: str, words: str
+) -> None:
+    out = [] if command in {"check", "index"} else ["--out", str(tmp_path / "out")]
+    assert main(["data", command, config, wrong, *out]) == 2
+    errors = capsys.readouterr().err
+    assert errors.startswith("error: ")
+    assert errors.count("error: ") == 1
+    assert words in errors
+    assert "Traceback" not in errors
+
+
+def test_a_config_that_is_not_there_is_one_error(capsys: Printed) -> None:
+    assert main(["data", "check", "no.yaml"]) == 2
+    assert capsys.readouterr().err.startswith("error: no.yaml: no such file")
+
+
+def test_an_unwritable_folder_is_known_before_anything_is_read(config: str, tmp_path: Path, capsys: Printed) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["data", "inspect", config, "--out", str(tmp_path / "file" / "in it")]) == 2
+    assert "--out" in capsys.readouterr().err
+
+
+def test_index_says_what_is_kept_and_where_and_builds_it_again(config: str, tmp_path: Path, capsys: Printed) -> None:
+    assert main(["data", "index", config]) == 0
+    assert "8 episodes, 320 steps" in capsys.readouterr().out
+    files = list((tmp_path / "cache" / "index").iterdir())
+    assert len(files) == 1
+    files[0].write_bytes(b"not an index")
+    assert main(["data", "index", config, "--rebuild"]) == 0
+    assert str(files[0]) in capsys.readouterr().out.replace("\n", "")
+    assert files[0].stat().st_size > 100
+
+
+def test_index_shows_the_kept_one_without_reading_the_data(
+    config: str, droid: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["data", "index", config]) == 0
+    del droid
+    monkeypatch.setattr("vjepa2_ac.data.index.index_cache.EpisodeTable.to_bytes", lambda _: pytest.fail("built again"))
+    assert main(["data", "index", config]) == 0
+    assert "looking through" not in capsys.readouterr().out.split("8 episodes")[-1]
+
+
+def test_inspect_prints_and_writes_figures_and_a_picture(config: str, tmp_path: Path, capsys: Printed) -> None:
+    out = tmp_path / "out"
+    assert main(["data", "inspect", config, "--out", str(out), "--limit", "4", "--rows", "1"]) == 0
+    printed = capsys.readouterr().out
+    for words in ("episodes", "standing still", "gripper", "the released weights", "12.9 cm", "wrist_left"):
+        assert words in printed
+    read = json.loads((out / "inspect.json").read_text())
+    assert (read["episodes"], read["sampled_episodes"]) == (8, 4)
+    assert (out / "contact_sheet.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_inspect_of_an_auto_stride_says_at_which_it_looked(config: str, tmp_path: Path, capsys: Printed) -> None:
+    arguments = ["data", "inspect", config, "data.stride=auto", "--out", str(tmp_path / "o"), "--rows", "1"]
+    assert main(arguments) == 0
+    assert "smallest candidate, 4" in capsys.readouterr().out
+
+
+def test_calibrate_prints_a_table_and_writes_its_figures(config: str, tmp_path: Path, capsys: Printed) -> None:
+    out = tmp_path / "out"
+    arguments = ["data", "calibrate", config, "data.stride=auto", "--out", str(out), "--limit", "4"]
+    assert main(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "Best: stride" in printed
+    read = json.loads((out / "calibration.json").read_text())
+    assert [row["stride"] for row in read["strides"]] == [4, 8, 15]
+    assert read["stride"] in {4, 8, 15}
+    assert {row["clips"] for row in read["strides"]} == {4}
+
+
+def test_calibrate_takes_another_model(config: str, tmp_path: Path, capsys: Printed) -> None:
+    arguments = ["data", "calibrate", config, "--out", str(tmp_path / "o"), "--model", "no/such/model"]
+    assert main(arguments) == 2
+    assert "model.base: no/such/model" in capsys.readouterr().err
+
+
+def test_a_random_model_cannot_choose(config: str, tmp_path: Path, capsys: Printed) -> None:
+    values = yaml.safe_load(Path(config).read_text())
+    values["model"] = {"random": {}, "dtype": "float32"}
+    values["adapter"] = {"kind": "none"}
+    path = tmp_path / "random.yaml"
+    path.write_text(yaml.safe_dump(values))
+    assert main(["data", "calibrate", str(path), "--out", str(tmp_path / "o")]) == 2
+    assert "learned nothing" in capsys.readouterr().err

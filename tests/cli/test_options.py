@@ -1,0 +1,186 @@
+"""An option that is no number, or too small or large a one, is told what would do."""
+
+import argparse
+import errno
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from vjepa2_ac.cli import main, program
+from vjepa2_ac.cli.options import parsed
+
+EVALUATE, SIMULATE = ["evaluate", "run"], ["simulate", "record", "folder"]
+CALIBRATE = ["data", "calibrate", "config.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "wrong", "needed"),
+    [
+        (EVALUATE, "--nodes", ["x", "2", "52", "3.5", ""], "a whole number from 3 to 51"),
+        (EVALUATE, "--reach", ["x", "0", "1000", "nan", "-1"], "a number of cm above 0 and below 1000"),
+        (EVALUATE, "--sensitivity-clips", ["-1", "many"], "a whole number from 0"),
+        (EVALUATE, "--landscapes", ["-1"], "a whole number from 0"),
+        (EVALUATE, "--examples", ["1e3"], "a whole number from 0"),
+        (EVALUATE, "--clips", ["0", "x"], "a whole number from 1"),
+        (CALIBRATE, "--frames", ["1", "257", "x"], "a whole number from 2 to 256"),
+        (CALIBRATE, "--limit", ["x"], "a whole number from 1"),
+        (SIMULATE, "--seed", ["x", "-1", "2147483648"], "a whole number from 0 to 2147483647"),
+        (SIMULATE, "--cameras", ["x"], "a whole number from 1 to 3"),
+    ],
+)
+def test_a_number_that_cannot_be_is_told_what_can(
+    command: list[str], option: str, wrong: list[str], needed: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for text in wrong:
+        with pytest.raises(SystemExit, match="2"):
+            main([*command, option, text])
+        assert re.search(rf"error: argument {option}.*: {re.escape(repr(text))} is not {needed}$", last_line(capsys))
+
+
+@pytest.mark.parametrize("number", ["3", "51"])
+def test_the_bounds_themselves_are_numbers_that_can_be(number: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "no-such-run", "--nodes", number, "--sensitivity-clips", "0"]) == 2
+    assert "no such folder" in last_line(capsys)
+
+
+def test_a_number_beyond_all_need_is_refused_before_anything_is_made_of_it(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main([*EVALUATE, "--clips", "100000000000"])
+    assert last_line(capsys).endswith("'100000000000' is not a whole number from 1 to 1000000000")
+
+
+def leaves(
+    parser: argparse.ArgumentParser, words: tuple[str, ...] = ()
+) -> dict[tuple[str, ...], argparse.ArgumentParser]:
+    """Return the parsers of all commands, by the words that lead to each."""
+    inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    if not inner:
+        return {words: parser}
+    found: dict[tuple[str, ...], argparse.ArgumentParser] = {}
+    for name, one in inner[0].choices.items():
+        found |= leaves(one, (*words, name))
+    return found
+
+
+COMMANDS = leaves(program._parser())
+WITHOUT_SETTINGS = {("compare",), ("export",), ("download",)}
+BEHIND = {  # what each must be given, and an option with a value
+    ("train",): (["c.yaml"], ["--check"]),
+    ("evaluate",): (["run"], ["--clips", "3"]),
+    ("data", "check"): (["c.yaml"], ["--limit", "3"]),
+    ("data", "index"): (["c.yaml"], ["--rebuild"]),
+    ("data", "inspect"): (["c.yaml"], ["--rows", "3"]),
+    ("data", "calibrate"): (["c.yaml"], ["--limit", "3"]),
+    ("encode",): (["c.yaml"], ["--out", "folder"]),
+    ("doctor",): (["c.yaml"], []),
+    ("plan",): (["run"], ["--start", "a.png", "--state", "-0.1,0,0,0,0,0,0", "--goal", "b.png"]),
+    ("config",): (["show", "c.yaml"], []),
+    ("simulate",): (["run"], ["--episodes", "3"]),
+}
+
+
+def test_every_command_is_known_to_take_settings_or_not() -> None:
+    assert set(COMMANDS) == set(BEHIND) | WITHOUT_SETTINGS, "say of a new command which it is"
+
+
+@pytest.mark.parametrize("words", BEHIND, ids=" ".join)
+def test_settings_may_stand_anywhere_behind_what_they_are_of(words: tuple[str, ...]) -> None:
+    given, option = BEHIND[words]
+    first, second = "planning.samples=64", "data.path=a=b"
+    for order in ([first, second, *option], [first, *option, second], [*option, first, second]):
+        options = parsed(program._parser(), [*words, *given, *order])
+        assert options.overrides == [first, second], order
+        assert vars(options).get("subjects", ["run"]) == ["run"]
+
+
+@pytest.mark.parametrize("words", BEHIND, ids=" ".join)
+def test_what_is_no_setting_is_refused(words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    given, option = BEHIND[words]
+    with pytest.raises(SystemExit, match="2"):
+        main([*words, *given, *option, "a.b=1", "--stepz", "3"])
+    assert last_line(capsys).endswith("unrecognized arguments: --stepz 3")
+
+
+def test_a_folder_whose_name_looks_like_a_setting_is_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("runs.lr=1").mkdir()
+    options = parsed(program._parser(), ["evaluate", "runs.lr=1", "runs.lr=2"])
+    assert (options.subjects, options.overrides) == (["runs.lr=1"], ["runs.lr=2"])
+
+
+def test_evaluate_needs_something_to_evaluate(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["evaluate", "planning.samples=64"])
+    assert last_line(capsys).endswith("the following arguments are required: RUN_OR_MODEL")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["evaluate", "run", "--clips", "3", "planning.samples=64"], "no plans are asked for.*Add --planning"),
+        (["evaluate", "run", "--clips", "3", "other"], "'other'.*one behind the other"),
+        (["config", "schema", "training.steps=3"], "config schema training.steps=3"),
+        (["plan", "run", "--start", "a", "--goal", "b", "--state", "1", "2", "-3"], r"'2 -3'.*--state 0\.4,0,"),
+        (["simulate", "run", "--episodes", "3", "samples"], "'samples'"),
+        (["data", "check", "c.yaml", "--limit", "3", "samples"], "no such file"),
+    ],
+)
+def test_a_word_that_does_nothing_is_refused(
+    arguments: list[str],
+    words: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert re.search(words, capsys.readouterr().err)
+
+
+def raising(error: BaseException) -> Callable[..., int]:
+    def handler(_options: object) -> int:
+        raise error
+
+    return handler
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(errno.EMFILE, "Too many open files"), r"error: ulimit -n: too many open files: this process may have"),
+        (OSError(errno.ENFILE, "Too many open files", "a.mp4"), r"error: a\.mp4: too many .* `ulimit -n 4096`"),
+        (MemoryError("Unable to allocate 9 TiB"), r"memory is not enough \(Unable to allocate 9 TiB\)"),
+        (MemoryError(), r"memory is not enough \(MemoryError\)"),
+        (RuntimeError("[enforce fail] DefaultCPUAllocator: can't allocate memory: 9 bytes"), "memory is not enough"),
+        (OSError(errno.ENOSPC, "No space left on device", "run"), r"No space left on device: 'run'"),
+    ],
+)
+def test_what_the_system_does_not_give_is_one_line(
+    error: BaseException, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(program, "_config", raising(error))
+    assert main(["config", "schema"]) == 2
+    assert re.search(words, capsys.readouterr().err)
+
+
+def test_a_mistake_of_ours_is_no_error_of_the_users(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(program, "_config", raising(RuntimeError("a mistake")))
+    with pytest.raises(RuntimeError, match="a mistake"):
+        main(["config", "schema"])
+
+
+def test_a_working_directory_that_is_gone_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    folder.rmdir()
+    assert main(["config", "schema"]) == 2
+    assert "working directory: it is gone" in capsys.readouterr().err
+
+
+def last_line(capsys: pytest.CaptureFixture[str]) -> str:
+    return capsys.readouterr().err.splitlines()[-1]

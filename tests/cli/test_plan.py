@@ -1,0 +1,197 @@
+"""`vjepa2-ac plan` writes a plan and its picture, or one clear error before anything is loaded."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from adapted_run import write_adapted_run
+from tiny_models import tiny_model
+from vjepa2_ac.cli import main
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_as_yaml, parse_config
+
+STATE = "0.4,0.0,0.3,3.1,0.0,0.1,0.2"
+QUICK = ["planning.samples=8", "planning.iterations=2", "planning.cem.elites=4", "--nodes", "0"]
+PLANNING = {"samples": 8, "iterations": 2, "horizon": 2, "cem": {"elites": 4}}
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with pictures, a model, a broken one, one that needs a camera's pose, and a run."""
+    here = tmp_path_factory.mktemp("workshop")
+    for name, seed, size in (
+        ("start", 0, (60, 48)),
+        ("goal", 1, (60, 48)),
+        ("other", 2, (48, 60)),
+        ("tiny", 3, (8, 8)),
+    ):
+        pixels = np.random.default_rng(seed).integers(0, 256, (*size, 3), dtype=np.uint8)
+        Image.fromarray(pixels).save(here / f"{name}.png")
+    (here / "notes.png").write_text("x,y,z")
+    black = np.zeros((60, 48), np.uint8)
+    Image.fromarray(black).save(here / "black.png")
+    black[:20, :20] = 255
+    Image.fromarray(black).save(here / "mask.png")
+    tiny_model().save_pretrained(here / "model")
+    tiny_model(extrinsics=True).save_pretrained(here / "camera")
+    broken = tiny_model()
+    with torch.no_grad():
+        broken.base_predictor.predictor_proj.weight.fill_(1e38)  # finite, and nothing that comes of it is
+    broken.save_pretrained(here / "broken")
+    write_adapted_run(config(here))
+    (here / "config.yaml").write_text(config_as_yaml(config(here)))
+    return here
+
+
+@pytest.fixture
+def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the picture, which takes most of the time."""
+    monkeypatch.setattr("vjepa2_ac.reports.figures.plan.plot_plan", lambda _, path: path)
+
+
+def config(here: Path) -> Config:
+    values = {
+        "run_dir": str(here / "run"), "seed": 4, "data": {"path": "none", "crop": "square", "stride": 5},
+        "model": {"base": str(here / "model"), "dtype": "float32"}, "adapter": {"rank": 4, "targets": ["q", "v"]},
+        "planning": PLANNING,
+    }  # fmt: skip
+    return parse_config(values, where="test")
+
+
+def plan(here: Path, *more: str, subject: str = "model", state: str = STATE, goal: str = "goal") -> tuple[int, dict]:
+    pictures = ["--start", str(here / "start.png"), "--goal", str(here / f"{goal}.png")]
+    out = here / "out"
+    status = main(["plan", str(here / subject), *pictures, "--state", state, "--out", str(out), *more])
+    return status, json.loads((out / "plan.json").read_text()) if status < 2 else {}
+
+
+def test_a_plan_its_picture_a_table_and_words_come_out(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, file = plan(workshop, *QUICK, "--seed", "9", "--nodes", "3")
+    assert status == 0
+    said = capsys.readouterr().out
+    assert "planning, iterations 2/2" in said
+    assert "Plan: planned" in said
+    assert "Goes" in said
+    assert str(workshop / "out" / "plan.png") in said
+    assert (workshop / "out" / "plan.png").stat().st_size > 10_000
+    assert (file["seed"], file["goals"], len(file["slices"])) == (9, [str(workshop / "goal.png")], 3)
+    assert len(file["model"]["predictor"]) == 64
+    assert plan(workshop, *QUICK, "--seed", "9")[1]["actions"] == file["actions"]
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_a_run_plans_by_its_config_with_the_checkpoint_that_is_named(workshop: Path) -> None:
+    newest = plan(workshop, "--nodes", "0", subject="run")[1]
+    assert (newest["seed"], newest["crop"], newest["settings"]["horizon"]) == (4, "square", 2)
+    assert newest["control_steps_of_a_model_step"] == 5
+    assert newest["model"]["checkpoint"] == "step-00000020 (the newest)"
+    best = plan(workshop, "--nodes", "0", "--checkpoint", "best", "planning.horizon=1", subject="run")[1]
+    assert best["model"]["checkpoint"] == "step-00000010 (the best)"
+    assert len(best["actions"]) == 1
+    assert best["model"]["base"] == newest["model"]["base"]
+    assert best["model"]["predictor"] != newest["model"]["predictor"]
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_a_model_takes_the_settings_of_a_config(workshop: Path) -> None:
+    file = plan(workshop, "--nodes", "0", "--config", str(workshop / "config.yaml"))[1]
+    assert (len(file["actions"]), file["seed"], file["crop"]) == (2, 4, "square")
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_goals_follow_one_another(workshop: Path) -> None:
+    second = ["--goal", str(workshop / "goal.png")]
+    summed = ["planning.energy.steps=sum", "planning.horizon=4"]
+    assert plan(workshop, *QUICK, *second, *summed)[1]["goal_of_each_step"] == [0, 0, 1, 1]
+    told = plan(workshop, *QUICK, *second, *summed, "--durations", "1")[1]
+    assert told["goal_of_each_step"] == [0, 1, 1, 1]
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_a_mask_changes_what_counts(workshop: Path) -> None:
+    whole, part = (plan(workshop, *QUICK, *more)[1] for more in ([], ["--mask", str(workshop / "mask.png")]))
+    assert whole["energy"]["now"] != part["energy"]["now"]
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_a_camera_pose_is_taken_where_the_model_needs_one(workshop: Path) -> None:
+    found = [
+        plan(workshop, *QUICK, "--extrinsics", pose, subject="camera")[1]["energy"]["doing_nothing"]
+        for pose in ("-0.4,0.5,0.9,-2,0,1", "1,0.5,0.9,-2,0,1")
+    ]
+    assert found[0] != found[1]
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_a_state_may_begin_with_a_minus(workshop: Path) -> None:
+    assert plan(workshop, *QUICK, state="-0.4,0,0.3,3.1,0,0.1,0.2")[1]["state"][0] == -0.4
+    assert plan(workshop, *QUICK, state="-.4 0 0.3 3.1 0 0.1 0.2")[1]["state"][0] == -0.4
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_the_goal_itself_leads_to_no_motion(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, file = plan(workshop, *QUICK, goal="start")
+    assert (status, file["why"]) == (0, "at the goal")
+    assert not np.any(file["actions"])
+    assert "Does nothing" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("no_picture")
+def test_a_broken_model_leads_to_no_motion_and_to_status_1(workshop: Path) -> None:
+    status, file = plan(workshop, *QUICK, subject="broken")
+    assert (status, file["why"]) == (1, "no finite energy")
+    assert not np.any(file["actions"])
+
+
+WRONG = {
+    "goal of another size": (["--goal", "{here}/other.png"], "48 x 60 pixels (width x height)"),
+    "no picture": (["--goal", "{here}/notes.png"], "no picture, starting with b'x,y,'"),
+    "a picture that is not there": (["--goal", "{here}/nowhere.png"], "nowhere.png: cannot be read: No such file"),
+    "a folder": (["--goal", "{here}"], "cannot be read"),
+    "too small a picture": (["--goal", "{here}/tiny.png"], "16 pixels or more"),
+    "a mask of another size": (["--mask", "{here}/other.png"], "as the goal's picture"),
+    "a black mask": (["--mask", "{here}/black.png"], "nothing of what the model sees counts"),
+    "degrees": (["--state", "0.4,0,0.3,180,0,5,0"], "multiply the angles by pi / 180"),
+    "millimetres": (["--state", "400,0,300,3.1,0,0,0"], "divide the position by 1000"),
+    "a gripper's width": (["--state", "0.4,0,0.3,3.1,0,0,80"], "0 for open"),
+    "too few numbers": (["--state", "0.4,0,0.3"], "3 numbers in the shape (3,)"),
+    "not a number": (["--state", "0.4,0,0.3,nan,0,0,0"], "finite"),
+    "words": (["--state", "here"], "'here'"),
+    "no state": (["--state", ""], "0 numbers"),
+    "limits below zero": (["planning.limits.xyz=[-0.05,0.05,0.05]"], "planning.limits.xyz.0"),
+    "limits that are not finite": (["planning.limits.xyz=[.inf,0.05,0.05]"], "planning.limits.xyz.0"),
+    "limits that hold everything": (["planning.limits={xyz: [0, 0, 0], gripper: 0}"], "nothing is left to plan"),
+    "an unknown knob": (["planning.horizn=2"], "did you mean horizon?"),
+    "a knob of training": (["training.steps=2"], "a setting that planning does not heed"),
+    "durations for one goal": (["--durations", "2"], "'2' for 1 goal"),
+    "durations of nothing": (["--goal", "{here}/goal.png", "--durations", "0"], "whole numbers from 1"),
+    "a camera that is not used": (["--extrinsics", "0,0,0,0,0,0"], "a camera pose exactly where the model uses it"),
+    "a camera of five numbers": (["--extrinsics", "0,0,0,0,0"], "5 numbers"),
+    "a checkpoint of a model": (["--checkpoint", "best"], "not the folder of a run"),
+    "a config that is none": (["--config", "{here}/notes.png"], "notes.png"),
+    "a file in the way": (["--out", "{here}/notes.png"], "notes.png"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("more", "complaint"), WRONG.values(), ids=WRONG.keys())
+def test_wrong_input_is_one_clear_error(
+    workshop: Path, capsys: pytest.CaptureFixture[str], more: list[str], complaint: str
+) -> None:
+    out = workshop / "nothing"
+    given = ["--start", str(workshop / "start.png"), "--state", STATE, "--out", str(out)]
+    goal = [] if "--goal" in more and "--durations" not in more else ["--goal", str(workshop / "goal.png")]
+    words = [word.format(here=workshop) if "{here}" in word else word for word in more]
+    assert main(["plan", str(workshop / "model"), *given, *goal, *QUICK, *words]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert complaint in error
+    assert not (out / "plan.json").exists()
+
+
+def test_a_model_that_is_not_there_is_named(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert plan(workshop, *QUICK, subject="nowhere")[0] == 2
+    assert "nowhere: no such file or folder" in capsys.readouterr().err

@@ -1,0 +1,247 @@
+"""Every knob once; everything that is wrong at once."""
+
+import os
+import re
+import textwrap
+import threading
+from operator import attrgetter
+from pathlib import Path
+
+import pytest
+import yaml
+
+from paths import ROOT
+from vjepa2_ac.config import Config, DataConfig, IdleConfig
+from vjepa2_ac.config.diagnostics import all_keys
+from vjepa2_ac.config.loading import (
+    changed_keys,
+    config_as_dict,
+    config_as_yaml,
+    config_schema,
+    load_config,
+    parse_config,
+)
+from vjepa2_ac.errors import InputError
+
+MINIMAL = {"run_dir": "runs/x", "data": {"path": "d"}, "model": {"base": "b.pt"}}
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "config.yaml"
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda p: p.name)
+def test_every_config_of_the_project_loads(path: Path) -> None:
+    load_config(path)
+
+
+def test_default_config_holds_the_mission() -> None:
+    config = load_config(ROOT / "configs/default.yaml")
+    assert (config.adapter.rank, config.adapter.alpha, config.adapter.rslora) == (16, 32, True)
+    assert (config.training.batch_size, config.training.accumulation, config.training.steps) == (4, 8, 100_000)
+    assert (config.training.learning_rate, config.training.precision) == (1e-4, "bf16")
+    assert (config.data.frames, config.model.sizes.image_size) == (16, 256)
+    assert (config.checkpoint.every, config.checkpoint.keep) == (1_000, 5)
+
+
+def test_a_resolved_config_reads_back_equal(tmp_path: Path) -> None:
+    config = parse_config(MINIMAL, where="here")
+    assert load_config(write(tmp_path, config_as_yaml(config))) == config
+
+
+def test_all_errors_are_reported_at_once_with_their_paths() -> None:
+    wrong = {
+        "data": {"path": "d", "strid": 4, "frames": 1},
+        "model": {"base": "b"},
+        "training": {"learning_rate": "fast", "rank": 8},
+    }
+    with pytest.raises(InputError) as caught:
+        parse_config(wrong, where="my.yaml")
+    message = str(caught.value)
+    assert "my.yaml" in message
+    assert "5 values are wrong" in message
+    assert "run_dir: missing" in message
+    assert "data.strid: unknown key; did you mean stride?" in message
+    assert "data.frames" in message
+    assert "greater than or equal to 2" in message
+    assert "training.learning_rate" in message
+    assert "training.rank: unknown key; did you mean adapter.rank?" in message
+
+
+@pytest.mark.parametrize(
+    ("override", "complaint"),
+    [
+        ("training.steps=0", "greater than or equal to 1"),
+        ("training.steps=many", "valid integer"),
+        ("training.steps=1.5", "valid integer"),
+        ("adapter.dropout=1.0", "less than 1"),
+        ("data.camera=third_eye", "exterior_1_left"),
+        ("data.stride_candidates=[]", "at least 1 item"),
+        ("training.rollout_steps=16", "data.frames of at least 17"),
+        ("training.warmup_steps=200000", "exceed steps"),
+        ("training.decay_steps=5", "warmup_stable_decay"),
+        ("model.base=null", "either base"),
+        ("model.sizes.patch_size=15", "multiple of patch_size"),
+        ("data.validation_share=0.97", "nothing to train on"),
+        ("training.learning_rate=.nan", "finite"),
+        ("steps=3", "did you mean training.steps?"),
+        ("seed.x=3", "valid integer"),
+        ("training", "an override such as"),
+    ],
+)
+def test_a_wrong_override_is_explained(tmp_path: Path, override: str, complaint: str) -> None:
+    path = write(tmp_path, yaml.safe_dump(MINIMAL))
+    with pytest.raises(InputError, match=complaint):
+        load_config(path, [override])
+
+
+def test_overrides_reach_nested_keys_and_read_numbers_as_people_write_them(tmp_path: Path) -> None:
+    path = write(tmp_path, yaml.safe_dump(MINIMAL))
+    config = load_config(
+        path, ["training.learning_rate=3e-4", "adapter.targets=[q, v]", "data.fields.gripper=openness"]
+    )
+    assert config.training.learning_rate == 3e-4
+    assert config.adapter.targets == ("q", "v")
+    assert config.data.fields.gripper == "openness"
+
+
+@pytest.mark.parametrize("written", ["22008760", '"22008760"'])
+def test_the_serial_number_of_a_camera_needs_no_quotes(tmp_path: Path, written: str) -> None:
+    path = write(tmp_path, yaml.safe_dump(MINIMAL))
+    for camera in (f"data.camera={written}", f"data.camera=[{written}]"):
+        assert load_config(path, ["data.source=droid_raw", camera]).data.cameras == ("22008760",)
+
+
+def test_words_that_yaml_takes_for_truth_values_are_words(tmp_path: Path) -> None:
+    path, sections = write(tmp_path, yaml.safe_dump(MINIMAL)), config_schema()["$defs"]
+    found = []
+    for key in all_keys():
+        section, _, name = key.rpartition(".")
+        knob = next((one["properties"][name] for one in sections.values() if name in one.get("properties", {})), {})
+        for word in knob.get("enum", ()):
+            if section and yaml.safe_load(str(word)) != word:
+                assert attrgetter(key)(load_config(path, [f"{key}={word}"])) == word
+                found.append(key)
+    assert {"data.cache", "training.compile", "planning.compile"} <= set(found)
+
+
+def test_a_key_given_twice_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="given twice"):
+        load_config(write(tmp_path, "run_dir: a\nrun_dir: b\n"))
+
+
+@pytest.mark.parametrize("text", ["", "- a list", "{unclosed", "run_dir: !!python/object:os.system x"])
+def test_what_is_not_a_config_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError):
+        load_config(write(tmp_path, text))
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"nowhere\.yaml"):
+        load_config(tmp_path / "nowhere.yaml")
+
+
+def test_changed_keys_names_the_dotted_keys() -> None:
+    old = parse_config(MINIMAL, where="")
+    new = parse_config({**MINIMAL, "seed": 3, "training": {"steps": 5000}}, where="")
+    assert changed_keys(old, new) == ["seed", "training.steps"]
+
+
+def test_config_is_frozen() -> None:
+    config = parse_config(MINIMAL, where="")
+    with pytest.raises(ValueError, match="frozen"):
+        config.seed = 3  # type: ignore[misc]
+
+
+def test_schema_documents_every_knob() -> None:
+    definitions = config_schema()["$defs"]
+    for name, section in {**definitions, "Config": config_schema()}.items():
+        for key, knob in section.get("properties", {}).items():
+            documented = knob.get("description") or "$ref" in knob  # a section is documented by its class
+            assert documented, f"{name}.{key} is not documented"
+
+
+def test_every_knob_is_read_somewhere() -> None:
+    source = "\n".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
+    for key in all_keys():
+        *sections, name = key.split(".")
+        owners = "|".join(["config", "sizes", "self", *sections[-1:]])
+        assert re.search(rf"\b_?({owners})\.{name}\b", source), f"nobody reads {key}"
+
+
+def test_plain_values_are_plain() -> None:
+    assert isinstance(config_as_dict(parse_config(MINIMAL, where=""))["adapter"]["targets"], list)
+    assert Config.model_config["extra"] == "forbid"
+
+
+def test_a_place_of_data_may_name_the_home_and_end_in_a_slash(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/somewhere")
+    given = {
+        "~/data/": "/somewhere/data", "data//": "data", "/": "/", "a~b": "a~b",
+        "gs://bucket/droid/": "gs://bucket/droid", "hf://datasets/a/b": "hf://datasets/a/b",
+    }  # fmt: skip
+    for path, meant in given.items():
+        assert DataConfig(path=path).path == meant
+    ranges = {"rule": "published", "ranges": "~/ranges.json"}
+    assert DataConfig(path="d", idle=IdleConfig(**ranges)).idle.ranges == "/somewhere/ranges.json"
+    with pytest.raises(InputError, match=r"data\.path.*empty"):
+        parse_config(MINIMAL | {"data": {"path": " "}}, where="here")
+
+
+def test_a_pattern_is_given_as_a_table(tmp_path: Path) -> None:
+    path = write(tmp_path, yaml.safe_dump(MINIMAL))
+    config = load_config(path, ["adapter.rank_pattern={fc1: 32, blocks.0.attn.q: 4}", "adapter.targets=[all]"])
+    assert config.adapter.rank_pattern == {"fc1": 32, "blocks.0.attn.q": 4}
+    assert parse_config(yaml.safe_load(config_as_yaml(config)), where="") == config
+    plain = load_config(path, ["adapter.targets=[all]"])
+    assert all(key.startswith("adapter.rank_pattern") for key in changed_keys(plain, config))
+    assert changed_keys(plain, config)
+    with pytest.raises(InputError, match=r"adapter\.rank_pattern.*greater than or equal to 1"):
+        load_config(path, ["adapter.rank_pattern={fc1: 0}"])
+
+
+def test_sections_that_others_are_merged_into_are_read(tmp_path: Path) -> None:
+    text = """
+    run_dir: runs/x
+    data: {path: d}
+    model: {base: b.pt}
+    validation: &measure
+      every: 7
+      clips: 9
+    training:
+      <<: {steps: 500, warmup_steps: 10}
+      warmup_steps: 20
+    """
+    config = load_config(write(tmp_path, textwrap.dedent(text)))
+    assert (config.training.steps, config.training.warmup_steps, config.validation.clips) == (500, 20, 9)
+
+
+@pytest.mark.parametrize(
+    "name", ["1e-4", "010", "1:30", "2024-01-01", "089", "on", "null", "0x1F", "1_0", "=", "é #: ü"]
+)
+def test_text_that_looks_like_a_number_stays_text_when_written_and_read(tmp_path: Path, name: str) -> None:
+    config = parse_config(MINIMAL | {"run_dir": name, "data": {"path": "d", "exclude": [name]}}, where="")
+    assert load_config(write(tmp_path, config_as_yaml(config))) == config
+
+
+def test_a_template_that_was_not_filled_in_is_named_with_its_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"config\.yaml: line 2, column 11.*Fill in the template"):
+        load_config(write(tmp_path, "seed: 1\nrun_dir: {{ RUN }}\n"))
+
+
+def test_a_config_is_of_bounded_size_and_may_come_through_a_pipe(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="more than 4,194,304 bytes"):
+        load_config(write(tmp_path, "#" * (5 << 20)))
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=pipe.write_text, args=(yaml.safe_dump(MINIMAL),))
+    writer.start()
+    assert load_config(pipe) == parse_config(MINIMAL, where="")
+    writer.join()
+
+
+def test_values_of_the_command_line_that_lie_too_deep_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="too deep"):
+        load_config(write(tmp_path, yaml.safe_dump(MINIMAL)), [".".join("a" * 5_000) + "=1"])

@@ -1,0 +1,94 @@
+"""Every figure of a table can be read, on a narrow terminal as on a wide one, and however long one cell is."""
+
+import re
+from collections.abc import Callable
+from typing import Any, cast
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from rich.table import Table
+
+from vjepa2_ac.console.closed_loop import contest_table
+from vjepa2_ac.console.data import calibration_table, motion_table, probe_table
+from vjepa2_ac.console.evaluation import comparison_table, evaluation_tables
+from vjepa2_ac.console.plan import plan_table
+from vjepa2_ac.console.progress import PlainConsole
+from vjepa2_ac.data.inspection.statistics import Inspection
+from vjepa2_ac.evaluation.data_variants.measure import TriedVariant, VariantProbe
+from vjepa2_ac.evaluation.evaluate import Contender, ProbeOptions, evaluate
+from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, TriedStride
+from vjepa2_ac.planning.decision import PlanResult
+from vjepa2_ac.reports.comparison import Comparison
+from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
+from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
+from worlds import Copier, Halfway, about, again, clips_batch
+
+SURE = Estimate(-0.123, -0.145, -0.101)
+SHARE = Estimate(0.912, 0.888, 0.934)
+REASON = "no episode of the validation split has the 1,351 steps that a clip of 16 frames has at stride 90; " * 3
+
+
+def calibrations() -> list[Table]:
+    tried = tuple(TriedStride(stride, stride / 15, SHARE, 0.4321, 0.5432, 12.3, 1024, 128) for stride in (4, 8, 15))
+    return [calibration_table(Calibration(tried, {90: REASON}, 16, "validation", 8, SURE))]
+
+
+def probes() -> list[Table]:
+    tried = tuple(TriedVariant(f"{name} or some other thing", "mend it", SHARE, SURE) for name in ("late", "mirrored"))
+    return [probe_table(VariantProbe(SHARE, tried, 64, 12))]
+
+
+def motions() -> list[Table]:
+    one = Mock(stride=15, seconds=1.0, percentiles=lambda _: (1234.5, 2345.6, 3456.7, 4567.8))
+    both = [Mock(spec=Inspection, is_pose=is_pose, motions=[one], changes=[one]) for is_pose in (True, False)]
+    return [motion_table(inspection) for inspection in both]
+
+
+def evaluations() -> list[Table]:
+    names = ["base", "adapter", "runs/of-another-day/with-a-long-name", "vjepa2-ac-vitg.pt"]
+    contenders = [Contender(name, "trained" if name == "adapter" else "base", Halfway()) for name in names[:2]]
+    contenders += [Contender(name, "other", Copier()) for name in names[2:]]
+    probes = ProbeOptions(sensitivity_clips=4, samples=4, landscape_clips=2, nodes=3, examples=0)
+    return list(evaluation_tables(evaluate(cast("Any", contenders), again(clips_batch(12, 0)), about(), probes=probes)))
+
+
+def comparisons() -> list[Table]:
+    columns = ("4.00 s ahead", "gain over first", "gain over its base", "one step", "shuffled", "rank", "Action Score")
+    rows = {name: (SHARE,) * len(columns) for name in ("first", "a/run/with/a/name/that/does/not/end/anywhere/near")}
+    return [comparison_table(Comparison("L1 error over persistence", columns, rows, np.arange(1.0), {}, ()))]
+
+
+def plans() -> list[Table]:
+    actions, states = np.full((3, 7), -0.12345), np.full((4, 7), -0.54321)
+    return [plan_table(Mock(spec=PlanResult, actions=actions, states=states, decision=Mock(why="planned")))]
+
+
+def contests() -> list[Table]:
+    result = Mock(
+        spec=ClosedLoopResult,
+        policy="the model of runs/of-another-day", steps=20, success_rate=SHARE, success_ever_rate=SHARE,
+        final_distance_cm=Estimate(12.3, 10.1, 14.5), steps_needed=SHARE,
+        seconds_per_decision=Estimate(16.2, 15.0, 17.0),
+    )  # fmt: skip
+    asked = Mock(task="reach", domain="B", episodes=100, seed=5)
+    return [contest_table(Mock(spec=ClosedLoopBenchmark, asked=asked, results=(result,), seconds_per_step=0.27))]
+
+
+@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("made", [calibrations, probes, motions, evaluations, comparisons, plans, contests])
+def test_no_figure_and_no_word_is_cut_off(made: Callable[[], list[Table]], width: int) -> None:
+    for table in made():
+        console = PlainConsole(width=width)
+        with console.capture() as capture:
+            console.print(table)
+        shown = capture.get()
+        assert all(len(line) <= width for line in shown.splitlines() if line and line[0] in "│┃┏┡├└")  # not the title
+        assert "…" not in shown
+        words = re.split(r"[\s│┃]+", shown)
+        for column in table.columns:
+            for cell in (column.header, *column.cells):
+                for word in str(cell).split():
+                    assert word in words or len(word) > 16, (word, shown)
+        assert all(word in words for word in str(table.caption or "").split())

@@ -1,0 +1,213 @@
+"""What takes part is decided once, counted, and the same for every source."""
+
+import hashlib
+import time
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from memory_source import MemorySource
+from synthetic import write_synthetic_droid
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.clips import dataset as opening
+from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
+from vjepa2_ac.data.filters.idle_ranges import FoundRanges
+from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
+from vjepa2_ac.errors import InputError
+
+Open = Callable[..., Dataset]
+
+
+@pytest.fixture
+def open_with(monkeypatch: pytest.MonkeyPatch) -> Open:
+    def open_it(source: Any, **knobs: Any) -> Dataset:
+        monkeypatch.setattr(opening, "open_source", lambda _: source)
+        chosen = {"frames": 3, "stride": 2, "validation_share": 0.0, "test_share": 0.0} | knobs
+        return open_dataset(DataConfig(path="the set", **chosen))
+
+    return open_it
+
+
+def removed(dataset: Dataset) -> dict[str, tuple[int, int, int | None]]:
+    return {one.name: (one.episodes, one.steps, one.windows) for one in dataset.removed}
+
+
+def problems(count: int) -> list[EpisodeProblem]:
+    return [
+        EpisodeProblem(f"bad {number}", f"shard 3: record {number}", "all zeros", "poses", "Look")
+        for number in range(count)
+    ]
+
+
+def test_every_filter_counts_what_it_took(open_with: Open) -> None:
+    source = MemorySource([10, 20, 30, 40, 50], [True, False, None, True, False], problems=problems(2))
+    dataset = open_with(source, exclude=("episode 4", "bad 1", "bad 0"), outcome="success")
+    assert removed(dataset) == {
+        "excluded": (3, 50, 46),
+        "outcome": (2, 50, 16 + 26),
+        "broken": (0, 0, 0),
+        "idle": (0, 0, 0),
+    }
+    assert dataset.windows("train").episodes.tolist() == [0, 3]
+    assert len(open_with(source, exclude=("bad 1", "bad 0"), outcome="failure").windows("train")) == 16 + 46
+
+
+def test_windows_are_not_counted_before_the_stride_is_known(open_with: Open) -> None:
+    dataset = open_with(MemorySource([10, 20]), stride="auto", exclude=("episode 1",))
+    assert removed(dataset)["excluded"] == (1, 20, None)
+    known = dataset.with_stride(4)
+    assert removed(known)["excluded"] == (1, 20, 12)
+    assert len(known.windows("train")) == 2
+    assert known.broken is dataset.broken
+
+
+def test_an_outcome_that_nobody_tells_is_refused(open_with: Open) -> None:
+    with pytest.raises(InputError, match=r"data\.outcome: success: no episode.*Set data\.outcome: all"):
+        open_with(MemorySource([10, 10]), outcome="success")
+    with pytest.raises(InputError, match=r"none of 2 episodes is left \(left out: outcome 2\)"):
+        open_with(MemorySource([10, 10], [False, None]), outcome="success")
+
+
+def test_a_broken_episode_stops_by_default_and_says_how_to_go_on(open_with: Open) -> None:
+    with pytest.raises(InputError) as caught:
+        open_with(MemorySource([10] * 2000, problems=problems(12)))
+    error = caught.value
+    assert (error.where, error.found, error.needed) == ("shard 3: record 0", "all zeros", "poses")
+    assert "Look. To go on without, set data.broken_episodes: skip, or add (the first 10 of 12) to data.exclude" in (
+        error.fix.replace("11 more cannot be used either. ", "")
+    )
+    assert '"bad 9"]' in error.fix
+    assert "bad 10" not in error.fix
+
+
+def test_broken_episodes_are_skipped_by_policy_counted_and_named(open_with: Open, caplog: Any) -> None:
+    dataset = open_with(MemorySource([10] * 1188, problems=problems(12)), broken_episodes="skip")
+    assert "12 of 1200 episodes are broken and left out: bad 0, bad 1" in caplog.text
+    assert "and 2 more; the first: shard 3: record 0: all zeros" in caplog.text
+    assert len(dataset.broken) == 12
+    assert removed(dataset)["broken"] == (12, 0, 0)
+
+
+def test_more_than_one_in_a_hundred_stops_the_run_whatever_the_policy(open_with: Open) -> None:
+    with pytest.raises(InputError, match=r"12 of 1199 episodes are broken: bad 0, .*needed: 1% at most"):
+        open_with(MemorySource([10] * 1187, problems=problems(12)), broken_episodes="skip")
+
+
+def test_broken_episodes_that_are_excluded_are_nobodys_concern(open_with: Open) -> None:
+    names = tuple(problem.name for problem in problems(12))
+    assert len(open_with(MemorySource([10], problems=problems(12)), exclude=names).broken) == 0
+
+
+def test_broken_episodes_met_later_count_once_each() -> None:
+    ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip"), 300)
+    for name in ("a", "b", "a", "c", "b"):
+        ledger.met(name, f"{name} is damaged")
+    assert ledger.names == ("a", "b", "c")
+    with pytest.raises(InputError, match=r"4 of 300 episodes are broken: a, b, c, d\. The first, a: a is damaged\."):
+        ledger.met("d", "d is damaged")
+
+
+def test_what_a_run_met_before_it_was_resumed_counts_unless_it_is_excluded() -> None:
+    def resumed(**knobs: Any) -> BrokenEpisodes:
+        ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip", **knobs), 300)
+        ledger.recall({name: f"{name} is damaged" for name in "abc"})
+        return ledger
+
+    resumed().met("a", "a is damaged")
+    with pytest.raises(InputError, match=r"4 of 300 episodes are broken: a, b, c, d\. The first, a: a is damaged\."):
+        resumed().met("d", "d is damaged")
+    resumed(exclude=("b",)).met("d", "d is damaged")
+
+
+def test_excluding_what_there_is_not_is_refused(open_with: Open) -> None:
+    with pytest.raises(InputError, match=r"data\.exclude: not the identity of any episode: elsewhere\."):
+        open_with(MemorySource([10], problems=problems(1)), exclude=("elsewhere", "bad 0"))
+
+
+def test_two_episodes_of_one_identity_are_refused(open_with: Open) -> None:
+    source = MemorySource([10, 20, 30], names=["same", "other", "same"])
+    with pytest.raises(
+        InputError, match=r"episodes 0 and 2 have the same identity: same.*data\.fields\.identity"
+    ) as caught:
+        open_with(source)
+    assert "broken_episodes" not in caught.value.fix, "that would not help"
+    assert open_with(source, exclude=("same",)).windows("train").episodes.tolist() == [1]
+
+
+def test_the_control_rate_is_the_sources(open_with: Open) -> None:
+    source = MemorySource([10])
+    assert open_with(source).control_rate_hz == 15.0
+    assert len(source.reads) == 1
+
+
+def test_nothing_is_read_to_open_a_set(open_with: Open) -> None:
+    source = MemorySource([10, 20])
+    dataset = open_with(source)
+    _ = dataset.removed, dataset.windows("train")
+    assert source.reads == []
+
+
+def test_shards_and_order_of_the_records_change_nothing(tmp_path: Path) -> None:
+    found = []
+    for shards in (1, 4):
+        folder = write_synthetic_droid(tmp_path / str(shards), steps=range(12, 18), size=(16, 16), shards=shards)
+        windows = open_dataset(DataConfig(path=str(folder), frames=3, stride=2)).windows("train")
+        dataset = open_dataset(DataConfig(path=str(folder), frames=3, stride=2))
+        found.append([(dataset.table.identity(e), s) for e, s in map(windows.__getitem__, range(len(windows)))])
+    assert found[0] == found[1]
+
+
+def droid_sized() -> EpisodeTable:
+    """Return a table of as many episodes as DROID 1.0.1 has, with identities as long as its own."""
+    count, generator = 95_658, np.random.default_rng(0)
+    names = np.array([f"{number:06d}".encode() * 38 for number in generator.permutation(count)])
+    return EpisodeTable(
+        num_steps=generator.integers(60, 520, count).astype(np.int32),
+        success=np.ones(count, np.int8),
+        id_ends=np.arange(1, count + 1) * 228,
+        id_bytes=np.frombuffer(names.tobytes(), np.uint8),
+        id_hash=np.array([int.from_bytes(hashlib.sha256(name).digest()[:8], "big") for name in names], np.uint64),
+        id_rank=np.argsort(np.argsort(names)).astype(np.int32),
+    )
+
+
+def two_ranges_each(table: EpisodeTable) -> FoundRanges:
+    """Return ranges with rests between them: a quarter of the steps, as in DROID."""
+    count, steps = len(table), table.num_steps
+    start, end = (np.zeros(2 * count, np.int32) for _ in range(2))
+    start[1::2], end[0::2], end[1::2] = steps * 0.4, steps * 0.3, steps * 0.85
+    return FoundRanges(np.repeat(np.arange(count, dtype=np.int32), 2), start, end, listed=count)
+
+
+@pytest.mark.parametrize("idle", [{}, {"rule": "motion"}, {"rule": "motion", "keep_share": 0.2}])
+def test_a_set_of_droids_size_is_opened_in_two_seconds_and_fifty_megabytes(
+    open_with: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, idle: dict[str, Any]
+) -> None:
+    kept, ranges = tmp_path / "table", tmp_path / "ranges"
+    table = droid_sized()
+    kept.write_bytes(table.to_bytes())
+    ranges.write_bytes(two_ranges_each(table).to_bytes())
+    monkeypatch.setattr(opening, "find_ranges", lambda *_: FoundRanges.from_bytes(ranges.read_bytes()))
+    del table
+
+    class Kept:
+        def infos(self, progress: object = None) -> EpisodeTable:
+            del progress
+            return EpisodeTable.from_bytes(kept.read_bytes())
+
+        def read(self, *_: object) -> Any: ...
+
+    tracemalloc.start()
+    began = time.perf_counter()
+    windows = open_with(Kept(), outcome="success", stride=4, frames=16, idle=idle).windows("train")
+    seconds = time.perf_counter() - began
+    size, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(windows) > (8e6 if idle else 15e6)
+    assert size < 50e6
+    assert seconds < 2

@@ -1,0 +1,99 @@
+"""The crop and the scaling are those of the released recipe (golden/DATA_ORIGIN.md)."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from paths import GOLDEN
+from vjepa2_ac.data.clips import transforms
+from vjepa2_ac.data.clips.transforms import CropBox, crop_box, pixels_to_input, view
+
+FLOAT16_ROUNDING = 2.0**-10  # half a step between 2 and 4
+
+
+def test_crops_equal_all_that_the_official_code_took() -> None:
+    rows = json.loads((GOLDEN / "crops.json").read_text())
+    assert len(rows) == 6
+    for row in rows:
+        found = crop_box(row["height"], row["width"])
+        assert [CropBox(*seen) for seen in row["train_crops_seen"]] == [found]
+
+
+def test_the_square_is_what_the_official_code_evaluates_on() -> None:
+    rows = json.loads((GOLDEN / "crops.json").read_text())
+    for row in rows:
+        assert crop_box(row["height"], row["width"], "square") == CropBox(*row["eval_crop"])
+
+
+def test_of_a_tall_picture_the_square_is_the_middle() -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (2, 32, 18, 3), dtype=np.uint8)
+    assert np.array_equal(view(frames, "square"), frames[:, 7:25])
+
+
+@pytest.mark.parametrize(("height", "width"), [(18, 32), (32, 18), (17, 32), (20, 20)])
+def test_a_letterbox_shows_every_pixel_between_black_bars(height: int, width: int) -> None:
+    frames = np.random.default_rng(0).integers(1, 256, (2, height, width, 3), dtype=np.uint8)
+    seen = view(frames, "letterbox")
+    side = max(height, width)
+    assert seen.shape == (2, side, side, 3)
+    top, left = (side - height) // 2, (side - width) // 2
+    assert np.array_equal(seen[:, top : top + height, left : left + width], frames)
+    assert int((seen == 0).sum()) == 2 * 3 * side * (side - min(height, width))
+    assert crop_box(height, width, "letterbox") == CropBox(0, 0, height, width)
+
+
+@pytest.mark.parametrize(("height", "width", "expected"), [(200, 100, (33, 0, 133, 100)), (180, 243, (0, 0, 180, 243))])
+def test_tall_pictures_are_cut_too_and_cropped_ones_are_left(
+    height: int, width: int, expected: tuple[int, ...]
+) -> None:
+    assert crop_box(height, width) == CropBox(*expected)
+
+
+def test_the_crop_is_a_slice_of_the_same_pixels() -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (2, 18, 32, 3), dtype=np.uint8)
+    cropped = view(frames)
+    assert cropped.base is frames
+    assert np.array_equal(cropped, frames[:, :, 4:28])
+
+
+def test_the_transform_equals_the_official_one_on_a_frame() -> None:
+    with np.load(GOLDEN / "transform_frame.npz") as golden:
+        frame, expected = golden["frame"], golden["clip"].astype(np.float32)
+    found = pixels_to_input(torch.from_numpy(view(frame[None]))[None], 256)[0, 0]
+    assert abs(found.numpy()[:, ::8, ::8] - expected).max() <= FLOAT16_ROUNDING
+
+
+def test_the_transform_equals_the_official_one_on_every_pixel(shared: Path) -> None:
+    with np.load(shared / "reference" / "transform.npz") as golden:
+        frames, expected = golden["frames"], golden["clip"].astype(np.float32)
+    found = pixels_to_input(torch.from_numpy(view(frames))[None], 256)[0]
+    assert abs(found.permute(1, 0, 2, 3).numpy() - expected).max() <= FLOAT16_ROUNDING
+
+
+def test_frames_of_a_batch_do_not_touch() -> None:
+    frames = torch.randint(0, 256, (2, 3, 18, 24, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    together = pixels_to_input(frames, 16)
+    assert together.shape == (2, 3, 3, 16, 16)
+    alone = pixels_to_input(frames[1:, 2:], 16)
+    assert torch.equal(together[1:, 2:], alone)
+
+
+def test_shrinking_samples_pixels_and_does_not_average_them() -> None:
+    """At a third of the size, an output pixel has the middle of one input pixel: no antialias."""
+    frames = torch.randint(0, 256, (1, 1, 24, 24, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(pixels_to_input(frames, 8), pixels_to_input(frames[:, :, 1::3, 1::3], 8))
+
+
+def test_a_picture_of_the_mean_colour_becomes_zero() -> None:
+    frames = torch.tensor([124, 116, 104], dtype=torch.uint8).expand(1, 1, 8, 8, 3)
+    assert pixels_to_input(frames, 8).abs().max() < 0.02
+
+
+def test_what_inference_has_kept_can_be_trained_with() -> None:
+    transforms._mean_and_std.cache_clear()
+    with torch.inference_mode():
+        pixels_to_input(torch.zeros(1, 1, 8, 8, 3, dtype=torch.uint8), 8)
+    assert not any(kept.is_inference() for kept in transforms._mean_and_std(torch.device("cpu")))

@@ -1,0 +1,310 @@
+"""DROID's raw recordings tell the same story as its RLDS."""
+
+import pickle
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import simplejpeg
+
+from gcs import Gcs
+from recordings import write_mp4, write_raw_droid
+from synthetic import draw_frame, synthetic_episode, synthetic_states
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.storage.remote import UnreachableError
+
+STEPS, SIZE = 24, (72, 128)
+LEFT, RIGHT, WRIST = "23404442", "29838012", "16787047"
+PLACE = "LAB/success/2023-07-07/Fri_Jul__7_09:42:23_2023"
+STATES = synthetic_states(STEPS)
+FRAMES = {
+    serial: [draw_frame(state, size=SIZE, camera=camera) for state in STATES]
+    for camera, serial in enumerate((LEFT, RIGHT, WRIST))
+}
+
+
+def write(root: Path, place: str = PLACE, **changes: Any) -> Path:
+    return write_raw_droid(root / place, STATES, **{"pictures": FRAMES, "gop": 8, **changes})
+
+
+def source(path: Path, **knobs: Any) -> RawDroidSource:
+    return RawDroidSource(DataConfig(source="droid_raw", path=str(path), **knobs))
+
+
+def psnr(one: np.ndarray, other: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / np.mean((one.astype(float) - other) ** 2)))
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two episodes, one a failure; changed by no test."""
+    root = tmp_path_factory.mktemp("raw")
+    write(root, pictures={LEFT: FRAMES[LEFT]})
+    write(root, "LAB/failure/2023-07-07/Fri_Jul__7_09:50:00_2023", pictures={LEFT: FRAMES[LEFT]}, success=False)
+    return root
+
+
+def test_an_episode_holds_the_measured_states_its_task_and_its_outcome(tree: Path) -> None:
+    raw = source(tree)
+    infos = raw.infos()
+    assert [info.success for info in infos] == [False, True]
+    assert infos[1].id == PLACE
+    episode = raw.read(1)
+    np.testing.assert_array_equal(episode.states, STATES)
+    assert (episode.control_rate_hz, episode.metadata) == (15.0, {"language": "move to place 0"})
+
+
+def test_pictures_and_actions_equal_those_of_rlds_within_what_the_codecs_lose(tree: Path) -> None:
+    drawn = synthetic_episode(0, steps=STEPS, size=SIZE)
+    pictures = np.stack([simplejpeg.decode_jpeg(jpeg) for jpeg in drawn.images["exterior_image_1_left"]])
+    episode = source(tree).read(1)
+    states = np.concatenate([drawn.observation.cartesian_position, drawn.observation.gripper_position], axis=1)
+    np.testing.assert_array_equal(actions_from_states(episode.states), actions_from_states(states))
+    steps = [5, 0, 23, 5]
+    assert psnr(episode.read_frames(steps), pictures[steps]) > 30
+    assert psnr(episode.read_frames([5]), pictures[[8]]) < 30
+
+
+def test_every_camera_is_found_by_its_name_or_serial_number(tmp_path: Path) -> None:
+    write(tmp_path)
+    for camera, serial in (("left", LEFT), ("right", RIGHT), ("wrist", WRIST), (RIGHT, RIGHT)):
+        for episode in (source(tmp_path, camera=camera).read(0), source(tmp_path).read(0, camera)):
+            assert psnr(episode.read_frames([7])[0], FRAMES[serial][7]) > 30
+
+
+@pytest.mark.parametrize("part", ["", "LAB", "LAB/success", PLACE])
+def test_an_identity_does_not_depend_on_which_part_of_the_tree_is_named(tree: Path, part: str) -> None:
+    assert PLACE in [info.id for info in source(tree / part).infos()]
+
+
+def test_a_folder_of_ones_own_layout_is_an_episode_too(tmp_path: Path) -> None:
+    write(tmp_path, "kitchen/seven", success=False)
+    (info,) = source(tmp_path).infos()
+    assert (info.id, info.success) == ("kitchen/seven", False)
+
+
+@pytest.mark.parametrize("frames", [STEPS - 1, STEPS, STEPS + 1])
+def test_an_episode_has_as_many_steps_as_pictures(tmp_path: Path, frames: int) -> None:
+    write(tmp_path, pictures={LEFT: (FRAMES[LEFT] * 2)[:frames]})
+    raw = source(tmp_path)
+    steps = min(frames, STEPS)
+    assert [info.num_steps for info in raw.infos()] == [steps]
+    assert len(raw.read(0).states) == steps
+    with pytest.raises(ValueError, match="steps"):
+        raw.read(0).read_frames([steps])
+
+
+def test_the_camera_with_the_fewest_pictures_sets_the_steps(tmp_path: Path) -> None:
+    write(tmp_path, pictures={LEFT: FRAMES[LEFT], RIGHT: FRAMES[RIGHT][:-1]})
+    raw = source(tmp_path, camera=("left", "right"))
+    assert [raw.infos()[0].num_steps, len(raw.read(0, "left").states)] == [STEPS - 1, STEPS - 1]
+
+
+@pytest.mark.parametrize("right", [STEPS - 2, STEPS + 2])
+def test_every_camera_must_have_a_picture_for_every_step(tmp_path: Path, right: int) -> None:
+    write(tmp_path, pictures={LEFT: FRAMES[LEFT][:-1], RIGHT: (FRAMES[RIGHT] * 2)[:right]})
+    assert source(tmp_path).infos()[0].num_steps == STEPS - 1
+    with pytest.raises(InputError, match=f"24 steps, but {right} pictures in {RIGHT}.mp4"):
+        source(tmp_path, camera=("left", "right")).infos()
+
+
+def test_steps_without_an_operator_are_dropped_with_their_pictures_or_kept(tmp_path: Path) -> None:
+    skipped = [0, 5, 6]
+    kept = np.setdiff1d(np.arange(STEPS), skipped)
+    poses = np.arange(STEPS * 6.0).reshape(STEPS, 6) / 100
+    write(tmp_path, skipped=skipped, extrinsics={LEFT: poses}, joint_velocities=np.ones((STEPS, 7)) * poses[:, :1])
+    episode = source(tmp_path).read(0)
+    np.testing.assert_array_equal(episode.states, STATES[kept])
+    np.testing.assert_array_equal(episode.extrinsics, poses[kept])
+    np.testing.assert_array_equal(episode.joint_velocities[:, 3], poses[kept, 0])
+    assert psnr(episode.read_frames([0, 4])[1], FRAMES[LEFT][7]) > 30
+    assert len(source(tmp_path, droid_raw={"skip_action": "keep"}).read(0).states) == STEPS
+
+
+def test_extrinsics_are_those_of_the_chosen_camera(tmp_path: Path) -> None:
+    still, moving = np.tile(np.arange(6.0), (STEPS, 1)), np.arange(STEPS * 6.0).reshape(STEPS, 6)
+    write(tmp_path, extrinsics={LEFT: still, WRIST: moving})
+    np.testing.assert_array_equal(source(tmp_path, camera="wrist").read(0).extrinsics, moving)
+    np.testing.assert_array_equal(source(tmp_path).read(0).extrinsics, still)
+    assert source(tmp_path, camera="right").read(0).extrinsics is None
+    with pytest.raises(InputError, match="pose_frame"):
+        source(tmp_path, camera="right", pose_frame="camera").infos()
+
+
+def test_what_was_found_out_is_kept_until_a_file_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write(tmp_path)
+    assert len(source(tmp_path).infos()) == 1
+    with monkeypatch.context() as patch:
+        patch.setattr(RawDroidSource, "_scan_all", None)
+        assert len(source(tmp_path).infos()) == 1
+    write_mp4(folder / f"recordings/MP4/{LEFT}.mp4", FRAMES[LEFT][:-1])
+    assert source(tmp_path).infos()[0].num_steps == STEPS - 1
+
+
+def test_a_source_travels_to_a_worker(tree: Path) -> None:
+    raw, here = pickle.loads(pickle.dumps(source(tree))), source(tree)  # noqa: S301 - our own
+    reader = pickle.loads(pickle.dumps(raw.read(1).read_frames))  # noqa: S301
+    np.testing.assert_array_equal(reader([3]), here.read(1).read_frames([3]))
+
+
+def h5(change: Callable[[h5py.File], object]) -> Callable[[Path], object]:
+    def apply(folder: Path) -> None:
+        with h5py.File(folder / "trajectory.h5", "r+") as file:
+            change(file)
+
+    return apply
+
+
+def put(name: str, value: Any) -> Callable[[Path], object]:
+    def change(file: h5py.File) -> None:
+        if name in file:
+            del file[name]
+        if value is not None:
+            file[name] = value
+
+    return h5(change)
+
+
+def cut(name: str, share: float) -> Callable[[Path], object]:
+    def apply(folder: Path) -> None:
+        (path,) = folder.glob(name)
+        path.write_bytes(path.read_bytes()[: int(path.stat().st_size * share)])
+
+    return apply
+
+
+POSE, GRIPPER = "observation/robot_state/cartesian_position", "observation/robot_state/gripper_position"
+MP4 = f"recordings/MP4/{LEFT}.mp4"
+ONE_NAN = np.where(np.arange(STEPS)[:, None] == 3, np.nan, STATES[:, :6])
+
+BROKEN = {
+    "no trajectory": (lambda folder: (folder / "trajectory.h5").unlink(), "trajectory.h5"),
+    "no metadata": (lambda folder: next(folder.glob("*.json")).unlink(), "metadata"),
+    "no video": (lambda folder: (folder / MP4).unlink(), f"{LEFT}.mp4: no such file"),
+    "no key": (put(GRIPPER, None), "gripper_position: no such array"),
+    "wrong shape": (put(POSE, STATES[:, :5]), r"shape \(24, 5\)"),
+    "text for numbers": (put(POSE, np.full((STEPS, 6), b"x")), "kind"),
+    "group for an array": (lambda folder: put(f"{POSE}/x", STATES)(put(POSE, None)(folder) or folder), "shape"),
+    "shorter gripper": (put(GRIPPER, STATES[:-1, 6]), r"shape \(23,\)"),
+    "no steps": (put(POSE, np.zeros((0, 6))), "no steps"),
+    "not a number": (put(POSE, ONE_NAN), "step 3"),
+    "not a number for a camera": (put(f"observation/camera_extrinsics/{LEFT}_left", ONE_NAN), "step 3"),
+    "out of reach": (put(POSE, STATES[:, :6] + [6, 0, 0, 0, 0, 0]), "5 m"),
+    "gripper outside its range": (put(GRIPPER, STATES[:, 6] * 0 + 1.2), "gripper"),
+    "all steps skipped": (put("observation/timestamp/skip_action", np.ones(STEPS, bool)), "no steps"),
+    "cut trajectory": (cut("trajectory.h5", 0.5), "trajectory.h5: .*HDF5"),
+    "empty trajectory": (cut("trajectory.h5", 0.0), "trajectory.h5: 0 bytes"),
+    "cut metadata": (cut("*.json", 0.5), "not JSON"),
+    "metadata of another kind": (lambda folder: next(folder.glob("*.json")).write_text("[]"), "a JSON list"),
+    "no such camera": (lambda folder: next(folder.glob("*.json")).write_text("{}"), "left_mp4_path"),
+    "cut video": (cut(MP4, 0.5), f"{LEFT}.mp4"),
+    "empty video": (cut(MP4, 0.0), f"{LEFT}.mp4"),
+    "no video in it": (lambda folder: (folder / MP4).write_text("a page that says 404" * 99), f"{LEFT}.mp4"),
+    "video two pictures short": (lambda folder: write_mp4(folder / MP4, FRAMES[LEFT][:-2]), "but 22 pictures"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", BROKEN)
+def test_an_episode_that_cannot_be_used_is_a_named_problem(tree: Path, tmp_path: Path, damage: str) -> None:
+    root = shutil.copytree(tree, tmp_path / "raw")
+    change, message = BROKEN[damage]
+    change(root / PLACE)
+    infos = source(root).infos()
+    assert len(infos) == 1
+    (problem,) = infos.problems
+    assert problem.name == PLACE
+    assert re.search(message, str(InputError(where=problem.where, found=problem.found, needed=problem.needed)))
+    with pytest.raises(InputError, match=message):
+        source(root / PLACE).infos()
+
+
+def test_two_episodes_of_one_identity_are_a_problem(tree: Path, tmp_path: Path) -> None:
+    for version in ("1.0.0", "1.0.1"):
+        shutil.copytree(tree, tmp_path / version)
+    infos = source(tmp_path).infos()
+    assert len(infos) == 2
+    assert [problem.name for problem in infos.problems] == [info.id for info in infos]
+
+
+def test_no_episodes_are_an_error_that_says_where_they_are(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no episodes under .*droid_raw"):
+        source(tmp_path / "nothing").infos()
+
+
+def test_a_video_that_was_cut_after_indexing_is_named(tmp_path: Path) -> None:
+    raw = source(write(tmp_path).parents[3])
+    raw.infos()
+    cut(MP4, 0.4)(tmp_path / PLACE)
+    with pytest.raises(InputError, match=f"{LEFT}.mp4"):
+        raw.read(0).read_frames([3])
+
+
+def test_a_tree_in_the_cloud_reads_as_here(tree: Path, gcs: Gcs, tmp_path: Path) -> None:
+    url, here = gcs.upload(tree, "bucket/droid_raw/1.0.1"), source(tree)
+    raw = source(url, disk_cache={"dir": str(tmp_path)})
+    assert list(raw.infos()) == list(here.infos())
+    episode, same = raw.read(1), here.read(1)
+    np.testing.assert_array_equal(episode.states, same.states)
+    np.testing.assert_array_equal(episode.read_frames([3, 20]), same.read_frames([3, 20]))
+    gcs.forget()
+    infos = pickle.loads(pickle.dumps(raw))  # noqa: S301 - our own
+    np.testing.assert_array_equal(infos.read(1).read_frames([7]), same.read_frames([7]))
+    assert gcs.requests == []  # all of it is kept, and how long it is
+
+
+@pytest.fixture(scope="module")
+def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An episode whose video is megabytes: noise does not compress."""
+    chance = np.random.default_rng(0)
+    noise = [chance.integers(0, 256, (144, 256, 3), np.uint8) for _ in range(3)]
+    root = tmp_path_factory.mktemp("noisy")
+    write_raw_droid(root / PLACE, synthetic_states(90), pictures={LEFT: noise * 30}, gop=10)
+    return root
+
+
+def test_a_clip_of_a_video_in_the_cloud_fetches_much_less_than_the_video(noisy: Path, gcs: Gcs, tmp_path: Path) -> None:
+    raw = source(gcs.upload(noisy, "bucket/raw"), disk_cache={"dir": str(tmp_path)})
+    raw.infos()
+    whole = (noisy / PLACE / MP4).stat().st_size
+    assert whole > 2_000_000
+    assert gcs.bytes_read(".mp4") < whole / 4, "the index reads headers"
+    gcs.forget()
+    frames = raw.read(0).read_frames([40, 44, 48])
+    assert 0 < gcs.bytes_read(".mp4") < whole / 3
+    np.testing.assert_array_equal(frames, source(noisy).read(0).read_frames([40, 44, 48]))
+
+
+@pytest.mark.parametrize("kept", [0.0, 1.0])
+def test_a_network_that_fails_within_a_video_is_neither_damage_nor_silence(
+    noisy: Path, gcs: Gcs, tmp_path: Path, kept: float
+) -> None:
+    raw = source(gcs.upload(noisy, "bucket/raw"), disk_cache={"dir": str(tmp_path), "limit_gb": kept})
+    frames = raw.read(0).read_frames
+    gcs.fail_next(503, times=5, match="download.*mp4")
+    with pytest.raises(UnreachableError, match="not reached in 5 attempts"):
+        frames([40, 44])
+    np.testing.assert_array_equal(frames([40, 44]), source(noisy).read(0).read_frames([40, 44]))
+
+
+def test_a_video_in_the_cloud_that_became_shorter_is_no_picture(noisy: Path, gcs: Gcs, tmp_path: Path) -> None:
+    raw = source(gcs.upload(noisy, "bucket/raw"), disk_cache={"dir": str(tmp_path)})
+    frames = raw.read(0).read_frames
+    frames([0])
+    gcs.put(f"bucket/raw/{PLACE}/{MP4}", (noisy / PLACE / MP4).read_bytes()[:900_000])
+    with pytest.raises((InputError, OSError), match=f"{LEFT}.mp4"):
+        frames([80])
+
+
+def test_a_network_that_is_down_is_not_a_broken_episode(tree: Path, gcs: Gcs, tmp_path: Path) -> None:
+    url = gcs.upload(tree, "bucket/droid_raw")
+    gcs.fail_next(503, times=99, match="trajectory.h5|mp4")
+    with pytest.raises(UnreachableError):
+        source(url, disk_cache={"dir": str(tmp_path)}).infos()

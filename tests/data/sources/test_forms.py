@@ -1,0 +1,184 @@
+"""One trajectory in every form gives the same clips in the same order."""
+
+import errno
+import itertools
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lerobot_sets import STATE, Recorded, write_v21, write_v30
+from recordings import write_raw_droid
+from synthetic import draw_frame, synthetic_episode
+from vjepa2_ac.config import Config, DataConfig
+from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
+from vjepa2_ac.encoding.encode_dataset import encode_config
+from vjepa2_ac.episode import Batch
+from vjepa2_ac.storage.remote import UnreachableError
+
+LENGTHS = (14, 17, 15, 12)
+SIZE = (36, 64)
+FORMS = ("rlds", "droid_raw", "lerobot_v3.0", "lerobot_v2.1", "npz")
+COMMANDS = {
+    "rule": "commands", "velocity_change_rad_s": 0.004, "shortest_idle_steps": 1, "shortest_kept_steps": 3,
+    "cut_last_steps": 0,
+}  # fmt: skip
+MOTION = {
+    "rule": "motion", "translation_m": 0.02, "rotation_rad": 0.03, "gripper": 0.03, "shortest_idle_steps": 2,
+    "shortest_kept_steps": 3, "cut_last_steps": 1,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def forms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the same four episodes in every form; their identities differ, but not their order."""
+    root = tmp_path_factory.mktemp("forms")
+    drawn = [synthetic_episode(number, steps=steps, size=SIZE) for number, steps in enumerate(LENGTHS)]
+    write_droid_rlds(root / "rlds" / "1.0.0", drawn, shards=2)
+    recorded = []
+    for number, episode in enumerate(drawn):
+        measured = episode.observation
+        states = np.concatenate([measured.cartesian_position, measured.gripper_position], axis=1).astype(np.float32)
+        velocities = np.asarray(episode.action_dict.joint_velocity, np.float32)
+        frames = [draw_frame(state, size=SIZE) for state in states]
+        recorded.append(
+            Recorded(
+                {STATE[0]: states[:, :6], STATE[1]: states[:, 6:], "action.joint_velocity": velocities},
+                {"observation.images.exterior_1_left": frames},
+            )
+        )
+        write_raw_droid(
+            root / f"droid_raw/LAB/success/2023-07-07/Fri_Jul__7_09:4{number}:00_2023",
+            states.astype(np.float64), pictures={"23404442": frames}, joint_velocities=velocities, gop=4,
+        )  # fmt: skip
+        (root / "npz").mkdir(exist_ok=True)
+        np.savez(root / f"npz/{number}.npz", states=states, frames=np.stack(frames), fps_hz=15.0)
+    write_v30(root / "lerobot_v3.0", recorded)
+    write_v21(root / "lerobot_v2.1", recorded)
+    return root
+
+
+def opened(forms: Path, form: str, **knobs: Any) -> Dataset:
+    chosen = {"frames": 3, "stride": 2, "workers": 0, "validation_share": 0.0, "test_share": 0.0} | knobs
+    path = forms / form / ("1.0.0" if form == "rlds" else "")
+    return open_dataset(DataConfig(source=form.split("_v", maxsplit=1)[0], path=str(path), **chosen))
+
+
+def clips(dataset: Dataset, count: int) -> tuple[list[tuple[int, int]], list[Batch]]:
+    """Return (episode, start) of the first clips, episodes by their place in alphabetical order, and the batches."""
+    batches = list(itertools.islice(training_loader(dataset, seed=5, batch_size=3), count))
+    ranks = {info.id: int(rank) for info, rank in zip(dataset.table, dataset.table.id_rank, strict=True)}
+    return [(ranks[n], s) for b in batches for n, s in zip(b.episode_ids, b.starts, strict=True)], batches
+
+
+@pytest.mark.parametrize("form", FORMS[1:])
+def test_every_form_gives_the_same_clips_in_the_same_order(forms: Path, form: str) -> None:
+    expected_order, expected = clips(opened(forms, "rlds"), 16)
+    order, found = clips(opened(forms, form), 16)
+    assert order == expected_order
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.states, other.states)
+        np.testing.assert_array_equal(one.actions, other.actions)
+        assert one.frames.shape == other.frames.shape
+        assert abs(one.frames.int() - other.frames.int()).float().mean() < 8, "more than a codec loses"
+
+
+@pytest.mark.parametrize("form", FORMS[1:])
+def test_every_form_moves_and_rests_at_the_same_steps(forms: Path, form: str) -> None:
+    rules = [MOTION] if form == "npz" else [MOTION, COMMANDS]  # .npz has no commanded velocities
+    for rule in rules:
+        expected, found = opened(forms, "rlds", idle=rule), opened(forms, form, idle=rule)
+        assert 0 < expected.kept.steps < sum(LENGTHS)
+        by_rank = [
+            [dataset.kept.of(episode) for episode in np.argsort(dataset.table.id_rank).tolist()]
+            for dataset in (expected, found)
+        ]
+        assert by_rank[0] == by_rank[1]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_tells_its_control_rate(forms: Path, form: str) -> None:
+    assert opened(forms, form).control_rate_hz == 15.0
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_set_is_indexed_once_by_whatever_path_it_is_named(
+    forms: Path, form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "link").symlink_to(forms)
+    monkeypatch.chdir(forms)
+    tables = [
+        opened(root, form, disk_cache={"dir": str(tmp_path / "cache")}).table
+        for root in (forms, Path(), tmp_path / "link")
+    ]
+    assert [list(table) for table in tables] == [list(tables[0])] * 3
+    assert len(list((tmp_path / "cache/index").glob("*.index"))) == 1
+
+
+@contextmanager
+def refused(folder: Path) -> Iterator[None]:
+    """Let the files of a folder be there, and not be read."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    root = os.geteuid() == 0
+    try:
+        for path in files:
+            path.chmod(0)
+        if root:  # to whom no file is refused
+            os.seteuid(65534)
+        yield
+    finally:
+        if root:
+            os.seteuid(0)
+        for path in files:
+            path.chmod(0o644)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_file_that_the_system_refuses_is_named_and_its_episode_not_called_broken(
+    forms: Path, form: str, tmp_path: Path
+) -> None:
+    shutil.copytree(forms / form, tmp_path / form)
+    for folder in (tmp_path, *tmp_path.parents):  # nobody may go through them, while the test pretends to be nobody
+        if folder.owner() == forms.owner() and folder.is_relative_to(tempfile.gettempdir()):
+            folder.chmod(0o755)
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new").chmod(0o777)
+    before, new = ({"dir": str(tmp_path / name), "limit_gb": 0.0} for name in ("before", "new"))
+    source = opened(tmp_path, form, disk_cache=before).source
+    frames = source.read(0).read_frames
+    with refused(tmp_path / form):
+        for action in (lambda: source.read(0), lambda: frames([0]), lambda: opened(tmp_path, form, disk_cache=new)):
+            with pytest.raises(UnreachableError, match=f"{os.strerror(errno.EACCES)}.*permissions"):
+                action()
+    assert len(opened(tmp_path, form, disk_cache=new).table) == len(LENGTHS)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_is_encoded_whole(forms: Path, form: str, tmp_path: Path) -> None:
+    sizes = {
+        "image_size": 32, "encoder": {"width": 12, "depth": 1, "heads": 1},
+        "predictor": {"width": 12, "depth": 1, "heads": 1},
+    }  # fmt: skip
+    data = opened(forms, form).config
+    config = Config.model_validate(
+        {"run_dir": "none", "data": data, "model": {"random": sizes, "dtype": "float32", "encode_chunk": 9},
+         "adapter": {"kind": "none"}, "training": {"device": "cpu", "precision": "fp32"}},
+    )  # fmt: skip
+    manifest = encode_config(config, lambda _: None, out=tmp_path / "latents").manifest
+    assert manifest is not None
+    assert (manifest.encoded, manifest.frames, dict(manifest.broken)) == (len(LENGTHS), sum(LENGTHS), {})
+    through = data.model_copy(update={"source": "latents", "path": str(tmp_path / "latents"), "camera": None})
+    expected_order, expected = clips(opened(forms, form), 8)
+    order, found = clips(open_dataset(through), 8)
+    assert order == expected_order
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(one.states, other.states)
+        np.testing.assert_array_equal(one.actions, other.actions)

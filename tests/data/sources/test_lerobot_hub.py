@@ -1,0 +1,185 @@
+"""LeRobot data sets that lie elsewhere: at `hf://datasets/owner/name`, and in a bucket."""
+
+import json
+import pickle
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gcs import Gcs
+from hub import Hub, serve_hub
+from lerobot_sets import CAMERAS, STATE, Recorded, change_info, numbers_of, recorded, write_v21, write_v30
+from vjepa2_ac import storage
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.remote import UnreachableError, retries
+
+LENGTHS = (12, 13, 14, 15, 16)
+
+
+@pytest.fixture(scope="module")
+def episodes() -> list[Recorded]:
+    return [recorded(number, steps) for number, steps in enumerate(LENGTHS)]
+
+
+@pytest.fixture(scope="module")
+def folder(episodes: list[Recorded], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("hub")
+    write_v30(folder / "v30", episodes, episodes_per_video=1)
+    write_v21(folder / "v21", episodes)
+    write_v30(folder / "closed", episodes[:1])
+    return folder
+
+
+@pytest.fixture
+def hub(folder: Path) -> Iterator[Hub]:
+    names = {f"lab/{path.name}": path for path in folder.iterdir()}
+    with serve_hub(names, gated={"lab/closed": "hf_right"}) as served:
+        yield served
+
+
+def source_of(name: str, cache: Path, **changes: Any) -> LeRobotSource:
+    path = name if "://" in name else f"hf://datasets/lab/{name}"
+    content = {"source": "lerobot", "path": path, "disk_cache": {"dir": str(cache)}} | changes
+    return LeRobotSource(DataConfig.model_validate_json(json.dumps(content)))
+
+
+@pytest.mark.parametrize("version", ["v30", "v21"])
+def test_a_data_set_on_the_hub_is_the_one_that_was_written(
+    version: str, hub: Hub, episodes: list[Recorded], tmp_path: Path
+) -> None:
+    assert hub.url
+    source = source_of(version, tmp_path)
+    infos = source.infos()
+    assert [info.num_steps for info in infos] == list(LENGTHS)
+    assert not infos.problems
+    for number in (3, 0, 4):
+        episode = source.read(number, camera=CAMERAS[1])
+        written = np.concatenate([episodes[number].columns[name] for name in STATE], axis=1)
+        np.testing.assert_array_equal(episode.states, written.astype(np.float64))
+        frames = episode.read_frames([7, 2, 11])
+        assert [numbers_of(frame) for frame in frames] == [(number, step, 1) for step in (7, 2, 11)]
+
+
+@pytest.mark.parametrize("version", ["v30", "v21"])
+def test_the_index_reads_nothing_but_what_lies_in_meta(version: str, hub: Hub, tmp_path: Path) -> None:
+    source_of(version, tmp_path).infos()
+    assert {path.split("/")[0] for path, _, _ in hub.ranges} == {"meta"}
+
+
+@pytest.mark.parametrize("version", ["v30", "v21"])
+def test_a_bucket_gives_the_same(version: str, folder: Path, gcs: Gcs, tmp_path: Path) -> None:
+    far = source_of(gcs.upload(folder / version, f"robots/{version}"), tmp_path)
+    here = LeRobotSource(DataConfig(source="lerobot", path=str(folder / version)))
+    assert [info.id for info in far.infos()] == [info.id for info in here.infos()]
+    assert {request.object.split("/")[2] for request in gcs.reads()} == {"meta"}
+    for number in (1, 4):
+        np.testing.assert_array_equal(far.read(number).states, here.read(number).states)
+        frames = [source.read(number).read_frames([3, 9]) for source in (far, here)]
+        np.testing.assert_array_equal(*frames)
+    gcs.fail_next(503, match="/download/.*mp4")
+    gcs.fail_next("short", match="/download/.*mp4")
+    far.read(0).read_frames([2])
+    assert gcs.faults_left == 0
+
+
+def test_the_outcome_is_in_the_tables_or_in_the_rows(hub: Hub, tmp_path: Path) -> None:
+    assert hub.url
+    outcomes = [number % 3 != 2 for number in range(5)]
+    assert [info.success for info in source_of("v30", tmp_path).infos()] == outcomes
+    assert [info.success for info in source_of("v21", tmp_path).infos()] == [None] * 5
+    assert [info.success for info in source_of("v21", tmp_path, outcome="success").infos()] == outcomes
+
+
+def test_what_was_fetched_once_is_not_fetched_again(hub: Hub, tmp_path: Path) -> None:
+    source = source_of("v30", tmp_path)
+    source.infos()
+    first = source.read(2).read_frames([1, 5])
+    assert hub.bytes_read(".mp4") > 0
+    hub.ranges.clear()
+    other_process = pickle.loads(pickle.dumps(source))  # noqa: S301 - our own bytes
+    np.testing.assert_array_equal(other_process.read(2).read_frames([1, 5]), first)
+    assert [path for path, _, _ in hub.ranges if path != "meta/info.json"] == []
+
+
+def test_a_clip_fetches_a_part_of_the_video(episodes: list[Recorded], tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    key = f"observation.images.{CAMERAS[0]}"
+    noise = [generator.integers(0, 256, (144, 256, 3), np.uint8) for _ in range(3)]
+    long = [
+        Recorded({name: np.repeat(episode.columns[name][:1], 60, axis=0) for name in STATE}, {key: noise * 20})
+        for episode in episodes
+    ]
+    root = write_v30(tmp_path / "set", long, episodes_per_video=5, gop=10)
+    with serve_hub({"lab/long": root}) as hub:
+        source = source_of("long", tmp_path)
+        source.infos()
+        before = storage.bytes_fetched()
+        source.read(3).read_frames([20, 24, 28])
+        whole = next(root.glob("videos/**/*.mp4")).stat().st_size
+        assert whole > 3_000_000
+        assert 0 < hub.bytes_read(".mp4") < whole / 4
+        assert storage.bytes_fetched() - before >= hub.bytes_read(".mp4")
+
+
+def test_a_passing_fault_is_tried_again(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=3, first_wait_s=0.001))
+    source = source_of("v30", tmp_path)
+    source.infos()
+    hub.faults += [503, 429]
+    episode = source.read(0)
+    hub.faults += [500]
+    assert numbers_of(episode.read_frames([3])[0]) == (0, 3, 0)
+    hub.faults += [503] * 3
+    with pytest.raises(UnreachableError, match=r"hf://datasets/lab/v30/data/.*3 attempts"):
+        source.read(4)
+    hub.faults, hub.faulty = [503] * 3, ".mp4"
+    with pytest.raises(UnreachableError, match=r"hf://datasets/lab/v30/videos/.*3 attempts"):
+        source.read(4).read_frames([1])
+    assert not hub.faults
+
+
+def test_what_the_network_did_is_never_booked_as_a_broken_episode(
+    hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=2, first_wait_s=0.001))
+    hub.faults, hub.faulty = [503] * 2, "episode_000002.parquet"
+    source = source_of("v21", tmp_path, outcome="success", connections=1)
+    with pytest.raises(UnreachableError, match="episode_000002"):
+        source.infos()
+    assert len(source.infos()) == 5, "it is asked again"
+
+
+def test_a_data_set_that_is_not_there_says_how_to_log_in(hub: Hub, tmp_path: Path) -> None:
+    assert hub.url
+    with pytest.raises(InputError, match=r"hf://datasets/lab/nothing.*hf auth login.*HF_TOKEN"):
+        source_of("nothing", tmp_path).infos()
+
+
+def test_a_gated_data_set_says_how_to_log_in(hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert hub.url
+    for token in (None, "hf_wrong"):
+        if token is not None:
+            monkeypatch.setenv("HF_TOKEN", token)
+        with pytest.raises(InputError, match=r"hf://datasets/lab/closed.*hf auth login.*HF_TOKEN"):
+            source_of("closed", tmp_path).infos()
+    monkeypatch.setenv("HF_TOKEN", "hf_right")
+    assert len(source_of("closed", tmp_path).infos()) == 1
+
+
+def test_files_that_are_not_there_are_problems(folder: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(folder / "v21", tmp_path / "set"))
+    next(root.glob(f"videos/*/*{CAMERAS[0]}/episode_000003.mp4")).unlink()
+    next(root.glob("data/*/episode_000001.parquet")).unlink()
+    with serve_hub({"lab/holes": root}):
+        infos = source_of("holes", tmp_path).infos()
+        assert [problem.name for problem in infos.problems] == ["episode_000001", "episode_000003"]
+        assert "no such video" in infos.problems[1].found
+    change_info(root, codebase_version="v9")
+    with serve_hub({"lab/holes": root}), pytest.raises(InputError, match="codebase_version 'v9'"):
+        source_of("holes", tmp_path).infos()

@@ -1,0 +1,51 @@
+"""A library that is not installed is not an episode that is broken."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from lerobot_sets import recorded, write_v21
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.clips.loader import clip_at
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.errors import InputError
+
+
+def dataset_of(folder: Path, progress: Progress | None = None) -> Dataset:
+    values = {
+        "source": "lerobot", "path": str(folder), "frames": 3, "stride": 2, "validation_share": 0.0, "test_share": 0.0,
+        "broken_episodes": "skip", "lerobot": {"cameras": {"wrist_left": "observation.images.wrist_left"}},
+        "disk_cache": {"dir": str(folder.parent / "cache")},
+    }  # fmt: skip
+    return open_dataset(DataConfig.model_validate_json(json.dumps(values)), progress=progress)
+
+
+def test_without_its_decoder_no_episode_is_offered_for_exclusion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset = dataset_of(write_v21(tmp_path / "set", [recorded(0, 20)]))
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match="PyAV, which decodes video, is not installed") as raised:
+        clip_at(dataset, 0, 0)
+    assert "pip install" in raised.value.fix
+    assert "exclude" not in str(raised.value)
+
+
+def test_without_its_reader_no_episode_is_called_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_v21(tmp_path / "set", [recorded(0, 20)])
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InputError, match="pyarrow, which reads LeRobot data sets, is not installed") as raised:
+        dataset_of(folder)
+    assert "broken" not in str(raised.value)
+
+
+def test_without_its_decoder_a_set_of_videos_is_not_indexed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Or the states of a hundred thousand episodes would be read before the first picture is missed."""
+    folder, told = write_v21(tmp_path / "set", [recorded(0, 20)]), []
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match=r"PyAV, which decodes video, is not installed.*pip install"):
+        dataset_of(folder, lambda *done: told.append(done))
+    assert told == []

@@ -1,0 +1,114 @@
+"""A short .npz file that claims to be long is a named problem, and is not unpacked to find that out."""
+
+import struct
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.sources.npz.source import NpzSource
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.npz_reader import NpzFile
+
+STEPS = 20
+ARRAYS = {
+    "states": np.full((STEPS, 7), 0.3),
+    "frames": np.zeros((STEPS, 8, 8, 3), np.uint8),
+    "fps_hz": np.float64(15.0),
+}
+_MB = 1 << 20
+
+
+def described(shape: tuple[int, ...], kind: str, *, claimed: int | None = None) -> bytes:
+    """Return the head of an array, as numpy writes it; it may claim to be longer than it is."""
+    text = str({"descr": kind, "fortran_order": False, "shape": shape}).encode().ljust(117) + b"\n"
+    if claimed is None:
+        return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+    return b"\x93NUMPY\x02\x00" + struct.pack("<I", claimed) + text
+
+
+def add(path: Path, name: str, head: bytes, zeros: int, kind: int = zipfile.ZIP_DEFLATED) -> None:
+    with zipfile.ZipFile(path, "a") as archive:
+        archive.writestr(zipfile.ZipInfo(f"{name}.npy"), head + bytes(zeros), compress_type=kind)
+
+
+def without(path: Path, name: str) -> Path:
+    np.savez(path, **{key: value for key, value in ARRAYS.items() if key != name})
+    return path
+
+
+LONG = 5_000_000  # steps: nine days
+
+BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "states without end": (
+        lambda path: add(without(path, "states"), "states", described((LONG, 7), "|u1"), 7 * LONG),
+        r"states: 35,000,000 numbers\. needed: at most 33,554,432",
+    ),
+    "a text without end": (
+        lambda path: add(without(path, ""), "language", described((), f"<U{4 * _MB}"), 16 * _MB),
+        r"language: 4,194,304 letters\. needed: at most 65,536",
+    ),
+    "a head without end": (
+        lambda path: add(without(path, "states"), "states", described((STEPS, 7), "<f8", claimed=32 * _MB), 32 * _MB),
+        r"states: cannot be read \(a header of 33,554,432 bytes\)",
+    ),
+    "a packing without a bound": (
+        lambda path: add(
+            without(path, "frames"), "frames", described((STEPS, 999, 999, 3), "|u1"), STEPS * 999 * 999 * 3,
+            zipfile.ZIP_BZIP2,
+        ),
+        "frames: cannot be read .*in another way than numpy",
+    ),
+    "pictures that are not there": (
+        lambda path: add(without(path, "frames"), "frames", described((STEPS, 4_000_000, 4_000_000, 3), "|u1"), 1000),
+        "frames: cannot be read .*in 1128 bytes",
+    ),
+    "sizes below nothing": (
+        lambda path: add(without(path, "states"), "states", described((-1, 7), "<f8"), 1000),
+        "states: cannot be read",
+    ),
+    "rows of nothing": (
+        lambda path: add(without(path, "states"), "states", described((1 << 40, 0), "<f8"), 0),
+        r"states: shape \(1099511627776, 0\)",
+    ),
+}  # fmt: skip
+
+
+def table_of(folder: Path) -> EpisodeTable:
+    config = {"source": "npz", "path": str(folder), "disk_cache": {"dir": str(folder.parent / "cache")}}
+    return NpzSource(DataConfig.model_validate(config)).infos()
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_what_claims_more_than_an_episode_holds_is_refused_before_it_is_unpacked(tmp_path: Path, bomb: str) -> None:
+    folder = tmp_path / "set"
+    folder.mkdir()
+    without(folder / "good.npz", "")
+    build, message = BOMBS[bomb]
+    build(folder / "bomb.npz")
+    tracemalloc.start()
+    try:
+        table = table_of(folder)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    (problem,) = table.problems
+    assert (problem.name, [info.id for info in table]) == ("bomb", ["good"])
+    with pytest.raises(InputError, match=message):
+        raise InputError(where=problem.where, found=problem.found, needed=problem.needed, fix=problem.fix)
+    assert peak < 6 * _MB
+
+
+def test_an_archive_of_very_many_members_is_an_archive(tmp_path: Path) -> None:
+    path = without(tmp_path / "many.npz", "")
+    with zipfile.ZipFile(path, "a") as archive:
+        for number in range(2000):
+            archive.writestr(f"{number}.npy", b"")
+    with path.open("rb") as file:
+        assert len(NpzFile(file, "many").names) == 2003
+        np.testing.assert_array_equal(NpzFile(file, "many").array("states"), ARRAYS["states"])

@@ -1,0 +1,393 @@
+"""RLDS episodes are read exactly, and whatever is wrong with them is named."""
+
+import dataclasses
+import json
+import os
+import pickle
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import simplejpeg
+
+from synthetic import synthetic_episode, synthetic_states, write_synthetic_droid
+from vjepa2_ac.config import DataConfig, RldsFields
+from vjepa2_ac.data.index.episode_table import EpisodeProblem
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.data.sources.rlds.tfrecord import index_records, write_record
+from vjepa2_ac.data.sources.rlds.writing.droid_writer import CAMERAS, write_droid_rlds
+from vjepa2_ac.errors import InputError
+
+Features = dict[str, tuple[Any, Any]]
+Spoil = Callable[[Callable[[Features], None]], Path]
+BRIDGE = RldsFields(
+    state=("steps/observation/state",),
+    gripper="openness",
+    identity=("episode_metadata/file_path", "episode_metadata/episode_id"),
+    cameras={"image_0": "steps/observation/image_0"},
+    control_rate_hz=5.0,
+)
+
+
+def open_droid(folder: Path, **knobs: Any) -> RldsSource:
+    return RldsSource(DataConfig(path=str(folder), **knobs))
+
+
+def at_step_2(features: Features, name: str, value: float) -> None:
+    values = features[f"steps/observation/{name}"][1]
+    values[2 * len(values) // 12] = value
+
+
+def error_of(problem: EpisodeProblem) -> InputError:
+    return InputError(where=problem.where, found=problem.found, needed=problem.needed, fix=problem.fix)
+
+
+def test_what_was_written_is_read(droid: Path) -> None:
+    source = open_droid(droid)
+    infos = source.infos()
+    assert sorted(info.num_steps for info in infos) == [12, 13, 14, 15, 16, 17]
+    for index, info in enumerate(infos):
+        number = int(info.id.split("episode_")[1][:4])
+        assert info.success is (number % 3 != 2)
+        episode = source.read(index)
+        assert episode.info == info
+        assert np.array_equal(episode.states, synthetic_states(info.num_steps + 1, seed=number)[:-1])
+        written = synthetic_episode(number, steps=info.num_steps, size=(48, 96)).images[CAMERAS[0]]
+        frames = episode.read_frames([info.num_steps - 1, 0])
+        for frame, jpeg in zip(frames, (written[-1], written[0]), strict=True):
+            assert np.array_equal(frame, simplejpeg.decode_jpeg(jpeg, fastdct=True))
+        assert episode.metadata["language"] == f"move to place {number}"
+        assert episode.control_rate_hz == 15.0
+
+
+def test_a_camera_is_the_one_that_was_asked_for(droid: Path) -> None:
+    frames = {camera: open_droid(droid, camera=camera).read(0).read_frames([0]) for camera in RldsFields().cameras}
+    blue = [frame[..., 2].mean() for frame in frames.values()]
+    assert blue[0] + 20 < blue[1] < blue[2] - 20
+
+
+def test_only_the_frames_asked_for_are_decoded(spoiled: Spoil) -> None:
+    def spoil(features: Features) -> None:
+        features["steps/observation/exterior_image_1_left"][1][5] = b"\xff\xd8 no JPEG"
+        features["steps/observation/wrist_image_left"][1][:] = [b""] * 12
+
+    episode = open_droid(spoiled(spoil)).read(0)
+    assert episode.read_frames([0, 4, 6]).shape == (3, 48, 96, 3)
+    with pytest.raises(InputError, match=r"exterior_image_1_left: step 5: .*not a JPEG"):
+        episode.read_frames([4, 5])
+
+
+def test_states_and_pictures_equal_what_tfds_reads_bit_for_bit(shared: Path) -> None:
+    folder = shared / "data" / "droid_rlds"
+    expected = json.loads((folder / "expected.json").read_text())
+    with np.load(folder / "expected.npz") as arrays:
+        tfds = dict(arrays)
+    compared = 0
+    for camera, feature in RldsFields().cameras.items():
+        source = open_droid(folder / "r2d2_faceblur" / "1.0.0", camera=camera)
+        assert [info.id for info in source.infos()] == expected["record_order"]
+        for number, info in enumerate(source.infos()):
+            assert info.num_steps == expected["episodes"][info.id]["steps"]
+            assert info.success == (expected["episodes"][info.id]["outcome"] == "success")
+            episode = source.read(number)
+            assert np.array_equal(episode.states, tfds[f"{number}.states"])
+            for name, value in tfds.items():
+                if name.startswith(f"{number}.{feature.split('/')[-1]}."):
+                    assert np.array_equal(episode.read_frames([int(name.split(".")[-1])])[0], value)
+                    compared += 1
+    assert compared == 18
+
+
+def test_real_robot_episodes_of_another_schema_are_read_by_mapped_names(shared: Path) -> None:
+    path = str(shared / "data" / "bridge_rlds" / "bridge_dataset" / "1.0.0")
+    source = RldsSource(DataConfig(path=path, fields=BRIDGE, camera="image_0"))
+    infos = source.infos()
+    assert len({info.id for info in infos}) == 25
+    for number, info in enumerate(infos):
+        episode = source.read(number)
+        assert info.success is None
+        assert episode.read_frames([0, info.num_steps - 1]).std() > 20  # pictures of something
+        assert abs(np.diff(episode.states[:, :3], axis=0)).max() < 0.1  # metres in a fifth of a second
+        assert episode.states[:, 6].min() > -0.05
+        assert episode.states[0, 6] < 0.1  # the gripper starts open
+        assert episode.metadata["language"]
+
+
+def test_openness_becomes_closedness(droid: Path) -> None:
+    closedness = open_droid(droid).read(1).states
+    openness = open_droid(droid, fields=RldsFields(gripper="openness")).read(1).states
+    assert np.array_equal(openness[:, 6], 1 - closedness[:, 6])
+    assert np.array_equal(openness[:, :6], closedness[:, :6])
+
+
+def test_a_source_travels_to_a_worker_small(droid: Path) -> None:
+    source = open_droid(droid)
+    infos = source.infos()
+    source.read(0)
+    sent = pickle.dumps(source)
+    assert len(sent) < 5_500
+    assert list(pickle.loads(sent).infos()) == list(infos)  # noqa: S301 - our own bytes
+
+
+def test_identities_do_not_depend_on_the_shards(droid: Path, tmp_path: Path) -> None:
+    other = write_synthetic_droid(tmp_path / "set", steps=range(12, 18), size=(16, 32), shards=5)
+    assert {info.id for info in open_droid(other).infos()} == {info.id for info in open_droid(droid).infos()}
+
+
+def test_length_is_that_of_the_states_where_no_step_is_flagged(spoiled: Spoil) -> None:
+    folder = spoiled(lambda features: features.pop("steps/is_first") and None)
+    assert open_droid(folder).infos()[0].num_steps == 12
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda f: f.pop("steps/observation/cartesian_position"), "no feature steps/observation/cartesian_position"),
+        (
+            lambda f: f.pop("steps/observation/exterior_image_1_left"),
+            "Did you mean steps/observation/exterior_image_2_left",
+        ),
+        (
+            lambda f: f.pop("episode_metadata/file_path"),
+            "no feature episode_metadata/file_path; the record has .*steps/action",
+        ),
+        (lambda f: f.update({"steps/is_first": ("float_list", [1.0] * 12)}), "a float_list.*needed: a int64_list"),
+        (lambda f: f.update({"steps/is_first": ("int64_list", [])}), "no steps.*needed: one or more"),
+        (lambda f: at_step_2(f, "cartesian_position", float("nan")), "step 2: .*finite"),
+        (lambda f: at_step_2(f, "cartesian_position", 900.0), "step 2: .*within 5 m"),
+        (lambda f: at_step_2(f, "gripper_position", 1.5), "step 2: .*gripper between 0 and 1"),
+        (lambda f: f["steps/observation/cartesian_position"][1].pop(), "71 numbers"),
+        (
+            lambda f: f["steps/observation/gripper_position"][1].extend([0.0] * 12),
+            "position \\[6\\] .*position \\[2\\]",
+        ),
+    ],
+)
+def test_an_episode_that_cannot_be_used_is_a_problem_and_no_row(spoiled: Spoil, change: Any, message: str) -> None:
+    def spoil(features: Features) -> None:
+        change(features)
+
+    table = open_droid(spoiled(spoil)).infos()
+    assert len(table) == 5
+    [problem] = table.problems
+    assert "tfrecord-00000-of-00002: record 0 at byte 0" in problem.where
+    assert re.search(message, str(error_of(problem)))
+
+
+def test_a_problem_is_named_like_the_episode_wherever_that_can_be_read(spoiled: Spoil) -> None:
+    def spoil(features: Features) -> None:
+        at_step_2(features, "gripper_position", 7.0)
+
+    [problem] = open_droid(spoiled(spoil)).infos().problems
+    assert "episode_0000" in problem.name
+    assert "--" in problem.name
+
+
+def test_where_no_episode_can_be_used_the_first_says_why(tmp_path: Path, droid: Path) -> None:
+    far = dataclasses.replace(synthetic_episode(0).observation, cartesian_position=np.full((40, 6), 7.0))
+    drawn = [synthetic_episode(number, steps=40, size=(16, 32)) for number in range(3)]
+    bad = [dataclasses.replace(episode, observation=far) for episode in drawn]
+    folder = write_droid_rlds(tmp_path / "some", [drawn[0], *bad[1:]], shards=1)
+    table = open_droid(folder).infos()
+    assert ([info.id for info in table], len(table.problems)) == ([table.identity(0)], 2)
+    every_one = write_droid_rlds(tmp_path / "every", bad, shards=1)
+    with pytest.raises(InputError, match=r"within 5 m.*Check data\.fields\.state\.$"):
+        open_droid(every_one).infos()
+    with pytest.raises(InputError, match="no feature steps/nothing"):
+        open_droid(droid, fields=RldsFields(state=("steps/nothing",))).infos()
+
+
+def test_a_data_set_without_language_is_read(spoiled: Spoil) -> None:
+    source = open_droid(spoiled(lambda features: features.pop("steps/language_instruction") and None))
+    assert source.infos()[0].num_steps == 12
+    assert source.read(0).metadata == {}
+    assert source.read(1).metadata["language"]
+
+
+def test_degrees_are_not_taken_for_radians(spoiled: Spoil) -> None:
+    def spoil(features: Features) -> None:
+        values = features["steps/observation/cartesian_position"][1]
+        values[:] = [value * 57.3 if place % 6 >= 3 else value for place, value in enumerate(values)]
+
+    [problem] = open_droid(spoiled(spoil)).infos().problems
+    assert "radians" in problem.needed
+
+
+def test_a_state_of_the_wrong_width_says_what_it_is_made_of(droid: Path) -> None:
+    fields = RldsFields(state=("steps/observation/joint_position", "steps/observation/gripper_position"))
+    with pytest.raises(InputError, match=r"joint_position \[7\] \+ .*gripper_position \[1\]"):
+        open_droid(droid, fields=fields).read(0)
+
+
+@pytest.mark.parametrize("check_crc", ["once", "always", "never"])
+def test_a_picture_too_few_is_named(spoiled: Spoil, check_crc: str) -> None:
+    """The CRC is right, so only a count can tell; without it all later pictures would be those of other states."""
+    folder = spoiled(lambda features: features["steps/observation/exterior_image_1_left"][1].pop(3) and None)
+    for camera in ("exterior_1_left", "wrist_left"):  # the config's camera, and one that is asked for
+        with pytest.raises(InputError, match=r"11 pictures.*12 steps"):
+            open_droid(folder, check_crc=check_crc, camera=camera).read(0, "exterior_1_left")
+
+
+def test_a_list_of_numbers_is_no_camera(droid: Path) -> None:
+    fields = RldsFields(cameras={"one": "steps/action"})
+    with pytest.raises(InputError, match=r"steps/action.*a float_list.*needed: a bytes_list"):
+        open_droid(droid, fields=fields).read(0)
+
+
+def test_commanded_joint_velocities_are_there_where_the_data_set_has_them(droid: Path) -> None:
+    found = open_droid(droid).read(1).joint_velocities
+    assert found is not None
+    assert np.array_equal(found, synthetic_episode(2, steps=14).action_dict.joint_velocity.astype(np.float32))
+    for name in (None, "steps/none"):
+        assert open_droid(droid, fields=RldsFields(joint_velocity=name)).read(1).joint_velocities is None
+
+
+def test_damage_is_found_by_the_first_read_on_this_machine_or_by_each(droid: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(droid, tmp_path / "set")
+    shard = sorted(folder.glob("*.tfrecord-*"))[0]
+    end = index_records(shard)[0].end
+    status = shard.stat()
+    for mode, finds_later_damage in (("once", False), ("always", True), ("never", False)):
+        open_droid(folder, check_crc=mode).read(0)
+        change_silently(shard, end - 10, status)
+        again = open_droid(folder, check_crc=mode)  # as another process would
+        if finds_later_damage:
+            with pytest.raises(InputError, match="record 0 at byte 0: the CRC of the data does not match"):
+                again.read(0)
+        else:
+            again.read(0)
+        if mode == "once":
+            with pytest.raises(InputError, match="CRC"):
+                open_droid(folder, check_crc=mode, disk_cache={"dir": str(tmp_path / "other")}).read(0)
+        change_silently(shard, end - 10, status)
+
+
+def change_silently(file: Path, place: int, status: os.stat_result) -> None:
+    """Flip a bit as a dying disk does: neither size nor time tell."""
+    whole = bytearray(file.read_bytes())
+    whole[place] ^= 1
+    file.write_bytes(whole)
+    os.utime(file, ns=(status.st_atime_ns, status.st_mtime_ns))
+
+
+def test_a_file_that_changes_while_it_is_in_use_is_an_error(droid: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(droid, tmp_path / "set")
+    source = open_droid(folder)
+    episode = source.read(0)
+    shard = sorted(folder.glob("*.tfrecord-*"))[0]
+    os.truncate(shard, shard.stat().st_size // 2)
+    for use in (lambda: source.read(0), lambda: episode.read_frames([3])):
+        with pytest.raises(InputError, match=rf"{shard.name}: .*it has changed since the data set was opened"):
+            use()
+    shard.unlink()
+    with pytest.raises(InputError, match=rf"{shard.name}: cannot be read"):
+        source.read(0)
+
+
+def test_files_that_changed_make_another_index(droid: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(droid, tmp_path / "set")
+    first, second = sorted(folder.glob("*.tfrecord-*"))
+    before = list(open_droid(folder).infos())
+    exchanged = [first.read_bytes(), second.read_bytes()]
+    first.write_bytes(exchanged[1])
+    second.write_bytes(exchanged[0])
+    after = list(open_droid(folder).infos())
+    assert after == before[3:] + before[:3]
+
+
+def test_the_index_is_made_once_and_progress_is_told(droid: Path, tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+
+    def progress(done: int, total: int) -> None:
+        told.append((done, total))
+
+    knobs = {"disk_cache": {"dir": str(tmp_path)}}
+    first = open_droid(droid, **knobs).infos(progress)
+    assert told == [(3, 6), (6, 6)]
+    again = open_droid(droid, **knobs).infos(progress)
+    assert len(told) == 2
+    assert list(again) == list(first)
+    open_droid(droid, camera="wrist_left", **knobs).infos(progress)  # another camera has to be there
+    assert len(told) == 4
+
+
+def test_of_two_episodes_of_one_identity_the_second_is_a_problem(tmp_path: Path) -> None:
+    episode = synthetic_episode(0, steps=3, size=(16, 32))
+    folder = write_droid_rlds(tmp_path / "set", [episode, episode], shards=2)
+    table = open_droid(folder).infos()
+    [problem] = table.problems
+    assert [info.id for info in table] == [problem.name]
+    assert re.search("00001-of-00002: record 0.*same identity as .*00000-of-00002: record 0", str(error_of(problem)))
+
+
+def test_a_shard_truncated_anywhere_costs_the_records_behind_the_cut(droid: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(droid, tmp_path / "set")
+    shard = sorted(folder.glob("*.tfrecord-*"))[0]
+    whole = shard.read_bytes()
+    ends = [span.end for span in index_records(shard)]
+    for size in (0, 1, 12, 1000, len(whole) // 2, len(whole) - 1, *ends[:-1]):
+        shard.write_bytes(whole[:size])
+        table = open_droid(folder).infos()
+        found = sum(end <= size for end in ends)
+        assert (len(table), len(table.problems)) == (3 + found, 3 - found)
+        assert all(shard.name in problem.where for problem in table.problems)
+        assert [problem.name for problem in table.problems] == [f"{shard.name}: record {n}" for n in range(found, 3)]
+
+
+def test_bytes_behind_the_last_promised_record_are_a_problem(droid: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(droid, tmp_path / "set")
+    shard = sorted(folder.glob("*.tfrecord-*"))[1]
+    with shard.open("ab") as file:
+        write_record(file, b"one more")
+    table = open_droid(folder).infos()
+    assert len(table) == 6
+    [problem] = table.problems
+    assert (problem.name, problem.found) == (f"{shard.name}: record 3", "24 bytes after the last record")
+
+
+def test_missing_shards_are_named(droid: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(droid, tmp_path / "set")
+    (folder / "r2d2_faceblur-train.tfrecord-00001-of-00002").unlink()
+    with pytest.raises(InputError, match=r"1 of 2 shards are missing: r2d2_faceblur-train\.tfrecord-00001-of-00002"):
+        open_droid(folder).infos()
+
+
+def test_a_folder_without_a_data_set_says_where_one_is(droid: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        open_droid(tmp_path / "none").infos()
+    with pytest.raises(InputError, match="is empty"):
+        open_droid(tmp_path).infos()
+    with pytest.raises(InputError, match=r"did you mean .*1\.0\.0\?"):
+        open_droid(droid.parent).infos()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not JSON"),
+        ("[" * 20_000, "too deep"),
+        ("[]", "a JSON list"),
+        ('{"name": "a"}', "not a description"),
+        ('{"name": "a", "splits": []}', "no episodes"),
+        ('{"name": "a", "splits": [{"name": "train", "shardLengths": ["x"]}]}', "not a description"),
+        ('{"name": "a", "splits": [{"name": "train", "shardLengths": [1e308]}]}', "not a description"),
+        (
+            '{"name": "a", "splits": [{"name": "train", "shardLengths": [9999999999]}]}',
+            "shard of 9,999,999,999 episodes",
+        ),
+        ('{"name": "a", "splits": [{"name": "train", "shardLengths": [-1]}]}', "not a description"),
+        (
+            '{"name": "a", "splits": [{"name": "t", "shardLengths": [2, 2], "filepathTemplate": "one.tfrecord"}]}',
+            "shards of one name",
+        ),
+        ('{"name": "a", "fileFormat": "array_record", "splits": []}', "array_record"),
+    ],
+)
+def test_a_description_that_is_none_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "dataset_info.json").write_text(text)
+    with pytest.raises(InputError, match=message):
+        open_droid(tmp_path).infos()

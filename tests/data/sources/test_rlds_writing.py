@@ -1,0 +1,159 @@
+"""What we write is DROID's schema as TFDS writes it (golden/DATA_ORIGIN.md), and appears whole or not at all."""
+
+import dataclasses
+import errno
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from paths import GOLDEN
+from synthetic import synthetic_episode, write_synthetic_droid
+from vjepa2_ac.data.sources.rlds.tfrecord import decode_example, index_records, read_record
+from vjepa2_ac.data.sources.rlds.writing.droid_writer import CAMERAS, DroidEpisode, write_droid_rlds
+from vjepa2_ac.errors import InputError
+
+
+def layout(shard: Path) -> dict[str, list[object]]:
+    """Return kind and number of values (per step) of the features of the first record."""
+    features = decode_example(read_record(index_records(shard)[0]), where="")
+    steps = len(features["steps/is_first"][1])
+    return {
+        name: [kind, len(values) // (steps if name.startswith("steps/") else 1)]
+        for name, (kind, values) in features.items()
+    }
+
+
+def test_records_have_the_layout_that_tfds_writes(droid: Path) -> None:
+    golden = json.loads((GOLDEN / "droid_record_layout.json").read_text())
+    for shard in droid.glob("*.tfrecord-*"):
+        assert layout(shard) == golden
+
+
+def test_the_golden_layout_is_that_of_a_file_by_tfds(shared: Path) -> None:
+    folder = shared / "data" / "droid_rlds" / "r2d2_faceblur" / "1.0.0"
+    assert layout(sorted(folder.glob("*.tfrecord-*"))[0]) == json.loads(
+        (GOLDEN / "droid_record_layout.json").read_text()
+    )
+    assert (folder / "features.json").read_text() == (GOLDEN / "droid_features.json").read_text()
+
+
+def test_features_json_is_tfds_own_byte_for_byte(tmp_path: Path) -> None:
+    folder = write_synthetic_droid(tmp_path / "set", episodes=1, steps=2, shards=1)
+    assert (folder / "features.json").read_text() == (GOLDEN / "droid_features.json").read_text()
+
+
+def test_dataset_info_counts_what_the_shards_hold(droid: Path) -> None:
+    info = json.loads((droid / "dataset_info.json").read_text())
+    (split,) = info["splits"]
+    spans = [index_records(shard) for shard in sorted(droid.glob("*.tfrecord-*"))]
+    assert split["shardLengths"] == [str(len(shard)) for shard in spans]
+    assert split["numBytes"] == str(sum(span.length for shard in spans for span in shard))
+    assert sorted(path.name for path in droid.iterdir()) == [
+        "dataset_info.json",
+        "features.json",
+        "r2d2_faceblur-train.tfrecord-00000-of-00002",
+        "r2d2_faceblur-train.tfrecord-00001-of-00002",
+    ]
+
+
+def test_flags_and_reward_follow_from_length_and_path(tmp_path: Path) -> None:
+    episodes = [synthetic_episode(number, steps=3, size=(16, 32), success=number == 0) for number in range(2)]
+    folder = write_droid_rlds(tmp_path / "set", episodes, shards=1)
+    spans = index_records(next(folder.glob("*.tfrecord-*")))
+    for span, reward in zip(spans, ([0, 0, 1], [0, 0, 0]), strict=True):
+        features = decode_example(read_record(span), where="")
+        flags = {
+            name: list(features[f"steps/{name}"][1])
+            for name in ("is_first", "is_last", "is_terminal", "reward", "discount")
+        }
+        assert flags == {
+            "is_first": [1, 0, 0],
+            "is_last": [0, 0, 1],
+            "is_terminal": [0, 0, 1],
+            "reward": reward,
+            "discount": [1, 1, 1],
+        }
+
+
+def test_values_and_pictures_are_written_unchanged(tmp_path: Path) -> None:
+    episode = synthetic_episode(0, steps=5, size=(16, 32))
+    folder = write_droid_rlds(tmp_path / "set", [episode], shards=1)
+    features = decode_example(read_record(index_records(next(folder.glob("*.tfrecord-*")))[0]), where="")
+    for name, array in (
+        ("action", episode.action),
+        ("action_dict/joint_velocity", episode.action_dict.joint_velocity),
+        ("observation/cartesian_position", episode.observation.cartesian_position),
+    ):
+        assert np.array_equal(np.float32(features[f"steps/{name}"][1]), array.astype(np.float32).ravel())
+    for camera in CAMERAS:
+        assert list(features[f"steps/observation/{camera}"][1]) == episode.images[camera]
+
+
+def test_a_writer_that_fails_leaves_nothing(tmp_path: Path) -> None:
+    def episodes() -> Iterator[DroidEpisode]:
+        yield synthetic_episode(0, steps=2, size=(16, 32))
+        raise RuntimeError("the simulator broke")
+
+    with pytest.raises(RuntimeError, match="broke"):
+        write_droid_rlds(tmp_path / "set", episodes(), shards=1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_the_users_error_and_an_episodes_own_error_is_not(tmp_path: Path) -> None:
+    def episodes(number: int) -> Iterator[DroidEpisode]:
+        yield synthetic_episode(0, steps=2, size=(16, 32))
+        raise OSError(number, os.strerror(number))
+
+    with pytest.raises(InputError, match="/set: cannot be written: No space left"):
+        write_droid_rlds(tmp_path / "set", episodes(errno.ENOSPC), shards=1)
+    with pytest.raises(FileNotFoundError):
+        write_droid_rlds(tmp_path / "set", episodes(errno.ENOENT), shards=1)
+
+
+def test_a_folder_with_something_in_it_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("precious")
+    with pytest.raises(InputError, match="not empty"):
+        write_synthetic_droid(tmp_path, episodes=1, steps=2, shards=1)
+    assert (tmp_path / "mine").read_text() == "precious"
+
+
+@pytest.mark.parametrize("place", ["file", "file/inner", "/proc/inner"])
+def test_a_place_that_cannot_be_a_data_set_is_refused_before_an_episode_is_made(tmp_path: Path, place: str) -> None:
+    def episodes() -> Iterator[DroidEpisode]:
+        pytest.fail("an episode was made")
+        yield
+
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=rf"{place}: cannot be written"):
+        write_droid_rlds(tmp_path / place, episodes(), shards=1)
+
+
+def test_an_empty_folder_is_used_also_where_one_stands_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_synthetic_droid(".", episodes=1, steps=2, shards=1, size=(16, 32))
+    assert (Path() / "dataset_info.json").exists()
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_an_empty_folder_is_used(tmp_path: Path) -> None:
+    (tmp_path / "set").mkdir()
+    assert (write_synthetic_droid(tmp_path / "set", episodes=1, steps=2, shards=1) / "dataset_info.json").exists()
+
+
+def test_more_shards_than_episodes_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"1 episodes.*3 shards"):
+        write_synthetic_droid(tmp_path / "set", episodes=1, steps=2, shards=3, size=(16, 32))
+
+
+def test_an_episode_whose_parts_do_not_fit_is_refused(tmp_path: Path) -> None:
+    good = synthetic_episode(0, steps=3, size=(16, 32))
+    short = {**good.images, CAMERAS[0]: good.images[CAMERAS[0]][:2]}
+    nan = dataclasses.replace(good, action=np.full((3, 7), np.nan))
+    blind = {name: good.images[name] for name in CAMERAS[:2]}
+    for bad in (dataclasses.replace(good, images=short), nan, dataclasses.replace(good, images=blind)):
+        with pytest.raises(ValueError, match=r"trajectory\.h5"):
+            write_droid_rlds(tmp_path / "set", [bad], shards=1)

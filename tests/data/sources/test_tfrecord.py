@@ -1,0 +1,153 @@
+"""Records come back as they were written, and every damage is noticed and named."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import google_crc32c
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vjepa2_ac.data.sources.rlds.tfrecord import (
+    decode_example,
+    decode_feature,
+    encode_example,
+    index_records,
+    read_record,
+    write_record,
+)
+from vjepa2_ac.data.sources.rlds.wire_format import NotAnExampleError, features_behind, locate_features
+from vjepa2_ac.errors import InputError
+
+RECORDS = [b"", b"one", bytes(1000), b"trailing zeros\0\0\0"]
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "set.tfrecord-00000-of-00001"
+    with path.open("wb") as stream:
+        for record in RECORDS:
+            write_record(stream, record)
+    return path
+
+
+def reader_of(data: bytes) -> Callable[[int, int], bytes]:
+    return lambda offset, length: data[offset : offset + length]
+
+
+def read_all(path: Path, *, check_crc: bool = True) -> list[bytes]:
+    return [read_record(span, check_crc=check_crc) for span in index_records(path)]
+
+
+def test_records_come_back_in_order(file: Path) -> None:
+    assert read_all(file) == RECORDS
+
+
+def test_framing_is_the_published_one(tmp_path: Path) -> None:
+    """CRC-32C of eight zero bytes is 0x8c28b28a; the mask rotates right by 15 and adds 0xa282ead8."""
+    assert google_crc32c.value(bytes(8)) == 0x8C28B28A
+    masked = (((0x8C28B28A >> 15) | (0x8C28B28A << 17)) + 0xA282EAD8) & 0xFFFFFFFF
+    with (tmp_path / "file").open("wb") as stream:
+        write_record(stream, b"")
+    written = (tmp_path / "file").read_bytes()
+    assert written[:12] == bytes(8) + masked.to_bytes(4, "little")
+    assert len(written) == 16
+
+
+def test_a_file_that_ends_within_a_record_is_truncated_wherever_it_ends(file: Path) -> None:
+    whole = file.read_bytes()
+    boundaries = {0, *(span.end for span in index_records(file))}
+    for size in set(range(0, len(whole), 7)) | {1, 11, 12, 15, len(whole) - 1}:
+        file.write_bytes(whole[:size])
+        if size in boundaries:
+            continue
+        with pytest.raises(InputError, match=r"record \d at byte \d+.*truncated"):
+            index_records(file)
+
+
+def test_a_file_that_shrinks_after_it_was_indexed_is_truncated(file: Path) -> None:
+    span = index_records(file)[2]
+    file.write_bytes(file.read_bytes()[: span.end - 1])
+    with pytest.raises(InputError, match="truncated"):
+        read_record(span)
+
+
+def test_every_flipped_bit_is_noticed(file: Path) -> None:
+    whole = bytearray(file.read_bytes())
+    for position in np.random.default_rng(0).integers(0, 8 * len(whole), 100):
+        whole[position // 8] ^= 1 << position % 8
+        file.write_bytes(whole)
+        with pytest.raises(InputError, match="CRC"):
+            read_all(file)
+        whole[position // 8] ^= 1 << position % 8
+
+
+def test_damaged_data_may_be_read_when_told_to(file: Path) -> None:
+    whole = bytearray(file.read_bytes())
+    whole[-5] ^= 1
+    file.write_bytes(whole)
+    assert read_all(file, check_crc=False)[:-1] == RECORDS[:-1]
+
+
+@pytest.mark.parametrize("content", [b"not a TFRecord, but a text that is long enough", bytes(100), b"\x89PNG" * 20])
+def test_a_foreign_file_is_called_one(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "file").write_bytes(content)
+    with pytest.raises(InputError, match=r"file: record 0 at byte 0: .*not a TFRecord"):
+        index_records(tmp_path / "file")
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none.*cannot be read"):
+        index_records(tmp_path / "none")
+
+
+features = st.dictionaries(
+    st.text(min_size=1, max_size=10),
+    st.one_of(
+        st.tuples(st.just("bytes_list"), st.lists(st.binary(max_size=300), max_size=5)),
+        st.tuples(st.just("float_list"), st.lists(st.floats(width=32, allow_nan=False), max_size=50)),
+        st.tuples(st.just("int64_list"), st.lists(st.integers(-(2**63), 2**63 - 1), max_size=50)),
+    ),
+    max_size=6,
+)
+
+
+@settings(max_examples=50, deadline=None)
+@given(features=features)
+def test_features_are_found_without_reading_the_others(features: dict) -> None:
+    data = b"before" + encode_example(features) + b"after"
+    located = locate_features(reader_of(data), 6, len(data) - 11)
+    assert located.keys() == features.keys()
+    for name, (kind, values) in features.items():
+        offset, length = located[name]
+        found_kind, found = decode_feature(data[offset : offset + length], where="")
+        assert list(found) == values
+        assert found_kind == kind
+    decoded = decode_example(data[6:-5], where="")
+    assert {name: list(values) for name, (_, values) in decoded.items()} == {n: v for n, (_, v) in features.items()}
+
+
+@settings(max_examples=50, deadline=None)
+@given(features=features, share=st.floats(0, 1))
+def test_what_is_found_from_the_end_lies_where_it_does(features: dict, share: float) -> None:
+    data = encode_example(features)
+    located = locate_features(reader_of(data), 0, len(data))
+    cut = int(share * len(data))
+    for place, name in enumerate(located):
+        behind = dict(list(located.items())[place:])
+        found = features_behind(name, data[cut:], cut)
+        assert found in ({}, behind)
+        if cut == 0 and data.count(name.encode()) == 1:
+            assert found == behind
+
+
+def test_bytes_that_are_no_example_are_refused() -> None:
+    example = encode_example({"name": ("bytes_list", [b"value" * 10])})
+    for length in range(1, len(example)):
+        with pytest.raises(NotAnExampleError):
+            locate_features(reader_of(example), 0, length)
+    with pytest.raises(InputError, match=r"here.*not a tf\.train\.Example"):
+        decode_example(example[:-1], where="here")
+    with pytest.raises(InputError, match=r"here.*not a tf\.train\.Feature"):
+        decode_feature(b"\xff\xff", where="here")

@@ -1,0 +1,169 @@
+"""Several processes make the run that one makes: the same clips, the same weights up to rounding, one stop."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from paths import ROOT
+from ranks import finish, free_port, start_rank
+from same_run import figures, trained_weights
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.distributed.preemption import EXIT_STATUS, StoppedError
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.resume import micro_batches_of
+from vjepa2_ac.training.setup import batches_from, set_up
+
+
+@pytest.fixture
+def without_dropout(make_config, tmp_path):
+    def make(name: str, **changes: object):
+        config = make_config(run_dir=str(tmp_path / name), adapter__dropout=0.0, **changes)
+        (tmp_path / f"{name}.yaml").write_text(config_as_yaml(config))
+        return config
+
+    return make
+
+
+def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
+    first, second = trained_weights(one), trained_weights(other)
+    for name, value in first.items():
+        torch.testing.assert_close(second[name], value, rtol=1e-3, atol=1e-6, msg=name)
+    for row, same in zip(figures(one), figures(other), strict=True):
+        assert row["step"] == same["step"]
+        if row["kind"] == "train":
+            assert same["loss"] == pytest.approx(row["loss"], rel=1e-5)
+            assert same["grad_norm"] == pytest.approx(row["grad_norm"], rel=1e-4)
+
+
+def stopping_after(last_step: int, reporter):
+    stepped = reporter.stepped
+
+    def stop(step: int, seen: dict) -> None:
+        stepped(step, seen)
+        if step == last_step:
+            os.kill(os.getpid(), signal.SIGUSR1)
+
+    reporter.stepped = stop
+    return reporter
+
+
+def test_two_processes_stopped_and_gone_on_as_one_make_the_run_of_one(without_dropout, reporter, tmp_path) -> None:
+    """One rank is signalled, both stop after the same step; one process goes on with all clips of a step."""
+    whole = train(without_dropout("whole", training__steps=16, training__accumulation=4), type(reporter)())
+    config = without_dropout("shared", training__steps=16, training__accumulation=2)
+    port = free_port()
+    ranks = [
+        start_rank(["-m", "vjepa2_ac.cli", "train", str(tmp_path / "shared.yaml")], rank, 2, port) for rank in range(2)
+    ]
+    deadline = time.monotonic() + 120
+    while not any(row["kind"] == "train" for row in read_metrics_log(tmp_path / "shared/metrics.jsonl")):
+        assert all(process.poll() is None for process in ranks), finish(ranks)
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    ranks[1].send_signal(signal.SIGUSR1)
+    (out, errors), (quiet_out, quiet_errors) = finish(ranks, EXIT_STATUS)
+    assert errors.startswith("SIGUSR1: stopped after step"), "the first process says so"
+    assert "parameters are trained" in out
+    assert (quiet_out, quiet_errors) == ("", ""), "only the first process speaks"
+    state = read_state(newest_checkpoint(tmp_path / "shared/checkpoints"))
+    assert 1 <= state.step < 16
+    assert (state.processes, state.clips_per_step, state.clips_done) == (2, 8, 8 * state.step)
+    with pytest.raises(StoppedError):
+        train(config, stopping_after(state.step + 1, type(reporter)()))
+    train(config, reporter)  # once more: the number of processes is not another any more, and a step not the config's
+    assert reporter.steps[0] == state.step + 2
+    assert any("4 micro-batches of 2 in each" in note for note in reporter.notes)
+    assert_equal_up_to_rounding(whole, tmp_path / "shared")
+
+
+def test_two_nodes_of_torchrun_make_the_run_of_one_process(without_dropout, reporter, tmp_path) -> None:
+    whole = train(without_dropout("whole", training__accumulation=2), reporter)
+    without_dropout("nodes", training__accumulation=1, data__workers=1)
+    port = free_port()
+    nodes = []
+    for node in range(2):
+        launcher = ["--nnodes=2", f"--node-rank={node}", "--nproc-per-node=1", "--local-addr=127.0.0.1"]
+        launcher += ["--rdzv-backend=c10d", f"--rdzv-endpoint=127.0.0.1:{port}"]
+        command = ["-m", "vjepa2_ac.cli", "train", str(tmp_path / "nodes.yaml")]
+        nodes.append(
+            subprocess.Popen(
+                [sys.executable, "-m", "torch.distributed.run", *launcher, *command],
+                env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            )
+        )  # fmt: skip
+    finish(nodes)
+    assert read_state(newest_checkpoint(tmp_path / "nodes/checkpoints")).processes == 2
+    assert_equal_up_to_rounding(whole, tmp_path / "nodes")
+
+
+def test_what_processes_say_to_each_other(tmp_path, without_dropout) -> None:
+    """Sums, gradients, broken episodes, a micro-batch that is empty for one process: in processes_together.py."""
+    without_dropout("pair", data__broken_episodes="skip", training__max_grad_norm=None)
+    script, port = ROOT / "tests/support/processes_together.py", free_port()
+    finish([start_rank([str(script), str(tmp_path / "pair.yaml")], rank, 2, port) for rank in range(2)])
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "micro_batches"), [(1, 1, 4), (1, 2, 2), (1, 4, 1), (2, 1, 8), (4, 2, 8), (2, 8, 1)]
+)
+def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
+    make_config, before: int, now: int, micro_batches: int
+) -> None:
+    config = make_config(training__batch_size=2, training__accumulation=4)
+    state = RunState(step=3, processes=before, clips_per_step=8 * before)
+    notes: list[str] = []
+    assert micro_batches_of(config, state, now, notes.append) == micro_batches
+    assert micro_batches * now * 2 == state.clips_per_step
+    assert bool(notes) == (before != now)
+
+
+@pytest.mark.parametrize("starts", [(2, 1, 1, 2), (1, 4, 4, 2), (4, 2, 8, 8, 1)])
+def test_a_step_keeps_its_clips_however_often_the_run_goes_on(make_config, starts: tuple[int, ...], reporter) -> None:
+    config, state = make_config(training__batch_size=2, training__accumulation=4), RunState(step=0)
+    for processes in starts:
+        micro_batches = micro_batches_of(config, state, processes, reporter.note)
+        clips = micro_batches * processes * 2
+        state = replace(state, processes=processes, clips_per_step=clips, clips_asked=8)
+        assert clips == 8 * starts[0]
+
+
+def test_processes_that_cannot_share_a_step_are_refused(make_config, reporter) -> None:
+    config = make_config(training__batch_size=2, training__accumulation=4)
+    with pytest.raises(InputError, match="3 processes of 2 clips for a run with 8 clips per step"):
+        micro_batches_of(config, RunState(step=3, clips_per_step=8), 3, reporter.note)
+
+
+def test_accumulation_changed_on_purpose_counts_as_it_is_written(make_config, reporter) -> None:
+    config = make_config(training__batch_size=2, training__accumulation=3)
+    for state in (RunState(step=3, clips_per_step=8), RunState(step=3, clips_per_step=8, clips_asked=4, processes=1)):
+        assert micro_batches_of(config, state, 2, reporter.note) == 3
+
+
+def test_a_run_whose_step_changes_goes_on_in_the_row_of_clips_where_it_stood(make_config, reporter) -> None:
+    run = set_up(make_config(), reporter.note)
+    run.state = replace(run.state, step=1, clips_done=6)
+    expected = training_loader(run.dataset, seed=run.config.seed, batch_size=2, start_position=6)
+    assert next(batches_from(run)).starts == next(expected).starts
+
+
+def test_a_run_whose_step_changes_counts_on_from_the_clips_it_has_had(make_config, reporter) -> None:
+    train(make_config(training__steps=2), reporter)
+    changed = make_config(training__steps=4, training__accumulation=1)
+    folder = train(changed, reporter, allow_config_change=True)
+    assert read_state(newest_checkpoint(folder / "checkpoints")).clips_done == 2 * 4 + 2 * 2
+
+
+def test_fp16_on_a_cpu_is_refused(make_config, reporter) -> None:
+    with pytest.raises(InputError, match="fp16 on a CPU"):
+        train(make_config(training__precision="fp16", model__dtype="bfloat16"), reporter)

@@ -1,0 +1,160 @@
+"""A signal ends a run where it can go on from; two signals end it at once."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+
+from same_run import assert_same_run
+from vjepa2_ac.config.loading import config_as_yaml
+from vjepa2_ac.distributed.preemption import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signals
+from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.training.loop import train
+
+COMMAND = """
+import signal, sys, torch
+signal.signal(signal.SIGINT, signal.default_int_handler)  # also where these tests run behind a shell's &
+torch.set_num_threads(1)
+from vjepa2_ac.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+WAITING = """
+import time
+from vjepa2_ac.distributed.preemption import stop_on_signals
+with stop_on_signals(same_within_s=0.0) as stop:
+    print(stop.reason, flush=True)
+    while stop.reason is None:
+        time.sleep(0.01)
+    print(stop.reason, flush=True)
+    while True:
+        time.sleep(0.01)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _signals_are_not_ignored():
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def signalled_reporter(reporter, at: int, number: int):
+    stepped = reporter.stepped
+
+    def step_and_signal(step: int, seen: dict) -> None:
+        stepped(step, seen)
+        if step == at:
+            os.kill(os.getpid(), number)
+
+    reporter.stepped = step_and_signal
+    return reporter
+
+
+@pytest.fixture
+def whole(make_config, reporter, tmp_path) -> Path:
+    return train(make_config(run_dir=str(tmp_path / "whole")), type(reporter)())
+
+
+@pytest.mark.parametrize(("number", "at"), [(signal.SIGTERM, 3), (signal.SIGINT, 1), (signal.SIGUSR1, 4)])
+def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
+    make_config, reporter, tmp_path, whole, number, at
+) -> None:
+    config = make_config(run_dir=str(tmp_path / "stopped"), checkpoint__keep_best=False)
+    with pytest.raises(StoppedError, match=f"{signal.Signals(number).name}: stopped after step {at}"):
+        train(config, signalled_reporter(type(reporter)(), at, number))
+    assert read_state(newest_checkpoint(tmp_path / "stopped/checkpoints")).step == at
+    train(config, reporter)
+    assert reporter.steps[0] == at + 1
+    assert_same_run(whole, tmp_path / "stopped")
+
+
+def test_a_run_asked_to_stop_after_its_last_step_is_done(make_config, reporter) -> None:
+    train(make_config(), signalled_reporter(reporter, 6, signal.SIGTERM))
+
+
+def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order(
+    make_config, reporter, tmp_path
+) -> None:
+    changes = {"training__steps": 40, "validation__every": 40, "checkpoint__every": 40, "data__workers": 2}
+    config = make_config(run_dir=str(tmp_path / "stopped"), **changes)
+    (tmp_path / "config.yaml").write_text(config_as_yaml(config))
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND, "train", str(tmp_path / "config.yaml")],
+        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
+    )  # fmt: skip
+    deadline = time.monotonic() + 120
+    while not any(row["kind"] == "train" for row in read_metrics_log(tmp_path / "stopped/metrics.jsonl")):
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    family = psutil.Process(process.pid).children(recursive=True)
+    assert len(family) >= 3, "a fork server and two workers"
+    os.killpg(process.pid, signal.SIGUSR1)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == EXIT_STATUS, errors
+    assert errors.startswith("SIGUSR1: stopped after step"), errors
+    assert len(errors.splitlines()) == 1, errors
+    assert not psutil.wait_procs(family, timeout=10)[1], "a worker stayed"
+    train(config, reporter)
+    assert 1 < reporter.steps[0] < 40
+    train(make_config(run_dir=str(tmp_path / "whole"), **{**changes, "data__workers": 0}), reporter)
+    assert_same_run(tmp_path / "whole", tmp_path / "stopped")
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_second_signal_ends_the_process_at_once(number: int) -> None:
+    process = subprocess.Popen([sys.executable, "-c", WAITING], stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "None\n"
+    process.send_signal(number)
+    assert process.stdout.readline() == f"{signal.Signals(number).name}\n"
+    process.send_signal(number)
+    assert process.wait(timeout=60) == -number
+    process.stdout.close()
+
+
+def test_a_signal_that_comes_twice_at_once_is_one() -> None:
+    with stop_on_signals(same_within_s=60.0) as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.reason == "SIGTERM"
+
+
+def test_a_terminal_that_goes_asks_to_stop_however_often_it_says_so() -> None:
+    with stop_on_signals(same_within_s=0.0) as stop:
+        for _ in range(3):
+            os.kill(os.getpid(), signal.SIGHUP)
+        assert stop.reason == "SIGHUP"
+
+
+def test_signals_do_afterwards_what_they_did_before() -> None:
+    def mine(number: int, frame: object) -> None: ...
+
+    signal.signal(signal.SIGTERM, mine)
+    signal.signal(signal.SIGUSR1, signal.SIG_IGN)
+    with stop_on_signals():
+        assert signal.getsignal(signal.SIGTERM) is not mine
+        assert signal.getsignal(signal.SIGUSR1) is signal.SIG_IGN, "the process was started to ignore it"
+    assert signal.getsignal(signal.SIGTERM) is mine
+    assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
+
+
+def test_outside_the_main_thread_signals_are_left_alone() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    seen = []
+
+    def run() -> None:
+        with stop_on_signals() as stop:
+            seen.extend([stop.reason, signal.getsignal(signal.SIGTERM)])
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert seen == [None, before]

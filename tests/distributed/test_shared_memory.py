@@ -1,0 +1,95 @@
+"""A run whose workers may fill /dev/shm says so, with the number and the ways out."""
+
+import os
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.distributed.shared_memory import SHARED_MEMORY, small_shared_memory
+from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.setup import set_up
+
+MB = 10**6
+
+
+def disk(free: int) -> Any:
+    """Return what tells that so many bytes are free."""
+
+    def statvfs(path: str) -> Any:
+        assert path == SHARED_MEMORY
+        return SimpleNamespace(f_bavail=free // 1000, f_frsize=1000)
+
+    return statvfs
+
+
+def config_of(make_config: Any, **changes: Any) -> Config:
+    return make_config(**{
+        "data__workers": 4, "data__prefetch": 2, "training__batch_size": 8, "validation__clips": 64,
+        "validation__batch_size": 5, **changes,
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "processes", "needed"),
+    [
+        ({}, 1, 4 * 3 * 8 * 11.5),
+        ({"data__workers": 1, "data__prefetch": 5}, 1, 1 * 6 * 8 * 11.5),
+        ({"validation__clips": 256}, 1, 4 * 3 * (8 + 5) * 11.5),  # so many that workers read them, too
+        ({}, 2, 2 * 4 * 3 * 8 * 11.5),
+    ],
+)
+def test_what_the_workers_may_hold_is_counted(make_config, changes: Any, processes: int, needed: float) -> None:
+    config, clip = config_of(make_config, **changes), round(11.5 * MB)
+    enough = round(needed * MB)
+    assert small_shared_memory(config, clip, processes, statvfs=disk(enough)) is None
+    assert small_shared_memory(config, clip, processes, statvfs=disk(enough - 1000)) is not None
+
+
+def test_the_number_and_the_ways_out_are_told(make_config) -> None:
+    said = small_shared_memory(config_of(make_config), round(11.5 * MB), 2, statvfs=disk(64 * MB))
+    assert said == (
+        f"{SHARED_MEMORY} has 0.064 GB free, and batches on their way from the loader's workers may take 2.21 GB:"
+        " 2 processes x 4 workers x (2 prefetched + 1) x 8 clips of 11.5 MB. Where it is full, workers die of a bus"
+        " error. Give a container more (docker run --shm-size=3g), or lower data.workers or data.prefetch"
+    )
+
+
+def test_a_system_without_shared_memory_is_not_asked_for_any(make_config) -> None:
+    def statvfs(path: str) -> Any:
+        raise FileNotFoundError(path)
+
+    assert small_shared_memory(config_of(make_config), 10**15, statvfs=statvfs) is None
+
+
+@pytest.fixture
+def little(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A machine with hardly any shared memory."""
+    real = os.statvfs
+    monkeypatch.setattr(os, "statvfs", lambda path: disk(1000)(path) if path == SHARED_MEMORY else real(path))
+
+
+def notes_of(reporter: Any) -> list[str]:
+    return [note for note in reporter.notes if SHARED_MEMORY in note]
+
+
+@pytest.mark.usefixtures("little")
+def test_a_run_says_so_before_its_first_step_and_only_where_it_has_workers(make_config, reporter) -> None:
+    set_up(make_config(), reporter.note)
+    assert notes_of(reporter) == []
+    set_up(make_config(data__workers=2), reporter.note)
+    (said,) = notes_of(reporter)
+    frames, numbers = 4 * 36 * 49 * 3, 4 * (4 * 7 + 3 * 7)
+    assert f"2 workers x (2 prefetched + 1) x 2 clips of {(frames + numbers) / MB:.3g} MB" in said
+
+
+@pytest.mark.usefixtures("little")
+def test_cached_latents_count_as_what_they_are(make_config, reporter, tmp_path) -> None:
+    config = make_config(data__cache="auto", data__cache_dir=str(tmp_path / "cache"), training__steps=1)
+    train(config, reporter)
+    assert notes_of(reporter) == []
+    set_up(config.model_copy(update={"data": config.data.model_copy(update={"workers": 1})}), reporter.note)
+    (said,) = notes_of(reporter)
+    latents, numbers = 4 * 4 * 24 * 2, 4 * (4 * 7 + 3 * 7)  # 4 frames of 4 tokens of 24 numbers, bf16
+    assert f"clips of {(latents + numbers) / MB:.3g} MB" in said

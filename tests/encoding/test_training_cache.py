@@ -1,0 +1,147 @@
+"""Training on cached latents is training on the fly: bit for bit in fp32, within what is rounded off otherwise."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from latent_sets import encode_for
+from same_run import assert_same_run, figures, trained_weights
+from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate import ProbeOptions
+from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
+from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reports.metrics_json import metrics_as_dict
+from vjepa2_ac.reports.write import evaluate_subject
+from vjepa2_ac.training.loop import train
+
+
+class KilledError(Exception):
+    """Stands for the end of the process."""
+
+
+def encoded(config: Config) -> Path:
+    """Encode the data set of a config and return the folder of the cache."""
+    dataset = open_dataset(config.data)
+    return encode_for(config, load_base(config.model, seed=config.seed), dataset)
+
+
+def of_cache(folder: Path, **changes: Any) -> dict[str, Any]:
+    """Return the changes that make a config of a cache without its data set."""
+    return {"data__source": "latents", "data__path": str(folder)} | changes
+
+
+KINDS = {
+    "as it is": {},
+    "two cameras, one phase": {"data__camera": ("exterior_1_left", "wrist_left"), "data__start_every": 2},
+    "bf16 arithmetic": {"training__precision": "bf16"},
+}
+
+
+@pytest.mark.parametrize("changes", KINDS.values(), ids=KINDS)
+def test_training_on_an_exact_cache_is_training_on_the_fly_bit_for_bit(
+    make_config, reporter, tmp_path, changes
+) -> None:
+    changes = changes | {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches"), "training__steps": 4}
+    on_the_fly = make_config(run_dir=str(tmp_path / "fly"), **changes)
+    train(on_the_fly, reporter)
+    folder = encoded(on_the_fly)
+    train(make_config(run_dir=str(tmp_path / "cached"), **(changes | of_cache(folder))), reporter)
+    assert_same_run(tmp_path / "fly", tmp_path / "cached")
+    train(make_config(run_dir=str(tmp_path / "through"), **(changes | {"data__cache": "require"})), reporter)
+    assert_same_run(tmp_path / "fly", tmp_path / "through")
+
+
+@pytest.mark.parametrize(("kind", "most"), [("bf16", 2e-3), ("int8", 1e-2)])
+def test_training_on_a_rounded_cache_differs_by_what_is_rounded_off(
+    make_config, reporter, tmp_path, kind, most
+) -> None:
+    changes = {"data__cache_dtype": kind, "data__cache_dir": str(tmp_path / "caches"), "training__steps": 3}
+    on_the_fly = make_config(run_dir=str(tmp_path / "fly"), **changes)
+    train(on_the_fly, reporter)
+    folder = encoded(on_the_fly)
+    train(make_config(run_dir=str(tmp_path / "cached"), **(changes | of_cache(folder))), reporter)
+    pairs = zip(figures(tmp_path / "fly"), figures(tmp_path / "cached"), strict=True)
+    losses = [(one["loss"], other["loss"]) for one, other in pairs if one["kind"] == "train"]
+    assert losses
+    assert all(0 < abs(one / other - 1) < most for one, other in losses)
+
+
+def test_a_run_goes_on_from_a_cache_where_it_stopped_on_the_fly(make_config, reporter, tmp_path) -> None:
+    changes = {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches")}
+    whole = make_config(run_dir=str(tmp_path / "whole"), **changes)
+    train(whole, reporter)
+    encoded(whole)
+    dying = type(reporter)()
+
+    def die_at_three(step: int, seen: object) -> None:
+        del seen
+        if step == 3:
+            raise KilledError
+
+    dying.stepped = die_at_three
+    with pytest.raises(KilledError):
+        train(make_config(run_dir=str(tmp_path / "broken"), **changes), dying)
+    cached = make_config(run_dir=str(tmp_path / "broken"), **(changes | {"data__cache": "require"}))
+    train(cached, reporter, allow_config_change=True)
+    assert_same_run(tmp_path / "whole", tmp_path / "broken")
+
+
+def test_a_cache_of_another_encoder_stops_a_run_before_the_first_step(make_config, reporter, tmp_path) -> None:
+    folder = encoded(make_config(data__cache_dir=str(tmp_path / "caches")))
+    other = tmp_path / "other"
+    base = WorldModel.from_pretrained(Path(make_config().model.base))
+    sizes = ModelSizes.model_validate(base.sizes.model_dump())
+    WorldModel.random(sizes, seed=99).save_pretrained(other)
+    for changes, said in (
+        ({"model__base": str(other)}, "encoder: "),
+        ({"training__precision": "bf16"}, r"training\.precision: "),
+    ):
+        with pytest.raises(InputError, match=f"made otherwise: {said}"):
+            train(make_config(**of_cache(folder, **changes)), reporter)
+    assert reporter.steps == []
+
+
+def test_encoding_more_frames_at_once_changes_no_bit(make_config) -> None:
+    """So a cache need not name its chunk; on a GPU another chunk may sum in another order."""
+    for dtype in (torch.float32, torch.bfloat16):
+        model = WorldModel.from_pretrained(Path(make_config().model.base), dtype)
+        frames = torch.randn(1, 19, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+        whole = model.encode(frames, chunk=19)
+        assert all(torch.equal(whole, model.encode(frames, chunk=chunk)) for chunk in (1, 2, 3, 8, 16))
+
+
+def test_the_weights_move(make_config, reporter, tmp_path) -> None:
+    """What is compared above is not nothing."""
+    train(make_config(training__steps=1), reporter)
+    assert any(weight.abs().max() > 0 for name, weight in trained_weights(tmp_path / "run").items() if "lora_B" in name)
+
+
+def test_a_run_is_evaluated_from_its_cache_as_from_its_data(make_config, reporter, tmp_path) -> None:
+    changes = {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches"), "training__steps": 2}
+    config = make_config(run_dir=str(tmp_path / "run"), data__cache="auto", **changes)
+    train(config, reporter)
+    asked = EvaluationOptions(clips=6, probes=ProbeOptions(sensitivity_clips=2, samples=4, landscape_clips=1, nodes=3))
+    folder = next((tmp_path / "caches").iterdir())
+    from_cache = evaluate_subject(str(tmp_path / "run"), asked).evaluation
+    folder.rename(tmp_path / "elsewhere")
+    from_data = evaluate_subject(str(tmp_path / "run"), asked).evaluation
+    found = [metrics_as_dict(one) for one in (from_cache, from_data)]
+    assert [examples.frames is not None for examples in from_cache.examples] == [True] * len(from_data.examples)
+    for cached, original in zip(from_cache.examples, from_data.examples, strict=True):
+        difference = cached.frames.astype(float) - original.frames
+        assert abs(difference).mean() < 12  # small and JPEG, but the same pictures
+    for one in found:
+        one.pop("about")
+    assert found[0] == found[1]
+
+
+def test_a_cache_alone_cannot_tell_the_stride(make_config, tmp_path) -> None:
+    config = make_config(data__cache_dir=str(tmp_path / "caches"))
+    with pytest.raises(InputError, match="encoded for clips at stride 2"):
+        calibrate_config(make_config(**of_cache(encoded(config))))

@@ -1,0 +1,234 @@
+"""Runs and models are measured on their own data or others, against what is named; what cannot be is said at once."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from latent_sets import encode_for
+from vjepa2_ac.cli import main
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_as_dict, parse_config
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate import ProbeOptions
+from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reports.write import evaluate_subject
+from vjepa2_ac.training.loop import train
+
+PROBES = ProbeOptions(sensitivity_clips=3, samples=6, landscape_clips=1, nodes=3, examples=1)
+QUICK = ["--sensitivity-clips", "3", "--samples", "6", "--landscapes", "1", "--nodes", "3", "--examples", "1"]
+
+
+class _Silent:
+    def note(self, text: str) -> None: ...
+    def indexed(self, done: int, total: int) -> None: ...
+    def encoded(self, done: int, total: int) -> None: ...
+    def started(self, done: int, total: int) -> None: ...
+    def stepped(self, step: int, figures: object) -> None: ...
+    def validated(self, step: int, errors: object) -> None: ...
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_folder: Path) -> Config:
+    """Return the config of a tiny run that is trained for two steps."""
+    folder = tmp_path_factory.mktemp("evaluation")
+    values = {
+        "run_dir": str(folder / "run"),
+        "data": {
+            "path": str(data_folder), "frames": 4, "stride": 2, "validation_share": 0.3, "test_share": 0.4,
+            "workers": 0, "cache_dir": str(folder / "caches"),
+        },
+        "model": {"base": str(base_folder), "dtype": "float32"},
+        "adapter": {"rank": 4, "alpha": 8},
+        "training": {
+            "steps": 2, "batch_size": 2, "accumulation": 1, "learning_rate": 1e-2, "warmup_steps": 0, "log_every": 1,
+            "precision": "fp32", "device": "cpu", "allow_weak_base": True,
+        },
+        "validation": {"every": 2, "clips": 4, "batch_size": 3},
+        "tracking": {"tensorboard": False},
+    }  # fmt: skip
+    config = parse_config(values, where="test")
+    train(config, _Silent())
+    return config
+
+
+@pytest.fixture
+def run(config: Config) -> str:
+    return config.run_dir
+
+
+def asked(**changes: Any) -> EvaluationOptions:
+    return EvaluationOptions(**({"clips": 5, "probes": PROBES} | changes))
+
+
+def written(config: Config, folder: Path, **data: object) -> str:
+    """Write a config, its data changed, and return its path."""
+    values = config_as_dict(config)
+    values["data"] |= data
+    path = folder / "config of the data.yaml"
+    path.write_text(yaml.safe_dump(values))
+    return str(path)
+
+
+def rollout(figures: dict[str, Any], name: str) -> list[float]:
+    return [one["value"] for one in figures["models"][name]["rollout"]["l1"]["error"]]
+
+
+def figures_of(folder: Path | str) -> dict[str, Any]:
+    return json.loads((Path(folder) / "metrics.json").read_text())
+
+
+def test_a_run_is_measured_against_its_base_with_everything_that_belongs_to_it(run: str) -> None:
+    found = evaluate_subject(run, asked())
+    evaluation = found.evaluation
+    assert list(evaluation.models) == ["base", "adapter"]
+    assert (evaluation.base, evaluation.trained) == ("base", "adapter")
+    assert [path.name for path in found.files] == ["evaluation.png", "metrics.json", "report.html"]
+    assert evaluation.about.checkpoint == "step-00000002 (the newest)"
+    assert (evaluation.about.stride, evaluation.about.frames) == (2, 4)
+    assert evaluation.about.seconds_per_step == pytest.approx(2 / 15)
+    curves = {curve.name: curve for curve in evaluation.training}
+    assert curves["train/loss"].steps == (1, 2)
+    assert curves["validation/rollout_over_persistence_last"].steps == (0, 2)
+    assert evaluation.examples[0].frames is not None
+    assert evaluation.examples[0].frames.shape == (4, 32, 32, 3)
+
+
+def test_figures_depend_on_neither_the_batch_size_nor_the_workers(config: Config, run: str, tmp_path: Path) -> None:
+    evaluate_subject(run, asked(out=tmp_path / "a"))
+    changed = config.model_copy(update={"validation": config.validation.model_copy(update={"batch_size": 2})})
+    path = Path(run) / "config.yaml"
+    before = path.read_text()
+    try:
+        path.write_text(yaml.safe_dump(config_as_dict(changed)))
+        evaluate_subject(run, asked(out=tmp_path / "b"))
+    finally:
+        path.write_text(before)
+    one, other = figures_of(tmp_path / "a"), figures_of(tmp_path / "b")
+    for name in ("base", "adapter"):
+        assert rollout(one, name) == pytest.approx(rollout(other, name), rel=1e-5)
+        ranks = [figures["models"][name]["sensitivity"]["rankings"][0]["rank_by_clip"] for figures in (one, other)]
+        assert ranks[0] == ranks[1]
+    assert one["clips"] == other["clips"]
+
+
+def test_a_model_is_measured_on_the_data_of_a_config_and_equals_the_base_of_a_run(
+    config: Config, run: str, tmp_path: Path, base_folder: Path
+) -> None:
+    path = written(config, tmp_path)
+    arguments = ["evaluate", str(base_folder), "--data", path, "--out", str(tmp_path / "model"), "--clips", "5", *QUICK]
+    assert main(arguments) == 0
+    of_model = figures_of(tmp_path / "model")
+    assert list(of_model["models"]) == ["model"]
+    assert of_model["base"] is None
+    assert of_model["about"]["checkpoint"] == ""
+    evaluate_subject(run, asked(out=tmp_path / "run"))
+    assert rollout(of_model, "model") == pytest.approx(rollout(figures_of(tmp_path / "run"), "base"), rel=1e-5)
+
+
+def test_others_are_measured_on_the_same_latents(run: str, tmp_path: Path, base_folder: Path) -> None:
+    found = evaluate_subject(run, asked(against=("base", run, str(base_folder)), out=tmp_path))
+    assert list(found.evaluation.models) == ["base", "run", "model", "adapter"]
+    assert [model.role for model in found.evaluation.models.values()] == ["base", "other", "other", "trained"]
+    figures = figures_of(tmp_path)
+    assert rollout(figures, "run") == pytest.approx(rollout(figures, "adapter"), rel=1e-6)
+    assert rollout(figures, "model") == pytest.approx(rollout(figures, "base"), rel=1e-6)
+    assert rollout(figures, "base") != rollout(figures, "adapter")
+    assert evaluate_subject(run, asked(against=(str(base_folder),), out=tmp_path)).evaluation.base is None
+
+
+def test_another_encoder_cannot_be_measured_on_these_latents(run: str, tmp_path: Path, base_folder: Path) -> None:
+    model = WorldModel.from_pretrained(base_folder)
+    WorldModel.random(model.sizes, seed=9).save_pretrained(tmp_path / "other")
+    with pytest.raises(InputError, match=r"another encoder than that of.*vjepa2-ac compare"):
+        evaluate_subject(run, asked(against=(str(tmp_path / "other"),)))
+
+
+def test_a_cache_gives_the_figures_of_the_pictures_and_pictures_of_its_own(
+    config: Config, run: str, tmp_path: Path
+) -> None:
+    encode_for(
+        changed(config, cache_dtype="fp32"),
+        load_base(config.model, seed=0),
+        open_dataset(config.data),
+    )
+    path = written(config, tmp_path, cache="require", cache_dtype="fp32")
+    assert main(["evaluate", run, "--out", str(tmp_path / "fly"), "--clips", "5", *QUICK]) == 0
+    found = main(["evaluate", run, "--data", path, "--out", str(tmp_path / "cached"), "--clips", "5", *QUICK])
+    assert found == 0
+    fly, cached = figures_of(tmp_path / "fly"), figures_of(tmp_path / "cached")
+    assert fly["models"] == cached["models"]
+    assert fly["clips"] == cached["clips"]
+
+
+def test_strides_are_calibrated_where_it_is_asked_for(run: str, tmp_path: Path) -> None:
+    evaluate_subject(run, asked(calibrate=True, out=tmp_path))
+    calibration = figures_of(tmp_path)["calibration"]
+    assert calibration["split"] == "test"
+    assert calibration["strides"]
+
+
+def test_compare_prints_a_row_for_each_run(run: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    evaluate_subject(run, asked())
+    evaluate_subject(run, asked(out=tmp_path / "again"))
+    capsys.readouterr()
+    assert main(["compare", run, str(tmp_path / "again"), "--out", str(tmp_path / "plot.png")]) == 0
+    printed = capsys.readouterr().out
+    assert "gain over run" in printed
+    assert "again" in printed
+    assert (tmp_path / "plot.png").is_file()
+
+
+def changed(config: Config, **data: object) -> Config:
+    """Return a config with other settings of its data."""
+    return config.model_copy(update={"data": config.data.model_copy(update=data)})
+
+
+WRONG: dict[str, tuple[Callable[[Config], EvaluationOptions], str]] = {
+    "other data without a folder": (lambda config: asked(data=config), "--data without --out"),
+    "a stride to be found out": (
+        lambda config: asked(data=changed(config, stride="auto"), out=Path("unused")),
+        "data.stride: auto",
+    ),
+    "an empty split": (
+        lambda config: asked(data=changed(config, test_share=0.0), out=Path(config.run_dir) / "out"),
+        "no test episodes",
+    ),
+    "clips longer than episodes": (
+        lambda config: asked(data=changed(config, frames=30), out=Path(config.run_dir) / "out"),
+        "shorter than a clip",
+    ),
+    "no such checkpoint": (lambda _: asked(checkpoint="7"), "no checkpoint of step 7"),
+}
+
+
+@pytest.mark.parametrize(("make", "words"), WRONG.values(), ids=WRONG)
+def test_what_cannot_be_measured_is_said_before_a_model_is_loaded(
+    config: Config, run: str, make: Callable[[Config], EvaluationOptions], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vjepa2_ac.evaluation.evaluate_run.load_run", lambda *_: pytest.fail("loaded"))
+    with pytest.raises(InputError, match=words):
+        evaluate_subject(run, make(config))
+
+
+def test_what_to_compare_with_and_is_not_there_is_named_as_it_was_given(run: str, tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"--against \S*nowhere: no such file or folder\. needed: base, the folder of a run"
+    ):
+        evaluate_subject(run, asked(against=(str(tmp_path / "nowhere"),)))
+
+
+def test_a_model_without_data_and_a_file_in_the_way_are_errors(run: str, tmp_path: Path, base_folder: Path) -> None:
+    with pytest.raises(InputError, match=r"no config\.yaml.*--data CONFIG"):
+        evaluate_subject(str(base_folder), asked())
+    with pytest.raises(InputError, match="no such folder"):
+        evaluate_subject(str(tmp_path / "nowhere"), asked())
+    (tmp_path / "file").touch()
+    with pytest.raises((InputError, OSError), match="file"):
+        evaluate_subject(run, asked(out=tmp_path / "file"))

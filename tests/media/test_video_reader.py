@@ -1,0 +1,215 @@
+"""A picture at a place is the same picture, however little else is decoded."""
+
+import io
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from recordings import write_mp4
+from synthetic import draw_frame, synthetic_states
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media import video_reader
+from vjepa2_ac.media.frame_targets import FrameTargets
+from vjepa2_ac.media.video_reader import Clock, count_frames, frame_size, read_frames
+
+STEPS = 40
+FRAMES = [draw_frame(state, size=(36, 64)) for state in synthetic_states(STEPS)]
+
+
+def every_frame(path: Path) -> np.ndarray:
+    with av.open(str(path)) as file:
+        return np.stack([frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)])
+
+
+@pytest.mark.parametrize(("gop", "b_frames"), [(1, 0), (2, 0), (12, 0), (12, 3), (250, 3)])
+def test_asked_pictures_equal_those_of_decoding_everything(tmp_path: Path, gop: int, b_frames: int) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=gop, b_frames=b_frames)
+    frames, generator = every_frame(path), np.random.default_rng(gop)
+    for _ in range(25):
+        steps = generator.integers(0, STEPS, generator.integers(1, 9)).tolist()
+        np.testing.assert_array_equal(read_frames(path, steps, where="a"), frames[steps])
+        np.testing.assert_array_equal(read_frames(path, steps, where="a", clock=Clock(0.0, 15.0)), frames[steps])
+
+
+def test_an_open_group_of_pictures_is_entered_where_its_pictures_can_be_decoded(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """x265's key frames are preceded by pictures that are stored after them."""
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12, codec="libx265")
+    frames = every_frame(path)
+    capfd.readouterr()  # what the encoder says
+    for step in range(STEPS):
+        np.testing.assert_array_equal(read_frames(path, [step], where="a")[0], frames[step])
+        np.testing.assert_array_equal(read_frames(path, [step], where="a", clock=Clock(0.0, 15.0))[0], frames[step])
+
+
+def test_av1_is_decoded(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES[:20], gop=2, codec="libsvtav1", preset="12")
+    capfd.readouterr()
+    np.testing.assert_array_equal(read_frames(path, [19, 4, 3], where="a"), every_frame(path)[[19, 4, 3]])
+
+
+@pytest.mark.parametrize("rate", [15, 30, 60])
+@pytest.mark.parametrize("b_frames", [0, 3])
+def test_the_headers_rate_does_not_matter(tmp_path: Path, rate: int, b_frames: int) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, rate=rate, b_frames=b_frames)
+    np.testing.assert_array_equal(read_frames(path, [31, 2], where="a"), every_frame(path)[[31, 2]])
+    assert count_frames(path, where="a") == STEPS
+
+
+@pytest.mark.parametrize("b_frames", [0, 2])
+def test_uneven_times_do_not_matter(tmp_path: Path, b_frames: int) -> None:
+    times = np.cumsum(np.random.default_rng(0).integers(100, 3000, STEPS)).tolist()
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, times=times, b_frames=b_frames)
+    frames = every_frame(path)
+    for step in range(STEPS):
+        np.testing.assert_array_equal(read_frames(path, [step], where="a")[0], frames[step])
+
+
+def test_an_episode_that_starts_within_a_file_is_found_by_time(tmp_path: Path) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=2)
+    read = read_frames(path, [0, 3], where="a", clock=Clock(17 / 15 + 1e-4, 15.0))
+    np.testing.assert_array_equal(read, every_frame(path)[[17, 20]])
+
+
+@pytest.mark.parametrize("flags", ["empty_moov+default_base_moof+frag_keyframe", "faststart"])
+def test_any_order_of_the_files_parts_is_read(tmp_path: Path, flags: str) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, container={"movflags": flags}, b_frames=2)
+    np.testing.assert_array_equal(read_frames(path, [39, 13], where="a"), every_frame(path)[[39, 13]])
+    assert count_frames(path, where="a") == STEPS
+
+
+def test_only_what_the_asked_pictures_need_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12)
+    decoded: list[int] = []
+    keep = video_reader._Video._keep
+
+    def counted(self: video_reader._Video, frames: Sequence[Any], wanted: FrameTargets) -> None:
+        decoded.extend(frame.pts for frame in frames)
+        keep(self, frames, wanted)
+
+    monkeypatch.setattr(video_reader._Video, "_keep", counted)
+    read_frames(path, [14, 38], where="a")
+    assert [time // 1024 for time in decoded] == [12, 13, 14, 36, 37, 38]
+
+
+def test_sizes_come_from_the_header(tmp_path: Path) -> None:
+    assert frame_size(write_mp4(tmp_path / "a.mp4", FRAMES[:2]), where="a") == (36, 64)
+
+
+def test_a_file_that_is_open_is_read_and_stays_open(tmp_path: Path) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES)
+    with path.open("rb") as file:
+        np.testing.assert_array_equal(read_frames(file, [3], where="a"), read_frames(path, [3], where="a"))
+        assert not file.closed
+
+
+class FailingFile(io.BytesIO):
+    """Reads that fail after a while, as a network's do."""
+
+    def __init__(self, data: bytes, reads: int) -> None:
+        super().__init__(data)
+        self.reads = reads
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        self.reads -= 1
+        if self.reads < 0:
+            raise ConnectionResetError("gone")
+        return super().read(size)
+
+
+@pytest.mark.parametrize("reads", [0, 1, 2])
+def test_a_network_that_fails_is_not_a_damaged_video(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], reads: int
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (30, 72, 128, 3), dtype=np.uint8)
+    data = write_mp4(tmp_path / "a.mp4", list(noise)).read_bytes()
+    with pytest.raises(ConnectionResetError):
+        read_frames(FailingFile(data, reads), [20], where="a")
+    assert capfd.readouterr().err == ""
+
+
+def cut(data: bytes, share: float) -> bytes:
+    return data[: int(len(data) * share)]
+
+
+def blanked(data: bytes) -> bytes:
+    """A stretch of zeros in the middle of the pictures."""
+    start = data.index(b"mdat") + 4000
+    return data[:start] + bytes(3000) + data[start + 3000 :]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda _: b"", "cannot be read as a video"),
+        (lambda _: b"<html>" * 100, "cannot be read as a video"),
+        (lambda data: cut(data, 0.5), "cannot be read as a video"),
+        (lambda data: cut(data, 0.99), "cannot be read as a video"),
+        (lambda data: data.replace(b"vide", b"soun"), "no video"),
+        (lambda data: data.replace(b"avc1", b"zzz1"), "codec"),
+        (blanked, "cannot be read as a video"),
+    ],
+)
+def test_a_damaged_video_is_named_and_libav_is_silent(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], damage: Callable[[bytes], bytes], message: str
+) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES * 2)
+    path.write_bytes(damage(path.read_bytes()))
+    capfd.readouterr()
+    with pytest.raises(InputError, match=f"a.mp4 of seven: .*{message}"):
+        read_frames(path, range(2 * STEPS), where="a.mp4 of seven")
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("clock", [None, Clock(0.0, 15.0)])
+def test_a_picture_past_the_end_is_named(tmp_path: Path, clock: Clock | None) -> None:
+    path = write_mp4(tmp_path / "a.mp4", FRAMES)
+    with pytest.raises(InputError, match=r"40 pictures. needed: at least 43|no picture at 2.800 s"):
+        read_frames(path, [3, 42], where="a", clock=clock)
+
+
+def test_a_missing_video_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"here: .*No such file"):
+        read_frames(tmp_path / "a.mp4", [0], where="here")
+
+
+def test_no_steps_or_one_before_the_first_are_the_programmers_errors(tmp_path: Path) -> None:
+    for steps in ([], [-1]):
+        with pytest.raises(ValueError, match="steps"):
+            read_frames(tmp_path / "a.mp4", steps, where="a")
+
+
+def test_without_pyav_the_way_to_install_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match=r"pip install .*\[video\]"):
+        read_frames(tmp_path / "a.mp4", [0], where="a")
+
+
+def test_pictures_that_are_moved_without_a_word_in_the_header_are_found_by_time(tmp_path: Path) -> None:
+    """A file of key frames alone needs no reordering to be decoded, yet may be shown in another order."""
+    shown = [1, 3, 2, 5, 4, 7, 6, 8]  # when each stored picture is shown
+    whole = every_frame(write_mp4(tmp_path / "whole.mp4", FRAMES[:8], gop=1))
+    with av.open(str(tmp_path / "whole.mp4")) as source, av.open(str(tmp_path / "moved.mp4"), "w") as target:
+        stream = target.add_stream_from_template(source.streams.video[0])
+        for number, packet in enumerate(list(source.demux(source.streams.video[0]))[:8]):
+            packet.pts, packet.dts, packet.stream = shown[number] * 1024, number * 1024, stream
+            target.mux(packet)
+    expected = whole[np.argsort(shown)]
+    np.testing.assert_array_equal(read_frames(tmp_path / "moved.mp4", range(8), where="a"), expected)
+
+
+def test_a_clock_too_coarse_for_its_pictures_shows_none_twice(tmp_path: Path) -> None:
+    """Of a time scale of 0 libav makes whole seconds: all pictures of one would be taken for the same."""
+    path = write_mp4(tmp_path / "a.mp4", FRAMES)
+    data = bytearray(path.read_bytes())
+    scale = data.index(b"mdhd") + 16
+    data[scale : scale + 4] = bytes(4)
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"times in units of 1 s for 15 pictures a second\. needed: a time for each"):
+        read_frames(path, [0, 5], where="a", clock=Clock(0.0, 15.0))

@@ -1,0 +1,514 @@
+"""The laws of an adapter."""
+
+import copy
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import peft
+import pytest
+import torch
+from torch import Tensor
+from torch.utils.checkpoint import checkpoint
+
+from vjepa2_ac.config import AdapterConfig, ModelSizes
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.lora import add_adapter, has_adapter, load_trained, save_trained, trainable_report
+from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
+from vjepa2_ac.model.network import predictor
+from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
+from vjepa2_ac.model.network.world_model import WorldModel
+
+LORA = AdapterConfig(rank=4, alpha=8.0, dropout=0.0)
+EVERYTHING = AdapterConfig(kind="none")
+Fresh = Callable[..., WorldModel]
+METHODS = {
+    "lora": LORA,
+    "gaussian": LORA.model_copy(update={"init": "gaussian"}),
+    "dora": LORA.model_copy(update={"dora": True}),
+    "pissa": LORA.model_copy(update={"init": "pissa"}),
+    "pissa_dora": LORA.model_copy(update={"init": "pissa", "dora": True}),
+    "heads": LORA.model_copy(update={"targets": ("all",), "modules_to_save": ("action_encoder", "state_encoder")}),
+    "ends": LORA.model_copy(
+        update={"modules_to_save": ("predictor_embed", "predictor_proj", "action_encoder", "state_encoder")}
+    ),
+    "patterns": LORA.model_copy(
+        update={"rslora": False, "rank_pattern": {"fc1": 6, r"blocks\.0\.attn\.q": 2}, "alpha_pattern": {"fc2": 3.0}}
+    ),
+}
+both_kinds = pytest.mark.parametrize("config", [*METHODS.values(), EVERYTHING], ids=[*METHODS, "none"])
+every_method = pytest.mark.parametrize("config", METHODS.values(), ids=METHODS)
+both_types = pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+
+
+def predict(model: WorldModel, inputs) -> Tensor:
+    with torch.no_grad():
+        return model.predict(inputs.latents, inputs.actions, inputs.states)
+
+
+def train(model: WorldModel, inputs, steps: int = 3) -> None:
+    """Take a few large steps, so that what is trained differs visibly."""
+    model.train()
+    trained = [value for value in model.parameters() if value.requires_grad]
+    optimizer = torch.optim.SGD(trained, lr=1.0)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        predicted = model.predict(inputs.latents[:, :-1], inputs.actions[:, :-1], inputs.states[:, :-1])
+        (predicted - inputs.latents[:, 1:]).abs().mean().backward()
+        optimizer.step()
+    model.eval()
+
+
+def copies(model: WorldModel) -> dict[str, Tensor]:
+    return {name: value.detach().clone() for name, value in model.named_parameters()}
+
+
+@both_types
+@every_method
+def test_a_fresh_adapter_leaves_predictions_unchanged(
+    fresh: Fresh, inputs, config: AdapterConfig, dtype: torch.dtype
+) -> None:
+    model = fresh(dtype=dtype)
+    before = predict(model, inputs)
+    add_adapter(model, config, seed=0)
+    after = predict(model.eval(), inputs)
+    if config.init == "pissa":  # what is left of a weight is rounded to the weight's type
+        torch.testing.assert_close(after, before, rtol=0, atol=1e-4 if dtype == torch.float32 else 0.1)
+    elif config.modules_to_save and dtype == torch.bfloat16:  # float32 arithmetic in the heads
+        torch.testing.assert_close(after, before, rtol=0, atol=0.1)
+    else:
+        assert torch.equal(after, before)
+
+
+@both_types
+@every_method
+def test_only_the_adapter_moves_and_all_of_it(fresh: Fresh, inputs, config: AdapterConfig, dtype: torch.dtype) -> None:
+    model = fresh(dtype=dtype)
+    add_adapter(model, config, seed=0)
+    before = copies(model)
+    train(model, inputs)
+    for name, value in model.named_parameters():
+        is_adapter = ".lora_" in name or ".modules_to_save." in name
+        assert value.requires_grad == is_adapter, name
+        assert value.dtype == (torch.float32 if is_adapter else dtype), name
+        assert torch.equal(value, before[name]) != is_adapter, name
+
+
+def test_everything_but_the_unused_camera_moves_when_all_is_trained(model: WorldModel, inputs) -> None:
+    add_adapter(model, EVERYTHING, seed=0)
+    before = copies(model)
+    train(model, inputs)
+    for name, value in model.named_parameters():
+        trained = name.startswith("predictor.") and "extrinsics_encoder" not in name
+        assert torch.equal(value, before[name]) != trained, name
+
+
+def test_every_named_target_gets_an_adapter_and_nothing_else(model: WorldModel) -> None:
+    targets = ("q", "fc2", "predictor_proj", "action_encoder")
+    add_adapter(model, LORA.model_copy(update={"targets": targets}), seed=0)
+    adapted = {name.rsplit(".", 1)[0] for name, _ in model.predictor.named_modules() if name.endswith(".lora_A")}
+    names = {name.removeprefix("base_model.model.") for name in adapted}
+    layers = {f"blocks.{index}.{layer}" for index in range(2) for layer in ("attn.q", "mlp.fc2")}
+    assert names == layers | {"predictor_proj", "action_encoder"}
+
+
+def adapted_layers(model: WorldModel) -> set[str]:
+    found = [name for name, _ in model.base_predictor.named_modules() if name.endswith(".lora_A")]
+    return {name.removesuffix(".lora_A") for name in found}
+
+
+@pytest.mark.parametrize(
+    ("targets", "names"),
+    [
+        (("attention",), {"attn.q", "attn.k", "attn.v", "attn.o"}),
+        (("mlp", "q"), {"mlp.fc1", "mlp.fc2", "attn.q"}),
+        (("all",), {"attn.q", "attn.k", "attn.v", "attn.o", "mlp.fc1", "mlp.fc2"}),
+    ],
+)
+def test_a_set_of_targets_stands_for_its_layers(model: WorldModel, targets: tuple[str, ...], names: set[str]) -> None:
+    add_adapter(model, LORA.model_copy(update={"targets": targets}), seed=0)
+    heads = {"predictor_embed", "predictor_proj", "action_encoder", "state_encoder"} if targets == ("all",) else set()
+    assert adapted_layers(model) == {f"blocks.{index}.{name}" for index in range(2) for name in names} | heads
+
+
+def test_a_pattern_gives_the_layers_it_names_another_rank_and_scale(model: WorldModel) -> None:
+    add_adapter(model, METHODS["patterns"], seed=0)
+    layers = dict(model.base_predictor.named_modules())
+    found = {
+        name: (layers[name].r["default"], layers[name].scaling["default"])
+        for name in ("blocks.0.attn.q", "blocks.1.attn.q", "blocks.1.mlp.fc1", "blocks.0.mlp.fc2")
+    }
+    assert found == {
+        "blocks.0.attn.q": (2, 4.0),
+        "blocks.1.attn.q": (4, 2.0),
+        "blocks.1.mlp.fc1": (6, 8 / 6),
+        "blocks.0.mlp.fc2": (4, 0.75),
+    }
+
+
+@pytest.mark.parametrize(
+    ("knobs", "message"),
+    [
+        ({"rank_pattern": {"fc3": 2}}, r"adapter\.rank_pattern: 'fc3' matches no layer that gets an adapter"),
+        ({"alpha_pattern": {"action_encoder": 2.0}}, r"adapter\.alpha_pattern: 'action_encoder' matches no layer"),
+        ({"rank_pattern": {"(": 2}}, r"adapter\.rank_pattern: '\(', no regular expression"),
+        ({"targets": ("q", "state_encoder"), "modules_to_save": ("state_encoder",)}, "state_encoder, which .* too"),
+        ({"targets": ("extrinsics_encoder",)}, "extrinsics_encoder matches no layer"),
+        (
+            {"init": "pissa", "rank": 8, "targets": ("all",)},
+            r"rank 8 for action_encoder.*rank_pattern\.action_encoder=7",
+        ),
+        ({"init": "pissa", "rank_pattern": {"q": 37}}, r"rank 37 for blocks\.0\.attn\.q"),
+    ],
+)
+def test_a_knob_that_does_not_fit_the_predictor_is_refused(
+    model: WorldModel, knobs: dict[str, object], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        add_adapter(model, LORA.model_copy(update=knobs), seed=0)
+    assert not has_adapter(model)
+
+
+@both_types
+def test_pissa_that_goes_on_takes_its_start_from_the_folder_and_does_not_compute_it(
+    fresh: Fresh, inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dtype: torch.dtype
+) -> None:
+    first, second = fresh(dtype=dtype), fresh(dtype=dtype)
+    add_adapter(first, METHODS["pissa"], seed=0)
+    train(first, inputs)
+    save_trained(first, tmp_path)
+    monkeypatch.setattr(torch.linalg, "svd", lambda *_, **__: pytest.fail("minutes, at the real size"))
+    add_adapter(second, METHODS["pissa"], seed=0, started=tmp_path)
+    load_trained(second, tmp_path, trainable=True)
+    assert all(torch.equal(value, second.state_dict()[name]) for name, value in first.state_dict().items())
+    with pytest.raises(InputError, match="pissa_start"):
+        add_adapter(fresh(), METHODS["pissa"].model_copy(update={"rank": 3}), seed=0, started=tmp_path)
+
+
+def test_pissa_starts_at_the_largest_singular_values(model: WorldModel) -> None:
+    weight = model.predictor.blocks[0].attn.q.weight.clone()
+    add_adapter(model, METHODS["pissa"], seed=0)
+    layer = model.base_predictor.blocks[0].attn.q
+    values = torch.linalg.svdvals(weight)
+    torch.testing.assert_close(torch.linalg.svdvals(layer.get_delta_weight("default"))[:4], values[:4])
+    torch.testing.assert_close(torch.linalg.svdvals(layer.get_base_layer().weight)[:32], values[4:])
+
+
+@pytest.mark.parametrize("targets", [("q", "query"), ()])
+def test_a_target_that_matches_nothing_is_refused(model: WorldModel, targets: tuple[str, ...]) -> None:
+    with pytest.raises(InputError, match=r"adapter\.targets: .* needed: some of action_encoder, .*fc1, .*q, "):
+        add_adapter(model, LORA.model_copy(update={"targets": targets}), seed=0)
+    assert not has_adapter(model)
+
+
+def test_the_seed_decides_the_fresh_adapter(fresh: Fresh) -> None:
+    def first_matrices(seed: int) -> list[Tensor]:
+        model = fresh()
+        add_adapter(model, LORA, seed=seed)
+        return [value for name, value in model.named_parameters() if "lora_A" in name]
+
+    again = zip(first_matrices(1), first_matrices(1), strict=True)
+    other = zip(first_matrices(1), first_matrices(2), strict=True)
+    assert all(torch.equal(a, b) for a, b in again)
+    assert not any(torch.equal(a, b) for a, b in other)
+
+
+def test_parameters_are_counted_as_facts_count_them() -> None:
+    with torch.device("meta"):
+        predictor = ActionConditionedPredictor._from_config(ActionConditionedPredictor.config_class())
+    total = sum(value.numel() for value in predictor.parameters())
+    layers = [layer for layer in predictor.modules() if isinstance(layer, torch.nn.Linear)]
+    in_blocks = [layer for layer in layers if layer not in list(predictor.children())]
+    assert total == pytest.approx(305e6, rel=2e-3)
+    assert sum(layer.in_features + layer.out_features for layer in in_blocks) == 442_368
+
+
+def test_the_report_counts_what_is_trained_against_the_base(model: WorldModel) -> None:
+    own = sum(value.numel() for value in model.predictor.parameters())
+    total = sum(value.numel() for value in model.parameters())
+    assert trainable_report(model) == (0, own, total)
+    add_adapter(model, LORA, seed=0)
+    per_block = 4 * (36 + 36) + 2 * (36 + 72)  # q, k, v, o; fc1, fc2
+    assert trainable_report(model) == (4 * 2 * per_block, own, total)
+    assert str(trainable_report(model)).startswith("4,032 parameters are trained: ")
+
+
+@pytest.mark.parametrize(
+    ("method", "expected"),
+    [
+        ("dora", 4_032 + 2 * (4 * 36 + 72 + 36)),  # a magnitude for each row
+        ("pissa", 4_032),
+        ("heads", 4_032 + 4 * 2 * (24 + 36) + 2 * (7 * 36 + 36)),  # two projections, two heads with their biases
+        ("patterns", 4_032 + 2 * 2 * (36 + 72) - 2 * (36 + 36)),
+    ],
+)
+def test_the_report_counts_whatever_is_trained(model: WorldModel, method: str, expected: int) -> None:
+    before = trainable_report(model)
+    add_adapter(model, METHODS[method], seed=0)
+    assert trainable_report(model) == (expected, before.predictor, before.total)
+
+
+@both_types
+@both_kinds
+def test_switched_off_it_is_the_base_and_switched_on_what_it_was(
+    fresh: Fresh, inputs, config: AdapterConfig, dtype: torch.dtype
+) -> None:
+    model = fresh(dtype=dtype)
+    base = predict(fresh(dtype=torch.float32 if config.kind == "none" else dtype), inputs)
+    add_adapter(model, config, seed=0)
+    train(model, inputs)
+    before, adapted, trained = copies(model), predict(model, inputs), trainable_report(model).trained
+    with base_only(model):
+        switched_off = predict(model, inputs)
+    rounding = 0.05 if (config.kind, dtype) == ("none", torch.bfloat16) else 0  # float32 arithmetic on rounded weights
+    torch.testing.assert_close(switched_off, base, rtol=0, atol=rounding)
+    assert not torch.allclose(adapted, base, atol=0.05)
+    assert torch.equal(predict(model, inputs), adapted)
+    assert all(torch.equal(value, before[name]) for name, value in model.named_parameters())
+    assert trainable_report(model).trained == trained
+
+
+def test_a_model_that_was_not_adapted_is_its_own_base(model: WorldModel, inputs) -> None:
+    before = predict(model, inputs)
+    with base_only(model):
+        assert torch.equal(predict(model, inputs), before)
+
+
+def test_looking_at_the_base_does_not_thaw_a_frozen_adapter(fresh: Fresh, tmp_path: Path) -> None:
+    first, second = fresh(), fresh()
+    add_adapter(first, LORA, seed=0)
+    save_trained(first, tmp_path)
+    load_trained(second, tmp_path)
+    with base_only(second):
+        pass
+    assert trainable_report(second).trained == 0
+
+
+@both_types
+@both_kinds
+def test_saved_and_loaded_it_is_the_same(
+    fresh: Fresh, inputs, tmp_path: Path, config: AdapterConfig, dtype: torch.dtype
+) -> None:
+    model, other = fresh(dtype=dtype), fresh(dtype=dtype)
+    add_adapter(model, config, seed=0)
+    train(model, inputs)
+    save_trained(model, tmp_path)
+    load_trained(other, tmp_path)
+    assert torch.equal(predict(other, inputs), predict(model, inputs))
+    assert trainable_report(other).trained == 0
+
+
+def test_a_loaded_adapter_predicts_without_dropout(fresh: Fresh, inputs, tmp_path: Path) -> None:
+    model, loaded = fresh(), fresh()
+    add_adapter(model, LORA.model_copy(update={"dropout": 0.5}), seed=0)
+    train(model, inputs)
+    save_trained(model, tmp_path)
+    load_trained(loaded, tmp_path)
+    assert torch.equal(predict(loaded, inputs), predict(model, inputs))
+
+
+@both_kinds
+def test_loaded_into_the_adapter_that_is_on_it_is_not_wrapped_twice(
+    fresh: Fresh, inputs, tmp_path: Path, config: AdapterConfig
+) -> None:
+    model, resumed = fresh(), fresh()
+    add_adapter(model, config, seed=0)
+    train(model, inputs)
+    save_trained(model, tmp_path)
+    add_adapter(resumed, config, seed=1)
+    names = [name for name, _ in resumed.named_parameters()]
+    load_trained(resumed, tmp_path)
+    assert [name for name, _ in resumed.named_parameters()] == names
+    assert trainable_report(resumed) == trainable_report(model)
+    assert torch.equal(predict(resumed.eval(), inputs), predict(model, inputs))
+    train(model, inputs, steps=1)
+    train(resumed, inputs, steps=1)
+    assert torch.equal(predict(resumed, inputs), predict(model, inputs))
+
+
+def test_an_adapter_fits_its_base_in_another_type(fresh: Fresh, inputs, tmp_path: Path) -> None:
+    model, precise = fresh(dtype=torch.bfloat16), fresh()
+    add_adapter(model, LORA, seed=0)
+    train(model, inputs)
+    save_trained(model, tmp_path)
+    load_trained(precise, tmp_path)
+    torch.testing.assert_close(predict(precise, inputs), predict(model, inputs), rtol=0, atol=0.1)
+
+
+@both_types
+@both_kinds
+def test_merged_it_predicts_the_same_and_is_a_plain_model_again(
+    fresh: Fresh, inputs, tmp_path: Path, config: AdapterConfig, dtype: torch.dtype
+) -> None:
+    model = fresh(dtype=dtype)
+    add_adapter(model, config, seed=0)
+    train(model, inputs)
+    adapted = predict(model, inputs)
+    merge_adapter(model)
+    rounding = 1e-5 if dtype == torch.float32 else 0.15
+    torch.testing.assert_close(predict(model, inputs), adapted, rtol=0, atol=rounding)
+    assert type(model.predictor) is ActionConditionedPredictor
+    assert {value.dtype for value in model.parameters()} == {dtype}
+    assert trainable_report(model).trained == 0
+    assert not has_adapter(model)
+    model.save_pretrained(tmp_path / "merged")
+    assert torch.equal(predict(WorldModel.from_pretrained(tmp_path / "merged"), inputs), predict(model, inputs))
+
+
+def test_merging_in_bfloat16_rounds_once(fresh: Fresh, inputs) -> None:
+    model = fresh(dtype=torch.bfloat16)
+    add_adapter(model, LORA, seed=0)
+    train(model, inputs)
+    layer = model.base_predictor.blocks[0].attn.q
+    expected = (layer.base_layer.weight.float() + layer.get_delta_weight("default").float()).bfloat16()
+    merge_adapter(model)
+    assert torch.equal(model.predictor.blocks[0].attn.q.weight, expected)
+
+
+@both_kinds
+def test_merging_under_autocast_is_merging(fresh: Fresh, inputs, config: AdapterConfig) -> None:
+    model = fresh()
+    add_adapter(model, config, seed=0)
+    train(model, inputs)
+    other = copy.deepcopy(model)
+    merge_adapter(model)
+    with torch.autocast("cpu", torch.bfloat16):
+        merge_adapter(other)
+    for name, value in model.predictor.state_dict().items():
+        assert torch.equal(value, other.predictor.state_dict()[name]), name
+
+
+def test_a_model_with_an_adapter_on_is_not_saved_as_a_base(model: WorldModel, tmp_path: Path) -> None:
+    add_adapter(model, LORA, seed=0)
+    with pytest.raises(ValueError, match="an adapter is on"):
+        model.save_pretrained(tmp_path / "model")
+
+
+def test_a_model_is_adapted_once(model: WorldModel) -> None:
+    add_adapter(model, LORA, seed=0)
+    with pytest.raises(ValueError, match="adapted already"):
+        add_adapter(model, LORA, seed=0)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of the libraries' own loaders
+@every_method
+def test_plain_peft_loads_it_on_the_predictor(model: WorldModel, inputs, tmp_path: Path, config: AdapterConfig) -> None:
+    model.save_pretrained(tmp_path / "base")
+    add_adapter(model, config, seed=0)
+    train(model, inputs)
+    save_trained(model, tmp_path / "adapter")
+    predictor = ActionConditionedPredictor.from_pretrained(tmp_path / "base" / "predictor")
+    plain = peft.PeftModel.from_pretrained(predictor, str(tmp_path / "adapter"))
+    with torch.no_grad():
+        expected = model.predictor(inputs.latents, inputs.actions, inputs.states)
+        found = plain.eval()(inputs.latents, inputs.actions, inputs.states)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-4 if config.init == "pissa" else 1e-6)
+
+
+@pytest.mark.parametrize("dropout", [0.0, 0.5])
+def test_only_with_dropout_a_block_computed_again_needs_the_state_of_random_numbers(
+    fresh: Fresh, inputs, monkeypatch: pytest.MonkeyPatch, dropout: float
+) -> None:
+    kept: list[bool] = []
+
+    def watched(block: Any, *given: Any, preserve_rng_state: bool, **how: Any) -> Any:
+        kept.append(preserve_rng_state)
+        return checkpoint(block, *given, preserve_rng_state=preserve_rng_state, **how)
+
+    monkeypatch.setattr(predictor, "checkpoint", watched)
+    model = fresh()
+    model.set_gradient_checkpointing(True)  # before there is an adapter
+    add_adapter(model, AdapterConfig(rank=2, dropout=dropout), seed=0)
+    model.predict(inputs.latents, inputs.actions, inputs.states)
+    assert kept == [dropout > 0] * len(model.base_predictor.blocks)
+
+
+def test_gradient_checkpointing_changes_no_gradient_of_an_adapter_and_its_dropout(fresh: Fresh, inputs) -> None:
+    def gradients(checkpointing: bool) -> list[Tensor]:
+        model = fresh()
+        model.set_gradient_checkpointing(checkpointing)
+        add_adapter(model, LORA.model_copy(update={"dropout": 0.5}), seed=0)
+        for value in model.parameters():
+            if value.requires_grad:
+                value.data.add_(0.01)  # or the first matrices have no gradient yet
+        assert model.base_predictor.gradient_checkpointing == checkpointing
+        model.train()
+        torch.manual_seed(0)
+        model.predict(inputs.latents, inputs.actions, inputs.states).square().mean().backward()
+        return [value.grad for value in model.parameters() if value.requires_grad and value.grad is not None]
+
+    kept, computed_again = gradients(False), gradients(True)
+    assert len(kept) == 2 * 6 * 2
+    for first, second in zip(kept, computed_again, strict=True):
+        assert first.any()
+        assert torch.equal(first, second)
+
+
+def test_an_adapter_of_another_base_is_refused(fresh: Fresh, sizes: ModelSizes, tmp_path: Path) -> None:
+    model = fresh(seed=0)
+    add_adapter(model, LORA, seed=0)
+    save_trained(model, tmp_path)
+    with pytest.raises(InputError, match="an adapter trained on another predictor"):
+        load_trained(fresh(seed=1), tmp_path)
+    other_encoder = fresh(seed=0)
+    other_encoder.encoder = WorldModel.random(sizes, seed=1).encoder
+    with pytest.raises(InputError, match="an adapter trained on another encoder"):
+        load_trained(other_encoder, tmp_path)
+
+
+def change_rank(folder: Path) -> None:
+    config = json.loads((folder / "adapter_config.json").read_text())
+    (folder / "adapter_config.json").write_text(json.dumps(config | {"r": 8}))
+
+
+def truncate(folder: Path) -> None:
+    path = folder / "adapter_model.safetensors"
+    path.write_bytes(path.read_bytes()[:-8])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda folder: (folder / "vjepa2_ac.json").unlink(), r"vjepa2_ac\.json: no such file"),
+        (lambda folder: (folder / "vjepa2_ac.json").write_text("[]"), r"vjepa2_ac\.json: a JSON list"),
+        (lambda folder: (folder / "adapter_model.safetensors").unlink(), r"adapter_model\.safetensors: no such file"),
+        (lambda folder: (folder / "adapter_config.json").unlink(), r"adapter_config\.json: cannot be read"),
+        (truncate, "not a whole safetensors file"),
+        (change_rank, r"24 tensors do not fit .*is \[4, 36\], not \[8, 36\]"),
+    ],
+)
+def test_a_folder_that_is_not_a_whole_adapter_is_named(
+    fresh: Fresh, tmp_path: Path, spoil: Callable[[Path], object], message: str
+) -> None:
+    model = fresh()
+    add_adapter(model, LORA, seed=0)
+    save_trained(model, tmp_path)
+    spoil(tmp_path)
+    with pytest.raises(InputError, match=message):
+        load_trained(fresh(), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (LORA.model_copy(update={"rank": 2}), r"an adapter with r 4\. needed: 2, as the model has"),
+        (METHODS["dora"], r"an adapter with use_dora False\. needed: True"),
+        (METHODS["pissa"], r"an adapter with init_lora_weights True\. needed: pissa"),
+        (
+            METHODS["heads"].model_copy(update={"targets": LORA.targets}),
+            r"modules_to_save None\. needed: \['action_enc",
+        ),
+        (LORA.model_copy(update={"targets": ("q",)}), r"with target_modules \['fc1', .*needed: \['q'\]"),
+        (EVERYTHING, r"an adapter of kind lora\. needed: one of kind none"),
+    ],
+)
+def test_an_adapter_unlike_the_one_that_is_on_is_refused(
+    fresh: Fresh, tmp_path: Path, config: AdapterConfig, message: str
+) -> None:
+    model, other = fresh(), fresh()
+    add_adapter(model, LORA, seed=0)
+    save_trained(model, tmp_path)
+    add_adapter(other, config, seed=0)
+    with pytest.raises(InputError, match=message):
+        load_trained(other, tmp_path)

@@ -1,0 +1,208 @@
+"""A file arrives whole over a line that breaks, or it does not arrive."""
+
+import re
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.checkpoints import download as module
+from vjepa2_ac.model.checkpoints.download import download
+
+CONTENT = bytes(range(256)) * 400
+
+
+@dataclass
+class Behaviour:
+    """What the server does: how many bytes it sends before it hangs up, which answers come first, what it can."""
+
+    content: bytes = CONTENT
+    cut_after: list[int] = field(default_factory=list)
+    answers: list[int] = field(default_factory=list)
+    resumes: bool = True
+    says_size: bool = True
+    seen: list[int] = field(default_factory=list)  # where each request started
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[[Behaviour], str]]:
+    servers: list[ThreadingHTTPServer] = []
+
+    def start(behaviour: Behaviour) -> str:
+        server = ThreadingHTTPServer(("127.0.0.1", 0), handler_for(behaviour))
+        servers.append(server)
+        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        return f"http://127.0.0.1:{server.server_port}/model.pt"
+
+    yield start
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+def handler_for(behaviour: Behaviour) -> type[BaseHTTPRequestHandler]:
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            match = re.fullmatch(r"bytes=(\d+)-", self.headers.get("Range", ""))
+            start = int(match[1]) if match and behaviour.resumes else 0
+            behaviour.seen.append(start)
+            if behaviour.answers:
+                self.send_error(behaviour.answers.pop(0))
+                return
+            size = len(behaviour.content)
+            if start >= size:
+                self.send_response(416)
+                self.send_header("Content-Range", f"bytes */{size}")
+                self.end_headers()
+                return
+            self.send_response(206 if start else 200)
+            if start:
+                self.send_header("Content-Range", f"bytes {start}-{size - 1}/{size}")
+            if behaviour.says_size:
+                self.send_header("Content-Length", str(size - start))
+            self.end_headers()
+            end = start + behaviour.cut_after.pop(0) if behaviour.cut_after else size
+            self.wfile.write(behaviour.content[start:end])
+
+        def log_message(self, *_: object) -> None: ...
+
+    return Handler
+
+
+def test_a_file_arrives_whole_and_progress_is_told(serve, tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    path = download(
+        serve(Behaviour()), tmp_path / "new" / "model.pt", progress=lambda here, whole: told.append((here, whole))
+    )
+    assert path.read_bytes() == CONTENT
+    assert told[-1] == (len(CONTENT), len(CONTENT))
+    assert [entry.name for entry in path.parent.iterdir()] == ["model.pt"]
+
+
+def test_a_broken_line_is_resumed_where_it_broke(serve, tmp_path: Path) -> None:
+    behaviour = Behaviour(cut_after=[1000, 5000])
+    path = download(serve(behaviour), tmp_path / "model.pt", wait_s=0.0)
+    assert path.read_bytes() == CONTENT
+    assert behaviour.seen == [0, 1000, 6000]
+
+
+def test_a_part_from_an_earlier_call_is_gone_on_with(serve, tmp_path: Path) -> None:
+    behaviour = Behaviour(cut_after=[1000], answers=[])
+    url = serve(behaviour)
+    behaviour.cut_after = [1000, 0, 0]
+    with pytest.raises(InputError, match=r"no answer after 2 attempts.*1000 bytes are in .*model\.pt\.part"):
+        download(url, tmp_path / "model.pt", attempts=2, wait_s=0.0)
+    assert not (tmp_path / "model.pt").exists()
+    assert download(url, tmp_path / "model.pt").read_bytes() == CONTENT
+    assert behaviour.seen == [0, 1000, 1000, 1000]
+
+
+def test_a_part_that_is_whole_already_is_kept(serve, tmp_path: Path) -> None:
+    (tmp_path / "model.pt.part").write_bytes(CONTENT)
+    assert download(serve(Behaviour()), tmp_path / "model.pt").read_bytes() == CONTENT
+
+
+def test_a_part_longer_than_the_file_is_thrown_away(serve, tmp_path: Path) -> None:
+    (tmp_path / "model.pt.part").write_bytes(CONTENT + b"more")
+    assert download(serve(Behaviour()), tmp_path / "model.pt", wait_s=0.0).read_bytes() == CONTENT
+
+
+def test_a_server_that_cannot_resume_sends_everything_again(serve, tmp_path: Path) -> None:
+    behaviour = Behaviour(cut_after=[1000], resumes=False)
+    assert download(serve(behaviour), tmp_path / "model.pt", wait_s=0.0).read_bytes() == CONTENT
+    assert behaviour.seen == [0, 0]
+
+
+def test_a_busy_server_is_asked_again_and_given_up_on_in_the_end(serve, tmp_path: Path) -> None:
+    assert download(serve(Behaviour(answers=[503, 503])), tmp_path / "a.pt", wait_s=0.0).read_bytes() == CONTENT
+    with pytest.raises(InputError, match=r"no answer after 3 attempts \(Service Unavailable\)"):
+        download(serve(Behaviour(answers=[503] * 3)), tmp_path / "b.pt", attempts=3, wait_s=0.0)
+
+
+def test_a_refusal_is_final(serve, tmp_path: Path) -> None:
+    behaviour = Behaviour(answers=[404])
+    with pytest.raises(InputError, match="the server answers 404 Not Found"):
+        download(serve(behaviour), tmp_path / "model.pt", wait_s=0.0)
+    assert behaviour.seen == [0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_network_is_said_clearly(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"no answer after 2 attempts \(.*refused.*\).* Check the network"):
+        download("http://127.0.0.1:9/model.pt", tmp_path / "model.pt", attempts=2, wait_s=0.0)
+
+
+def test_a_file_that_is_here_is_not_fetched_again(serve, tmp_path: Path) -> None:
+    (tmp_path / "model.pt").write_bytes(b"mine")
+    behaviour = Behaviour()
+    assert download(serve(behaviour), tmp_path / "model.pt").read_bytes() == b"mine"
+    assert behaviour.seen == []
+
+
+def test_a_file_whose_size_is_not_said_is_refused(serve, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"does not say how large.*needed: its size \(Content-Length\)"):
+        download(serve(Behaviour(says_size=False)), tmp_path / "model.pt")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture
+def official(serve, monkeypatch: pytest.MonkeyPatch) -> Callable[[Behaviour], str]:
+    """Serve the official checkpoint, which is a little smaller than it ought to be."""
+
+    def start(behaviour: Behaviour) -> str:
+        url = serve(behaviour)
+        monkeypatch.setattr(module, "OFFICIAL_URL", url)
+        monkeypatch.setattr(module, "OFFICIAL_LEAST_BYTES", len(CONTENT))
+        return url
+
+    return start
+
+
+def test_less_than_the_official_checkpoint_is_not_taken_for_it(official, tmp_path: Path) -> None:
+    part = tmp_path / "model.pt.part"
+    part.write_bytes(CONTENT[:1000])
+    with pytest.raises(
+        InputError, match=r"a file of 11 bytes\. needed: the official checkpoint, of more than 102,400.*proxy"
+    ):
+        download(official(Behaviour(content=b"please wait", resumes=False)), tmp_path / "model.pt")
+    assert part.read_bytes() == CONTENT[:1000]  # hours of a good line are not thrown away
+    assert download(official(Behaviour()), tmp_path / "model.pt").read_bytes() == CONTENT
+
+
+def test_a_file_that_is_here_and_cannot_be_the_official_checkpoint_is_named(official, tmp_path: Path) -> None:
+    (tmp_path / "model.pt").write_bytes(b"<html>")
+    with pytest.raises(InputError, match=r"model\.pt: a file of 6 bytes.*Delete it"):
+        download(official(Behaviour()), tmp_path / "model.pt")
+    with pytest.raises(InputError, match=r"a folder\. needed: the name of a file"):
+        download(official(Behaviour()), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "url", ["foo", "foo.pt", "file:///etc/passwd", "https://", "http://[", "http://a:b/", "http://a b/"]
+)
+def test_what_is_no_address_is_told_at_once(tmp_path: Path, url: str) -> None:
+    with pytest.raises(InputError, match=r"not an address.*https://"):
+        download(url, tmp_path / "model.pt")
+
+
+@pytest.mark.parametrize("place", ["file/model.pt", "/proc/none/model.pt", "folder.part"])
+def test_a_path_that_cannot_be_written_is_told_at_once(serve, tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "folder.part").mkdir()
+    behaviour = Behaviour()
+    with pytest.raises(InputError, match=rf"{place}: cannot be written"):
+        download(serve(behaviour), tmp_path / place.removesuffix(".part"))
+    assert len(behaviour.seen) <= 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
+def test_a_full_disk_is_told_and_not_tried_again(serve, tmp_path: Path) -> None:
+    (tmp_path / "model.pt.part").symlink_to("/dev/full")
+    behaviour = Behaviour()
+    with pytest.raises(InputError, match=r"model\.pt\.part: cannot be written: No space left.*Free some space"):
+        download(serve(behaviour), tmp_path / "model.pt")
+    assert behaviour.seen == [0]

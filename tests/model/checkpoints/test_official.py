@@ -1,0 +1,294 @@
+"""The official code's own figures, for both reference checkpoints; and what a checkpoint must be."""
+
+import io
+import json
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from paths import GOLDEN
+from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.checkpoints.official import load_official, official_name, to_official
+from vjepa2_ac.model.network.world_model import WorldModel
+
+
+class Reference(NamedTuple):
+    path: Path
+    facts: dict[str, Any]
+    io: dict[str, Tensor]
+    sizes: ModelSizes
+    model: WorldModel
+
+
+def sizes_from(config: dict[str, Any]) -> ModelSizes:
+    return ModelSizes(
+        image_size=config["img"],
+        encoder=EncoderSizes(heads=config["enc_heads"]),
+        predictor=PredictorSizes(heads=config["p_heads"], use_extrinsics=config.get("extr", False)),
+    )
+
+
+@pytest.fixture(scope="module", params=["tiny", "tiny_extrinsics"])
+def reference(request: pytest.FixtureRequest) -> Reference:
+    path = GOLDEN / "model" / f"{request.param}.pt"
+    facts = json.loads(path.with_suffix(".json").read_text())
+    sizes = sizes_from(facts["config"])
+    return Reference(path, facts, load_file(path.with_suffix(".io.safetensors")), sizes, load_official(path, sizes))
+
+
+def assert_equal_to_rounding(found: Tensor, expected: Tensor) -> None:
+    """Within 1e-5 of the largest value: fp32 rounding of sums in another order."""
+    assert (found - expected).abs().max() <= 1e-5 * expected.abs().max()
+
+
+def predictions(reference: Reference) -> tuple[Tensor, Tensor, Tensor]:
+    """Return latents, teacher-forced predictions, and the rollout that starts with the first of them."""
+    io, model = reference.io, reference.model
+    cameras = io.get("extrinsics")
+    z = model.encode(io["clips"].transpose(1, 2))
+    forced = model.predict(z[:, :-1], io["actions"], io["states"][:, :-1], None if cameras is None else cameras[:, :-1])
+    steps = reference.facts["auto_steps"]
+    rolled = model.rollout(
+        torch.cat([z[:, :1], forced[:, :1]], dim=1),
+        io["actions"][:, :steps],
+        io["states"][:, :steps],
+        None if cameras is None else cameras[:, :steps],
+    )
+    return z, forced, torch.cat([forced[:, :1], rolled], dim=1)
+
+
+def test_features_equal_the_official_ones(reference: Reference) -> None:
+    frames = reference.io["clips"].transpose(1, 2)
+    raw = reference.model.encoder(frames.flatten(0, 1))
+    assert_equal_to_rounding(raw.reshape(reference.io["features_raw"].shape), reference.io["features_raw"])
+    assert_equal_to_rounding(reference.model.encode(frames).flatten(1, 2), reference.io["features"])
+
+
+@pytest.mark.parametrize("attention", ["dense", "per_step"])
+def test_predictions_losses_and_gradients_equal_the_official_ones(reference: Reference, attention: str) -> None:
+    model, io, facts = reference.model, reference.io, reference.facts
+    model.set_attention(attention)
+    model.predictor.requires_grad_(True)
+    model.zero_grad()
+    z, forced, rolled = predictions(reference)
+    assert_equal_to_rounding(forced.flatten(1, 2), io["z_tf"])
+    assert_equal_to_rounding(rolled.flatten(1, 2), io["z_ar"])
+    losses = [(part - z[:, 1 : part.shape[1] + 1]).abs().mean() for part in (forced, rolled)]
+    assert losses[0].item() == pytest.approx(facts["loss_teacher_forcing"], rel=1e-5)
+    assert losses[1].item() == pytest.approx(facts["loss_rollout"], rel=1e-5)
+    (losses[0] + losses[1]).backward()
+    check_gradients(model, io, facts["predictor_grad_norm"])
+    model.predictor.requires_grad_(False)
+
+
+def check_gradients(model: WorldModel, io: dict[str, Tensor], norm: float) -> None:
+    fused: dict[str, dict[int | None, Tensor]] = {}
+    for name, value in model.predictor.named_parameters():
+        if value.grad is not None:
+            official, third = official_name(name, "predictor")
+            fused.setdefault(official, {})[third] = value.grad
+    whole = {n: g[None] if None in g else torch.cat([g[0], g[1], g[2]]) for n, g in fused.items()}
+    expected = {name.removeprefix("grad."): value for name, value in io.items() if name.startswith("grad.")}
+    assert len(expected) >= 20
+    for name, value in expected.items():
+        assert_equal_to_rounding(whole[name], value)
+    total = torch.stack([gradient.norm() for gradient in whole.values()]).norm().item()
+    assert total == pytest.approx(norm, rel=1e-5)
+
+
+def test_sizes_are_read_from_the_tensors(reference: Reference) -> None:
+    found, config = reference.model.sizes, reference.facts["config"]
+    assert (found.encoder.width, found.encoder.depth) == (config["enc_dim"], config["enc_depth"])
+    assert (found.predictor.width, found.predictor.depth) == (config["p_dim"], config["p_depth"])
+    assert found.encoder.mlp_ratio == config["mlp_ratio"]
+
+
+def test_the_sizes_it_was_loaded_with_load_it_again(reference: Reference) -> None:
+    assert load_official(reference.path, reference.model.sizes).sizes == reference.model.sizes
+
+
+def test_official_weights_go_out_as_they_came_in(reference: Reference) -> None:
+    whole = torch.load(reference.path, weights_only=True)
+    exported = to_official(reference.model)
+    for part in ("encoder", "target_encoder", "predictor"):
+        assert exported[part].keys() == whole[part].keys()
+        assert all(torch.equal(exported[part][name], value) for name, value in whole[part].items())
+
+
+def test_loading_in_bfloat16_rounds_the_weights(reference: Reference) -> None:
+    rounded = load_official(reference.path, reference.sizes, dtype=torch.bfloat16)
+    expected = dict(reference.model.named_parameters())
+    for name, value in rounded.named_parameters():
+        assert torch.equal(value, expected[name].bfloat16()), name
+
+
+TINY_SIZES = ModelSizes(image_size=64, encoder=EncoderSizes(heads=2), predictor=PredictorSizes(heads=4))
+Whole = dict[str, Any]
+
+
+@pytest.fixture
+def rewritten(tmp_path: Path) -> Callable[[Callable[[Whole], Any]], Path]:
+    """Write the tiny checkpoint, changed by a function of what is in it."""
+
+    def rewrite(change: Callable[[Whole], Any]) -> Path:
+        whole = torch.load(GOLDEN / "model" / "tiny.pt", weights_only=True)
+        changed = change(whole)
+        torch.save(whole if changed is None else changed, tmp_path / "changed.pt")
+        return tmp_path / "changed.pt"
+
+    return rewrite
+
+
+def renamed(weights: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {prefix + name.removeprefix("module."): value for name, value in weights.items()}
+
+
+@pytest.mark.parametrize("prefix", ["", "backbone.", "module.backbone.", "backbone.module."])
+def test_prefixes_in_any_order_and_an_unused_pos_embed_are_no_obstacle(rewritten, prefix: str) -> None:
+    def change(whole: Whole) -> None:
+        for part in ("encoder", "predictor"):
+            whole[part] = renamed(whole[part], prefix)
+        whole["encoder"][prefix + "pos_embed"] = torch.zeros(1, 16, 48)
+
+    model = load_official(rewritten(change), TINY_SIZES)
+    assert (
+        model.predictor_fingerprint() == load_official(GOLDEN / "model" / "tiny.pt", TINY_SIZES).predictor_fingerprint()
+    )
+
+
+def rename_one(whole: Whole) -> None:
+    whole["encoder"]["module.blocks.1.norm1.scale"] = whole["encoder"].pop("module.blocks.1.norm1.weight")
+
+
+def drop_head(whole: Whole) -> None:
+    del whole["predictor"]["module.state_encoder.weight"]
+
+
+def drop_predictor(whole: Whole) -> None:
+    del whole["predictor"]
+
+
+def narrow(whole: Whole) -> None:
+    whole["predictor"]["module.predictor_proj.weight"] = torch.zeros(24, 64)
+
+
+def other_actions(whole: Whole) -> None:
+    whole["predictor"]["module.action_encoder.weight"] = torch.zeros(64, 4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            rename_one,
+            r"encoder: 2 tensors do not fit \(missing: blocks.1.norm1.weight; unknown: blocks.1.norm1.scale\)",
+        ),
+        (drop_head, r"predictor: 1 tensors do not fit \(missing: state_encoder.weight\)"),
+        (drop_predictor, "no weights under 'predictor'"),
+        (narrow, r"predictor_proj.weight is \[24, 64\], not \[48, 64\]"),
+        (other_actions, "action_encoder.weight of 7 columns"),
+        (lambda _: [1, 2], "changed.pt: a list. needed: a checkpoint of V-JEPA 2-AC"),
+        (lambda whole: {"model": whole["encoder"]}, r"no weights under 'encoder' \(keys: model\)"),
+    ],
+)
+def test_a_checkpoint_that_does_not_fit_is_explained(rewritten, change: Callable[[Whole], Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_official(rewritten(change), TINY_SIZES)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        (TINY_SIZES.model_copy(update={"encoder": EncoderSizes(heads=22)}), "encoder.width 48 is not a multiple of"),
+        (
+            TINY_SIZES.model_copy(update={"predictor": PredictorSizes(heads=4, depth=12)}),
+            "predictor.depth 3. needed: predictor.depth 12, as model.sizes says",
+        ),
+    ],
+)
+def test_sizes_that_contradict_the_tensors_are_refused(sizes: ModelSizes, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        load_official(GOLDEN / "model" / "tiny.pt", sizes)
+
+
+@pytest.mark.parametrize("error", [IndexError("pop from empty list"), AttributeError("no dtype"), TypeError("dict")])
+def test_whatever_a_damaged_pickle_ends_in_names_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def load(*_: Any, **__: Any) -> None:
+        raise error
+
+    (tmp_path / "spoiled.pt").write_bytes(b"PK" * 99)
+    monkeypatch.setattr(torch, "load", load)
+    with pytest.raises(InputError, match=r"spoiled\.pt: "):
+        load_official(tmp_path / "spoiled.pt", TINY_SIZES)
+
+
+def test_a_truncated_and_a_missing_file_are_refused(tmp_path: Path) -> None:
+    whole = (GOLDEN / "model" / "tiny.pt").read_bytes()
+    (tmp_path / "cut.pt").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match=r"cut\.pt: 0.00 GB that torch cannot read .*truncated.* 11.7 GB"):
+        load_official(tmp_path / "cut.pt", TINY_SIZES)
+    with pytest.raises(InputError, match=r"none\.pt: no such file"):
+        load_official(tmp_path / "none.pt", TINY_SIZES)
+
+
+class Hostile:
+    """Runs a command of the system where it is unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return os.mkdir, ("it-was-executed",)
+
+
+def in_the_old_format(value: object) -> bytes:
+    file = io.BytesIO()
+    torch.save(value, file, _use_new_zipfile_serialization=False)
+    return file.getvalue()
+
+
+def in_the_new_format(value: object) -> bytes:
+    file = io.BytesIO()
+    torch.save(value, file)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.yaml", b"run_dir: runs/a\nmodel: {base: b.pt}\n", "a YAML file, such as a config"),
+        ("a.pt", b"hello", "a text file"),
+        ("a.pt", b"", "an empty file"),
+        ("a.pt", b"version https://git-lfs.github.com/spec/v1\noid", "a pointer of Git LFS"),
+        ("a.pt", b"<!DOCTYPE html><html>not found</html>", "a web page"),
+        ("a.pt", save({"weight": torch.zeros(1)}), "a safetensors file"),
+        ("a.pt", pickle.dumps({"encoder": Hostile()}), r"would call posix\.mkdir: it was refused.*run foreign code"),
+        ("a.pt", in_the_new_format({"encoder": Hostile()}), r"would call posix\.mkdir: it was refused"),
+        ("a.pt", in_the_old_format({"encoder": Hostile()}), r"would call posix\.mkdir: it was refused"),
+        ("a.pt", in_the_old_format({"encoder": {"weight": torch.zeros(1)}}), "a file of an old version of torch"),
+    ],
+)
+def test_a_file_that_is_no_checkpoint_is_called_what_it_is_and_never_executed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, content: bytes, said: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path(name).write_bytes(content)
+    with pytest.raises(InputError, match=said) as caught:
+        load_official(name, TINY_SIZES)
+    assert "truncated" not in str(caught.value)
+    assert not Path("it-was-executed").exists()
+
+
+def test_a_weight_that_is_not_finite_is_named(rewritten) -> None:
+    def spoil(whole: Whole) -> None:
+        whole["predictor"]["module.predictor_blocks.1.mlp.fc1.weight"][2, 1] = float("nan")
+
+    with pytest.raises(InputError, match=r"changed\.pt: predictor: blocks\.1\.mlp\.fc1\.weight holds NaN or infinity"):
+        load_official(rewritten(spoil), TINY_SIZES)

@@ -1,0 +1,229 @@
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch._dynamo import config as dynamo
+from torch._dynamo.utils import counters
+from torch.utils.checkpoint import checkpoint
+
+from tracing import tracing
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network import attention, blocks
+from vjepa2_ac.model.network.attention import AttentionKind, best_kind, block_causal_attention
+from vjepa2_ac.model.network.blocks import Block
+from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
+
+PER_STEP = 5
+REAL_STEP, REAL_STEPS = 66, 7  # 462 tokens: no multiple of a kernel's tiles, and more than short kernels take
+ON_CUDA = pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"))
+ROUNDING = {torch.float32: 2e-3, torch.bfloat16: 2e-2}  # on CUDA, of the largest
+
+
+def drawn(dtype: torch.dtype = torch.float32, steps: int = 4, device: str = "cpu") -> list[Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    shape = (2, 2, steps * PER_STEP, 16)
+    return [torch.randn(shape, generator=generator).to(device, dtype).requires_grad_() for _ in range(3)]
+
+
+def output_and_gradients(kind: AttentionKind, inputs: list[Tensor]) -> list[Tensor]:
+    output = block_causal_attention(*inputs, PER_STEP, kind)
+    weights = torch.randn(output.shape, generator=torch.Generator().manual_seed(1)).to(output)
+    return [output, *torch.autograd.grad((output * weights).sum(), inputs)]
+
+
+@pytest.mark.parametrize("steps", [1, 4])
+@pytest.mark.parametrize("kind", ["per_step", "auto"])
+def test_every_way_gives_the_output_and_gradients_of_the_dense_mask(kind: AttentionKind, steps: int) -> None:
+    inputs = drawn(steps=steps)
+    for found, expected in zip(output_and_gradients(kind, inputs), output_and_gradients("dense", inputs), strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_ways_agree_in_bfloat16_to_its_rounding() -> None:
+    inputs = drawn(torch.bfloat16)
+    for found, expected in zip(
+        output_and_gradients("per_step", inputs), output_and_gradients("dense", inputs), strict=True
+    ):
+        assert found.dtype == torch.bfloat16
+        torch.testing.assert_close(found, expected, rtol=2e-2, atol=4e-2)
+
+
+@pytest.mark.parametrize("kind", ["per_step", "dense"])
+def test_the_last_steps_alone_see_what_they_see_among_all(kind: AttentionKind) -> None:
+    query, key, value = (x.detach() for x in drawn())
+    whole = block_causal_attention(query, key, value, PER_STEP, "dense")
+    last = block_causal_attention(query[:, :, 2 * PER_STEP :], key, value, PER_STEP, kind)
+    torch.testing.assert_close(last, whole[:, :, 2 * PER_STEP :], rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:flex_attention called without torch.compile")  # eager on purpose: no compiler here
+def test_flex_gives_the_output_of_the_dense_mask() -> None:
+    inputs = [value.detach() for value in drawn()]
+    found = block_causal_attention(*inputs, PER_STEP, "flex")
+    whole = block_causal_attention(*inputs, PER_STEP, "dense")
+    torch.testing.assert_close(found, whole, rtol=1e-5, atol=1e-6)
+    query, key, value = inputs
+    last = block_causal_attention(query[:, :, 2 * PER_STEP :], key, value, PER_STEP, "flex")
+    torch.testing.assert_close(last, whole[:, :, 2 * PER_STEP :], rtol=1e-5, atol=1e-6)
+
+
+def assert_near(found: list[Tensor], expected: list[Tensor], share: float) -> None:
+    assert len(found) == len(expected) > 1
+    for one, other in zip(found, expected, strict=True):
+        assert (one.float() - other.float()).abs().max() <= share * other.float().abs().max()
+
+
+@pytest.mark.parametrize("last", [REAL_STEPS, 2], ids=["all steps", "the last two"])
+@pytest.mark.parametrize("dtype", list(ROUNDING), ids=str)
+@pytest.mark.parametrize("kind", ["flex", "per_step", "auto"])
+@pytest.mark.parametrize("device", ["cpu", ON_CUDA])
+def test_every_way_agrees_at_the_lengths_that_training_has(
+    device: str, kind: AttentionKind, dtype: torch.dtype, last: int
+) -> None:
+    if kind == "flex" and device == "cpu":
+        pytest.skip("FlexAttention has gradients on CUDA only")
+    generator = torch.Generator().manual_seed(0)
+    shape = (2, 2, REAL_STEP * REAL_STEPS, 64)
+    query, key, value = (torch.randn(shape, generator=generator).to(device) for _ in range(3))
+    query = query[:, :, -last * REAL_STEP :]
+
+    def outcome(kind: AttentionKind, dtype: torch.dtype) -> list[Tensor]:
+        given = [one.to(dtype, copy=True).requires_grad_() for one in (query, key, value)]
+        output = block_causal_attention(*given, REAL_STEP, kind)
+        weights = torch.randn(output.shape, generator=torch.Generator().manual_seed(1)).to(output)
+        return [output, *torch.autograd.grad((output * weights).sum(), given)]
+
+    assert_near(outcome(kind, dtype), outcome("dense", torch.float32), ROUNDING[dtype])
+
+
+@pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
+@pytest.mark.parametrize("device", ["cpu", ON_CUDA])
+@pytest.mark.parametrize("kind", ["per_step", "flex"])
+def test_attention_between_compiled_halves_and_computed_again_is_the_plain_one(
+    request: pytest.FixtureRequest, kind: AttentionKind, device: str
+) -> None:
+    if device == "cpu":
+        if kind == "flex":
+            pytest.skip("FlexAttention has gradients on CUDA only")
+        request.getfixturevalue("traced")  # on CUDA the real compiler is asked
+    block = Block(128, 2, 256, layer=1)
+    generator = torch.Generator().manual_seed(0)
+    for value in block.parameters():
+        nn.init.normal_(value.data, std=0.05, generator=generator)
+    block.to(device)
+    tokens = torch.randn(1, REAL_STEP * REAL_STEPS, 128, generator=generator).to(device)
+    tables = rotary_tables(TokenLayout(REAL_STEPS, 8, conditioning=2), 64, torch.device(device))
+
+    def outcome(kind: AttentionKind, *, optimised: bool) -> list[Tensor]:
+        block.compiled = "always" if optimised else "never"
+        given = tokens.clone().requires_grad_()
+        arguments: tuple[Any, ...] = (given, tables, REAL_STEP, kind)
+        output, _ = checkpoint(block, *arguments, use_reentrant=False) if optimised else block(*arguments)
+        return [output, *torch.autograd.grad(output.square().sum(), [given, *block.parameters()])]
+
+    assert_near(outcome(kind, optimised=True), outcome("dense", optimised=False), ROUNDING[torch.float32])
+
+
+@pytest.fixture
+def flex_is_traced(monkeypatch: pytest.MonkeyPatch) -> None:
+    """FlexAttention goes through torch.compile as on CUDA, but what is traced runs as it is."""
+    original = attention._flex_attention
+    monkeypatch.setattr(attention, "_flex_attention", lambda _: original(True))
+
+
+def attended(clips: int) -> Tensor:
+    query, key, value = (one.detach()[:1].expand(clips, -1, -1, -1) for one in drawn())
+    return block_causal_attention(query, key, value, PER_STEP, "flex")
+
+
+@pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
+@pytest.mark.usefixtures("traced", "flex_is_traced")
+def test_flex_is_compiled_for_more_numbers_of_clips_than_pytorch_allows_by_itself() -> None:
+    plain = block_causal_attention(*(one.detach()[:1] for one in drawn()), PER_STEP, "dense")
+    numbers = range(1, 13)
+    for clips in numbers:
+        torch.testing.assert_close(attended(clips), plain.expand(clips, -1, -1, -1), rtol=1e-5, atol=1e-6)
+    assert counters["stats"]["unique_graphs"] == len(numbers)  # none of them by the way that holds all scores
+
+
+@pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
+@pytest.mark.usefixtures("traced", "flex_is_traced")
+def test_where_flex_would_not_be_compiled_any_more_is_an_error_with_a_way_out() -> None:
+    attended(1)
+    with dynamo.patch(recompile_limit=2):
+        attended(2)
+        with pytest.raises(InputError, match=r"training\.attention: .*more than 2 sizes.*training\.attention=per_step"):
+            attended(3)
+
+
+@pytest.mark.usefixtures("traced")
+@pytest.mark.filterwarnings(*(one.args[0] for one in tracing))
+def test_where_blocks_would_not_be_compiled_any_more_is_an_error_with_a_way_out() -> None:
+    def double(given: Tensor, times: int) -> Tensor:
+        return given * times
+
+    call = blocks.compiled(double, way_out="training.compile=off")
+    with dynamo.patch(recompile_limit=1, automatic_dynamic_shapes=False):
+        call(torch.ones(2), 2)
+        with pytest.raises(InputError, match=r"training\.compile: .*more than 1 sizes.*Set training\.compile=off"):
+            call(torch.ones(3), 2)
+
+
+@pytest.mark.parametrize("kind", ["dense", "per_step"])
+def test_a_step_sees_itself_and_the_past_but_not_the_future(kind: AttentionKind) -> None:
+    query, key, value = (x.detach() for x in drawn())
+    before = block_causal_attention(query, key, value, PER_STEP, kind)
+    changed = value.clone()
+    changed[:, :, 2 * PER_STEP + 4] += 1.0  # the last token of step 2
+    after = block_causal_attention(query, key, changed, PER_STEP, kind)
+    same = (before == after).all(dim=-1).all(dim=1).all(dim=0)
+    assert same[: 2 * PER_STEP].all()
+    assert not same[2 * PER_STEP :].any()
+
+
+def test_auto_compiles_only_for_long_sequences_with_gradients_on_cuda(monkeypatch: pytest.MonkeyPatch) -> None:
+    cpu, cuda = torch.device("cpu"), torch.device("cuda")
+    monkeypatch.setattr(attention, "has_triton", lambda: True)
+    assert best_kind(cuda, 64, 4, gradients=True) == "flex"
+    assert best_kind(cuda, 64, 3, gradients=True) == "per_step"
+    assert best_kind(cuda, 64, 15, gradients=False) == "per_step"
+    assert best_kind(cuda, 12, 15, gradients=True) == "per_step"
+    assert best_kind(cpu, 64, 15, gradients=True) == "per_step"
+    monkeypatch.setattr(attention, "has_triton", lambda: False)
+    assert best_kind(cuda, 64, 15, gradients=True) == "per_step"
+
+
+@pytest.mark.parametrize("gradients", [True, False])
+def test_auto_is_asked_with_the_steps_and_gradients_at_hand(monkeypatch: pytest.MonkeyPatch, gradients: bool) -> None:
+    asked = []
+
+    def best(device: torch.device, head_dim: int, steps: int, *, gradients: bool) -> AttentionKind:
+        asked.append((device.type, head_dim, steps, gradients))
+        return "dense"
+
+    monkeypatch.setattr(attention, "best_kind", best)
+    with torch.set_grad_enabled(gradients):
+        block_causal_attention(*drawn(steps=3), PER_STEP)
+    assert asked == [("cpu", 16, 3, gradients)]
+
+
+def test_a_sequence_of_broken_steps_is_refused() -> None:
+    query = torch.zeros(1, 1, 11, 16)
+    with pytest.raises(ValueError, match="not a whole number of steps"):
+        block_causal_attention(query, query, query, PER_STEP)
+
+
+def test_queries_without_a_key_of_their_own_are_refused() -> None:
+    query, key = torch.zeros(1, 1, 10, 16), torch.zeros(1, 1, 5, 16)
+    with pytest.raises(ValueError, match="10 queries would look at 5 keys"):
+        block_causal_attention(query, key, key, PER_STEP)
+
+
+def test_adding_up_gradients_changes_none_that_came_in() -> None:
+    gradients = [torch.randn(1, 1, end, 2, generator=torch.Generator().manual_seed(end)) for end in (2, 4)]
+    before = [gradient.clone() for gradient in gradients]
+    total, _ = attention._Beginnings.backward(None, *gradients)
+    assert all(map(torch.equal, gradients, before))
+    assert torch.equal(total[:, :, :2], before[1][:, :, :2] + before[0])
+    assert torch.equal(total[:, :, 2:], before[1][:, :, 2:])

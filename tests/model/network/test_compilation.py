@@ -1,0 +1,126 @@
+"""Compiled blocks compute what plain ones do, and are compiled a few times, not for every step, layer or length."""
+
+import shutil
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch._dynamo.utils import counters
+
+from tracing import tracing
+from vjepa2_ac.config import AdapterConfig, ModelSizes
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.network import blocks, compilation
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.training.loss import prediction_losses
+
+pytestmark = [pytest.mark.usefixtures("traced"), *tracing]
+
+
+def graphs() -> int:
+    return int(counters["stats"]["unique_graphs"])
+
+
+def adapted(sizes: ModelSizes, **changes: Any) -> WorldModel:
+    """Return a model of two blocks whose adapter does something."""
+    model = WorldModel.random(sizes, seed=0)
+    add_adapter(model, AdapterConfig(**{"rank": 4, "alpha": 8.0, "dropout": 0.0} | changes), seed=0)
+    generator = torch.Generator().manual_seed(2)
+    for value in model.parameters():
+        if value.requires_grad:
+            value.data += 0.05 * torch.randn(value.shape, generator=generator)
+    return model.train()  # type: ignore[return-value]
+
+
+def clips(inputs: Any, count: int = 2) -> LatentBatch:
+    given = (inputs.latents[:count], inputs.states[:count], inputs.actions[:count, :-1])
+    return LatentBatch(*given, None, ("a",) * count, (0,) * count)
+
+
+def loss_and_gradients(model: WorldModel, batch: LatentBatch, *, compiled: bool, rollout: int = 2) -> list[Tensor]:
+    model.set_compiled("with gradients" if compiled else "never")
+    model.zero_grad()
+    torch.manual_seed(0)
+    loss = prediction_losses(model, batch, rollout).total
+    loss.backward()
+    return [loss.detach(), *(value.grad.clone() for value in model.parameters() if value.grad is not None)]
+
+
+def assert_same(found: list[Tensor], expected: list[Tensor], tolerance: float = 1e-5) -> None:
+    assert len(found) == len(expected) > 1
+    for one, other in zip(found, expected, strict=True):
+        assert (one - other).norm() <= tolerance * other.norm()
+
+
+def test_compiled_steps_are_the_plain_ones_and_nothing_is_compiled_again_after_the_first(
+    sizes: ModelSizes, inputs
+) -> None:
+    model, batch = adapted(sizes), clips(inputs)
+    names = list(model.state_dict())
+    expected = loss_and_gradients(model, batch, compiled=False)
+    assert_same(loss_and_gradients(model, batch, compiled=True), expected)
+    # Two halves of: a first block, later ones, and one step of the rollout. Not one for each block.
+    assert graphs() == 2 * 3
+    assert not counters["graph_break"]
+    for rollout, checkpointing in [(2, False), (3, False), (2, True), (3, True)]:
+        model.set_gradient_checkpointing(checkpointing)
+        expected = loss_and_gradients(model, batch, compiled=False, rollout=rollout)
+        assert_same(loss_and_gradients(model, batch, compiled=True, rollout=rollout), expected)
+    assert graphs() == 2 * 3
+    assert list(model.state_dict()) == names
+
+
+def test_compiled_steps_with_dropout_and_autocast_are_the_plain_ones(sizes: ModelSizes, inputs) -> None:
+    model, batch = adapted(sizes, dropout=0.5), clips(inputs)
+    with torch.autocast("cpu", torch.bfloat16):
+        expected = loss_and_gradients(model, batch, compiled=False)
+        found = loss_and_gradients(model, batch, compiled=True)
+        assert_same(found, expected)
+        before = graphs()
+        model.set_gradient_checkpointing(True)
+        assert_same(loss_and_gradients(model, batch, compiled=True), expected)
+    assert not counters["graph_break"]
+    assert graphs() == before
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Compile nothing, and tell what was asked for."""
+    names: list[str] = []
+    monkeypatch.setattr(blocks, "compiled", lambda function, **_: names.append(function.__name__) or function)
+    return names
+
+
+def test_only_with_gradients_and_only_if_asked_for_a_block_is_compiled(
+    sizes: ModelSizes, inputs, asked: list[str]
+) -> None:
+    model = adapted(sizes)
+    given = (inputs.latents, inputs.actions, inputs.states)
+    model.predict(*given)
+    model.set_compiled("with gradients")
+    with torch.no_grad():
+        model.predict(*given)
+    assert not asked
+    model.predict(*given)
+    assert asked == ["_before_attention", "_after_attention"] * sizes.predictor.depth
+
+
+def test_what_a_machine_lacks_to_compile_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setattr(compilation, "has_triton", lambda: True)
+    here = {"gcc", "clang++"}
+    monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}" if name in here else None)
+    assert compilation.missing_for_compilation("cuda") is None
+    assert compilation.missing_for_compilation("cpu") is None
+    monkeypatch.setenv("CXX", "other")
+    assert compilation.missing_for_compilation("cpu") == "no compiler is found (other)"
+    assert compilation.missing_for_compilation("cuda") is None
+    here.clear()
+    assert compilation.missing_for_compilation("cuda") == "no compiler is found (gcc or clang)"
+    here.add("gcc")
+    monkeypatch.setattr(compilation, "has_triton", lambda: False)
+    assert compilation.missing_for_compilation("cuda") == "Triton is not installed"
+    assert compilation.missing_for_compilation("cpu") is not None

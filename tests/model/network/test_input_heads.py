@@ -1,0 +1,219 @@
+"""The laws of fresh input heads: a robot of other states or actions than the base knows."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from vjepa2_ac.config import AdapterConfig, ModelConfig, ModelSizes
+from vjepa2_ac.episode import Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained
+from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.checkpoints.official import to_official
+from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, widths_of_model
+from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
+from vjepa2_ac.model.network.world_model import WorldModel
+
+TINY = ModelSizes.model_validate(
+    {
+        "image_size": 32,
+        "encoder": {"width": 24, "depth": 1, "heads": 2, "mlp_ratio": 2.0},
+        "predictor": {"width": 24, "depth": 2, "heads": 2},
+    }
+)
+HEADS = ("action_encoder", "state_encoder")
+LORA = AdapterConfig(rank=2, alpha=4.0, dropout=0.0, modules_to_save=HEADS)  # with more, float32 is ill-conditioned
+EVERYTHING = AdapterConfig(kind="none")
+both_kinds = pytest.mark.parametrize("config", [LORA, EVERYTHING], ids=["lora", "none"])
+widths = pytest.mark.parametrize("widths", [Widths(14, 14), Widths(8, 7), Widths(7, 8)], ids=str)
+
+
+def base() -> WorldModel:
+    return WorldModel.random(TINY, seed=1)
+
+
+def fitted(widths: Widths, *, seed: int = 0) -> WorldModel:
+    model = base()
+    fit_heads(model, widths, seed)
+    return model
+
+
+def predict(model: WorldModel, widths: Widths) -> Tensor:
+    generator = torch.Generator().manual_seed(5)
+    latents, states, actions = (torch.randn(1, 3, *shape, generator=generator) for shape in ((4, 24), *zip(widths)))
+    with torch.no_grad():
+        return model.predict(latents, actions, states)
+
+
+def trained(widths: Widths, config: AdapterConfig) -> WorldModel:
+    """A model whose every trained weight has moved."""
+    model = fitted(widths)
+    add_adapter(model, config, seed=0)
+    generator = torch.Generator().manual_seed(9)
+    with torch.no_grad():
+        for value in model.parameters():
+            if value.requires_grad:
+                value += 0.05 * torch.randn(value.shape, generator=generator)
+    return model
+
+
+@widths
+def test_only_heads_that_do_not_fit_are_replaced_and_each_is_told(widths: Widths) -> None:
+    model, before = base(), base().predictor.state_dict()
+    lines = fit_heads(model, widths, seed=0)
+    expected = {
+        "state encoder": (widths.state, "state_encoder"),
+        "action encoder": (widths.action, "action_encoder"),
+    }
+    told = [
+        f"{words}: {width} numbers instead of the base's 7: initialised anew"
+        for words, (width, _) in expected.items()
+        if width != 7
+    ]
+    assert sorted(lines) == sorted(told)
+    assert set(heads_to_replace(TINY, widths)) == {name for width, name in expected.values() if width != 7}
+    for name, value in model.predictor.state_dict().items():
+        if name.split(".")[0] not in heads_to_replace(TINY, widths):
+            assert torch.equal(value, before[name]), name
+    assert widths_of_model(model.sizes) == widths
+    assert (model.predictor.config.state_dim, model.predictor.config.action_dim) == widths
+    assert predict(model, widths).shape == (1, 3, 4, 24)
+
+
+def test_heads_that_fit_stay_bit_for_bit() -> None:
+    model = base()
+    assert fit_heads(model, Widths(7, 7), seed=0) == []
+    assert model.fresh_heads is None
+    assert model.sizes == TINY
+    for name, value in base().predictor.state_dict().items():
+        assert torch.equal(model.predictor.state_dict()[name], value)
+
+
+def test_fresh_heads_are_decided_by_the_seed_and_drawn_as_the_recipe_draws() -> None:
+    one, same, other = fitted(Widths(14, 14)), fitted(Widths(14, 14)), fitted(Widths(14, 14), seed=1)
+    for name in HEADS:
+        weight = getattr(one.predictor, name).weight
+        assert torch.equal(weight, getattr(same.predictor, name).weight)
+        assert not torch.equal(weight, getattr(other.predictor, name).weight)
+        assert abs(weight.std().item() - 0.02) < 0.004
+        assert not getattr(one.predictor, name).bias.any()
+    assert not torch.equal(one.predictor.action_encoder.weight, one.predictor.state_encoder.weight)
+    assert torch.equal(fitted(Widths(7, 14)).predictor.action_encoder.weight, one.predictor.action_encoder.weight)
+
+
+@widths
+def test_fresh_heads_do_not_change_which_base_it_is(widths: Widths) -> None:
+    assert fitted(widths).predictor_fingerprint() == base().predictor_fingerprint()
+
+
+def test_heads_are_replaced_once_and_before_adapting() -> None:
+    model = fitted(Widths(14, 14))
+    with pytest.raises(ValueError, match="replaced once"):
+        fit_heads(model, Widths(8, 8), seed=0)
+    adapted = base()
+    add_adapter(adapted, LORA, seed=0)
+    with pytest.raises(ValueError, match="before the model is adapted"):
+        fit_heads(adapted, Widths(8, 8), seed=0)
+
+
+def test_a_fresh_head_that_would_not_be_trained_is_refused_with_the_line_to_add() -> None:
+    plain = LORA.model_copy(update={"modules_to_save": ()})
+    with pytest.raises(InputError, match=r"modules_to_save=\[action_encoder, state_encoder\]"):
+        add_adapter(fitted(Widths(14, 14)), plain, seed=0)
+    one = LORA.model_copy(update={"modules_to_save": ("action_encoder",)})
+    with pytest.raises(InputError, match=r"trains the state encoder.*=\[action_encoder, state_encoder\]"):
+        add_adapter(fitted(Widths(8, 7)), one, seed=0)
+    add_adapter(fitted(Widths(7, 8)), one, seed=0)  # the only fresh one
+
+
+@both_kinds
+@widths
+def test_what_was_trained_comes_back_onto_the_plain_base(tmp_path: Path, config: AdapterConfig, widths: Widths) -> None:
+    model = trained(widths, config)
+    save_trained(model, tmp_path)
+    loaded = base()
+    load_trained(loaded, tmp_path)
+    assert torch.equal(predict(loaded, widths), predict(model, widths))
+    assert not any(value.requires_grad for value in loaded.parameters())
+    resumed = fitted(widths)
+    add_adapter(resumed, config, seed=0)
+    load_trained(resumed, tmp_path, trainable=True)
+    assert torch.equal(predict(resumed, widths), predict(model, widths))
+    names = [name for name, value in resumed.predictor.named_parameters() if value.requires_grad]
+    assert all(any(head in name for name in names) for head in HEADS)
+
+
+@both_kinds
+def test_base_only_brings_fresh_heads_back_as_they_were_drawn(tmp_path: Path, config: AdapterConfig) -> None:
+    model, start = trained(Widths(14, 14), config), predict(fitted(Widths(14, 14)), Widths(14, 14))
+    save_trained(model, tmp_path)
+    loaded = base()
+    load_trained(loaded, tmp_path)
+    for one in (model, loaded):
+        with base_only(one):
+            assert torch.equal(predict(one, Widths(14, 14)), start)
+        assert not torch.equal(predict(one, Widths(14, 14)), start)
+
+
+@both_kinds
+@widths
+def test_merged_it_is_a_base_of_its_own_that_folders_keep(
+    tmp_path: Path, config: AdapterConfig, widths: Widths
+) -> None:
+    model = trained(widths, config)
+    before = predict(model, widths)
+    merge_adapter(model)
+    assert model.fresh_heads is None
+    model.save_pretrained(tmp_path)
+    loaded = load_base(ModelConfig(base=str(tmp_path), dtype="float32"), seed=0)
+    assert widths_of_model(loaded.sizes) == widths
+    assert fit_heads(loaded, widths, seed=3) == []
+    torch.testing.assert_close(predict(loaded, widths), before, atol=1e-5, rtol=1e-5)
+    alone = ActionConditionedPredictor.from_pretrained(tmp_path / "predictor")
+    assert (alone.state_encoder.in_features, alone.action_encoder.in_features) == widths
+
+
+def test_an_adapter_of_fresh_heads_does_not_go_onto_another_base(tmp_path: Path) -> None:
+    save_trained(trained(Widths(14, 14), LORA), tmp_path)
+    with pytest.raises(InputError, match="trained on another predictor"):
+        load_trained(WorldModel.random(TINY, seed=2), tmp_path)
+
+
+def test_a_damaged_card_of_fresh_heads_is_named(tmp_path: Path) -> None:
+    save_trained(trained(Widths(14, 14), LORA), tmp_path)
+    path = tmp_path / "vjepa2_ac.json"
+    for wrong in ({"state_dim": 14}, {"state_dim": 0, "action_dim": 14, "seed": 0}, 3):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"fresh_heads": wrong}))
+        with pytest.raises(InputError, match=r"vjepa2_ac\.json: fresh_heads"):
+            load_trained(base(), tmp_path)
+
+
+def test_a_folder_from_before_widths_were_written_is_a_model_of_seven(tmp_path: Path) -> None:
+    base().save_pretrained(tmp_path)
+    for path in (tmp_path / "config.json", tmp_path / "predictor/config.json"):
+        old = json.loads(path.read_text())
+        for part in (old, old.get("sizes", {}).get("predictor", {})):
+            part.pop("action_dim", None)
+            part.pop("state_dim", None)
+        assert "action_dim" not in json.dumps(old)
+        path.write_text(json.dumps(old))
+    loaded = WorldModel.from_pretrained(tmp_path)
+    assert widths_of_model(loaded.sizes) == Widths(7, 7)
+    assert torch.equal(predict(loaded, Widths(7, 7)), predict(base(), Widths(7, 7)))
+    assert ActionConditionedPredictor.from_pretrained(tmp_path / "predictor").config.state_dim == 7
+
+
+def test_sizes_that_were_given_must_be_those_of_the_model(tmp_path: Path) -> None:
+    fitted(Widths(14, 14)).save_pretrained(tmp_path)
+    wrong = {"base": str(tmp_path), "sizes": {"predictor": {"state_dim": 8}}}
+    with pytest.raises(InputError, match=r"predictor\.state_dim 14.*predictor\.state_dim 8"):
+        load_base(ModelConfig.model_validate(wrong), seed=0)
+
+
+def test_meta_has_no_name_for_other_widths() -> None:
+    with pytest.raises(ValueError, match="Meta's code takes"):
+        to_official(fitted(Widths(14, 14)))

@@ -1,0 +1,213 @@
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.world_model import WorldModel
+
+Fresh = Callable[..., WorldModel]
+
+
+def test_the_same_seed_gives_the_same_model_and_another_seed_another(fresh: Fresh) -> None:
+    torch.manual_seed(5)
+    model = fresh(seed=3)
+    torch.manual_seed(6)
+    assert model.predictor_fingerprint() == fresh(seed=3).predictor_fingerprint() != fresh(4).predictor_fingerprint()
+    assert model.encoder_fingerprint() == fresh(seed=3).encoder_fingerprint() != fresh(4).encoder_fingerprint()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="another device to draw on")
+def test_weights_are_drawn_where_they_are_to_be(model: WorldModel) -> None:
+    drawn, again = (WorldModel.random(model.sizes, 0, at_persistence=True, device="cuda") for _ in range(2))
+    assert {value.device.type for value in drawn.parameters()} == {"cuda"}
+    assert drawn.predictor_fingerprint() == again.predictor_fingerprint()
+    weight = drawn.base_predictor.blocks[0].attn.q.weight
+    assert weight.std() == pytest.approx(0.02, rel=0.2)
+
+
+def test_nothing_of_a_base_is_trained(model: WorldModel) -> None:
+    assert not any(value.requires_grad for value in model.parameters())
+
+
+def test_a_rollout_feeds_back_what_it_predicted(model: WorldModel, inputs) -> None:
+    z, a, s = inputs.latents, inputs.actions, inputs.states
+    first = model.predict(z[:, :1], a[:, :1], s[:, :1])[:, -1:]
+    seen = torch.cat([z[:, :1], first], dim=1)
+    second = model.predict(seen, a[:, :2], s[:, :2])[:, -1:]
+    third = model.predict(torch.cat([seen, second], dim=1), a[:, :3], s[:, :3])[:, -1:]
+    expected = torch.cat([first, second, third], dim=1)
+    torch.testing.assert_close(model.rollout(z[:, :1], a[:, :3], s[:, :3]), expected, rtol=1e-5, atol=1e-5)
+
+
+def test_the_first_step_of_a_rollout_is_the_teacher_forced_prediction(model: WorldModel, inputs) -> None:
+    z, a, s = inputs.latents, inputs.actions, inputs.states
+    forced = model.predict(z, a, s)
+    for context in (1, 3):
+        rolled = model.rollout(z[:, :context], a, s)
+        assert rolled.shape[1] == 4 - context + 1
+        torch.testing.assert_close(rolled[:, 0], forced[:, context - 1], rtol=1e-5, atol=1e-5)
+
+
+def test_a_rollout_goes_on_from_a_prediction_that_is_appended_to_its_context(model: WorldModel, inputs) -> None:
+    z, a, s = inputs.latents, inputs.actions, inputs.states
+    whole = model.rollout(z[:, :1], a, s)
+    rest = model.rollout(torch.cat([z[:, :1], whole[:, :1]], dim=1), a, s)
+    torch.testing.assert_close(rest, whole[:, 1:], rtol=1e-5, atol=1e-5)
+
+
+def test_a_context_longer_than_the_actions_is_refused(model: WorldModel, inputs) -> None:
+    with pytest.raises(ValueError, match="2 actions do not reach the end of a context of 3"):
+        model.rollout(inputs.latents[:, :3], inputs.actions[:, :2], inputs.states[:, :2])
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_predictions_are_normalised_float32_and_carry_gradients(fresh: Fresh, inputs, dtype: torch.dtype) -> None:
+    model = fresh(dtype=dtype)
+    latents = inputs.latents.requires_grad_()
+    with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+        predicted = model.predict(latents, inputs.actions, inputs.states)
+    assert predicted.dtype == torch.float32
+    torch.testing.assert_close(predicted.mean(dim=-1), torch.zeros(2, 4, 9), rtol=0, atol=1e-5)
+    predicted.square().sum().backward()
+    assert latents.grad is not None
+
+
+def test_a_saved_model_is_the_same_when_it_is_loaded(model: WorldModel, tmp_path: Path, inputs) -> None:
+    model.save_pretrained(tmp_path / "model")
+    loaded = WorldModel.from_pretrained(tmp_path / "model")
+    assert loaded.sizes == model.sizes
+    assert not any(value.requires_grad for value in loaded.parameters())
+    assert torch.equal(loaded.encode(inputs.frames), model.encode(inputs.frames))
+    expected = model.predict(inputs.latents, inputs.actions, inputs.states)
+    assert torch.equal(loaded.predict(inputs.latents, inputs.actions, inputs.states), expected)
+
+
+def test_fingerprints_do_not_depend_on_the_type_loaded(model: WorldModel, tmp_path: Path) -> None:
+    model.save_pretrained(tmp_path / "model")
+    rounded = WorldModel.from_pretrained(tmp_path / "model", dtype=torch.bfloat16)
+    assert {value.dtype for value in rounded.parameters()} == {torch.bfloat16}
+    assert rounded.encoder_fingerprint() == model.encoder_fingerprint()
+    assert rounded.predictor_fingerprint() == model.predictor_fingerprint()
+
+
+def test_saving_again_replaces_the_folder_and_leaves_nothing_else(fresh: Fresh, tmp_path: Path) -> None:
+    fresh(seed=0).save_pretrained(tmp_path / "model")
+    fresh(seed=1).save_pretrained(tmp_path / "model")
+    assert WorldModel.from_pretrained(tmp_path / "model").encoder_fingerprint() == fresh(seed=1).encoder_fingerprint()
+    assert [path.name for path in tmp_path.iterdir()] == ["model"]
+
+
+def test_a_model_is_saved_where_one_stands_and_beside_what_is_there(
+    fresh: Fresh, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "README.md").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    for seed in (0, 1):
+        fresh(seed).save_pretrained(".")
+    assert WorldModel.from_pretrained(".").encoder_fingerprint() == fresh(1).encoder_fingerprint()
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["README.md", "config.json", "encoder.safetensors", "predictor"]
+
+
+@pytest.mark.parametrize("place", ["file", "file/inner", "/proc/inner"])
+def test_a_place_that_cannot_hold_a_model_is_named(model: WorldModel, tmp_path: Path, place: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=rf"{place}: cannot be written"):
+        model.save_pretrained(tmp_path / place)
+
+
+def test_the_config_of_a_saved_model_promises_nothing_that_is_not_checked(model: WorldModel, tmp_path: Path) -> None:
+    model.save_pretrained(tmp_path / "model")
+    assert json.loads((tmp_path / "model" / "config.json").read_text()).keys() == {"format", "sizes"}
+
+
+def break_config(folder: Path) -> None:
+    (folder / "config.json").write_text("{")
+
+
+def break_sizes(folder: Path) -> None:
+    card = json.loads((folder / "config.json").read_text())
+    card["sizes"]["predictor"]["depth"] = 3
+    (folder / "config.json").write_text(json.dumps(card))
+
+
+def break_format(folder: Path) -> None:
+    (folder / "config.json").write_text('{"model_type": "vjepa2"}')
+
+
+def truncate_encoder(folder: Path) -> None:
+    path = folder / "encoder.safetensors"
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def remove_predictor(folder: Path) -> None:
+    (folder / "predictor" / "model.safetensors").unlink()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (shutil.rmtree, "config.json: no such file. needed: a folder written by"),
+        (break_config, "config.json: not JSON"),
+        (break_format, "config.json: not the config of a world model"),
+        (break_sizes, r"model.safetensors: 16 tensors do not fit \(missing: blocks.2.attn.k.bias"),
+        (truncate_encoder, "encoder.safetensors: not a whole safetensors file"),
+        (remove_predictor, "predictor/model.safetensors: no such file"),
+    ],
+)
+def test_a_folder_that_is_not_a_whole_model_is_named(
+    model: WorldModel, tmp_path: Path, spoil: Callable[[Path], None], message: str
+) -> None:
+    model.save_pretrained(tmp_path / "model")
+    spoil(tmp_path / "model")
+    with pytest.raises(InputError, match=message):
+        WorldModel.from_pretrained(tmp_path / "model")
+
+
+def test_a_model_whose_encoder_is_set_aside_predicts_as_before_and_knows_which_one_it_was(
+    model: WorldModel, fresh: Fresh, inputs, tmp_path: Path
+) -> None:
+    model.set_encoder_aside()
+    model.set_encoder_aside()  # once more changes nothing
+    whole = fresh(seed=0)
+    assert model.encoder_fingerprint() == whole.encoder_fingerprint()
+    assert sum(p.numel() for p in model.parameters()) == sum(p.numel() for p in whole.predictor.parameters())
+    assert model.to("cpu").device == torch.device("cpu")
+    given = inputs.latents, inputs.actions, inputs.states
+    assert torch.equal(model.predict(*given), whole.predict(*given))
+    for needs_it in (lambda: model.encode(inputs.frames), lambda: model.save_pretrained(tmp_path / "model")):
+        with pytest.raises(ValueError, match="set aside"):
+            needs_it()
+
+
+@pytest.mark.parametrize(
+    ("sizes", "complaint"),
+    [
+        ({"predictor": {"depth": 10**9}}, "sizes.predictor.depth: Input should be less than or equal to 512"),
+        ({"encoder": {"width": 2**62, "heads": 1}}, "sizes.encoder.width: "),
+        ({"encoder": {"width": 16_384, "depth": 512, "heads": 128}}, "weights, more than"),
+        ({"image_size": 8_192, "patch_size": 8_192}, "weights, more than"),
+        ({"image_size": 8_192, "patch_size": 1}, "tokens a frame, more than 65,536"),
+        ({"encoder": {"mlp_ratio": 1e-9}}, "leaves nothing of encoder.width"),
+        ({"encoder": {"mlp_ratio": "4"}}, "sizes.encoder.mlp_ratio: Input should be a valid number"),
+        ({"predictor": []}, "sizes.predictor: Input should be a mapping"),
+        ({"predictor": {"state_dim": 10**6}}, "sizes.predictor.state_dim: "),
+        (None, "sizes: Input should be"),
+    ],
+)
+def test_a_folder_that_claims_absurd_sizes_is_refused_before_anything_is_made(
+    model: WorldModel, tmp_path: Path, sizes: dict[str, Any] | None, complaint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model.save_pretrained(tmp_path)
+    card = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(card | {"sizes": sizes}))
+    monkeypatch.setattr(WorldModel, "empty", None)
+    with pytest.raises(InputError) as caught:
+        WorldModel.from_pretrained(tmp_path)
+    assert complaint in str(caught.value)
+    assert caught.value.where == str(tmp_path / "config.json")

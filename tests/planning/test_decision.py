@@ -1,0 +1,133 @@
+"""A decision is told as it is: in values, in a file, in words."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from decisions import QUICK, STATE, asked, picture
+from tiny_models import tiny_model
+from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.decision import PlanRequest, PlanResult, decide
+from vjepa2_ac.planning.plan_json import write_plan
+from vjepa2_ac.planning.summary import axes_at_limit, summarize
+
+
+def read(found: PlanResult, folder: Path) -> dict:
+    def refuse(name: str) -> None:
+        raise ValueError(name)
+
+    path = write_plan(found, {"model": {"subject": "a model"}}, folder / "plan.json")
+    return json.loads(path.read_text(), parse_constant=refuse)
+
+
+def test_an_answer_is_what_the_controller_decides() -> None:
+    found = asked()
+    controller = Controller(tiny_model(), QUICK, seed=5)
+    controller.reset(picture(100))
+    np.testing.assert_array_equal(controller.act(picture(0), STATE), found.actions[0])
+    assert found.decision.cost is not None
+    assert found.doing_nothing == pytest.approx(float(found.decision.cost(torch.zeros(1, 2, 7))[0]))
+    assert found.states.shape == (3, 7)
+    assert len(found.slices) == 3
+    assert asked(nodes=0).slices == asked(nodes=2).slices == ()
+
+
+def test_the_file_holds_the_decision(tmp_path: Path) -> None:
+    found = asked()
+    file = read(found, tmp_path)
+    plan = found.decision.plan
+    assert plan is not None
+    assert file["format"] == 1
+    assert file["model"] == {"subject": "a model"}
+    assert (file["why"], file["seed"], file["crop"]) == ("planned", 5, "released")
+    np.testing.assert_allclose(file["actions"], found.actions)
+    np.testing.assert_allclose(file["states"], found.states)
+    np.testing.assert_allclose(file["state"], STATE)
+    assert file["energy"] == {
+        "now": found.decision.energy_now, "doing_nothing": found.doing_nothing, "plan": plan.energy
+    }  # fmt: skip
+    assert [one["lowest"] for one in file["iterations"]] == [one.lowest for one in plan.iterations]
+    np.testing.assert_allclose(file["iterations"][2]["std"], plan.iterations[2].std)
+    assert PlanningConfig.model_validate_json(json.dumps(file["settings"])) == QUICK
+    assert file["evaluations"] == plan.evaluations
+    assert file["in_words"] == summarize(found)
+    second = file["slices"][1]
+    assert (second["across"], second["up"]) == ("dx", "dz")
+    np.testing.assert_allclose(second["energy"], found.slices[1].energy)
+    np.testing.assert_allclose(second["dz"], found.slices[1].up)
+
+
+def test_words_say_how_far_it_goes_and_what_it_is_worth() -> None:
+    found = asked()
+    words, way = summarize(found), (found.states[2] - found.states[0])[:3] * 100
+    assert words.startswith(f"Goes {np.linalg.norm(way):.1f} cm in 2 model steps (dx {way[0]:+.1f}, dy {way[1]:+.1f}")
+    plan = found.decision.plan
+    assert plan is not None
+    assert f"Energy {found.decision.energy_now:.4f} now, {plan.energy:.4f} predicted" in words
+    assert f"{found.doing_nothing:.4f} predicted when doing nothing" in words
+    assert f"Planner cem, seed 5: {plan.evaluations} action sequences in 3 iterations" in words
+
+
+def test_at_the_goal_nothing_is_done_and_said(tmp_path: Path) -> None:
+    found = asked(7, start=7)
+    assert summarize(found).startswith("Does nothing: what the model sees now")
+    file = read(found, tmp_path)
+    assert file["why"] == "at the goal"
+    assert not np.any(file["actions"])
+    np.testing.assert_allclose(file["states"], np.tile(STATE, (3, 1)))
+    assert file["energy"]["plan"] is file["energy"]["doing_nothing"] is None
+    assert file["iterations"] == file["slices"] == []
+
+
+def test_a_broken_model_does_nothing_and_the_file_says_why(tmp_path: Path) -> None:
+    found = asked(broken=True)
+    file = read(found, tmp_path)
+    assert file["why"] == "no finite energy"
+    assert not np.any(file["actions"])
+    assert file["energy"]["plan"] is file["iterations"][0]["lowest"] is None
+    assert file["iterations"][0]["finite"] == 0
+    assert file["slices"] == []
+    assert "no finite energy for any of 37 action sequences" in summarize(found)
+
+
+def test_goals_without_a_part_in_the_plan_are_named() -> None:
+    last = asked(100, 101)
+    assert last.decision.goals == (0, 1)
+    assert last.unused_goals == (0,)
+    assert "goal 1" in summarize(last)
+    summed = asked(100, 101, energy=EnergyConfig(steps="sum"))
+    assert summed.unused_goals == ()
+    assert "goal" not in summarize(summed)
+    assert asked(100, 101, 102, energy=EnergyConfig(steps="sum")).unused_goals == (2,)
+
+
+def test_goals_share_the_horizon_unless_told() -> None:
+    one = PlanRequest(picture(0), STATE, (picture(1), picture(2), picture(3)))
+    assert one.with_equal_durations(6).durations == (2, 2)
+    assert one.with_equal_durations(1).durations == (1, 1)
+
+
+def test_an_action_at_its_limit_is_said_to_be() -> None:
+    found = asked(limits=LimitsConfig(xyz=(0.05, 0.0, 0.05)))
+    found.actions[0, :3] = (-0.0495, 0.0, 0.048)
+    assert axes_at_limit(found) == ["dx"]
+    assert "at its limit along dx (" in summarize(found)
+
+
+def test_a_plan_that_is_no_better_than_doing_nothing_is_said_to_be() -> None:
+    found = asked()
+    assert "better than doing nothing" not in summarize(found)
+    object.__setattr__(found, "doing_nothing", -1.0)
+    assert "Nothing that was tried is predicted to be better than doing nothing." in summarize(found)
+
+
+def test_running_out_of_time_is_said() -> None:
+    ticks = iter(range(1000))
+    controller = Controller(tiny_model(), QUICK.model_copy(update={"budget_s": 4.0}), clock=lambda: float(next(ticks)))
+    found = decide(controller, PlanRequest(picture(0), STATE, (picture(100),)))
+    assert "Time was up after" in summarize(found)
+    assert " of 3 iterations" in summarize(found)

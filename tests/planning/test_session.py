@@ -1,0 +1,205 @@
+"""What was named is planned with, as its own config says; what cannot be planned with is refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from adapted_run import write_adapted_run
+from vjepa2_ac.config.loading import config_as_dict, config_as_yaml
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
+from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
+from vjepa2_ac.planning.session import PlanningSession, load_to_plan
+from vjepa2_ac.runs.folder import check_run_folder, config_changes, open_run_folder, read_run_config
+from vjepa2_ac.runs.loading import load_run
+
+PLANNING = {"horizon": 2, "samples": 12, "iterations": 2, "cem": {"elites": 4}}
+STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
+
+
+@pytest.fixture
+def run(make_config, tmp_path: Path) -> Path:
+    return write_adapted_run(
+        make_config(run_dir=str(tmp_path / "a run"), planning=PLANNING, seed=7, data__crop="square")
+    )
+
+
+@torch.no_grad()
+def prediction(world_model: WorldModel) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(0)
+    latents = torch.randn(1, 1, world_model.num_tokens, world_model.latent_dim, generator=generator)
+    return world_model.predict(latents, torch.full((1, 1, 7), 0.1), torch.full((1, 1, 7), 0.2))
+
+
+def test_a_run_is_planned_with_as_its_own_config_says(run: Path) -> None:
+    steering = load_to_plan(str(run))
+    assert steering.checkpoint == "step-00000020 (the newest)"
+    assert steering.config.planning.horizon == 2
+    controller = steering.controller()
+    pictures = np.random.default_rng(0).integers(0, 256, (2, 40, 64, 3), dtype=np.uint8)
+    controller.reset(pictures[0])
+    controller.act(pictures[1], STATE)
+    assert controller.decision is not None
+    assert controller.decision.plan is not None
+    assert controller.decision.plan.seed == 7
+    assert len(controller.decision.plan.actions) == 2
+    assert controller.crop == "square"
+    assert steering.controller(seed=3).seed == 3
+
+
+def test_the_checkpoint_that_is_named_is_the_one_that_plans(run: Path, base_folder: Path) -> None:
+    newest, best, base = (
+        prediction(load_to_plan(*given[:1], checkpoint=given[1]).world_model)
+        for given in ((str(run), "newest"), (str(run), "best"), (str(base_folder), "newest"))
+    )
+    torch.testing.assert_close(prediction(load_to_plan(str(run), checkpoint="10").world_model), best)
+    assert not torch.allclose(newest, best, atol=1e-4)
+    assert not torch.allclose(base, best, atol=1e-4)
+
+
+def test_a_model_in_eval_mode_comes_out(run: Path, base_folder: Path) -> None:
+    for subject in (str(run), str(base_folder)):
+        assert not any(module.training for module in load_to_plan(subject).world_model.modules())
+
+
+def test_a_model_needs_no_config_and_takes_one(make_config, base_folder: Path, tmp_path: Path) -> None:
+    alone = load_to_plan(str(base_folder), overrides=["planning.samples=20", "seed=4"])
+    assert (alone.config.planning.samples, alone.config.seed, alone.config.planning.horizon) == (20, 4, 1)
+    path = tmp_path / "its.yaml"
+    path.write_text(config_as_yaml(make_config(planning=PLANNING, model__dtype="bfloat16", training__precision="bf16")))
+    told = load_to_plan(str(base_folder), config=path, overrides=["planning.cem.elites=3"])
+    assert (told.config.planning.horizon, told.config.planning.cem.elites) == (2, 3)
+    assert next(told.world_model.parameters()).dtype == torch.bfloat16
+
+
+def test_the_model_that_was_named_is_loaded_not_that_of_the_config(make_config, base_folder, tmp_path: Path) -> None:
+    sizes = config_as_dict(make_config())["model"]["sizes"] | {"image_size": 32}
+    sizes["encoder"] = {"width": 12, "depth": 1, "heads": 1}
+    fresh = make_config(model={"random": sizes, "dtype": "float32"}, adapter__kind="none")
+    path = tmp_path / "its.yaml"
+    path.write_text(config_as_yaml(fresh))
+    assert load_to_plan(str(base_folder), config=path).world_model.latent_dim == 24
+
+
+def test_the_builtin_model_plans_at_once() -> None:
+    steering = load_to_plan("builtin:sim-tiny")
+    assert isinstance(steering, PlanningSession)
+    assert steering.checkpoint == ""
+
+
+@pytest.mark.parametrize(
+    ("given", "complaint"),
+    [
+        ({"overrides": ["training.steps=3"]}, r"training\.steps=3: a setting that planning does not heed"),
+        ({"overrides": ["horizon=3"]}, r"did you mean planning\.horizon"),
+        ({"overrides": ["planning.horizon=0"]}, r"planning\.horizon.*greater than or equal to 1"),
+        ({"overrides": ["planning.limits.xyz=[-0.1, 0, 0]"]}, r"planning\.limits\.xyz"),
+        ({"overrides": ["planning.limits={xyz: [0, 0, 0], gripper: 0}"]}, "nothing is left to plan"),
+        ({"overrides": ["planning.horizont=3"]}, "did you mean horizon"),
+        ({"checkpoint": "best"}, "not the folder of a run"),
+    ],
+)
+def test_what_a_model_cannot_be_asked_for_is_refused(base_folder: Path, given: dict, complaint: str) -> None:
+    with pytest.raises(InputError, match=complaint):
+        load_to_plan(str(base_folder), **given)
+
+
+def test_what_a_run_cannot_be_asked_for_is_refused(run: Path) -> None:
+    with pytest.raises(InputError, match="a config of its own"):
+        load_to_plan(str(run), config="other.yaml")
+    with pytest.raises(InputError, match="one of the steps 10, 20"):
+        load_to_plan(str(run), checkpoint="15")
+    with pytest.raises(InputError, match="no such file or folder"):
+        load_to_plan(str(run / "nowhere"))
+
+
+def test_a_model_of_vectors_is_refused(make_config, tmp_path: Path) -> None:
+    config = make_config()
+    vectors = config.model_copy(update={"data": config.data.model_copy(update={"states": "vector"})})
+    path = tmp_path / "its.yaml"
+    path.write_text(config_as_yaml(vectors))
+    with pytest.raises(InputError, match="a model of poses"):
+        load_to_plan("builtin:sim-tiny", config=path)
+
+
+ADAPTERS = {
+    "lora": {"rank": 4},
+    "dora": {"rank": 4, "dora": True, "modules_to_save": ["predictor_proj", "state_encoder"]},
+    "none": {"kind": "none"},
+}
+
+
+@pytest.mark.parametrize("adapter", ADAPTERS.values(), ids=ADAPTERS)
+def test_a_run_is_merged_in_its_bases_type_and_its_fingerprints_are_those_of_what_was_trained(
+    make_config, adapter: dict
+) -> None:
+    config = make_config(adapter=adapter, model__dtype="bfloat16", training__precision="bf16")
+    run = write_adapted_run(config)
+    steering, trained = load_to_plan(str(run)), load_run(run).world_model
+    assert type(steering.world_model.predictor) is ActionConditionedPredictor
+    assert steering.world_model.adaptation is None
+    assert {value.dtype for value in steering.world_model.parameters()} == {torch.bfloat16}
+    torch.testing.assert_close(prediction(steering.world_model), prediction(trained.eval()), rtol=0, atol=0.1)
+    told = steering.as_dict()["model"]
+    assert told["encoder"] == trained.encoder_fingerprint()
+    assert told["base"] == load_base(config.model, seed=0).predictor_fingerprint()
+    assert told["predictor"] == fingerprint(trained.predictor.state_dict())
+    assert told["dtype"] == "bfloat16"
+
+
+def test_a_base_is_known_by_its_own_weights(base_folder: Path) -> None:
+    base = WorldModel.from_pretrained(base_folder)
+    told = load_to_plan(str(base_folder)).as_dict()["model"]
+    assert told["encoder"] == base.encoder_fingerprint()
+    assert told["base"] == base.predictor_fingerprint()
+    assert told["predictor"] == fingerprint(base.predictor.state_dict())
+
+
+def test_a_run_in_float32_is_planned_with_in_bfloat16_if_that_is_asked_for(run: Path) -> None:
+    steering = load_to_plan(str(run), overrides=["model.dtype=bfloat16"])
+    assert {value.dtype for value in steering.world_model.parameters()} == {torch.bfloat16}
+
+
+def test_how_a_run_was_trained_does_not_keep_it_from_planning_here(make_config) -> None:
+    config = make_config()
+    run = write_adapted_run(
+        config.model_copy(update={"training": config.training.model_copy(update={"precision": "fp16"})})
+    )
+    assert load_to_plan(str(run)).world_model.device.type == "cpu"
+
+
+@pytest.mark.parametrize("kind", ["int8", "fp8"])
+def test_8_bits_in_float32_are_refused_before_a_model_is_loaded(make_config, kind: str, tmp_path: Path) -> None:
+    path = tmp_path / "its.yaml"
+    path.write_text(config_as_yaml(make_config(planning__quantize=kind)))
+    told = rf"planning\.quantize: {kind}, with weights in float32\. needed: bfloat16.*Set model\.dtype=bfloat16"
+    with pytest.raises(InputError, match=told):
+        load_to_plan("no such model", config=path)
+
+
+def test_fp8_that_the_device_has_not_is_refused_before_a_model_is_loaded(make_config, tmp_path: Path) -> None:
+    pytest.importorskip("torchao", reason="the extra quantize is not installed")
+    path = tmp_path / "its.yaml"
+    path.write_text(config_as_yaml(make_config(planning__quantize="fp8", training__precision="bf16")))
+    with pytest.raises(InputError, match=r"planning\.quantize: fp8, on cpu"):
+        load_to_plan("no such model", config=path, overrides=["model.dtype=bfloat16"])
+
+
+def test_a_run_from_before_there_was_a_planning_section_goes_on_unchanged(make_config) -> None:
+    config = make_config()
+    folder = open_run_folder(config, "name")
+    plain = config_as_dict(config)
+    del plain["planning"]
+    (folder / "config.yaml").write_text(yaml.safe_dump(plain))
+    assert read_run_config(folder) == config
+    check_run_folder(config)
+    assert config_changes(config) == []
+
+
+def test_a_run_may_go_on_with_other_settings_of_planning(make_config) -> None:
+    open_run_folder(make_config(), "name")
+    check_run_folder(make_config(planning=PLANNING))

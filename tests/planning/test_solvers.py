@@ -1,0 +1,372 @@
+"""Every planner finds known optima, keeps to limits and time, and survives a cost that says nothing."""
+
+import json
+import math
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+
+from paths import GOLDEN
+from solver_problems import PLANNERS, config, parabola, rosenbrock, solve, space, two_basins
+from vjepa2_ac.config.planning import CemConfig, GradientConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
+from vjepa2_ac.evaluation.action_score.protocol import SCORED
+from vjepa2_ac.planning.action_space import ActionSpace, Ball
+from vjepa2_ac.planning.interfaces import Plan, PlanStart
+from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.planning.solvers.base import EvaluatedPlans, white_noise
+from vjepa2_ac.planning.solvers.gradient import GradientSolver
+from vjepa2_ac.planning.solvers.icem import coloured_noise
+from vjepa2_ac.planning.solvers.mppi import MppiSolver
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_the_lowest_place_of_a_parabola_is_found(planner: str) -> None:
+    target = torch.tensor([[0.3, -0.2], [0.1, 0.7], [-0.6, 0.0]])
+    plan = solve(planner, parabola(target), space(3), iterations=40)
+    torch.testing.assert_close(plan.actions, target, atol=0.03, rtol=0)
+    assert plan.energy == pytest.approx(float((plan.actions - target).square().sum()), abs=1e-6)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_the_end_of_a_bent_valley_is_found(planner: str) -> None:
+    patient = {
+        "cem": CemConfig(momentum_std=0.8), "icem": IcemConfig(momentum=0.8, shrink=1.0),
+        "mppi": MppiConfig(temperature=0.003, std_decay=0.95),
+    }  # fmt: skip
+    plan = solve(planner, rosenbrock, space(), iterations=100, **patient)
+    torch.testing.assert_close(plan.actions, torch.tensor([[0.5, 0.5]]), atol=0.03, rtol=0)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_deeper_of_two_basins_is_found(planner: str, seed: int) -> None:
+    plan = solve(planner, two_basins, space(), seed)
+    torch.testing.assert_close(plan.actions, torch.tensor([[0.6, 0.6]]), atol=0.03, rtol=0)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_an_optimum_beyond_the_limits_is_sought_at_their_edge(planner: str) -> None:
+    plan = solve(planner, parabola(torch.tensor([[3.0, 0.2]])), space(), iterations=40)
+    torch.testing.assert_close(plan.actions, torch.tensor([[1.0, 0.2]]), atol=0.03, rtol=0)
+    assert (plan.actions.abs() <= 1).all()
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize(("norm", "optimum"), [("l2", (0.6, 0.8, 0.1)), ("l1", (0.0, 1.0, 0.1))])
+def test_an_optimum_beyond_a_ball_is_sought_on_it(planner: str, norm: str, optimum: tuple[float, ...]) -> None:
+    target = torch.tensor([[1.2, 1.6, 0.1]]) if norm == "l2" else torch.tensor([[0.0, 2.0, 0.1]])
+    ball = Ball(norm, 1.0, axes=2)  # type: ignore[arg-type]
+    plan = solve(planner, parabola(target), space(dim=3, reach=5.0, ball=ball), iterations=60)
+    torch.testing.assert_close(plan.actions, torch.tensor([optimum]), atol=0.05, rtol=0)
+    assert torch.linalg.vector_norm(plan.actions[:, :2], ord=int(norm[1])) <= 1.0
+
+
+def upstream_cost(actions: Tensor) -> Tensor:
+    """Return the energies of the world in which upstream's planner was run (golden/DATA_ORIGIN.md)."""
+    goal = torch.tensor([[0.03, -0.02, 0.06, 0.3], [0.05, 0.0, 0.0, 0.0]])
+    first = torch.zeros(len(actions), 4)
+    second, x = torch.zeros(len(actions)), torch.full((len(actions),), 0.4)
+    for dx, dy, dz, *_, grip in (step.unbind(-1) for step in actions.unbind(1)):
+        first = first + torch.stack([dx, dy + dx * dz, dz, grip], dim=-1)
+        second, x = second + x * grip, x + dx
+    second = torch.nn.functional.pad(second[:, None], (0, 3))
+    return (torch.stack([first, second], dim=1) - goal).abs().mean(dim=(1, 2))
+
+
+@pytest.mark.parametrize("case", json.loads((GOLDEN / "cem.json").read_text()), ids=lambda case: str(case["seed"]))
+def test_cem_gives_upstreams_plan_for_upstreams_seed(case: dict) -> None:  # type: ignore[type-arg]
+    given = case["arguments"]
+    closing = given.get("close_gripper")
+    limits = LimitsConfig(
+        xyz=(given.get("maxnorm", 0.05),) * 3,
+        gripper_mode="rounded" if closing is None else "close",
+        gripper_from=closing or 0,
+    )
+    cem = CemConfig(
+        elites=given["topk"],
+        momentum_mean=given.get("momentum_mean", 0.25),
+        momentum_std=given.get("momentum_std", 0.95),
+        momentum_mean_gripper=given.get("momentum_mean_gripper", 0.15),
+        momentum_std_gripper=given.get("momentum_std_gripper", 0.15),
+    )
+    settings = PlanningConfig(
+        horizon=given["rollout"], samples=given["samples"], iterations=given["cem_steps"], limits=limits, cem=cem
+    )
+    plan = Planner(settings).plan(upstream_cost, torch.Generator().manual_seed(case["seed"]))
+    expected = torch.tensor(case["actions"])
+    if closing is not None:  # there a mean on its way to 1
+        expected[closing:, 6] = 1.0
+    torch.testing.assert_close(plan.actions, expected, atol=1e-6, rtol=1e-5)
+
+
+def jepa_wms_cost(actions: Tensor) -> Tensor:
+    """Return the energies of the world in which JEPA-WMs' planner was run (golden/DATA_ORIGIN.md)."""
+    goal = torch.tensor([0.12, -0.05, 0.3, 0.02, 0.0, -0.04, 0.6])
+    far = (actions.sum(dim=1) - goal).square().sum(dim=-1)
+    return far + 0.1 * (actions[:, 0, 0] * actions[:, 1, 1]).abs() + 0.05 * actions[:, :, 3].square().sum(dim=1)
+
+
+@pytest.mark.parametrize("case", json.loads((GOLDEN / "cem_jepa_wms.json").read_text()), ids=lambda c: str(c["seed"]))
+def test_cem_with_the_action_scores_settings_gives_jepa_wms_plan(case: dict) -> None:  # type: ignore[type-arg]
+    settings = SCORED.model_copy(update={"samples": 304})  # then their one draw and our three give the same numbers
+    plan = Planner(settings).plan(jepa_wms_cost, torch.Generator().manual_seed(case["seed"]))
+    torch.testing.assert_close([one.lowest for one in plan.iterations], case["losses"], rtol=1e-3, atol=1e-7)
+    torch.testing.assert_close(plan.actions, torch.tensor(case["actions"]), atol=1e-5, rtol=1e-3)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_the_same_seed_gives_the_same_plan_and_another_seed_another(planner: str) -> None:
+    first, again, other = (solve(planner, rosenbrock, space(), seed, iterations=3) for seed in (5, 5, 6))
+    assert torch.equal(first.actions, again.actions)
+    assert first.seed == 5
+    assert not torch.equal(first.iterations[0].elites, other.iterations[0].elites)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize("says", [math.nan, math.inf, -math.inf])
+def test_without_a_finite_energy_nothing_is_done(planner: str, says: float) -> None:
+    plan = solve(planner, lambda actions: actions.sum(dim=(1, 2)) * 0 + says, space(2), iterations=3)
+    assert not plan.actions.any()
+    assert plan.stopped == "no finite energy"
+    assert math.isnan(plan.energy)
+    assert all(one.finite == 0 and one.lowest == math.inf for one in plan.iterations)
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_samples_without_a_finite_energy_do_no_harm(planner: str) -> None:
+    target = torch.tensor([[0.4, -0.3]])
+
+    def cost(actions: Tensor) -> Tensor:
+        return torch.where(actions[:, 0, 1] > 0, math.nan, parabola(target)(actions))
+
+    plan = solve(planner, cost, space(), iterations=40)
+    torch.testing.assert_close(plan.actions, target, atol=0.03, rtol=0)
+    assert 0 < plan.iterations[0].finite < plan.iterations[0].samples
+
+
+def test_a_mean_without_a_finite_energy_gives_way_to_the_best_sample() -> None:
+    def ring(actions: Tensor) -> Tensor:
+        length = actions.norm(dim=(1, 2))
+        return torch.where(length < 0.5, math.nan, length)
+
+    plan = solve("cem", ring, space(), iterations=1)
+    assert math.isnan(float(ring(plan.mean[None])))
+    assert plan.energy == plan.iterations[0].lowest == pytest.approx(float(plan.actions.norm()))
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_cost_that_wants_ever_more_does_not_push_a_plan_beyond_the_limits(planner: str) -> None:
+    settings = config(
+        planner, iterations=30, horizon=4, action_repeat=2,
+        limits=LimitsConfig(xyz=(0.05, 0.03, 0.0), ball="l1", radius=0.06, rotation=0.1),
+    )  # fmt: skip
+    plan = Planner(settings).plan(lambda actions: -1e6 * actions.sum(dim=(1, 2)), torch.Generator())
+    assert plan.actions.shape == (4, 7)
+    for number, limit in enumerate((0.05, 0.03, 0.0, 0.1, 0.1, 0.1, 0.75)):
+        assert (plan.actions[:, number].abs().double() <= limit).all()
+    assert (plan.actions[:, :3].abs().double().sum(dim=1) <= 0.06).all()
+    assert (plan.actions[:, 3:6] > 0.05).all()
+    assert torch.equal(plan.actions[0], plan.actions[1])
+
+
+class Watch:
+    """A clock that goes only when it is told."""
+
+    def __init__(self) -> None:
+        self.time = 100.0
+
+    def __call__(self) -> float:
+        return self.time
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+@pytest.mark.parametrize(("budget", "iterations"), [(0.1, 1), (2.9, 2), (3.0, 3), (99.0, 5)])
+def test_no_iteration_begins_that_would_end_after_the_time_budget(planner: str, budget: float, iterations: int) -> None:
+    watch = Watch()
+
+    def slow(actions: Tensor) -> Tensor:
+        watch.time += 1.0 if len(actions) > 1 else 0.0
+        return parabola(torch.zeros(1, 2))(actions)
+
+    settings = config(planner, iterations=5, budget_s=budget)
+    plan = Planner(settings, space(), clock=watch).plan(slow, torch.Generator())
+    assert len(plan.iterations) == iterations
+    assert plan.stopped == ("finished" if iterations == 5 else "out of time")
+    assert plan.seconds == iterations
+    assert [one.seconds for one in plan.iterations] == [1.0] * iterations
+    assert math.isfinite(plan.energy)
+
+
+def test_how_far_it_is_is_told_after_every_iteration() -> None:
+    told: list[tuple[int, int]] = []
+    planner = Planner(config("cem", iterations=3), space(), progress=lambda done, total: told.append((done, total)))
+    planner.plan(parabola(torch.zeros(1, 2)), torch.Generator())
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_when_time_is_up_no_mean_is_returned_that_is_worse_than_what_was_tried(planner: str) -> None:
+    watch = Watch()
+
+    def two_valleys(actions: Tensor) -> Tensor:
+        watch.time += 1.0
+        return (actions[:, 0].abs() - 0.5).square().sum(dim=-1)
+
+    settings = config(planner, iterations=5, budget_s=0.1)
+    plan = Planner(settings, space(), clock=watch).plan(two_valleys, torch.Generator().manual_seed(0))
+    assert plan.stopped == "out of time"
+    assert plan.energy <= plan.iterations[0].lowest
+    assert plan.energy == pytest.approx(float(two_valleys(plan.actions[None])[0]))
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_plan_tells_how_it_was_found(planner: str) -> None:
+    cost = parabola(torch.tensor([[0.3, -0.2]]))
+    plan = solve(planner, cost, space(), iterations=15)
+    for one in plan.iterations:
+        torch.testing.assert_close(one.elite_energies, cost(one.elites))
+        assert one.lowest == one.elite_energies[0] == one.elite_energies.min()
+        assert one.elite_energy == pytest.approx(float(one.elite_energies.mean()))
+        assert one.mean.shape == one.std.shape == (1, 2)
+    assert plan.evaluations >= sum(one.samples for one in plan.iterations)
+    assert plan.iterations[-1].elite_energy < 0.1 * plan.iterations[0].elite_energy
+    assert plan.iterations[-1].std.norm() < 0.5 * plan.iterations[0].std.norm()
+    assert plan.planner == planner
+
+
+@pytest.mark.parametrize("planner", PLANNERS)
+def test_a_warm_start_begins_where_the_last_plan_led(planner: str) -> None:
+    target = torch.tensor([[0.2, 0.1], [0.8, -0.9], [-0.7, 0.6]])
+    before = solve(planner, parabola(target), space(3), iterations=40)
+    following = torch.cat([target[1:], target[-1:]])
+    start = before.start_after(1)
+    torch.testing.assert_close(start.mean[:2], before.mean[1:])
+
+    def first(start: PlanStart | None) -> float:
+        settings = config(planner, iterations=1, samples=20)
+        plan = Planner(settings, space(3)).plan(parabola(following), torch.Generator().manual_seed(1), start)
+        return plan.iterations[0].lowest
+
+    assert first(start) < first(None)
+
+
+@pytest.mark.parametrize(("done", "places"), [(0, [0, 1, 2]), (2, [1, 2, 2]), (5, [2, 2, 2])])
+def test_what_was_done_of_a_plan_is_gone_and_its_end_is_repeated(done: int, places: list[int]) -> None:
+    plan = repeated_plan()
+    start = plan.start_after(done)
+    assert torch.equal(start.mean, plan.mean[places])
+    assert torch.equal(start.elites, plan.iterations[-1].elites[:, places])
+    with pytest.raises(ValueError, match="-1 steps"):
+        plan.start_after(-1)
+
+
+def test_within_a_repeated_action_the_next_plan_begins_with_what_is_left_of_it() -> None:
+    plan = repeated_plan()
+    start = plan.start_after(1)
+    torch.testing.assert_close(start.mean[0], (plan.mean[0] + plan.mean[1]) / 2)
+    torch.testing.assert_close(start.mean[2], plan.mean[2])
+    elites = plan.iterations[-1].elites
+    torch.testing.assert_close(start.elites[:, 1], (elites[:, 1] + elites[:, 2]) / 2)
+    assert len(set(plan.mean[:, 0].tolist())) == 3
+
+
+def repeated_plan() -> Plan:
+    settings = config("icem", iterations=2, samples=20, horizon=6, action_repeat=2)
+    return Planner(settings).plan(lambda actions: actions.square().sum(dim=(1, 2)), torch.Generator())
+
+
+def test_icems_elites_take_part_again() -> None:
+    before = solve("icem", rosenbrock, space(2), iterations=3)
+    start = before.start_after(1)
+    shown: list[Tensor] = []
+
+    def cost(actions: Tensor) -> Tensor:
+        shown.append(actions)
+        return rosenbrock(actions)
+
+    settings = config("icem", iterations=2, samples=40, icem=IcemConfig(elites=10, kept=0.3))
+    plan = Planner(settings, space(2)).plan(cost, torch.Generator(), start)
+    assert torch.equal(shown[0][40:], start.elites[:3])
+    assert torch.equal(shown[1][32:35], plan.iterations[0].elites[:3])  # 40 / 1.25 fresh ones stand before
+    torch.testing.assert_close(shown[1][35], plan.iterations[0].mean)  # the last iteration tries the mean
+    assert all(later.lowest <= earlier.lowest for earlier, later in pairwise(plan.iterations))
+
+
+def test_mppi_tries_its_mean_and_weighs_by_energy() -> None:
+    search = MppiSolver(space(), MppiConfig(temperature=0.5, std_decay=0.5), 3, torch.Generator(), None)
+    assert torch.equal(search.sample()[0], search.mean)
+    tried = torch.tensor([[[0.0, 0.0]], [[1.0, 0.0]], [[0.0, 1.0]]])
+    energies = torch.tensor([1.0, 3.0, 2.0])
+    search.update(EvaluatedPlans(tried, energies))
+    weights = torch.exp(-energies / (0.5 * (2 / 3) ** 0.5))
+    torch.testing.assert_close(search.mean, (weights[1:] / weights.sum())[None])
+    torch.testing.assert_close(search.std, torch.full((1, 2), 0.5))
+
+
+def test_descents_survive_a_cost_that_once_says_nothing() -> None:
+    target, calls = torch.tensor([[0.3, -0.2]]), []
+
+    def cost(actions: Tensor) -> Tensor:
+        calls.append(len(actions))
+        nothing = torch.sqrt(-1 - actions.square().sum(dim=(1, 2)))  # its gradient is not a number, either
+        return nothing if len(calls) == 1 else parabola(target)(actions)
+
+    plan = solve("gradient", cost, space(), iterations=40)
+    assert [one.finite for one in plan.iterations[:2]] == [0, 16]
+    torch.testing.assert_close(plan.actions, target, atol=0.03, rtol=0)
+    assert plan.iterations[-1].elite_energy < 0.02  # every descent got there
+
+
+def test_a_descent_at_the_limits_turns_back_at_once() -> None:
+    search = GradientSolver(space(), GradientConfig(starts=1, learning_rate=0.1), 1000, torch.Generator(), None)
+    nothing, slope = torch.zeros(0, 1, 2), torch.ones(1, 1, 2)
+    for towards in [-1.0] * 40 + [1.0] * 20:
+        search.update(EvaluatedPlans(nothing, torch.zeros(0), towards * slope))
+    assert (search.sample() < 0.9).all()
+
+
+def test_the_first_descent_begins_where_the_last_best_one_ended() -> None:
+    before = solve("gradient", two_basins, space())
+    after = Planner(config("gradient", iterations=1), space()).plan(
+        two_basins, torch.Generator(), before.start_after(0)
+    )
+    torch.testing.assert_close(after.iterations[0].elites[0], before.iterations[-1].elites[0])
+    assert (before.mean - before.actions).norm() > 0.1
+
+
+@pytest.mark.parametrize("decisions", [1, 2, 7, 8])
+@pytest.mark.parametrize("exponent", [0.0, 2.0])
+def test_coloured_noise_has_variance_one_everywhere(decisions: int, exponent: float) -> None:
+    noise = coloured_noise(40_000, decisions, 1, exponent, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(noise.var(dim=0), torch.ones(decisions, 1), atol=0.05, rtol=0)
+    assert noise.mean(dim=0).abs().max() < 0.03
+
+
+def test_coloured_noise_has_the_spectrum_that_was_asked_for() -> None:
+    noise = coloured_noise(20_000, 16, 1, 2.0, torch.Generator().manual_seed(0))[..., 0]
+    power = torch.fft.rfft(noise).abs().square().mean(dim=0)
+    torch.testing.assert_close(power[1] / power[4], torch.tensor(16.0), rtol=0.1, atol=0)
+    torch.testing.assert_close(power[0] / power[1], torch.tensor(1.0), rtol=0.1, atol=0)
+    white = coloured_noise(20_000, 16, 1, 0.0, torch.Generator().manual_seed(0))[..., 0]
+    power = torch.fft.rfft(white).abs().square().mean(dim=0)
+    torch.testing.assert_close(power / power.mean(), torch.ones(9), rtol=0, atol=0.1)
+
+
+def test_held_axes_get_no_noise() -> None:
+    upper = torch.tensor([[1.0, 0.0, 1.0]])
+    noise = white_noise(ActionSpace(-upper, upper, upper), 5, torch.Generator())
+    assert not noise[..., 1].any()
+    assert noise[..., [0, 2]].all()
+
+
+def test_a_cost_of_another_shape_is_refused() -> None:
+    with pytest.raises(ValueError, match="energies of shape"):
+        Planner(config("cem"), space()).plan(lambda actions: actions.sum(), torch.Generator())
+
+
+def test_a_start_of_another_shape_is_refused() -> None:
+    start = PlanStart(torch.zeros(2, 2), torch.zeros(0, 2, 2))
+    with pytest.raises(ValueError, match="start of"):
+        Planner(config("cem"), space()).plan(rosenbrock, torch.Generator(), start)

@@ -1,0 +1,35 @@
+"""A decision's picture is drawn for every end that a decision has."""
+
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from decisions import asked, picture
+from vjepa2_ac.planning.decision import PlanResult
+from vjepa2_ac.reports.figures.plan import plot_plan
+
+
+def drawn(found: PlanResult, folder: Path) -> np.ndarray:
+    with Image.open(plot_plan(found, folder / "plan.png")) as image:
+        return np.array(image.convert("RGB"))
+
+
+def test_slices_are_a_row_of_their_own(tmp_path: Path) -> None:
+    heights = [drawn(found, tmp_path).shape[0] for found in (asked(), asked(nodes=0), asked(start=100))]
+    assert heights == sorted(set(heights), reverse=True)
+
+
+def test_a_plan_without_energies_is_drawn_as_well(tmp_path: Path) -> None:
+    assert drawn(asked(broken=True), tmp_path).std() > 10
+
+
+def test_many_goals_and_a_mask_are_shown(tmp_path: Path) -> None:
+    found = asked(100, 101, 102, 103, nodes=0)
+    plain = drawn(found, tmp_path)
+    mask = np.zeros(picture(0).shape[:2], bool)
+    mask[:30] = True
+    object.__setattr__(found.question, "mask", mask)
+    masked = drawn(found, tmp_path)
+    assert masked.shape == plain.shape
+    assert not np.array_equal(masked, plain)

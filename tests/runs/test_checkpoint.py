@@ -1,0 +1,356 @@
+"""A checkpoint is whole or is not used."""
+
+import errno
+import json
+import logging
+import os
+import re
+import resource
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from vjepa2_ac.config import CheckpointConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.runs.checkpoint import (
+    CheckpointClock,
+    RunState,
+    checkpoint_name,
+    find_damage,
+    newest_checkpoint,
+    read_state,
+    write_checkpoint,
+)
+from vjepa2_ac.runs.manifest import write_manifest
+from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.setup import save_checkpoint, set_up
+
+
+def write_weights(folder: Path) -> None:
+    (folder / "adapter").mkdir()
+    (folder / "adapter" / "weights.bin").write_bytes(b"weights" * 1000)
+    (folder / "optimizer.pt").write_bytes(b"moments" * 1000)
+
+
+def write(folder: Path, step: int, keep: int = 5) -> Path:
+    return write_checkpoint(folder, RunState(step), write_weights, keep=keep)
+
+
+def test_what_is_written_is_found_again(tmp_path: Path) -> None:
+    path = write(tmp_path, 20)
+    assert newest_checkpoint(tmp_path) == path
+    assert read_state(path) == RunState(20)
+    assert find_damage(path) is None
+
+
+def test_a_folder_without_checkpoints_has_none(tmp_path: Path) -> None:
+    assert newest_checkpoint(tmp_path) is None
+    assert newest_checkpoint(tmp_path / "missing") is None
+
+
+def test_only_the_newest_are_kept(tmp_path: Path) -> None:
+    for step in (10, 20, 30, 100, 110):
+        write(tmp_path, step, keep=2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == [checkpoint_name(100), checkpoint_name(110)]
+
+
+@pytest.mark.parametrize("name", ["adapter/weights.bin", "optimizer.pt", "state.json", "manifest.json"])
+@pytest.mark.parametrize("fault", ["truncate", "flip", "remove"])
+def test_a_damaged_checkpoint_is_passed_over_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, fault: str
+) -> None:
+    older, newer = write(tmp_path, 10), write(tmp_path, 20)
+    victim = newer / name
+    content = bytearray(victim.read_bytes())
+    if fault == "truncate":
+        victim.write_bytes(content[: len(content) // 2])
+    elif fault == "flip":
+        content[len(content) // 2] ^= 0x10
+        victim.write_bytes(content)
+    else:
+        victim.unlink()
+    with caplog.at_level(logging.WARNING):
+        assert newest_checkpoint(tmp_path) == older
+    assert str(newer) in caplog.text
+
+
+def test_a_full_disk_leaves_the_older_checkpoints_and_no_debris(tmp_path: Path) -> None:
+    older = write(tmp_path, 10)
+
+    def disk_is_full(folder: Path) -> None:
+        (folder / "half").write_bytes(b"x")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(InputError, match="No space left"):
+        write_checkpoint(tmp_path, RunState(step=20), disk_is_full, keep=1)
+    assert list(tmp_path.iterdir()) == [older]
+    assert find_damage(older) is None
+
+
+@pytest.mark.parametrize("step", [30, 40])
+def test_what_a_killed_writer_left_behind_is_never_resumed_from_and_is_cleaned_up(tmp_path: Path, step: int) -> None:
+    debris = tmp_path / f".writing-{checkpoint_name(30)}"
+    debris.mkdir()
+    write_weights(debris)
+    assert newest_checkpoint(tmp_path) is None
+    path = write(tmp_path, step)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_when_every_checkpoint_is_damaged_the_run_stops_and_leaves_them(tmp_path: Path) -> None:
+    for step in (10, 20):
+        (write(tmp_path, step) / "optimizer.pt").write_bytes(b"")
+    with pytest.raises(InputError, match="none of 2 checkpoints is whole"):
+        newest_checkpoint(tmp_path)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_a_new_checkpoint_replaces_the_damaged_ones_after_it(tmp_path: Path) -> None:
+    older = write(tmp_path, 10, keep=1)
+    for step in (20, 30, 40):
+        (write(tmp_path, step, keep=9) / "optimizer.pt").write_bytes(b"")
+    path = write(tmp_path, 20, keep=2)
+    assert sorted(tmp_path.iterdir()) == [older, path]
+    assert newest_checkpoint(tmp_path) == path
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_best_stays_besides_the_newest_until_there_is_a_better_one(tmp_path: Path) -> None:
+    for step, error in [(10, 0.9), (20, 0.7), (30, 0.8), (40, float("nan")), (50, 0.7)]:
+        before = newest_checkpoint(tmp_path)
+        state = replace(read_state(before), step=step) if before else RunState(step)
+        write_checkpoint(tmp_path, state.measured(error), write_weights, keep=2)
+    assert names(tmp_path) == [checkpoint_name(20), checkpoint_name(40), checkpoint_name(50)]
+    state = read_state(newest_checkpoint(tmp_path))
+    assert (state.best_step, state.best_error) == (20, 0.7)
+    write_checkpoint(tmp_path, replace(state, step=60).measured(0.6), write_weights, keep=2)
+    assert names(tmp_path) == [checkpoint_name(50), checkpoint_name(60)]
+
+
+def test_a_best_checkpoint_that_is_gone_or_damaged_is_not_what_others_must_beat(tmp_path: Path) -> None:
+    best = write_checkpoint(tmp_path, RunState(10).measured(0.5), write_weights, keep=2)
+    newest = write_checkpoint(tmp_path, RunState(20, best_step=10, best_error=0.5), write_weights, keep=2)
+    assert read_state(newest) == RunState(20, best_step=10, best_error=0.5)
+    (best / "optimizer.pt").write_bytes(b"torn")
+    assert read_state(newest) == RunState(20)
+    shutil.rmtree(best)
+    assert read_state(newest) == RunState(20)
+
+
+def test_a_state_without_a_best_is_read_and_one_without_its_place_in_the_data_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path, 20)
+    (path / "state.json").write_text('{"step": 20, "clips_done": 80, "windows": 7}')
+    assert read_state(path) == RunState(20, clips_done=80, windows=7)
+    (path / "state.json").write_text('{"step": 20, "windows": 7}')
+    with pytest.raises(InputError, match="older version"):
+        read_state(path)
+
+
+def test_a_checkpoint_is_due_by_steps_and_by_minutes_since_the_last() -> None:
+    now = [0.0]
+    clock = CheckpointClock(CheckpointConfig(every=10, every_minutes=2.0), lambda: now[0])
+    assert [step for step in range(1, 21) if clock.is_due(step)] == [10, 20]
+    now[0] = 119.0
+    assert not clock.is_due(3)
+    now[0] = 120.0
+    assert clock.is_due(3)
+    clock.restart()
+    assert not clock.is_due(4)
+    now[0] = 1e9
+    assert not CheckpointClock(CheckpointConfig(every_minutes=None), lambda: now[0]).is_due(1)
+
+
+def manifest_of(files: dict[str, str]) -> str:
+    return json.dumps({"files": files})
+
+
+def test_a_manifest_that_names_too_little_or_a_file_elsewhere_is_no_manifest(tmp_path: Path, caplog) -> None:
+    older, newer = write(tmp_path / "run", 10), write(tmp_path / "run", 20)
+    files = json.loads((newer / "manifest.json").read_text())["files"]
+    (tmp_path / "elsewhere").write_bytes((newer / "state.json").read_bytes())
+    elsewhere = {"../../elsewhere": files["state.json"]}
+    for text, words in [
+        (manifest_of({}), "does not name state.json"),
+        (manifest_of({name: digest for name, digest in files.items() if name != "state.json"}), "does not name"),
+        (manifest_of({**files, **elsewhere}), "names ../../elsewhere, which is outside"),
+        (manifest_of({**files, str(tmp_path / "elsewhere"): files["state.json"]}), "which is outside"),
+        *((text, "no readable manifest.json") for text in ("", "[]", "{}", '{"files": 3}')),
+    ]:
+        (newer / "manifest.json").write_text(text)
+        caplog.clear()
+        assert newest_checkpoint(tmp_path / "run") == older
+        assert str(newer) in caplog.text, text
+        assert words in caplog.text, text
+
+
+class Faults:
+    """Lets the n-th operation that changes a disk fail, whoever asks for it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.done, self.fails_at, self._error = 0, -1, OSError()
+        places = [(os, name) for name in ("mkdir", "rename", "replace", "fsync")]
+        for where, name in [*places, (Path, "write_text"), (Path, "write_bytes")]:
+            monkeypatch.setattr(where, name, self._failing(getattr(where, name)))
+
+    def set(self, number: int, code: int) -> None:
+        self.done, self.fails_at, self._error = 0, number, OSError(code, os.strerror(code))
+
+    def _failing(self, real):
+        def operation(*arguments, **options):
+            self.done += 1
+            if self.done == self.fails_at:
+                raise self._error
+            return real(*arguments, **options)
+
+        return operation
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EROFS, errno.EIO])
+def test_whatever_operation_fails_older_checkpoints_stay_and_nothing_half_is_left(tmp_path, monkeypatch, code) -> None:
+    faults = Faults(monkeypatch)
+    write(tmp_path / "count", 10)
+    faults.set(-1, code)
+    write(tmp_path / "count", 20)
+    operations = faults.done
+    assert operations > 10, "folders, files, flushes, a rename"
+    for number in range(1, operations + 1):
+        folder = tmp_path / str(number)
+        faults.set(-1, code)
+        older = write(folder, 10)
+        faults.set(number, code)
+        with pytest.raises(InputError, match=rf"{checkpoint_name(20)}: .*cannot be written \({os.strerror(code)}\)"):
+            write(folder, 20)
+        assert find_damage(older) is None
+        assert all(find_damage(path) is None for path in folder.iterdir()), "whole or absent"
+        path = write(folder, 20)
+        assert newest_checkpoint(folder) == path, "with room again"
+
+
+def test_what_survives_a_power_cut_is_whole_and_is_there_before_an_older_one_goes(tmp_path, monkeypatch) -> None:
+    write(tmp_path, 10, keep=1)
+    happened: list[str] = []
+
+    def noting(what: str, real):
+        def operation(*arguments, **options):
+            path = Path(f"/proc/self/fd/{arguments[0]}").readlink() if what == "flush" else Path(arguments[0])
+            happened.append(f"{what} {path.relative_to(tmp_path)}")
+            return real(*arguments, **options)
+
+        return operation
+
+    monkeypatch.setattr(os, "fsync", noting("flush", os.fsync))
+    monkeypatch.setattr(os, "rename", noting("rename", os.rename))
+    monkeypatch.setattr(shutil, "rmtree", noting("remove", shutil.rmtree))
+    written = write(tmp_path, 20, keep=1)
+    temporary = f".writing-{checkpoint_name(20)}"
+    renamed = happened.index(f"rename {temporary}")
+    parts = [written, *written.rglob("*")]
+    assert {f"flush {temporary}/{part.relative_to(written)}".removesuffix("/.") for part in parts} < set(
+        happened[:renamed]
+    )
+    assert happened[renamed + 1 :] == ["flush .", f"remove {checkpoint_name(10)}"]
+
+
+@contextmanager
+def files_end_at(size: int) -> Iterator[None]:
+    """Let no file grow beyond a size: a full disk for Python, torch and safetensors alike."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("init", ["default", "pissa"])
+def test_a_disk_that_fills_up_in_any_file_is_the_users_error_and_changes_nothing(make_config, reporter, init) -> None:
+    config = make_config(training__steps=1, adapter__init=init)
+    folder = train(config, reporter)
+    run = set_up(config, reporter.note)
+    older = newest_checkpoint(folder / "checkpoints")
+    sizes = sorted(path.stat().st_size for path in older.rglob("*") if path.is_file())
+    run.state = replace(run.state, step=2)
+    for size in {0, *(size - 1 for size in sizes), sizes[-1] // 2, *range(0, sizes[-1], 9973)}:
+        with files_end_at(size), pytest.raises(InputError, match=r"step-00000002: .*cannot be written"):
+            save_checkpoint(run, folder)
+        assert [path.name for path in (folder / "checkpoints").iterdir()] == [older.name]
+    assert find_damage(older) is None
+    with files_end_at(sizes[-1] + 4096):
+        save_checkpoint(run, folder)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"adapter__init": "pissa"}, {"adapter__modules_to_save": ["action_encoder"]}, {"adapter__kind": "none"}],
+    ids=["lora", "pissa", "heads", "none"],
+)
+def test_a_checkpoint_holds_what_is_trained_and_never_the_frozen_base(make_config, reporter, changes) -> None:
+    config = make_config(training__steps=1, **changes)
+    checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
+    model = set_up(config, reporter.note).world_model
+    trained = sum(value.numel() for value in model.parameters() if value.requires_grad)
+    state = torch.load(checkpoint / "optimizer.pt", weights_only=True)["state"].values()
+    assert sum(moments[name].numel() for moments in state for name in ("exp_avg", "exp_avg_sq")) == 2 * trained
+    written = {path.name: load_file(path) for path in checkpoint.rglob("*.safetensors")}
+    if config.adapter.kind == "none":
+        assert {name: value.keys() for name, value in written.items()} == {
+            "predictor.safetensors": model.predictor.state_dict().keys()
+        }
+        return
+    for weights in written.values():  # the adapter; of PiSSA also where it started
+        assert sum(value.numel() for value in weights.values()) == trained
+        assert all(re.search(r"\.lora_[AB]|\.action_encoder\.", name) for name in weights)
+    rest = sum(path.stat().st_size for path in checkpoint.rglob("*") if path.name not in {*written, "optimizer.pt"})
+    assert rest < 20_000, "text"
+
+
+class Bomb:
+    """Leaves a mark when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self._mark = mark
+
+    def __reduce__(self) -> tuple:
+        return (Path.touch, (self._mark,))
+
+
+def test_an_optimizer_file_that_would_run_code_is_refused_and_does_not(make_config, reporter, tmp_path) -> None:
+    config = make_config(training__steps=1)
+    checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
+    torch.save({"state": Bomb(tmp_path / "mark")}, checkpoint / "optimizer.pt")
+    write_manifest(checkpoint)  # whoever can write the file can write the manifest
+    with pytest.raises(InputError, match=r"optimizer\.pt: more than tensors and plain values .*run foreign code"):
+        train(config, reporter)
+    assert not (tmp_path / "mark").exists()
+    torch.load(checkpoint / "optimizer.pt", weights_only=False)
+    assert (tmp_path / "mark").exists(), "the bomb is one"
+
+
+def test_a_checkpoint_of_another_base_is_refused_though_its_path_is_the_same(
+    make_config, reporter, base_folder: Path, tmp_path
+) -> None:
+    base = tmp_path / "base"
+    shutil.copytree(base_folder, base)
+    config = make_config(model__base=str(base), training__steps=1)
+    train(config, reporter)
+    shutil.rmtree(base)
+    WorldModel.random(WorldModel.from_pretrained(base_folder).sizes, seed=4).save_pretrained(base)
+    with pytest.raises(InputError, match="an adapter trained on another predictor"):
+        train(config, reporter)
+
+
+def test_a_run_of_pissa_goes_on_without_computing_where_it_started(make_config, reporter, monkeypatch) -> None:
+    config = make_config(training__steps=1, adapter__init="pissa")
+    train(config, reporter)
+    monkeypatch.setattr(torch.linalg, "svd", lambda *_, **__: pytest.fail("minutes, at the real size"))
+    assert set_up(config, reporter.note).state.step == 1

@@ -1,0 +1,194 @@
+"""Rows are appended, survive a kill, and are not written twice."""
+
+import errno
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from same_run import assert_same_run
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.metrics_log import MetricsLog, read_metrics_log
+from vjepa2_ac.runs.trackers import Trackers
+from vjepa2_ac.training import loop
+from vjepa2_ac.training.loop import train
+
+
+def steps(folder: Path) -> list[int]:
+    return [row["step"] for row in read_metrics_log(folder / "metrics.jsonl")]
+
+
+def test_rows_read_back(tmp_path: Path) -> None:
+    with MetricsLog(tmp_path, first_step=0) as journal:
+        journal.write("train", 1, {"loss": 0.5, "by_horizon": [1.0, 2.0]})
+    assert list(read_metrics_log(tmp_path / "metrics.jsonl")) == [
+        {"kind": "train", "step": 1, "loss": 0.5, "by_horizon": [1.0, 2.0]}
+    ]
+
+
+def test_steps_that_will_be_done_again_are_dropped_on_resume(tmp_path: Path) -> None:
+    with MetricsLog(tmp_path, first_step=0) as journal:
+        for step in range(6):
+            journal.write("train", step, {"loss": 0.5})
+    with MetricsLog(tmp_path, first_step=3) as journal:
+        journal.write("train", 4, {"loss": 0.4})
+    assert steps(tmp_path) == [0, 1, 2, 3, 4]
+
+
+def test_a_line_left_by_halves_is_dropped(tmp_path: Path) -> None:
+    (tmp_path / "metrics.jsonl").write_text(json.dumps({"kind": "train", "step": 1}) + '\n{"kind": "tra')
+    with MetricsLog(tmp_path, first_step=5):
+        pass
+    assert steps(tmp_path) == [1]
+
+
+def test_bytes_that_are_no_text_are_dropped_with_their_line(tmp_path: Path) -> None:
+    rows = b'{"kind": "train", "step": 1}\n', b"\x00\xff\xfe\n", b'{"kind": "train", "step": 2}\n'
+    (tmp_path / "metrics.jsonl").write_bytes(b"".join(rows))
+    assert steps(tmp_path) == [1, 2]
+
+
+def test_rows_are_on_the_disk_before_the_checkpoint_after_them(make_config, reporter, monkeypatch) -> None:
+    """Else a power cut could leave a run that goes on behind rows that it does not have."""
+    flushed: list[str] = []
+    real = os.fsync
+
+    def fsync(handle: int) -> None:
+        path = Path(f"/proc/self/fd/{handle}").readlink()
+        rows = f" {path.stat().st_size}" if path.name == "metrics.jsonl" else ""
+        flushed.append(path.name + rows)
+        real(handle)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    folder = train(make_config(training__steps=2, training__learning_rate=1e-9, checkpoint__every=1), reporter)
+    states = [place for place, name in enumerate(flushed) if name == "state.json"]
+    sizes = [row["step"] for row in read_metrics_log(folder / "metrics.jsonl")]
+    assert sizes == [0, 1, 2, 2], "a validation, a step, a step and its validation"
+    lines = (folder / "metrics.jsonl").read_text().splitlines(keepends=True)
+    ends = [len("".join(lines[:2])), len("".join(lines))]
+    for place, end in zip(states, ends, strict=True):
+        assert f"metrics.jsonl {end}" in flushed[:place]
+
+
+class FullDisk:
+    """Lets writes to metrics.jsonl fail, after some bytes of them, from a row on."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.is_full, self._write = False, os.write
+        monkeypatch.setattr(os, "write", self.write)
+
+    def write(self, handle: int, data: bytes) -> int:
+        if not self.is_full or Path(f"/proc/self/fd/{handle}").readlink().name != "metrics.jsonl":
+            return self._write(handle, data)
+        if bytes(data).startswith(b"{"):
+            return self._write(handle, bytes(data)[:7])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def full_from(disk: FullDisk, reporter, at: int):
+    stepped = reporter.stepped
+
+    def step_on(step: int, figures: dict) -> None:
+        stepped(step, figures)
+        disk.is_full = step >= at
+
+    reporter.stepped = step_on
+    return reporter
+
+
+def test_a_run_that_cannot_write_its_record_writes_its_checkpoint_and_says_of_which_file(
+    make_config, reporter, tmp_path, monkeypatch
+) -> None:
+    disk, quiet = FullDisk(monkeypatch), type(reporter)()
+    config = make_config(checkpoint__every=100, checkpoint__every_minutes=None, checkpoint__keep_best=False)
+    with pytest.raises(InputError, match=r"metrics\.jsonl: .*No space left on device.*The checkpoint of this step is"):
+        train(config, full_from(disk, reporter, 4))
+    assert reporter.steps[-1] == 4, "it ended at once"
+    disk.is_full = False
+    train(config, quiet)
+    assert quiet.steps == [5, 6], "no step was lost"
+    assert [row["step"] for row in read_metrics_log(tmp_path / "run/metrics.jsonl") if row["kind"] == "train"] == [
+        1, 2, 3, 5, 6
+    ]  # fmt: skip
+
+
+def test_where_a_checkpoint_makes_room_the_run_goes_on_and_its_record_is_whole(
+    make_config, reporter, tmp_path, monkeypatch
+) -> None:
+    disk, save = FullDisk(monkeypatch), loop.save_checkpoint
+
+    def make_room(*arguments: object) -> None:
+        save(*arguments)
+        disk.is_full = False
+
+    train(make_config(run_dir=str(tmp_path / "whole")), type(reporter)())
+    monkeypatch.setattr(loop, "save_checkpoint", make_room)
+    train(make_config(), full_from(disk, reporter, 3))
+    assert_same_run(tmp_path / "whole", tmp_path / "run")
+
+
+def test_where_neither_record_nor_checkpoint_can_be_written_both_are_named(tmp_path: Path, monkeypatch) -> None:
+    disk = FullDisk(monkeypatch)
+
+    def no_checkpoint() -> None:
+        with journal.before_a_checkpoint():
+            raise InputError(where="step-00000001", found="it cannot be written")
+
+    with MetricsLog(tmp_path, first_step=0) as journal:
+        with pytest.raises(InputError, match=r"^step-00000001: it cannot be written"):
+            no_checkpoint()
+        disk.is_full = True
+        journal.write("train", 1, {"loss": 0.5})
+        assert journal.is_behind
+        with pytest.raises(InputError, match=r"metrics\.jsonl: .*No space left.*step-00000001: it cannot be written"):
+            no_checkpoint()
+
+
+def test_a_flush_that_failed_is_not_taken_for_done_when_the_next_one_is(tmp_path: Path, monkeypatch) -> None:
+    """The system may have forgotten what it was to write."""
+    real, failures = os.fsync, [OSError(errno.EIO, "Input/output error")]
+
+    def fsync(handle: int) -> None:
+        if failures:
+            raise failures.pop()
+        real(handle)
+
+    def checkpoint() -> None:
+        with journal.before_a_checkpoint():
+            pass
+
+    with MetricsLog(tmp_path, first_step=0) as journal:
+        monkeypatch.setattr(os, "fsync", fsync)
+        with pytest.raises(InputError, match="Input/output error"):
+            checkpoint()
+
+
+def test_what_json_cannot_hold_becomes_null(tmp_path: Path) -> None:
+    with MetricsLog(tmp_path, first_step=0) as journal:
+        journal.write("train", 1, {"loss": float("nan")})
+    assert next(read_metrics_log(tmp_path / "metrics.jsonl"))["loss"] is None
+
+
+def test_trackers_get_each_row_and_are_closed_with_the_journal(tmp_path: Path) -> None:
+    class Tracker:
+        def __init__(self) -> None:
+            self.said: list[object] = []
+
+        def log(self, figures: Mapping[str, float], step: int) -> None:
+            self.said.append((step, dict(figures)))
+            raise RuntimeError("disk quota")
+
+        def close(self) -> None:
+            self.said.append("closed")
+
+    working, broken = Tracker(), Tracker()
+    working.log = lambda figures, step: working.said.append((step, dict(figures)))  # type: ignore[method-assign]
+    trackers = Trackers({"working": lambda: working, "broken": lambda: broken})
+    with MetricsLog(tmp_path, first_step=0, trackers=trackers) as journal:
+        journal.write("train", 1, {"loss": 0.5})
+        journal.write("train", 2, {"loss": 0.25})
+    assert steps(tmp_path) == [1, 2]
+    assert working.said == [(1, {"train/loss": 0.5}), (2, {"train/loss": 0.25}), "closed"]
+    assert broken.said == [(1, {"train/loss": 0.5})], "one that failed is left alone"

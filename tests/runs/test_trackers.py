@@ -1,0 +1,264 @@
+"""Trackers get the figures, and go on in the same run; one that fails costs a warning and nothing else."""
+
+import logging
+import sys
+import threading
+import time
+import types
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vjepa2_ac.config import Config, TrackingConfig
+from vjepa2_ac.config.loading import parse_config
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs import tracker_thread
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.runs.trackers import Trackers, open_trackers, require_installed
+from vjepa2_ac.training import loop
+from vjepa2_ac.training.loop import train
+
+
+@pytest.fixture(autouse=True)
+def _own_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No tracker writes into the user's home, reports home, or knows the user's account."""
+    for name in ("HOME", "WANDB_CACHE_DIR", "WANDB_CONFIG_DIR", "WANDB_DATA_DIR", "TRACKIO_DIR"):
+        monkeypatch.setenv(name, str(tmp_path / "home"))
+    for name in ("WANDB_API_KEY", "WANDB_DIR", "WANDB_MODE", "WANDB_PROJECT", "WANDB_RUN_ID"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("WANDB_ERROR_REPORTING", "false")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+
+
+def run_config(folder: Path, **tracking: Any) -> Config:
+    values = {
+        "run_dir": str(folder), "data": {"path": "d"}, "model": {"base": "b"},
+        "tracking": {"tensorboard": False, **tracking},
+    }  # fmt: skip
+    return parse_config(values, where="test")
+
+
+class Kept:
+    """A tracker that keeps what it gets, or raises."""
+
+    def __init__(self, fails_in: str = "") -> None:
+        self.rows: list[tuple[int, dict[str, float]]] = []
+        self.fails_in = fails_in
+        self.closed = 0
+
+    def log(self, figures: Mapping[str, float], step: int) -> None:
+        if self.fails_in == "log":
+            raise ConnectionError("the network\nis away")
+        self.rows.append((step, dict(figures)))
+
+    def close(self) -> None:
+        self.closed += 1
+        if self.fails_in == "close":
+            raise ConnectionError("the network is away")
+
+
+def failing() -> Kept:
+    raise ConnectionError("the network is away")
+
+
+def leaving() -> Kept:
+    raise SystemExit(3)
+
+
+def warnings_in(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+
+
+def test_figures_come_by_name_and_lists_number_by_number() -> None:
+    kept = Kept()
+    trackers = Trackers({"one": lambda: kept})
+    trackers.log("validation", 7, {"error": 0.5, "by_horizon": [1.0, 2.0], "nothing": float("nan"), "words": "no"})
+    trackers.close()
+    assert kept.rows == [(7, {"validation/error": 0.5, "validation/by_horizon/1": 1.0, "validation/by_horizon/2": 2.0})]
+
+
+@pytest.mark.parametrize("opening", [failing, leaving])
+def test_one_that_cannot_be_opened_costs_one_warning(caplog, opening: Callable[[], Kept]) -> None:
+    kept = Kept()
+    trackers = Trackers({"bad": opening, "good": lambda: kept})
+    trackers.log("train", 1, {"loss": 0.5})
+    trackers.close()
+    assert len(kept.rows) == kept.closed == 1
+    assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["bad cannot be opened"]
+
+
+@pytest.mark.parametrize("fails_in", ["log", "close"])
+def test_one_that_fails_later_costs_one_warning(caplog, fails_in: str) -> None:
+    bad, good = Kept(fails_in), Kept()
+    trackers = Trackers({"bad": lambda: bad, "good": lambda: good})
+    for step in (1, 2):
+        trackers.log("train", step, {"loss": 0.5})
+    trackers.close()
+    trackers.close()
+    assert len(good.rows) == 2
+    assert good.closed == 1
+    (said,) = warnings_in(caplog)
+    assert said.startswith("bad ")
+    assert "ConnectionError: the network" in said
+    assert "\n" not in said
+
+
+def test_one_that_hangs_is_left_behind(caplog) -> None:
+    never, started = threading.Event(), time.monotonic()
+    slow = Kept()
+    slow.close = never.wait  # type: ignore[method-assign, assignment]
+    trackers = Trackers({"stuck": lambda: never.wait(), "slow": lambda: slow}, opening_s=0.05, closing_s=0.05)  # type: ignore[dict-item, return-value]
+    trackers.log("train", 1, {"loss": 0.5})
+    trackers.close()
+    assert time.monotonic() - started < 4.0
+    never.set()
+    assert len(slow.rows) == 1
+    assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["stuck cannot be opened", "slow did not close"]
+
+
+def test_one_that_takes_minutes_holds_up_nothing_and_gets_all_in_the_end(caplog) -> None:
+    slow, goes_on = Kept(), threading.Event()
+    taken = slow.log
+
+    def log(figures: Mapping[str, float], step: int) -> None:
+        assert goes_on.wait(60)
+        taken(figures, step)
+
+    slow.log = log  # type: ignore[method-assign]
+    trackers = Trackers({"slow": lambda: slow}, opening_s=0.05, closing_s=60.0)
+    started = time.monotonic()
+    for step in range(100):
+        trackers.log("train", step, {"loss": 0.5})
+    time.sleep(0.1)
+    trackers.log("train", 100, {"loss": 0.5})
+    trackers.log("train", 101, {"loss": 0.5})
+    assert time.monotonic() - started < 30, "none was waited for"
+    assert warnings_in(caplog) == ["slow failed (no answer within 0.05 s); its figures wait"]
+    goes_on.set()
+    trackers.close()
+    assert [step for step, _ in slow.rows] == list(range(102))
+    assert slow.closed == 1
+
+
+def test_one_that_has_nothing_to_do_for_long_is_not_warned_of(caplog) -> None:
+    kept = Kept()
+    trackers = Trackers({"kept": lambda: kept}, opening_s=0.05)
+    trackers.log("train", 1, {"loss": 0.5})
+    while not kept.rows:
+        time.sleep(0.001)
+    time.sleep(0.1)
+    trackers.log("train", 2, {"loss": 0.5})
+    trackers.close()
+    assert warnings_in(caplog) == []
+
+
+def test_what_waits_for_a_tracker_is_bounded_and_the_rest_counted(caplog, monkeypatch) -> None:
+    monkeypatch.setattr(tracker_thread, "MOST_ROWS", 5)
+    never, slow = threading.Event(), Kept()
+
+    def opened() -> Kept:
+        never.wait(60)
+        return slow
+
+    trackers = Trackers({"slow": opened}, closing_s=60.0)
+    for step in range(12):
+        trackers.log("train", step, {"loss": 0.5})
+    never.set()
+    trackers.close()
+    assert [step for step, _ in slow.rows] == [0, 1, 2, 3, 4]
+    assert warnings_in(caplog) == ["slow was too slow for 7 rows, which are missing there"]
+
+
+def test_a_run_does_not_wait_for_a_tracker_that_never_opens(make_config, reporter, monkeypatch, caplog) -> None:
+    never = threading.Event()
+
+    def stuck(*_: object, **__: object) -> Trackers:
+        return Trackers({"stuck": lambda: never.wait()}, closing_s=0.05)  # type: ignore[dict-item, return-value]
+
+    monkeypatch.setattr(loop, "open_trackers", stuck)
+    folder = train(make_config(training__steps=2), reporter)
+    never.set()
+    assert [row["step"] for row in read_metrics_log(folder / "metrics.jsonl") if row["kind"] == "train"] == [1, 2]
+    assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["stuck cannot be opened"]
+
+
+@pytest.mark.parametrize("library", ["wandb", "trackio"])
+def test_one_that_is_not_installed_is_an_error_that_says_how_to_install_it(monkeypatch, library: str) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    require_installed(TrackingConfig())
+    asked = TrackingConfig(wandb="offline") if library == "wandb" else TrackingConfig(trackio=True)
+    with pytest.raises(InputError, match=rf"tracking\.{library}.*pip install .*\[{library}\]"):
+        require_installed(asked)
+
+
+def test_tensorboard_gets_the_numbers_and_forgets_steps_that_are_done_again(tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    config = run_config(tmp_path, tensorboard=True)
+    for first_step, steps in ((0, (1, 2, 3)), (1, (2,))):
+        trackers = open_trackers(config, tmp_path, run_id="x", first_step=first_step)
+        for step in steps:
+            trackers.log("train", step, {"loss": 0.25 * step})
+        trackers.close()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    assert [(event.step, event.value) for event in events.Scalars("train/loss")] == [(1, 0.25), (2, 0.5)]
+
+
+def test_weights_and_biases_goes_on_in_the_same_run_without_a_network(tmp_path: Path) -> None:
+    pytest.importorskip("wandb")
+    config = run_config(tmp_path, wandb="offline", project="arms")
+    for first_step in (0, 1):
+        trackers = open_trackers(config, tmp_path, run_id="abc123", first_step=first_step)
+        trackers.log("train", first_step + 1, {"loss": 0.25})
+        trackers.close()
+    files = list((tmp_path / "wandb").glob("offline-run-*-abc123/run-abc123.wandb"))
+    written = b"".join(path.read_bytes() for path in files)
+    assert written.count(b"train/loss") >= 2
+    for word in (b"arms", b"training.learning_rate", b"adapter.rank"):
+        assert word in written
+
+
+def test_weights_and_biases_without_a_login_costs_one_warning(tmp_path: Path, caplog, monkeypatch) -> None:
+    pytest.importorskip("wandb")
+    monkeypatch.setattr("sys.stdin", None)
+    trackers = open_trackers(run_config(tmp_path, wandb="online"), tmp_path, run_id="abc123", first_step=0)
+    trackers.log("train", 1, {"loss": 0.25})
+    trackers.close()
+    (said,) = warnings_in(caplog)
+    assert said.startswith("Weights & Biases cannot be opened")
+
+
+def test_a_tracker_is_asked_to_resume_the_run_by_its_id(tmp_path: Path, monkeypatch) -> None:
+    asked: dict[str, dict[str, Any]] = {}
+    kept = Kept()
+    kept.finish = kept.close  # type: ignore[attr-defined]
+
+    for library in ("wandb", "trackio"):
+        module = types.ModuleType(library)
+        module.init = lambda _library=library, **given: asked.setdefault(_library, given) and kept  # type: ignore[attr-defined]
+        module.Settings = types.SimpleNamespace  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, library, module)
+    config = run_config(tmp_path, wandb="online", trackio=True, project="arms")
+    trackers = open_trackers(config, tmp_path, run_id="abc123", first_step=0)
+    trackers.log("train", 3, {"loss": 0.5})
+    trackers.close()
+    assert kept.rows == [(3, {"train/loss": 0.5})] * 2
+    assert kept.closed == 2
+    assert (asked["wandb"]["id"], asked["trackio"]["name"]) == ("abc123", "abc123")
+    for given in asked.values():
+        assert (given["project"], given["resume"]) == ("arms", "allow")
+        assert given["config"]["training.learning_rate"] == config.training.learning_rate
+
+
+def test_trackio_goes_on_in_the_same_run(tmp_path: Path) -> None:
+    trackio = pytest.importorskip("trackio")
+    config = run_config(tmp_path, trackio=True, project="arms")
+    for first_step in (0, 1):
+        trackers = open_trackers(config, tmp_path, run_id="abc123", first_step=first_step)
+        trackers.log("train", first_step + 1, {"loss": 0.25})
+        trackers.close()
+    (run,) = trackio.Api().runs("arms")
+    assert run.name == "abc123"

@@ -1,0 +1,158 @@
+"""A model steers beside those it is compared with; table, figures and film tell the same."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+pytest.importorskip("av", reason="the extra `video` is not installed")
+
+from tiny_models import tiny_model
+from vjepa2_ac.cli import main
+from vjepa2_ac.console.closed_loop import contest_notes
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.video_reader import count_frames
+from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.simulation.closed_loop.benchmark import FILE, FILM, BenchmarkOptions, run_benchmark
+from vjepa2_ac.simulation.closed_loop.video import film_frames
+
+SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3", "planning.limits.xyz=[0.03,0.03,0.03]"]
+TWICE = ["--episodes", "2", "--steps", "2", "--films", "1"]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> str:
+    folder = tmp_path_factory.mktemp("models") / "tiny"
+    tiny_model().save_pretrained(folder)
+    return str(folder)
+
+
+def figures(folder: Path) -> dict:
+    return json.loads((folder / FILE).read_text())
+
+
+def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
+    model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["simulate", model, "--task", "reach", "--domain", "B", *TWICE, "--out", str(tmp_path), *SMALL]) == 0
+    shown = capsys.readouterr().out
+    rows = {line.split("│")[1].strip(): line for line in shown.splitlines() if line.startswith("│")}
+    assert list(rows) == ["tiny", "do nothing", "random", "oracle"]
+    assert "reach in domain B: 2 problems of seed 0, 2 steps of 0.27 s" in shown
+    told = figures(tmp_path)
+    assert list(told["policies"]) == list(rows)
+    assert told["about"]["planning"]["samples"] == 6
+    assert told["about"]["success_below_cm"] == 5
+    for name, one in told["policies"].items():
+        distances = np.array(one["by_episode"]["distance_cm"])
+        assert distances.shape == (2, 3)
+        assert one["final_distance_cm"]["value"] == pytest.approx(distances[:, -1].mean(), abs=1e-3)
+        assert one["by_episode"]["success"] == (distances[:, -1] < 5).tolist()
+        assert f"{one['final_distance_cm']['value']:.1f} [" in rows[name]
+    assert told["policies"]["tiny"]["why_counts"] == {"planned": 4}
+    starts = [one["by_episode"]["distance_cm"][0][0] for one in told["policies"].values()]
+    assert starts == starts[:1] * 4  # the same problems for all
+    assert count_frames(tmp_path / FILM, where="film") == 4 + 1 + 4  # the first and the last picture are held
+
+
+def test_the_same_call_gives_the_same_figures_and_another_seed_others(model: str, tmp_path: Path) -> None:
+    found = []
+    for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
+        out = str(tmp_path / name)
+        assert main(["simulate", model, *TWICE, "--films", "0", "--seed", seed, "--out", out, *SMALL]) == 0
+        found.append([one["by_episode"]["distance_cm"] for one in figures(tmp_path / name)["policies"].values()])
+        assert not (tmp_path / name / FILM).exists()
+    assert found[0] == found[1] != found[2]
+
+
+def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tiny_model()
+    with torch.no_grad():
+        broken.base_predictor.predictor_proj.weight.fill_(1e38)  # finite, and nothing that comes of it is
+    broken.save_pretrained(tmp_path / "broken")
+    out = tmp_path / "out"
+    assert main(["simulate", str(tmp_path / "broken"), *TWICE, "--films", "0", "--out", str(out), *SMALL]) == 1
+    assert "broken: of 4 decisions no finite energy 4" in capsys.readouterr().out
+    steered, nothing = (figures(out)["policies"][name]["by_episode"] for name in ("broken", "do nothing"))
+    assert steered["distance_cm"] == nothing["distance_cm"]
+
+
+def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path: Path) -> None:
+    asked = BenchmarkOptions(episodes=2, steps=1, films=1)
+    contest, files = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
+    assert [file.name for file in files] == [FILE, FILM]
+    steered = contest.results[0]
+    frames = list(film_frames([steered]))
+    episode = steered.episodes[0]
+    for frame, picture in ((frames[0], episode.pictures[0]), (frames[-1], episode.pictures[1])):
+        np.testing.assert_array_equal(frame[-360::2, :640:2], picture)
+        np.testing.assert_array_equal(frame[-360::2, -640::2], episode.goal_picture)
+    assert (frames[0] != frames[-1]).any()
+
+
+def test_what_was_unusual_is_noted(model: str, tmp_path: Path) -> None:
+    steering = load_to_plan(model, overrides=[*SMALL, "planning.budget_s=0.000001"])
+    contest, _ = run_benchmark(steering, BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path)
+    assert contest_notes(contest) == ("tiny: of 2 decisions out of time 2",)
+
+
+@pytest.mark.parametrize(
+    ("words", "wrong"),
+    [
+        (["{model}", "--domain", "random"], "needed: A or B"),
+        (["{model}", "--domain", "C"], "'C'"),
+        (["{model}", "--workers", "2"], "--workers"),
+        (["{model}", "--out", "{model}/config.json"], "config.json"),
+        (["{model}", "training.steps=3"], "training.steps=3"),
+        (["{model}", "--checkpoint", "best"], "--checkpoint best"),
+        (["no-such-model"], "no-such-model"),
+        (["record"], "one folder"),
+        (["record", "{here}/x", "{here}/y"], "one folder"),
+        (["record", "{here}/x", "--films", "1"], "--films"),
+    ],
+)
+def test_what_cannot_be_is_one_line(
+    words: list[str], wrong: str, model: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [word.format(model=model, here=tmp_path) for word in words]
+    assert main(["simulate", *given]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ")
+    assert wrong in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_library_is_told_before_anything_is_done(
+    model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "av", None)
+    with pytest.raises(InputError, match="PyAV"):
+        run_benchmark(load_to_plan(model), BenchmarkOptions(), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_model_of_states_in_the_cameras_frame_is_refused(model: str, tmp_path: Path) -> None:
+    steering = load_to_plan(model)
+    data = steering.config.data.model_copy(update={"pose_frame": "camera"})
+    steering = replace(steering, config=steering.config.model_copy(update={"data": data}))
+    with pytest.raises(InputError, match=r"data\.pose_frame: camera"):
+        run_benchmark(steering, BenchmarkOptions(), tmp_path)
+
+
+def test_a_task_with_a_block_has_its_own_number_of_steps(model: str, tmp_path: Path) -> None:
+    asked = BenchmarkOptions(task="pick", episodes=1, films=0)
+    contest, _ = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
+    assert figures(tmp_path)["about"]["steps"] == contest.results[0].steps == 12
+    assert figures(tmp_path)["policies"]["oracle"]["success"]["value"] == 1.0
+
+
+def test_a_stride_that_is_to_be_found_out_is_no_stride(model: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"data\.stride"):
+        run_benchmark(load_to_plan(model, overrides=["data.stride=auto"]), BenchmarkOptions(), tmp_path)

@@ -1,0 +1,130 @@
+"""What is recorded reads back as DROID, is consistent with the kinematics, and is the same every time."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import simplejpeg
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, DomainRanges
+from vjepa2_ac.simulation.world.kinematics import forward_kinematics
+
+pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+
+from vjepa2_ac.simulation.recording.record import episode_folder, record_dataset, record_episode
+from vjepa2_ac.simulation.world.arm import SimulatedArm
+
+EPISODES, STEPS = 3, 5
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sim") / "B"
+    return record_dataset(folder, domain="B", episodes=EPISODES, steps=STEPS, seed=3, shards=2)
+
+
+def test_the_loader_reads_what_was_recorded(recorded: Path) -> None:
+    source = RldsSource(DataConfig(path=str(recorded)))
+    infos = source.infos()
+    assert [info.num_steps for info in infos] == [STEPS] * EPISODES
+    assert len({info.id for info in infos}) == EPISODES
+    expected = {}
+    for index in range(EPISODES):
+        episode = record_episode(index, domain=DOMAIN_B, steps=STEPS, seed=3)
+        expected[f"{episode.recording_folderpath}--{episode.file_path}"] = episode
+    for index, info in enumerate(infos):
+        made, read = expected[info.id], source.read(index)
+        states = np.concatenate([made.observation.cartesian_position, made.observation.gripper_position], axis=1)
+        np.testing.assert_allclose(read.states, states, atol=1e-6)
+        assert info.success is ("/success/" in made.file_path)
+
+
+def test_the_pictures_show_the_measured_state(recorded: Path) -> None:
+    source = RldsSource(DataConfig(path=str(recorded)))
+    episode = source.read(0)
+    arm = SimulatedArm(DOMAIN_B)
+    for step in (0, STEPS - 1):
+        arm.set_state(np.asarray(episode.states[step], dtype=np.float64))
+        difference = np.abs(episode.read_frames([step])[0].astype(int) - arm.picture())
+        assert difference.mean() < 4.0  # JPEG, and the arm's spare degree of freedom
+
+
+def test_measured_poses_are_those_of_the_measured_joints() -> None:
+    for domain in (DOMAIN_A, DOMAIN_B):
+        seen = record_episode(0, domain=domain, steps=STEPS, seed=0).observation
+        np.testing.assert_array_equal(forward_kinematics(seen.joint_position), seen.cartesian_position)
+
+
+def test_commands_differ_from_measurements_and_velocities_from_zero() -> None:
+    episode = record_episode(1, domain=DOMAIN_A, steps=9, seed=0)
+    assert np.abs(episode.action[:, :3] - episode.observation.cartesian_position[:, :3]).max() > 0.005
+    np.testing.assert_array_equal(episode.action[:, :6], episode.action_dict.cartesian_position)
+    moved = np.diff(episode.action_dict.joint_position, axis=0) * 15.0
+    np.testing.assert_allclose(episode.action_dict.joint_velocity[1:], moved)
+    assert np.abs(episode.action_dict.cartesian_velocity).max() < 5.0  # no jump where angles wrap
+
+
+def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(recorded: Path, tmp_path: Path) -> None:
+    again = record_dataset(tmp_path / "again", domain="B", episodes=EPISODES, steps=STEPS, seed=3, shards=2, workers=2)
+    for file in sorted(recorded.iterdir()):
+        assert file.read_bytes() == (again / file.name).read_bytes()
+
+
+def test_another_seed_gives_other_episodes() -> None:
+    first, second = (record_episode(0, domain=DOMAIN_A, steps=2, seed=seed) for seed in (0, 1))
+    assert first.file_path.rsplit("/", 2)[1] != second.file_path.rsplit("/", 2)[1]
+    assert np.abs(first.observation.joint_position - second.observation.joint_position).max() > 0.01
+
+
+def test_another_look_changes_the_pictures_and_nothing_else() -> None:
+    looks = DOMAIN_A, replace(DOMAIN_A, look=DOMAIN_B.look)
+    first, second = (record_episode(0, domain=domain, steps=2, seed=0) for domain in looks)
+    np.testing.assert_array_equal(first.observation.joint_position, second.observation.joint_position)
+    np.testing.assert_array_equal(first.action, second.action)
+    assert first.images["exterior_image_1_left"] != second.images["exterior_image_1_left"]
+
+
+def test_one_camera_is_shared_by_all_three_and_three_differ() -> None:
+    shared = record_episode(0, domain=DOMAIN_A, steps=2, seed=0)
+    own = record_episode(0, domain=DOMAIN_A, steps=2, seed=0, cameras=3)
+    assert len({tuple(pictures) for pictures in shared.images.values()}) == 1
+    assert len({tuple(pictures) for pictures in own.images.values()}) == 3
+    assert own.images["exterior_image_1_left"] == shared.images["exterior_image_1_left"]
+
+
+def test_most_episodes_succeed_and_no_two_share_a_folder() -> None:
+    folders = [episode_folder(index, 0, "A") for index in range(500)]
+    assert 0.85 < np.mean(["/success/" in folder for folder in folders]) < 0.95
+    assert len(set(folders)) == 500
+
+
+def test_every_episode_of_a_random_set_has_its_own_world() -> None:
+    walls = []
+    for index in range(3):
+        jpeg = record_episode(index, domain=DomainRanges(), steps=2, seed=0).images["exterior_image_1_left"][0]
+        walls.append(simplejpeg.decode_jpeg(jpeg)[:20, :20].reshape(-1, 3).mean(axis=0))
+    assert np.ptp(walls, axis=0).max() > 20
+
+
+def test_progress_is_told_after_every_episode(tmp_path: Path) -> None:
+    told: list[tuple[int, int]] = []
+    record_dataset(
+        tmp_path / "random", domain="random", episodes=2, steps=2, progress=lambda *state: told.append(state)
+    )
+    assert told == [(1, 2), (2, 2)]
+
+
+def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="at least 1 episode"):
+        record_dataset(tmp_path / "x", domain="A", episodes=0)
+    with pytest.raises(InputError, match="seed -1"):
+        record_dataset(tmp_path / "x", domain="A", episodes=1, seed=-1)
+    with pytest.raises(InputError, match="shards 0"):
+        record_dataset(tmp_path / "x", domain="A", episodes=1, shards=0)
+    with pytest.raises(InputError, match="one of A, B, or random"):
+        record_dataset(tmp_path / "x", domain="Z", episodes=1)
+    assert not (tmp_path / "x").exists()

@@ -1,0 +1,73 @@
+"""Demonstrations with a block touch it, and are recorded as all others."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vjepa2_ac.simulation.world.domains import DOMAIN_A
+from vjepa2_ac.simulation.world.kinematics import forward_kinematics
+
+pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+
+from vjepa2_ac.cli import main
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.simulation.recording.record import record_episode
+from vjepa2_ac.simulation.recording.scripted_play import play
+
+
+def blocks_of(task: str, seed: int, *, script: bool, steps: int = 41) -> np.ndarray:
+    seen = []
+    play(task, DOMAIN_A, steps, np.random.default_rng(seed), script=script, look=lambda arm: seen.append(arm.block))
+    return np.array(seen)
+
+
+def test_scripts_and_play_move_the_block() -> None:
+    pushed = blocks_of("push", 1, script=True)
+    assert len(pushed) == 41
+    assert np.linalg.norm(pushed[-1, :2] - pushed[0, :2]) > 0.08
+    assert blocks_of("pick", 1, script=True)[-1, 2] > 0.10
+    played = [blocks_of("push", seed, script=False, steps=25) for seed in range(3)]
+    ways = [np.linalg.norm(blocks[-1, :2] - blocks[0, :2]) for blocks in played]
+    assert max(ways) > 0.05
+
+
+def test_measurements_follow_commands_that_are_held_for_a_model_step() -> None:
+    motion = play("push", DOMAIN_A, 9, np.random.default_rng(0), script=False)
+    for first in (0, 4):
+        np.testing.assert_array_equal(motion.commanded_joints[first : first + 4], motion.commanded_joints[[first] * 4])
+    assert (motion.commanded_joints[4] != motion.commanded_joints[3]).any()
+    to_go = [np.abs(motion.commanded_joints[0] - motion.joints[step]).max() for step in range(4)]
+    assert to_go[0] > to_go[1] > to_go[2] > to_go[3]
+
+
+def test_an_episode_with_a_block_is_consistent_and_always_the_same() -> None:
+    first, again = (record_episode(2, domain=DOMAIN_A, steps=6, seed=1, task="pick") for _ in range(2))
+    assert first.images == again.images
+    seen = first.observation
+    np.testing.assert_array_equal(forward_kinematics(seen.joint_position), seen.cartesian_position)
+    assert all(len(film) == 6 for film in first.images.values())
+    assert first.language_instruction == "pick up the block"
+    other = record_episode(2, domain=DOMAIN_A, steps=6, seed=1)
+    assert other.language_instruction != first.language_instruction
+    assert np.abs(other.action - first.action).max() > 0.01
+
+
+def test_every_other_episode_is_scripted(monkeypatch: pytest.MonkeyPatch) -> None:
+    from vjepa2_ac.simulation.recording import scripted_play as module
+
+    asked, real = [], module.play
+    monkeypatch.setattr(module, "play", lambda *args, **more: asked.append(more["script"]) or real(*args, **more))
+    for index in range(3):
+        record_episode(index, domain=DOMAIN_A, steps=2, seed=0, task="push")
+    assert asked == [True, False, True]
+
+
+def test_the_command_records_a_task(tmp_path: Path) -> None:
+    words = ["simulate", "record", str(tmp_path / "data"), "--task", "push", "--episodes", "2", "--steps", "5"]
+    assert main(words) == 0
+    source = RldsSource(DataConfig(path=str(tmp_path / "data")))
+    assert [info.num_steps for info in source.infos()] == [5, 5]
+    frame = source.read(0).read_frames([0])[0].astype(int)
+    assert (frame[..., 1] > 1.8 * np.maximum(frame[..., 0], frame[..., 2])).sum() > 20  # the green block

@@ -1,0 +1,199 @@
+"""What the cameras see is the arm where it is, in the domain's colours."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import matrices_from_euler
+from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain, DomainRanges, named_domain, sample_domain
+from vjepa2_ac.simulation.world.kinematics import HOME, LOW, forward_kinematics
+from vjepa2_ac.simulation.world.motion import rest_joints
+
+mujoco = pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+
+from vjepa2_ac.simulation.world import arm as arm_module  # noqa: E402
+from vjepa2_ac.simulation.world.arm import SimulatedArm  # noqa: E402
+from vjepa2_ac.simulation.world.camera import RayCamera  # noqa: E402
+from vjepa2_ac.simulation.world.ray_renderer import View  # noqa: E402
+from vjepa2_ac.simulation.world.scene import compile_scene, load_mujoco  # noqa: E402
+
+REACHES = HOME + np.array([[0] * 7, [0.4, 0.3, 0.0, 0.4, 0.1, 0.2, 0.5], [-0.6, 0.2, 0.3, -0.2, 0.0, -0.3, 0.0]])
+
+
+@pytest.fixture(scope="module")
+def arm() -> SimulatedArm:
+    return SimulatedArm(DOMAIN_A)
+
+
+def hand_pixel(arm: SimulatedArm) -> tuple[int, int]:
+    """Project the middle of the hand into the picture by the extrinsics and the state that the arm reports."""
+    camera, pose = arm.extrinsics(), arm.state
+    middle = pose[:3] + 0.035 * matrices_from_euler(pose[3:6])[:, 2]
+    x, y, z = matrices_from_euler(camera[3:]).T @ (middle - camera[:3])
+    focal = 90.0 / np.tan(np.deg2rad(arm.domain.camera.vertical_fov_deg) / 2)
+    return int(160.0 + focal * x / z), int(90.0 + focal * y / z)
+
+
+def test_the_scene_and_the_arithmetic_agree_on_where_the_flange_is() -> None:
+    model = compile_scene(DOMAIN_A)
+    data = mujoco.MjData(model)
+    for joints in np.random.default_rng(0).uniform(LOW, -LOW, size=(10, 7)):
+        data.qpos[:7] = joints
+        mujoco.mj_kinematics(model, data)
+        pose = forward_kinematics(joints)
+        np.testing.assert_allclose(data.site("flange").xpos, pose[:3], atol=1e-9)
+        np.testing.assert_allclose(data.site("flange").xmat.reshape(3, 3), matrices_from_euler(pose[3:]), atol=1e-6)
+
+
+@pytest.mark.parametrize("domain", [DOMAIN_A, DOMAIN_B], ids=["A", "B"])
+def test_the_hand_is_in_the_picture_where_the_reported_poses_say(domain: Domain) -> None:
+    arm = SimulatedArm(domain)
+    pictures = []
+    for joints in REACHES:
+        arm.set_joints(joints + rest_joints(domain) - HOME, 0.0)
+        picture = arm.picture().astype(int)
+        column, row = hand_pixel(arm)
+        red, _, blue = picture[row, column]
+        assert red > 2 * blue  # the hand's colour, which nothing else has
+        pictures.append(picture)
+    changed = (np.abs(pictures[0] - pictures[1]) > 40).any(axis=-1).mean()
+    assert 0.03 < changed < 0.6
+
+
+def test_the_arm_is_large_in_the_picture(arm: SimulatedArm) -> None:
+    arm.set_joints(HOME, 0.0)
+    picture = arm.picture()[:, 38:281].astype(int)  # what the model sees of it
+    white, orange = picture.min(axis=-1) > 130, picture[..., 0] > 2 * picture[..., 2]
+    assert (white | orange).mean() > 0.08
+    assert orange.mean() > 0.01
+
+
+def test_leaving_out_rays_that_pass_the_arm_by_changes_no_pixel(monkeypatch: pytest.MonkeyPatch) -> None:
+    sparing, thorough = (SimulatedArm(DOMAIN_B) for _ in range(2))
+    for joints in REACHES:
+        sparing.set_joints(joints, 0.0)
+        thorough.set_joints(joints, 0.0)
+        with monkeypatch.context() as patch:
+            seen = sparing.picture()
+            patch.setattr(View, "near_arm", lambda view, *_: np.arange(len(view.rays)))
+            np.testing.assert_array_equal(seen, thorough.picture())
+
+
+def test_closing_the_gripper_is_seen(arm: SimulatedArm) -> None:
+    arm.set_joints(HOME, 0.0)
+    opened = arm.picture()
+    arm.set_joints(HOME, 1.0)
+    assert (opened != arm.picture()).any()
+
+
+def test_another_look_gives_another_picture_of_the_same_arm() -> None:
+    other = SimulatedArm(replace(DOMAIN_A, look=DOMAIN_B.look))
+    first = SimulatedArm(DOMAIN_A)
+    np.testing.assert_array_equal(first.state, other.state)
+    assert (np.abs(first.picture().astype(int) - other.picture()).max(axis=-1) > 20).mean() > 0.5
+
+
+def test_the_three_cameras_see_different_things(arm: SimulatedArm) -> None:
+    pictures = [arm.picture(name) for name in ("exterior_1", "exterior_2", "wrist")]
+    assert not (pictures[0] == pictures[1]).all()
+    assert not (pictures[1] == pictures[2]).all()
+    with pytest.raises(ValueError, match="no camera"):
+        arm.picture("elbow")
+
+
+def test_the_wrist_camera_moves_with_the_arm(arm: SimulatedArm) -> None:
+    views = []
+    for joints in REACHES[:2]:
+        arm.set_joints(joints, 0.0)
+        views.append((arm.picture("wrist"), arm.extrinsics("wrist")))
+    assert np.linalg.norm(views[0][1][:3] - views[1][1][:3]) > 0.05
+    fresh = SimulatedArm(DOMAIN_A)
+    fresh.set_joints(REACHES[1], 0.0)
+    np.testing.assert_array_equal(fresh.picture("wrist"), views[1][0])
+
+
+def test_a_fixed_camera_is_where_its_domain_puts_it_however_the_robot_is_mounted() -> None:
+    extrinsics = SimulatedArm(DOMAIN_B).extrinsics()
+    turn = DOMAIN_B.base_pose()[:3, :3]
+    np.testing.assert_allclose(turn @ extrinsics[:3], DOMAIN_B.camera.pose()[:3, 3], atol=1e-9)
+    np.testing.assert_allclose(turn @ matrices_from_euler(extrinsics[3:]), DOMAIN_B.camera.pose()[:3, :3], atol=1e-9)
+
+
+def test_a_commanded_state_is_approached_and_reached() -> None:
+    arm = SimulatedArm(DOMAIN_B)
+    target = arm.state + np.array([0.05, -0.05, -0.05, 0, 0, 0, 1.0])
+    first = arm.command(target)
+    assert 0.02 < np.linalg.norm(first[:3] - target[:3]) < 0.08
+    last = arm.command(target, control_steps=40)
+    np.testing.assert_allclose(last[:3], target[:3], atol=1e-4)
+    assert abs(last[6] - 1.0) < 1e-3
+    np.testing.assert_array_equal(last, arm.state)
+
+
+def test_a_state_that_is_set_is_the_state_that_is_measured() -> None:
+    arm = SimulatedArm(DOMAIN_A)
+    state = np.array([0.5, 0.1, 0.3, np.pi, 0.0, -0.6, 0.5])
+    arm.set_state(state)
+    np.testing.assert_allclose(arm.state[:3], state[:3], atol=1e-4)
+    assert arm.state[6] == 0.5
+
+
+def test_sampled_domains_stay_in_their_ranges_and_differ() -> None:
+    rng, ranges = np.random.default_rng(5), DomainRanges(azimuth_deg=(40.0, 60.0))
+    domains = [sample_domain(rng, ranges) for _ in range(20)]
+    assert len(set(domains)) == 20
+    for domain in domains:
+        assert 40.0 <= domain.camera.azimuth_deg <= 60.0
+        assert abs(np.mean(domain.look.arm) - np.mean(domain.look.table)) > 0.1
+    assert sample_domain(np.random.default_rng(1)) == sample_domain(np.random.default_rng(1))
+
+
+def test_domain_b_lies_outside_of_what_the_base_is_trained_on() -> None:
+    ranges = DomainRanges()
+    assert ranges.azimuth_deg[0] <= DOMAIN_A.camera.azimuth_deg <= ranges.azimuth_deg[1] < DOMAIN_B.camera.azimuth_deg
+    assert ranges.base_yaw_deg[1] < DOMAIN_B.base_yaw_deg
+
+
+def test_an_unknown_domain_is_refused_by_name() -> None:
+    with pytest.raises(InputError, match=r"'C'.*A, B"):
+        named_domain("C")
+
+
+def test_missing_mujoco_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(InputError, match=r'pip install -c constraints.txt -e "\.\[sim\]"'):
+        load_mujoco()
+
+
+def test_opengl_that_does_not_work_is_one_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise AttributeError("no display")
+
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    with pytest.raises(InputError, match=r"OpenGL does not work here .*no display.*renderer: rays"):
+        SimulatedArm(DOMAIN_A, renderer="opengl")
+
+
+def test_the_opengl_camera_is_told_the_same_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    class FakeRenderer:
+        def __init__(self, *_: object) -> None: ...
+
+        def update_scene(self, _: object, camera: object) -> None:
+            seen.append(camera)
+
+        def render(self) -> np.ndarray:
+            return np.zeros((180, 320, 3), dtype=np.uint8)
+
+    monkeypatch.setattr(mujoco, "Renderer", FakeRenderer)
+    SimulatedArm(DOMAIN_A, renderer="opengl").picture()
+    eye, pose = seen[0], DOMAIN_A.camera.pose()
+    azimuth, elevation = np.deg2rad(eye.azimuth), np.deg2rad(eye.elevation)
+    forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    np.testing.assert_allclose(forward, pose[:3, 2], atol=1e-9)
+    np.testing.assert_allclose(np.array(eye.lookat) - eye.distance * forward, pose[:3, 3], atol=1e-9)
+    assert arm_module.OpenGlCamera is not RayCamera

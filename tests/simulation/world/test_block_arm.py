@@ -1,0 +1,130 @@
+"""With contacts the arm goes where it went without them, stops where something is in the way, and moves the block."""
+
+import numpy as np
+import pytest
+
+from vjepa2_ac.geometry import matrices_from_euler
+from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING
+from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, Domain
+from vjepa2_ac.simulation.world.motion import downward_poses, poses_in_base
+from vjepa2_ac.simulation.world.scene import BLOCK_M, FINGERTIP_M
+
+pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+
+from vjepa2_ac.simulation.closed_loop.tasks import arm_for
+from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.world.block_arm import ContactArm
+
+
+@pytest.fixture
+def arm() -> ContactArm:
+    return ContactArm(DOMAIN_B)
+
+
+def state_over(domain: Domain, x: float, y: float, z: float, closedness: float = 0.0) -> np.ndarray:
+    """Return the state with the flange at a place of the world, pointing down."""
+    pose = poses_in_base(downward_poses(np.array([[x, y, z, 0.0]])), domain)[0]
+    return np.append(pose, closedness)
+
+
+def block_at(domain: Domain, x: float, y: float, z: float = BLOCK_M / 2) -> np.ndarray:
+    place = domain.base_pose()[:3, :3].T @ np.array([x, y, z])
+    return np.append(place, -np.deg2rad(domain.base_yaw_deg))
+
+
+def moved(state: np.ndarray, *way: float, closedness: float | None = None) -> np.ndarray:
+    return np.array([*(state[:3] + way), *state[3:6], state[6] if closedness is None else closedness])
+
+
+@pytest.mark.parametrize("domain", [DOMAIN_A, DOMAIN_B], ids=["A", "B"])
+def test_where_nothing_is_in_the_way_the_arm_follows_as_without_contacts(domain: Domain) -> None:
+    free, touching = SimulatedArm(domain), ContactArm(domain)
+    for step in range(3):
+        target = moved(free.state, 0.05, -0.05, -0.04, closedness=0.3 * (step + 1))
+        one, other = free.command(target, 4), touching.command(target, 4)
+        np.testing.assert_allclose(other[:3], one[:3], atol=2e-3)
+        turn = matrices_from_euler(other[3:6]) @ matrices_from_euler(one[3:6]).T
+        assert np.arccos(min(1.0, (np.trace(turn) - 1) / 2)) < 0.01
+        assert other[6] == pytest.approx(one[6], abs=0.02)
+
+
+def test_a_block_is_where_it_was_put_in_the_frame_of_the_base(arm: ContactArm) -> None:
+    block = np.array([0.4, 0.2, 0.25, 0.3])
+    arm.place_block(block)
+    np.testing.assert_allclose(arm.block, block, atol=1e-9)
+    in_world = DOMAIN_B.base_pose()[:3, :3] @ block[:3]
+    np.testing.assert_allclose(arm._data.body("block").xpos, in_world, atol=1e-9)
+    arm.command_joints(arm.joints, 0.0, 15)
+    assert arm.block[2] == pytest.approx(BLOCK_M / 2, abs=2e-3)  # it fell on the table
+    np.testing.assert_allclose(arm.block[:2], block[:2], atol=5e-3)
+
+
+def test_a_hand_that_goes_through_a_block_pushes_it_ahead(arm: ContactArm) -> None:
+    arm.set_state(state_over(DOMAIN_B, 0.42, 0.0, 0.17, 1.0))
+    arm.place_block(block_at(DOMAIN_B, 0.50, 0.0))
+    before = arm.block
+    for step in range(1, 5):
+        state = arm.command(state_over(DOMAIN_B, 0.42 + 0.035 * step, 0.0, 0.17, 1.0), 4)
+    turn = DOMAIN_B.base_pose()[:3, :3]
+    way, hand = turn @ (arm.block - before)[:3], turn @ state[:3]
+    assert 0.07 < way[0] < 0.14
+    assert abs(way[1]) < 0.015
+    assert (turn @ arm.block[:3])[0] - hand[0] > BLOCK_M / 2  # not through it
+
+
+def test_the_table_stops_the_fingers(arm: ContactArm) -> None:
+    arm.set_state(state_over(DOMAIN_B, 0.45, 0.1, 0.20))
+    for _ in range(5):
+        state = arm.command(moved(arm.state, 0.0, 0.0, -0.04), 4)
+    assert FINGERTIP_M - 0.012 < state[2] < FINGERTIP_M + 0.005
+
+
+def test_a_grasped_block_is_lifted_held_and_let_go(arm: ContactArm) -> None:
+    arm.set_state(state_over(DOMAIN_B, 0.48, 0.05, BLOCK_M / 2 + GRASP_M))
+    arm.place_block(block_at(DOMAIN_B, 0.48, 0.05))
+    closed = arm.command(moved(arm.state, 0.0, 0.0, 0.0, closedness=0.9), 8)
+    assert closed[6] == pytest.approx(HOLDING, abs=0.06)  # measured where the block stops it
+    for _ in range(3):
+        arm.command(moved(arm.state, 0.0, 0.0, 0.05), 4)  # the gripper is told to stay: it goes on holding
+    lifted = arm.block[2]
+    assert lifted > BLOCK_M / 2 + 0.10
+    arm.command(moved(arm.state, 0.0, 0.0, 0.0), 15)
+    assert arm.block[2] == pytest.approx(lifted, abs=0.02)
+    arm.command(moved(arm.state, 0.0, 0.0, 0.0, closedness=0.0), 15)
+    assert arm.block[2] < 0.05
+
+
+def test_the_camera_sees_the_block_where_it_is_now(arm: ContactArm) -> None:
+    camera = arm.extrinsics()
+    focal = 90.0 / np.tan(np.deg2rad(DOMAIN_B.camera.vertical_fov_deg) / 2)
+    for y in (-0.15, 0.05):
+        arm.place_block(block_at(DOMAIN_B, 0.55, y))
+        picture = arm.picture().astype(int)
+        x, down, far = matrices_from_euler(camera[3:]).T @ (arm.block[:3] - camera[:3])
+        row, column = int(90 + focal * down / far), int(160 + focal * x / far)
+        red, green, blue = picture[row, column]
+        assert green > 1.8 * max(red, blue)
+        is_green = picture[..., 1] > 1.8 * np.maximum(picture[..., 0], picture[..., 2])
+        rows, columns = np.nonzero(is_green)
+        assert abs(rows.mean() - row) < 6
+        assert abs(columns.mean() - column) < 6
+
+
+def test_a_placed_arm_is_at_rest_whatever_it_did_before(arm: ContactArm) -> None:
+    found = []
+    for first in (0.05, -0.05):
+        arm.command(moved(arm.state, first, 0.0, 0.0, closedness=1.0), 2)
+        arm.set_joints(arm.joints * 0 + [0.0, -0.4, 0.0, -2.4, 0.0, 2.0, 0.8], 0.2)
+        arm.place_block(block_at(DOMAIN_B, 0.5, 0.2))
+        found.append(arm.command_joints(arm.joints, 0.2, 4))
+        arm.command(moved(arm.state, 0.02, 0.0, 0.0), 2)
+    np.testing.assert_array_equal(found[0], found[1])
+    assert found[0][6] == pytest.approx(0.2, abs=1e-3)
+
+
+def test_only_tasks_with_a_block_have_one() -> None:
+    reaching = arm_for("reach", DOMAIN_A)
+    assert reaching.block is None
+    with pytest.raises(ValueError, match="no block to be put"):
+        reaching.place_block(np.zeros(4))
+    assert all(arm_for(task, DOMAIN_A).block is not None for task in ("push", "pick"))

@@ -1,0 +1,77 @@
+"""Demonstrations stay in their box, move as far as they should, and are measured behind their commands."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from vjepa2_ac.geometry import matrices_from_euler
+from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
+from vjepa2_ac.simulation.world.kinematics import HIGH, HOME, LOW, forward_kinematics
+from vjepa2_ac.simulation.world.motion import MotionRecipe, follow, random_reaching, rest_joints, tracking_share
+
+RECIPE = MotionRecipe()
+
+
+def test_a_model_step_moves_the_flange_two_to_eight_centimetres() -> None:
+    ways = []
+    for seed in range(6):
+        poses = random_reaching(DOMAIN_A, 41, np.random.default_rng(seed)).poses
+        ways.append(np.linalg.norm(np.diff(poses[:: RECIPE.stride, :3], axis=0), axis=1))
+    lengths = np.concatenate(ways)
+    assert np.mean((lengths > 0.02) & (lengths < 0.08)) > 0.75
+    assert lengths.max() < 0.075 * np.sqrt(3)
+
+
+def test_the_flange_stays_in_the_box_and_the_joints_within_their_limits() -> None:
+    motion = random_reaching(DOMAIN_A, 81, np.random.default_rng(0))
+    positions = motion.commanded_poses[:, :3]
+    assert (positions > np.array(RECIPE.low_m) - 1e-4).all()
+    assert (positions < np.array(RECIPE.high_m) + 1e-4).all()
+    assert (motion.joints >= LOW).all()
+    assert (motion.joints <= HIGH).all()
+    downward = matrices_from_euler(motion.commanded_poses[:, 3:])[:, 2, 2]
+    np.testing.assert_allclose(downward, -1.0, atol=1e-6)
+
+
+def test_measurements_lag_behind_the_commands() -> None:
+    motion = random_reaching(DOMAIN_A, 61, np.random.default_rng(1))
+    commanded, measured = motion.commanded_poses[:, :3], motion.poses[:, :3]
+    same_time = np.linalg.norm(measured - commanded, axis=1).mean()
+    one_later = np.linalg.norm(measured[1:] - commanded[:-1], axis=1).mean()
+    assert 0.005 < one_later < same_time < 0.05
+    share = tracking_share(DOMAIN_A.lag_s)
+    ways = share * (motion.commanded_joints[:-1] - motion.joints[:-1])
+    np.testing.assert_allclose(np.diff(motion.joints, axis=0), ways, atol=1e-12)
+
+
+def test_a_command_that_holds_is_reached() -> None:
+    measured = follow(np.concatenate([np.zeros((1, 1)), np.ones((40, 1))]), 0.5)
+    assert measured[0] == 0.0
+    assert measured[1] == 0.5
+    assert abs(measured[-1] - 1.0) < 1e-9
+
+
+def test_the_gripper_opens_and_closes() -> None:
+    motion = random_reaching(DOMAIN_A, 200, np.random.default_rng(2))
+    assert set(motion.commanded_gripper) == {0.0, 1.0}
+    assert ((motion.gripper >= 0.0) & (motion.gripper <= 1.0)).all()
+    assert ((motion.gripper > 0.1) & (motion.gripper < 0.9)).any()
+
+
+def test_another_look_leaves_the_motion_as_it_was() -> None:
+    other = replace(DOMAIN_A, look=DOMAIN_B.look, camera=DOMAIN_B.camera)
+    first, second = (random_reaching(domain, 9, np.random.default_rng(3)) for domain in (DOMAIN_A, other))
+    np.testing.assert_array_equal(first.joints, second.joints)
+
+
+def test_a_turned_arm_rests_over_the_same_spot() -> None:
+    resting = forward_kinematics(rest_joints(DOMAIN_B))[:3]
+    np.testing.assert_allclose(DOMAIN_B.base_pose()[:3, :3] @ resting, forward_kinematics(HOME)[:3], atol=1e-9)
+
+
+def test_a_turned_base_reports_the_same_motion_turned() -> None:
+    turned = replace(DOMAIN_A, base_yaw_deg=30.0)
+    straight, other = (random_reaching(domain, 21, np.random.default_rng(4)) for domain in (DOMAIN_A, turned))
+    in_world = forward_kinematics(other.commanded_joints)[:, :3] @ turned.base_pose()[:3, :3].T
+    np.testing.assert_allclose(in_world, straight.commanded_poses[:, :3], atol=2e-4)
+    assert np.abs(other.poses[:, :3] - straight.poses[:, :3]).max() > 0.05

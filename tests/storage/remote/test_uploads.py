@@ -1,0 +1,212 @@
+"""What is written elsewhere arrives whole, through failures that pass; those that do not are named in time."""
+
+import os
+from pathlib import Path
+
+import pytest
+from fsspec import AbstractFileSystem, register_implementation
+
+from gcs import Failure, Gcs
+from vjepa2_ac import storage
+from vjepa2_ac.storage import remote
+from vjepa2_ac.storage.remote import filesystems, retries, uploads
+
+SMALL, LARGE = 3000, 6 << 20  # gcsfs sends more than 5 MB in pieces
+PLACE = "gs://bucket/run/file"
+
+pytestmark = pytest.mark.filterwarnings("ignore:Sending a large body:ResourceWarning")  # aiohttp's view of gcsfs
+
+
+@pytest.fixture
+def bucket(gcs: Gcs) -> Gcs:
+    gcs.put("bucket/before", b"1")
+    gcs.forget()
+    return gcs
+
+
+def source_of(folder: Path, size: int) -> Path:
+    path = folder / "source"
+    path.write_bytes(os.urandom(size))
+    return path
+
+
+@pytest.mark.usefixtures("bucket")
+@pytest.mark.parametrize("size", [0, SMALL, LARGE])
+def test_what_is_uploaded_is_read_again(tmp_path: Path, size: int) -> None:
+    source = source_of(tmp_path, size)
+    storage.upload(source, PLACE)
+    assert storage.read_bytes(PLACE) == source.read_bytes()
+    assert storage.file_sizes("gs://bucket/run") == {"file": size}
+    storage.download(PLACE, tmp_path / "copy")
+    assert (tmp_path / "copy").read_bytes() == source.read_bytes()
+
+
+@pytest.mark.parametrize("size", [SMALL, LARGE])
+@pytest.mark.parametrize("failure", [408, 429, 500, 503, "reset", "cut"])
+def test_an_upload_survives_what_passes(bucket: Gcs, tmp_path: Path, size: int, failure: Failure) -> None:
+    source = source_of(tmp_path, size)
+    bucket.fail_next(failure, times=2, match="POST /upload/")
+    storage.upload(source, PLACE)
+    assert bucket.faults_left == 0
+    assert storage.read_bytes(PLACE) == source.read_bytes()
+
+
+@pytest.mark.usefixtures("bucket")
+def test_a_failure_between_two_pieces_leaves_nothing_and_is_sent_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(filesystems, "_PIECE_BYTES", 2 << 20)
+    source = source_of(tmp_path, LARGE)
+    begun = []
+    answer = Gcs._failure_of
+
+    def fail_second_piece(gcs: Gcs, target: str) -> Failure | None:
+        if "upload_id" in target and target.startswith("POST"):
+            begun.append(target)
+            if len(begun) == 2:
+                return 503
+        return answer(gcs, target)
+
+    monkeypatch.setattr(Gcs, "_failure_of", fail_second_piece)
+    storage.upload(source, PLACE)
+    assert storage.read_bytes(PLACE) == source.read_bytes()
+    assert len(begun) == 2 + 3, "two of the first attempt, three of the second"
+
+
+def test_an_upload_that_stalls_is_cut_off_and_begun_again(
+    bucket: Gcs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retries, "DEFAULT", retries.RetryPolicy(attempts=2, first_wait_s=0.0, timeout_s=0.3))
+    source = source_of(tmp_path, SMALL)
+    bucket.fail_next("hang", match="POST /upload/")
+    storage.upload(source, PLACE)
+    bucket.fail_next("hang", times=2, match="POST /upload/")
+    with pytest.raises(remote.UnreachableError, match="2 attempts over") as raised:
+        storage.upload(source, PLACE)
+    assert not isinstance(raised.value, remote.RefusedError)
+
+
+def test_a_large_file_has_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    allowed = []
+    monkeypatch.setattr(uploads, "send", lambda source, url, timeout_s: allowed.append((source, url, timeout_s)))
+    storage.upload(source_of(tmp_path, LARGE), PLACE)
+    assert allowed == [(tmp_path / "source", PLACE, retries.DEFAULT.timeout_s + 6)]
+
+
+@pytest.mark.parametrize(
+    ("failure", "words"),
+    [(403, r"no permission .*You are not logged in\. Log in with `gcloud"), (412, "cannot be written")],
+)
+def test_a_refusal_is_not_tried_again(bucket: Gcs, tmp_path: Path, failure: int, words: str) -> None:
+    bucket.fail_next(failure, times=9)
+    with pytest.raises(remote.RefusedError, match=words):
+        storage.upload(source_of(tmp_path, SMALL), PLACE)
+    assert len(bucket.requests) == 1
+
+
+@pytest.mark.usefixtures("bucket")
+def test_a_bucket_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    for action in (
+        lambda: storage.upload(source_of(tmp_path, SMALL), "gs://other/run/file"),
+        lambda: storage.file_sizes("gs://other/run"),
+        lambda: storage.try_writing("gs://other/run"),
+    ):
+        with pytest.raises(remote.RefusedError, match="there is no bucket other"):
+            action()
+
+
+@pytest.mark.usefixtures("bucket")
+def test_a_source_that_is_gone_is_no_missing_bucket(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        storage.upload(tmp_path / "none", PLACE)
+
+
+@pytest.fixture(params=["gs", "memory", "folder"])
+def place(request: pytest.FixtureRequest, bucket: Gcs, tmp_path: Path) -> str:
+    """A place of every kind: an object store, a file system of fsspec with folders, a folder of this machine."""
+    assert bucket.names("bucket") == ["before"]
+    return {"gs": "gs://bucket/run", "memory": f"memory://{tmp_path.name}/run", "folder": str(tmp_path / "at/run")}[
+        request.param
+    ]
+
+
+def test_every_kind_of_place_is_written_listed_and_removed_from(place: str, tmp_path: Path) -> None:
+    source = source_of(tmp_path, SMALL)
+    assert storage.file_sizes(place) == {}
+    for name in ("a", "inner/b", "inner/deep/c"):
+        storage.upload(source, storage.join(place, name))
+    assert storage.file_sizes(place) == dict.fromkeys(("a", "inner/b", "inner/deep/c"), SMALL)
+    source.write_bytes(b"other")
+    storage.upload(source, storage.join(place, "a"))
+    assert storage.read_bytes(storage.join(place, "a")) == b"other"
+    storage.remove(storage.join(place, "a"))
+    storage.remove(storage.join(place, "a"))
+    storage.remove_folder(storage.join(place, "inner"), first="deep/c")
+    storage.remove_folder(storage.join(place, "inner"), first="deep/c")
+    assert storage.file_sizes(place) == {}
+
+
+def test_trying_a_place_leaves_nothing(place: str, bucket: Gcs, tmp_path: Path) -> None:
+    storage.try_writing(place)
+    assert storage.file_sizes(place) == {}
+    assert not (tmp_path / "at").exists()
+    assert bucket.names("bucket") == ["before"]
+
+
+def test_the_file_without_which_a_folder_does_not_count_goes_first(bucket: Gcs) -> None:
+    for name in ("a", "manifest.json", "z"):
+        bucket.put(f"bucket/run/{name}", b"1")
+    storage.remove_folder("gs://bucket/run", first="manifest.json")
+    gone = [request.target.rsplit("/", 1)[1] for request in bucket.requests if request.target.startswith("DELETE")]
+    assert gone == ["manifest.json", "a", "z"]
+
+
+def test_a_folder_of_this_machine_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for action in (
+        lambda: storage.upload(source_of(tmp_path, SMALL), str(tmp_path / "file/inner/a")),
+        lambda: storage.try_writing("/proc/none"),
+    ):
+        with pytest.raises(remote.RefusedError, match="cannot be written"):
+            action()
+
+
+class OnlyRead(AbstractFileSystem):
+    protocol = "only-read"
+
+    def _open(self, path: str, mode: str = "rb", **options: object) -> None:
+        raise NotImplementedError((path, mode, options))
+
+
+def test_what_can_only_be_read_is_refused(tmp_path: Path) -> None:
+    register_implementation("only-read", OnlyRead, clobber=True)
+    with pytest.raises(remote.RefusedError, match="only-read:// cannot be written"):
+        storage.upload(source_of(tmp_path, SMALL), "only-read://place/file")
+
+
+def test_a_place_has_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert storage.place("runs/one/") == storage.place(f"file://{tmp_path}/runs/one") == str(tmp_path / "runs/one")
+    assert storage.place("gs://bucket/run/") == "gs://bucket/run"
+
+
+def test_failures_are_said_below_warnings_where_that_is_asked_for(
+    bucket: Gcs, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retries, "_last_said", [-1e9])
+    bucket.fail_next(503, times=4)
+    with remote.quietly():
+        assert storage.file_sizes("gs://bucket/run") == {}
+    assert not caplog.records
+    bucket.fail_next(503, times=4)
+    storage.file_sizes("gs://bucket/run")
+    assert "trying again" in caplog.text
+
+
+@pytest.mark.usefixtures("bucket")
+def test_reading_asks_for_no_right_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(filesystems, "_filesystems", {})
+    storage.file_sizes("gs://bucket/run")
+    assert [system.credentials.access for system in filesystems._filesystems.values()] == ["read_only"]
+    storage.upload(source_of(tmp_path, SMALL), PLACE)
+    assert [system.credentials.access for system in filesystems._filesystems.values()] == ["read_only", "read_write"]

@@ -1,0 +1,59 @@
+"""What does a data set look like in which an episode is there twice? The same recording under another name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lerobot_sets import recorded, write_v30
+from recordings import write_raw_droid
+from synthetic import draw_frame, synthetic_episode, synthetic_states
+from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
+
+STEPS = 14
+SIZE = (24, 32)
+
+
+def write_npz(folder: Path, recordings: Sequence[int], **texts: Callable[[int], str]) -> Path:
+    """Write episodes NNN.npz, each of the recording of a number; texts by the place of the episode."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for place, number in enumerate(recordings):
+        states = synthetic_states(STEPS, seed=number)
+        frames = np.stack([draw_frame(state, size=SIZE) for state in states])
+        said = {name: np.array(text(place)) for name, text in texts.items()}
+        np.savez(folder / f"{place:03d}.npz", states=states, frames=frames, fps_hz=15.0, **said)
+    return folder
+
+
+def write_rlds(folder: Path, recordings: Sequence[int]) -> Path:
+    """Write DROID's RLDS likewise; the copy's name is longer, past what one byte counts."""
+
+    def episodes() -> list:  # type: ignore[type-arg]  # of DroidEpisode
+        made = []
+        for place, number in enumerate(recordings):
+            drawn = synthetic_episode(number, steps=STEPS, size=SIZE)
+            name = f"/data/LAB{place % 2}/success/2023-01-{place + 1:02d}/{'again_' * 12 * (place > 3)}{place:04d}"
+            made.append(replace(drawn, file_path=f"{name}/trajectory.h5", recording_folderpath=f"{name}/recordings"))
+        return made
+
+    return write_droid_rlds(folder, iter(episodes()), shards=2)
+
+
+def write_lerobot(folder: Path, recordings: Sequence[int]) -> Path:
+    """Write LeRobot v3.0 likewise."""
+    return write_v30(folder, [recorded(number, STEPS, size=SIZE) for number in recordings], episodes_per_video=1)
+
+
+def write_raw(folder: Path, recordings: Sequence[int]) -> Path:
+    """Write raw DROID likewise."""
+    for place, number in enumerate(recordings):
+        states = synthetic_states(STEPS, seed=number)
+        frames = {"1234": [draw_frame(state, size=SIZE) for state in states]}
+        write_raw_droid(folder / f"LAB/success/2023-07-{place + 1:02d}/{place:04d}", states, pictures=frames)
+    return folder
+
+
+WRITERS = {"npz": write_npz, "rlds": write_rlds, "lerobot": write_lerobot, "droid_raw": write_raw}

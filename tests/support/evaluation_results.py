@@ -1,0 +1,158 @@
+"""An evaluation made up of numbers that are known, for tests of what is written and drawn of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from vjepa2_ac.evaluation.estimates import episode_scores
+from vjepa2_ac.evaluation.intervals import mean_of
+from vjepa2_ac.evaluation.result import (
+    About,
+    Clips,
+    Errors,
+    Evaluation,
+    Example,
+    Landscape,
+    Landscapes,
+    ModelResult,
+    Predicted,
+    Ranking,
+    Sensitivity,
+    Stratum,
+    TrainingCurve,
+)
+
+ABOUT = About(
+    subject="runs/kitchen",
+    checkpoint="the newest, of step 800",
+    checkpoint_path="runs/kitchen/checkpoints/step-00000800",
+    source="rlds",
+    data="demo/data",
+    cameras=("exterior_image_1_left",),
+    split="test",
+    frames=4,
+    stride=4,
+    seconds_per_step=4 / 15,
+    is_pose=True,
+    seed=0,
+    version="0.1.0",
+    time="2026-11-21 16:00 UTC",
+)
+
+
+def errors(rng: np.random.Generator, level: float, clips: int, horizon: int, episode_of: np.ndarray) -> Errors:
+    """Return errors about a level that grow with the horizon and are alike within an episode."""
+    of_episode = 1 + 0.1 * rng.standard_normal(episode_of.max() + 1)[episode_of][:, None]
+    grown = np.linspace(1.0, 1.15, horizon)[None]
+    values = 0.35 * level * of_episode * grown * (1 + 0.04 * rng.standard_normal((clips, horizon)))
+    return Errors(l1=values, l2=values**2 * 1.6, cosine=values * 0.4)
+
+
+def _predicted(rng: np.random.Generator, level: float, clips: int, horizon: int, episode_of: np.ndarray) -> Predicted:
+    return Predicted(*(errors(rng, level, clips, horizon, episode_of) for _ in range(2)))
+
+
+def _sensitivity(rng: np.random.Generator, ids: tuple[str, ...], skill: float) -> Sensitivity:
+    rank = rng.beta(1.0, 1.0 + 3 * skill, size=len(ids))
+    change = np.abs(rng.normal(0.1 + 0.2 * skill, 0.05, size=len(ids)))
+
+    def ranking(drawn_from: Any, words: str) -> Ranking:
+        top = {k: mean_of((rank < k / 65).astype(np.float64), ids) for k in (1, 5)}
+        return Ranking(drawn_from, words, 64, tuple(range(len(ids))), rank, mean_of(rank, ids), top)
+
+    rankings = (
+        ranking("clips", "actions of other episodes"),
+        ranking("box", "uniform actions of up to 7.5 cm an axis"),
+    )
+    return Sensitivity(mean_of(change, ids), change, rankings)
+
+
+def _landscape(rng: np.random.Generator, episode_id: str, off: float) -> Landscape:
+    true = rng.uniform(-4, 4, size=3)
+    steps = np.arange(-6, 7) * 1.25
+    axes = np.stack([true[axis] + steps for axis in range(3)])
+    centre = true + off * rng.standard_normal(3)
+    x, y, z = np.meshgrid(*axes, indexing="ij")
+    energy = 0.4 + 0.002 * ((x - centre[0]) ** 2 + (y - centre[1]) ** 2 + 0.5 * (z - centre[2]) ** 2)
+    place = np.unravel_index(energy.argmin(), energy.shape)
+    minimum = np.array([axes[axis][place[axis]] for axis in range(3)])
+    return Landscape(episode_id, 12, axes, energy, true, minimum, float(np.linalg.norm(minimum - true)))
+
+
+def _landscapes(rng: np.random.Generator, ids: tuple[str, ...], off: float) -> Landscapes:
+    maps = tuple(_landscape(rng, name, off) for name in ids[:5])
+    distance = mean_of(np.array([one.distance for one in maps]), ids[:5])
+    signs = tuple(mean_of(np.array([1.0, 1.0, 0.0, 1.0, 1.0]), ids[:5]) for _ in range(3))
+    return Landscapes(("dx", "dy", "dz"), "cm", maps, distance, 8.1, signs, (0.5, 0.5, 0.5), (5, 5, 0), 1.25)  # type: ignore[arg-type]
+
+
+def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, models: list[str], size: int) -> Example:
+    grid = max(4, size // 16)
+    y, x = np.mgrid[:size, :size] / size
+    frames = np.stack([
+        np.stack([255 * x, 255 * y, 255 * (np.hypot(x - 0.2 - 0.5 * t / times, y - 0.5) < 0.15)], axis=-1)
+        for t in range(times)
+    ]).astype(np.uint8)  # fmt: skip
+    colours = frames[:, :: size // grid, :: size // grid][:, :grid, :grid]
+    return Example(
+        why,
+        episode_id,
+        12,
+        frames,
+        {name: rng.gamma(2.0, 0.15, size=(times - 1, grid, grid)) for name in ("persistence", *models)},
+        colours,
+        dict.fromkeys(models, colours[1:] // 2 + 40),
+    )
+
+
+@lru_cache(maxsize=8)
+def evaluation(
+    *, episodes: int = 12, clips: int = 48, frames: int = 4, with_base: bool = True, others: tuple[str, ...] = (),
+    size: int = 64, id_form: str = "AUTOLab/success/2023-07-0{0}/Fri_{0}",
+) -> Evaluation:  # fmt: skip
+    """Return an evaluation of which everything was measured."""
+    rng = np.random.default_rng(0)
+    horizon = frames - 1
+    ids = tuple(id_form.format(clip % episodes) for clip in range(clips))
+    episode_of = np.arange(clips) % episodes
+    names = [*(["base"] if with_base else []), *others, "adapter"]
+    nothing = _predicted(rng, 1.0, clips, horizon, episode_of)
+    models = {}
+    for place, name in enumerate(names):
+        skill = (place + 1) / len(names)
+        level = 1.1 - 0.4 * skill
+        predicted = [_predicted(rng, level * wrong, clips, horizon, episode_of) for wrong in (1.0, 1.1, 1.2)]
+        models[name] = ModelResult(
+            name,
+            {"base": "base", "adapter": "trained"}.get(name, "other"),  # type: ignore[arg-type]
+            *predicted,
+            _sensitivity(rng, ids, skill),
+            _landscapes(rng, ids, 4 - 3 * skill),
+        )
+    size_of_action = rng.gamma(2.0, 2.0, size=(clips, horizon))
+    moving = size_of_action > 1.5
+    base = models["base"].true.rollout.l1[:, -1] if with_base else None
+    return Evaluation(
+        about=replace(ABOUT, frames=frames),
+        clips=Clips(ids, tuple(range(clips)), size_of_action, moving, "the flange moves 1.5 cm or more in a step"),
+        persistence=nothing,
+        models=models,
+        strata=(
+            Stratum("moving", "motion", moving),
+            Stratum("idle", "motion", ~moving),
+            Stratum("0.0 to 3.0 cm", "action size", size_of_action < 3),
+            Stratum("3.0 to 9.9 cm", "action size", size_of_action >= 3),
+        ),
+        episodes=episode_scores(ids, models["adapter"].true.rollout.l1[:, -1], nothing.rollout.l1[:, -1], base),
+        examples=tuple(_example(rng, why, ids[0], frames, names, size) for why in ("best", "worst")),
+        training=(
+            TrainingCurve("train/loss", tuple(range(10, 810, 10)), tuple(0.4 + 0.3 * np.exp(-np.arange(80) / 20))),
+            TrainingCurve("validation/rollout_over_persistence_last", (0, 400, 800), (0.95, 0.8, 0.78)),
+            TrainingCurve("train/data_wait_share", (10, 400, 800), (0.1, 0.02, 0.03)),
+            TrainingCurve("train/learning_rate", tuple(range(10, 810, 10)), tuple(np.linspace(3e-3, 0, 80))),
+        ),
+    )

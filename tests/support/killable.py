@@ -1,0 +1,167 @@
+"""How is a real run killed with SIGKILL, at moments of one's choice, twenty times in a minute or two?
+
+Starting Python with PyTorch takes seconds. A `Nursery` is a process that has imported everything, done nothing yet and
+has one thread; it forks a child per start, which runs the command line as any process does and dies as any does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from vjepa2_ac import output
+
+KILLED = -signal.SIGKILL
+
+
+class Nursery:
+    """Starts commands of `vjepa2-ac`, one after the other, each in a process of its own."""
+
+    def __init__(self) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, __file__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+        )  # fmt: skip
+
+    def start(
+        self, *arguments: str, folder: Path, die_at: int | None = None, out: str = os.devnull, err: str | None = None
+    ) -> Child:
+        """Start a command; it kills itself when it is about to do its `die_at`-th change to the files in a folder.
+
+        Its standard output is the file `out`; its standard error the file `err`, else that of this process.
+        """
+        self._say({"arguments": arguments, "folder": str(folder), "die_at": die_at, "out": out, "err": err})
+        return Child(int(self._answer()), self)
+
+    def status_of_last(self) -> int:
+        """Wait for the last child; return its status, negative where a signal ended it."""
+        return int(self._answer())
+
+    def close(self) -> None:
+        self._process.stdin.close()
+        self._process.stdout.close()
+        self._process.wait(timeout=60)
+
+    def _say(self, what: dict) -> None:
+        self._process.stdin.write(json.dumps(what) + "\n")
+        self._process.stdin.flush()
+
+    def _answer(self) -> str:
+        answer = self._process.stdout.readline()
+        assert answer, "the nursery is gone"
+        return answer
+
+
+@dataclass(frozen=True)
+class Child:
+    """A command that is running."""
+
+    pid: int
+    nursery: Nursery
+
+    def is_running(self) -> bool:
+        try:
+            return "\nState:\tZ" not in Path(f"/proc/{self.pid}/status").read_text()
+        except (FileNotFoundError, ProcessLookupError):
+            return False
+
+    def wait(self) -> int:
+        return self.nursery.status_of_last()
+
+    def kill_after(self, delay_s: float) -> int:
+        """Let it run for a while, then kill it; return its status, which is another one where it was done before."""
+        until = time.monotonic() + delay_s
+        while time.monotonic() < until and self.is_running():
+            time.sleep(0.0005)
+        return self.kill()
+
+    def kill(self) -> int:
+        if self.is_running():
+            os.kill(self.pid, signal.SIGKILL)  # not reaped before `wait`: the number cannot be another's
+        return self.wait()
+
+
+def wait_for_the_end_of(sessions: set[int], timeout_s: float) -> list[psutil.Process]:
+    """Wait until no process of these sessions is left; return those that stay."""
+    left = [process for process in psutil.process_iter() if _session(process.pid) in sessions]
+    return psutil.wait_procs(left, timeout=timeout_s)[1]
+
+
+def _session(process: int) -> int:
+    try:
+        return os.getsid(process)
+    except ProcessLookupError:
+        return -1
+
+
+def _serve() -> None:
+    """Fork a child for each line of the standard input; tell its number, and later its status."""
+    import torch
+
+    import vjepa2_ac.console.progress
+    import vjepa2_ac.training.loop  # noqa: F401 - what a start imports
+    from vjepa2_ac.cli import main
+
+    torch.set_num_threads(1)
+    for line in sys.stdin:
+        wish = json.loads(line)
+        child = os.fork()
+        if child == 0:
+            _become(wish, main)
+        _tell(child)
+        _tell(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+
+
+def _tell(number: int) -> None:
+    sys.stdout.write(f"{number}\n")
+    sys.stdout.flush()
+
+
+def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
+    """Be a process that runs a command, and nothing else."""
+    status = 1
+    try:
+        os.setsid()  # its workers are in its session, and known by it when it is dead
+        signal.alarm(300)  # no test waits for ever
+        output.LAST_S = 0.5
+        os.dup2(os.open(os.devnull, os.O_RDWR), 0)
+        os.dup2(os.open(wish["out"], os.O_WRONLY | os.O_NOCTTY), 1)
+        if wish["err"] is not None:
+            os.dup2(os.open(wish["err"], os.O_WRONLY | os.O_NOCTTY), 2)
+        if wish["die_at"] is not None:
+            _die_at(wish["die_at"], wish["folder"])
+        status = main(wish["arguments"])
+    finally:
+        os._exit(status)
+
+
+def _die_at(number: int, folder: str) -> None:
+    """Kill this process when it is about to change the files of a folder for the n-th time.
+
+    Python tells of every file that is opened, renamed or removed. Those that a library writes by itself show in the
+    opening that follows, to flush or to hash them.
+    """
+    left = number
+    changes = {"open", "os.rename", "os.remove", "os.mkdir", "os.rmdir"}
+
+    def watch(event: str, values: tuple) -> None:
+        nonlocal left
+        if event in changes and isinstance(values[0], str | os.PathLike) and str(values[0]).startswith(folder):
+            left -= 1
+            if left == 0:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    sys.addaudithook(watch)
+
+
+if __name__ == "__main__":
+    _serve()

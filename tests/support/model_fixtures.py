@@ -1,0 +1,52 @@
+"""Tiny world models, and inputs that fit them."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+from vjepa2_ac.config import EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.model.network.world_model import WorldModel
+
+SIZES = ModelSizes(
+    image_size=48,
+    encoder=EncoderSizes(width=24, depth=2, heads=2, mlp_ratio=2.0),
+    predictor=PredictorSizes(width=36, depth=2, heads=3, mlp_ratio=2.0),
+)
+
+
+@dataclass(frozen=True)
+class Inputs:
+    frames: Tensor
+    latents: Tensor
+    actions: Tensor
+    states: Tensor
+
+
+@pytest.fixture
+def sizes() -> ModelSizes:
+    return SIZES
+
+
+@pytest.fixture
+def model() -> WorldModel:
+    return WorldModel.random(SIZES, seed=0)
+
+
+@pytest.fixture
+def fresh() -> Callable[..., WorldModel]:
+    """Make the model of the fixture `model` once more, or one of another seed or type."""
+
+    def make(seed: int = 0, dtype: torch.dtype = torch.float32) -> WorldModel:
+        return WorldModel.random(SIZES, seed=seed, dtype=dtype)
+
+    return make
+
+
+@pytest.fixture
+def inputs() -> Inputs:
+    generator = torch.Generator().manual_seed(1)
+    draw = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
+    return Inputs(draw(2, 4, 3, 48, 48), draw(2, 4, 9, 24), draw(2, 4, 7), draw(2, 4, 7))

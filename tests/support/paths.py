@@ -1,0 +1,6 @@
+"""Where do tests find the project and the small reference files?"""
+
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+GOLDEN = ROOT / "tests" / "golden"

@@ -1,0 +1,110 @@
+"""A tiny run on synthetic episodes."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from killable import Nursery
+from synthetic import write_synthetic_droid
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_as_dict, parse_config
+from vjepa2_ac.model.network.world_model import WorldModel
+
+TINY = {
+    "image_size": 32,
+    "patch_size": 16,
+    "encoder": {"width": 24, "depth": 1, "heads": 2, "mlp_ratio": 2.0},
+    "predictor": {"width": 24, "depth": 2, "heads": 2},
+}
+
+
+class SilentReporter:
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+        self.steps: list[int] = []
+
+    def note(self, text: str) -> None:
+        self.notes.append(text)
+
+    def indexed(self, done: int, total: int) -> None: ...
+
+    def encoded(self, done: int, total: int) -> None: ...
+
+    def started(self, done: int, total: int) -> None: ...
+
+    def stepped(self, step: int, figures: object) -> None:
+        del figures
+        self.steps.append(step)
+
+    def validated(self, step: int, errors: object) -> None: ...
+
+
+@pytest.fixture(scope="session")
+def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_synthetic_droid(tmp_path_factory.mktemp("data") / "set", episodes=8, steps=24, size=(36, 64))
+
+
+@pytest.fixture(scope="session")
+def base_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from vjepa2_ac.config import ModelSizes
+
+    folder = tmp_path_factory.mktemp("base") / "model"
+    WorldModel.random(ModelSizes.model_validate(TINY), seed=3).save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def nursery() -> Iterator[Nursery]:
+    """Starts real processes in no time."""
+    nursery = Nursery()
+    yield nursery
+    nursery.close()
+
+
+MakeConfig = Callable[..., Config]
+
+
+@pytest.fixture
+def make_config(tmp_path: Path, data_folder: Path, base_folder: Path) -> MakeConfig:
+    """Return a config of a tiny LoRA run; dotted keys change it."""
+
+    def make(**changes: object) -> Config:
+        values: dict[str, object] = {
+            "run_dir": str(tmp_path / "run"),
+            "data": {
+                "path": str(data_folder), "frames": 4, "stride": 2, "validation_share": 0.3, "test_share": 0.2,
+                "workers": 0,
+            },
+            "model": {"base": str(base_folder), "dtype": "float32"},
+            "adapter": {"rank": 4, "alpha": 8},
+            "training": {
+                "steps": 6, "batch_size": 2, "accumulation": 2, "learning_rate": 1e-3, "warmup_steps": 1,
+                "precision": "fp32", "device": "cpu", "log_every": 1, "allow_weak_base": True,
+            },
+            "validation": {"every": 3, "clips": 4, "batch_size": 2},
+            "checkpoint": {"every": 2, "keep": 5},
+            "tracking": {"tensorboard": False},
+        }  # fmt: skip
+        for key, value in changes.items():
+            *sections, name = key.split("__")
+            inner = values
+            for section in sections:
+                inner = inner.setdefault(section, {})  # type: ignore[assignment]
+            inner[name] = value
+        return parse_config(values, where="test")
+
+    return make
+
+
+@pytest.fixture
+def reporter() -> SilentReporter:
+    return SilentReporter()
+
+
+def as_yaml(config: Config) -> str:
+    import yaml
+
+    return yaml.safe_dump(config_as_dict(config))

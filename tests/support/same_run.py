@@ -1,0 +1,52 @@
+"""Are two runs the same, bit for bit? Weights, optimizer state and figures but for timings."""
+
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file
+
+from vjepa2_ac.runs.checkpoint import newest_checkpoint
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.training.monitoring.throughput import MEASURED
+
+TIMINGS = MEASURED  # figures of the machine
+
+
+def trained_weights(run: Path) -> dict[str, torch.Tensor]:
+    return load_file(newest_checkpoint(run / "checkpoints") / "adapter" / "adapter_model.safetensors")
+
+
+def all_weights(run: Path) -> dict[str, torch.Tensor]:
+    """Return what is trained of any kind of run, and where PiSSA began."""
+    folder = newest_checkpoint(run / "checkpoints") / "adapter"
+    files = sorted(folder.rglob("*.safetensors"))
+    return {f"{file.name} {name}": value for file in files for name, value in load_file(file).items()}
+
+
+def optimizer_state(run: Path) -> dict:
+    return torch.load(newest_checkpoint(run / "checkpoints") / "optimizer.pt", weights_only=True)["state"]
+
+
+def figures(run: Path) -> list[dict]:
+    """Return all rows of numbers; what warnings advise depends on what a run keeps."""
+    rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] != "warning"]
+    return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
+
+
+def numbers_in(state: dict, place: str = "") -> dict[str, torch.Tensor]:
+    """Return all numbers of nested dicts by their places: 8-bit moments are a dict in a dict."""
+    inner = [numbers_in(value, f"{place}{key}.") for key, value in state.items() if isinstance(value, dict)]
+    own = {f"{place}{key}": torch.as_tensor(value) for key, value in state.items() if not isinstance(value, dict)}
+    return {name: value for numbers in (own, *inner) for name, value in numbers.items()}
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    for first, second in (
+        (all_weights(one), all_weights(other)),
+        (numbers_in(optimizer_state(one)), numbers_in(optimizer_state(other))),
+    ):
+        assert first
+        assert first.keys() == second.keys()
+        for name, value in first.items():
+            assert torch.equal(value, second[name]), name
+    assert figures(one) == figures(other)

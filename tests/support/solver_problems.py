@@ -1,0 +1,52 @@
+"""Problems whose optimum is known, and spaces to search it in."""
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vjepa2_ac.config.planning import GradientConfig, MppiConfig, PlanningConfig
+from vjepa2_ac.planning.action_space import ActionSpace, Ball
+from vjepa2_ac.planning.interfaces import Plan
+from vjepa2_ac.planning.planner import Planner
+
+PLANNERS = ("cem", "icem", "mppi", "gradient")
+
+
+def space(decisions: int = 1, dim: int = 2, reach: float = 1.0, ball: Ball | None = None) -> ActionSpace:
+    """Return a box around zero."""
+    upper = torch.full((decisions, dim), reach)
+    return ActionSpace(-upper, upper, upper, ball=ball)
+
+
+def config(planner: str, iterations: int = 30, samples: int = 200, **changes: Any) -> PlanningConfig:
+    """Return settings that are good enough for a few numbers."""
+    more: dict[str, Any] = {
+        "gradient": GradientConfig(starts=16, learning_rate=0.1), "mppi": MppiConfig(std_decay=0.85),
+    }  # fmt: skip
+    return PlanningConfig(planner=planner, iterations=iterations, samples=samples, **(more | changes))
+
+
+def solve(planner: str, cost: Callable[[Tensor], Tensor], where: ActionSpace, seed: int = 0, **changes: Any) -> Plan:
+    """Return the plan of least cost in a space."""
+    generator = torch.Generator().manual_seed(seed)
+    return Planner(config(planner, **changes), where).plan(cost, generator)
+
+
+def parabola(target: Tensor) -> Callable[[Tensor], Tensor]:
+    """Return the squared distance of an action sequence from the target."""
+    return lambda actions: (actions - target).square().sum(dim=(1, 2))
+
+
+def rosenbrock(actions: Tensor) -> Tensor:
+    """Return a bent valley; its lowest place is (1, 1), here at (0.5, 0.5)."""
+    x, y = (2 * actions[:, 0]).unbind(-1)
+    return (1 - x) ** 2 + 100 * (y - x**2) ** 2
+
+
+def two_basins(actions: Tensor) -> Tensor:
+    """Return two basins: a wide one at -0.5, and a deeper one at 0.6 where a search from 0 has to go uphill."""
+    from_wide = (actions[:, 0] + 0.5).square().sum(-1)
+    from_deep = (actions[:, 0] - 0.6).square().sum(-1)
+    return torch.minimum(0.5 + from_wide, 4 * from_deep)

@@ -1,0 +1,60 @@
+"""A tiny world model, a scene of it, and goals."""
+
+import torch
+from torch import Tensor
+
+from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
+from vjepa2_ac.config.planning import EnergyConfig
+from vjepa2_ac.model.adapter.lora import add_adapter
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.energy import Scene, WorldModelCost
+from vjepa2_ac.planning.goal import Goal
+
+TOKENS, DIM = 9, 24
+
+
+def tiny_model(*, adapted: bool = False, extrinsics: bool = False) -> WorldModel:
+    """Return a random model that heeds its actions; perhaps with an adapter that does something."""
+    sizes = ModelSizes(
+        image_size=48,
+        encoder=EncoderSizes(width=DIM, depth=1, heads=2, mlp_ratio=2.0),
+        predictor=PredictorSizes(width=36, depth=2, heads=3, mlp_ratio=2.0, use_extrinsics=extrinsics),
+    )
+    model = WorldModel.random(sizes, seed=0)
+    generator = torch.Generator().manual_seed(2)
+    with torch.no_grad():
+        model.base_predictor.action_encoder.weight.mul_(40)
+        if adapted:
+            add_adapter(model, AdapterConfig(rank=4, alpha=8.0, dropout=0.1), seed=0)
+            for name, value in model.named_parameters():
+                if "lora_" in name:
+                    value.add_(0.05 * torch.randn(value.shape, generator=generator))
+    return model.eval()
+
+
+def draw(*shape: int, seed: int = 1) -> Tensor:
+    """Return normal numbers."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def scene(context: int = 1, *, extrinsics: bool = False) -> Scene:
+    """Return the last frames before a decision."""
+    camera = draw(6, seed=4) if extrinsics else None
+    return Scene(
+        draw(context, TOKENS, DIM), draw(context, 7, seed=2) * 0.3, draw(context - 1, 7, seed=3) * 0.05, camera
+    )
+
+
+def actions(samples: int, steps: int, seed: int = 5) -> Tensor:
+    """Return actions of a few cm."""
+    return 0.05 * draw(samples, steps, 7, seed=seed)
+
+
+def goal(goals: int = 1, **more: object) -> Goal:
+    """Return latents that are wanted."""
+    return Goal(torch.nn.functional.layer_norm(draw(goals, TOKENS, DIM, seed=6), (DIM,)), **more)  # type: ignore[arg-type]
+
+
+def cost(model: WorldModel, context: int = 1, **settings: object) -> WorldModelCost:
+    """Return the energy towards one goal from a scene."""
+    return WorldModelCost(model, scene(context), goal(), EnergyConfig(**settings))  # type: ignore[arg-type]

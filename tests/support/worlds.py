@@ -1,0 +1,116 @@
+"""Worlds small enough to compute by hand, and predictors of which one knows how good they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.evaluate import RepeatableClips
+from vjepa2_ac.evaluation.result import About
+
+TIME, TOKENS, DIM = 5, 4, 6
+
+
+def moved(latents: Tensor, actions: Tensor) -> Tensor:
+    """Return the next frames of this world: the first numbers of every token grow by those of the action, in cm."""
+    grown = torch.zeros(*latents.shape[:2], 1, latents.shape[-1])
+    width = min(actions.shape[-1], latents.shape[-1])
+    grown[..., :width] = actions[:, :, None, :width] * 100
+    return latents + grown
+
+
+class Oracle:
+    """Knows the world."""
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        """Return the true next frames, given true ones and true actions."""
+        del states, extrinsics
+        return moved(latents, actions)
+
+    def rollout(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        """Return the frames after the first."""
+        frames = [latents[:, -1:]]
+        for step in range(actions.shape[1]):
+            frames.append(self.predict(frames[-1], actions[:, step : step + 1], states, extrinsics))
+        return torch.cat(frames[1:], dim=1)
+
+
+class Copier:
+    """Persistence: the last frame that was seen."""
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        """Return the frames that were given."""
+        del actions, states, extrinsics
+        return latents
+
+    def rollout(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        """Return the last one, again and again."""
+        del states, extrinsics
+        return latents[:, -1:].expand(-1, actions.shape[1], -1, -1)
+
+
+class Halfway(Oracle):
+    """Thinks that an action does half of what it does."""
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        """Return frames that are half as far."""
+        return super().predict(latents, actions / 2, states, extrinsics)
+
+
+def actions_of(clips: int, seed: int = 0, width: int = 7) -> Tensor:
+    """Return actions of a few cm; the rotations are small, too."""
+    generator = torch.Generator().manual_seed(seed)
+    return 0.03 * torch.randn(clips, TIME - 1, width, generator=generator)
+
+
+def clips_batch(clips: int = 12, seed: int = 0, width: int = 7, actions: Tensor | None = None) -> LatentBatch:
+    """Return clips of this world, two of each episode."""
+    actions = actions_of(clips, seed, width) if actions is None else actions
+    generator = torch.Generator().manual_seed(seed + 1)
+    start = torch.randn(clips, 1, TOKENS, DIM, generator=generator)
+    states = torch.zeros(clips, TIME, 7)
+    latents = torch.cat([start, Oracle().rollout(start, actions, states)], dim=1)
+    ids = tuple(f"episode {clip // 2}" for clip in range(clips))
+    return LatentBatch(latents, states, actions, None, ids, tuple(range(clips)))
+
+
+def rows(batch: LatentBatch, places: list[int]) -> LatentBatch:
+    """Return some clips of a batch."""
+    return LatentBatch(
+        batch.latents[places],
+        batch.states[places],
+        batch.actions[places],
+        None,
+        tuple(batch.episode_ids[place] for place in places),
+        tuple(batch.starts[place] for place in places),
+    )
+
+
+def in_batches(batch: LatentBatch, size: int) -> list[LatentBatch]:
+    """Return the same clips in smaller batches."""
+    count = len(batch.starts)
+    return [rows(batch, list(range(first, min(first + size, count)))) for first in range(0, count, size)]
+
+
+def again(batch: LatentBatch, size: int = 4) -> RepeatableClips:
+    """Return clips that can be read again; their pictures are grey."""
+    places = {name: place for place, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True))}
+
+    def read(names):  # type: ignore[no-untyped-def]
+        chosen = list(places.values()) if names is None else [places[name] for name in names]
+        for part in in_batches(rows(batch, chosen), size):
+            yield part, lambda _: np.full((TIME, 8, 8, 3), 128, np.uint8)
+
+    return RepeatableClips(len(places), read)
+
+
+def about(**changes: object) -> About:
+    """Return what an evaluation of these clips is called."""
+    values: dict[str, object] = {
+        "subject": "run", "checkpoint": "step-00000002 (the newest)", "checkpoint_path": "step-00000002",
+        "source": "rlds", "data": "data", "cameras": ("exterior_1_left",), "split": "test", "frames": TIME, "stride": 4,
+        "seconds_per_step": 0.25, "is_pose": True, "seed": 0, "version": "0", "time": "2026-01-01T00:00:00Z",
+    }  # fmt: skip
+    return About(**(values | changes))  # type: ignore[arg-type]

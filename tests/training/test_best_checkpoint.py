@@ -1,0 +1,74 @@
+"""Errors of other clips, over another time or of other latents are no better or worse."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from vjepa2_ac.config.loading import config_as_dict, parse_config
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
+from vjepa2_ac.training import loop, validation
+from vjepa2_ac.training.best_checkpoint import best_so_far, measured_on
+from vjepa2_ac.training.loop import train
+
+BEST = RunState(20, best_step=10, best_error=0.5)
+
+
+def of(config: object) -> dict[str, str]:
+    return dict(measured_on(config, open_dataset(config.data)))  # type: ignore[attr-defined, arg-type]
+
+
+def test_the_best_of_other_frames_no_longer_counts_and_the_reason_is_named(make_config, reporter, monkeypatch) -> None:
+    errors = iter([0.9, 0.2, 0.3, 0.8, 0.6])  # the first is the base's
+    for module in (loop, validation):
+        monkeypatch.setattr(module, "validation_metrics", lambda _: {validation.BEST_BY: next(errors)})
+    every = {"validation__every": 1, "checkpoint__every": 1, "training__steps": 2}
+    folder = train(make_config(**every), reporter) / "checkpoints"
+    assert read_state(newest_checkpoint(folder)).best_error == 0.2
+    train(make_config(**{**every, "training__steps": 4}, data__frames=5), reporter, allow_config_change=True)
+    (said,) = [note for note in reporter.notes if "no longer counts" in note]
+    assert said.startswith(
+        "Validation measures something else than before (other: data.frames, its clips): the error 0.2 "
+    )
+    state = read_state(newest_checkpoint(folder))
+    assert (state.best_step, state.best_error) == (4, 0.6), "0.2 was of three steps ahead"
+
+
+def test_the_best_stays_where_a_run_goes_on_with_what_it_had(make_config, reporter) -> None:
+    now = of(make_config())
+    known = replace(BEST, measured_on=now)
+    moved = make_config(
+        training__steps=9, training__learning_rate=1e-4, data__workers=1, validation__every=1, validation__batch_size=4
+    )
+    assert best_so_far(known, of(moved), reporter.note) == known
+    assert best_so_far(BEST, now, reporter.note) == known, "an earlier version did not say"
+    assert reporter.notes == []
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"data__frames": 5}, {"data.frames", "its clips"}),
+        ({"data__stride": 3}, {"data.stride", "its clips"}),
+        ({"data__crop": "square"}, {"data.crop"}),
+        ({"data__fields": {"gripper": "openness"}}, {"data.fields.gripper"}),
+        ({"validation__clips": 2}, {"its clips"}),
+        ({"data__validation_share": 0.75}, {"its clips"}),
+        ({"data__split_by": r"episode_(\d+)"}, {"its clips"}),
+    ],
+)
+def test_what_changes_the_measurement_is_named(make_config, change: dict[str, object], named: set[str]) -> None:
+    before, now = of(make_config()), of(make_config(**change))
+    assert {key for key in before | now if before.get(key) != now.get(key)} == named
+    notes: list[str] = []
+    state = best_so_far(replace(BEST, measured_on=before), now, notes.append)
+    assert (state.best_step, state.best_error, state.measured_on) == (None, None, now)
+    assert all(name in notes[0] for name in named)
+
+
+def test_the_same_clips_elsewhere_are_the_same(make_config, tmp_path: Path, data_folder: Path) -> None:
+    (tmp_path / "link").symlink_to(data_folder)
+    values = config_as_dict(make_config())
+    values["data"]["path"] = str(tmp_path / "link")
+    assert of(parse_config(values, where="here")) == of(make_config())

@@ -1,0 +1,203 @@
+"""A robot of other states or actions than the base knows, from its recordings to a model of its own."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+import yaml
+
+from same_run import assert_same_run
+from vector_sets import write_vectors
+from vjepa2_ac.config import Config, ModelConfig
+from vjepa2_ac.episode import Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
+from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
+from vjepa2_ac.export.export import export_run
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.model.network.pretrained_folder import read_sizes
+from vjepa2_ac.reports.metrics_json import metrics_as_dict
+from vjepa2_ac.reports.write import evaluate_subject
+from vjepa2_ac.runs.checkpoint import newest_checkpoint
+from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.training.loop import train
+
+MakeConfig = Callable[..., Config]
+HEADS = ["action_encoder", "state_encoder"]
+ROBOTS = {"14/14": Widths(14, 14), "8/7": Widths(8, 7), "7/8": Widths(7, 8)}
+
+
+@pytest.fixture
+def make_robot(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
+    """Return the config of a tiny run on a robot of some widths; the base must prove itself."""
+
+    def make(widths: Widths = ROBOTS["14/14"], **changes: object) -> Config:
+        folder = tmp_path / f"set {widths.state} {widths.action}"
+        if not folder.exists():
+            write_vectors(folder, width=widths.state, action_width=widths.action)
+        recorded = {"data__actions": "recorded", "data__join_actions": "sum"} if len(set(widths)) > 1 else {}
+        values: dict[str, Any] = {
+            "data__source": "npz", "data__path": str(folder), "data__states": "vector",
+            "adapter__modules_to_save": HEADS, "training__allow_weak_base": False, **recorded,
+        }  # fmt: skip
+        return make_config(**(values | changes))
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("widths", "kind"), [*((widths, "lora") for widths in ROBOTS.values()), (Widths(14, 14), "none")], ids=str
+)
+def test_from_recordings_to_a_model_of_its_own(
+    make_robot: MakeConfig, reporter: Any, tmp_path: Path, widths: Widths, kind: str
+) -> None:
+    config = make_robot(widths, adapter__kind=kind, training__steps=2, validation__every=2)
+    folder = train(config, reporter)
+    fresh = [note for note in reporter.notes if "initialised anew" in note]
+    assert len(fresh) == sum(width != 7 for width in widths)
+    if widths.state != 7:
+        assert f"state encoder: {widths.state} numbers instead of the base's 7: initialised anew" in fresh
+    assert any("not asked whether it is better" in note for note in reporter.notes)
+    run = load_run(folder)
+    assert widths_of_model(run.world_model.sizes) == widths
+
+    evaluation = evaluate_subject(str(folder), EvaluationOptions(split="validation", clips=4)).evaluation
+    assert list(evaluation.models) == ["adapter" if kind == "lora" else "model"]
+    figures = metrics_as_dict(evaluation)
+    assert "no base to compare with" in figures["verdict"]
+    assert figures["base"] is None
+
+    merged = export_run(folder, tmp_path / "merged").path
+    base = load_base(ModelConfig(base=str(merged), dtype="float32"), seed=5)
+    assert widths_of_model(base.sizes) == widths
+    generator = torch.Generator().manual_seed(1)
+    latents = torch.randn(1, 2, 4, 24, generator=generator)
+    states, actions = (torch.randn(1, 2, width, generator=generator) for width in widths)
+    with torch.no_grad():
+        torch.testing.assert_close(
+            base.predict(latents, actions, states),
+            run.world_model.eval().predict(latents, actions, states),
+            atol=1e-5,
+            rtol=1e-5,
+        )
+    with pytest.raises(InputError, match=f"states of {widths.state} and actions of {widths.action} numbers"):
+        export_run(folder, tmp_path / "official.pt", "official")
+
+
+def test_a_run_with_fresh_heads_that_was_stopped_goes_on_bit_for_bit(
+    make_robot: MakeConfig, reporter: Any, tmp_path: Path
+) -> None:
+    whole, stopped = ({"run_dir": str(tmp_path / name)} for name in ("whole", "stopped"))
+    train(make_robot(**whole), type(reporter)())
+
+    class Interrupts(type(reporter)):  # type: ignore[misc]
+        def stepped(self, step: int, figures: object) -> None:
+            super().stepped(step, figures)
+            if step == 3:
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(make_robot(**stopped), Interrupts())
+    train(make_robot(**stopped), reporter)
+    assert any(note.startswith("Going on from") for note in reporter.notes)
+    assert_same_run(tmp_path / "whole", tmp_path / "stopped")
+
+
+def test_the_heads_learn(make_robot: MakeConfig, reporter: Any) -> None:
+    folder = train(make_robot(training__steps=2), reporter)
+    weights = load_run(folder).world_model.predictor.state_dict()
+    for head in HEADS:
+        drawn, learnt = (
+            next(value for name, value in weights.items() if f"{head}.{part}" in name and name.endswith("weight"))
+            for part in ("original_module", "modules_to_save")
+        )
+        assert drawn.shape == learnt.shape == (24, 14)
+        assert not torch.equal(drawn, learnt)
+
+
+def test_what_it_learnt_is_a_base_that_the_same_robot_trains_on(
+    make_robot: MakeConfig, reporter: Any, tmp_path: Path
+) -> None:
+    merged = export_run(train(make_robot(training__steps=1), reporter), tmp_path / "merged").path
+    again = type(reporter)()
+    second = {"model__base": str(merged), "adapter__modules_to_save": [], "run_dir": str(tmp_path / "second")}
+    folder = train(make_robot(training__steps=1, training__allow_weak_base=True, **second), again)
+    assert not any("initialised anew" in note for note in again.notes)
+    assert any("state encoder: the base's own" in note for note in again.notes)
+    evaluation = evaluate_subject(str(folder), EvaluationOptions(split="validation", clips=4)).evaluation
+    assert list(evaluation.models) == ["base", "adapter"]
+    tried = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), clips=4).tried
+    assert [one.moved_cm for one in tried] == [None, None]
+
+
+def test_a_head_that_nothing_trains_is_refused_before_the_model_is_loaded(
+    make_robot: MakeConfig, reporter: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from vjepa2_ac.training import setup
+
+    monkeypatch.setattr(setup, "load_base", lambda *_, **__: pytest.fail("loaded"))
+    with pytest.raises(InputError, match=r"Set adapter\.modules_to_save=\[action_encoder, state_encoder\]"):
+        train(make_robot(adapter__modules_to_save=[]), reporter)
+    with pytest.raises(InputError, match=r"data\.stride: auto, for states of 14"):
+        train(make_robot(data__stride="auto"), reporter)
+
+
+def test_a_fresh_model_gets_heads_for_the_robot(make_robot: MakeConfig, reporter: Any, base_folder: Path) -> None:
+    sizes = read_sizes(base_folder).model_dump(mode="json")
+    config = make_robot(model__base=None, model__random=sizes, adapter__kind="none", training__steps=1)
+    assert widths_of_model(load_run(train(config, reporter)).world_model.sizes) == Widths(14, 14)
+
+
+def test_vectors_as_wide_as_poses_keep_the_heads_and_must_prove_themselves(
+    make_robot: MakeConfig, reporter: Any, tmp_path: Path
+) -> None:
+    widths = Widths(7, 7)
+    with pytest.raises(InputError, match="allow_weak_base"):
+        train(make_robot(widths, adapter__modules_to_save=[]), reporter)
+    assert [note for note in reporter.notes if "encoder: the base's own" in note]
+    folder = train(make_robot(widths, training__allow_weak_base=True, training__steps=1), reporter)
+    evaluation = evaluate_subject(str(folder), EvaluationOptions(split="validation", clips=4)).evaluation
+    assert list(evaluation.models) == ["base", "adapter"]
+    assert export_run(folder, tmp_path / "official.pt", "official").path.is_file()
+
+
+def test_a_model_of_one_robot_is_not_measured_on_another(make_robot: MakeConfig, reporter: Any, tmp_path: Path) -> None:
+    config = make_robot(training__steps=1)
+    folder = train(config, reporter)
+    path = folder / "config.yaml"
+    write_vectors(tmp_path / "other", width=8)
+    changed = yaml.safe_load(path.read_text())
+    changed["data"]["path"] = str(tmp_path / "other")
+    path.write_text(yaml.safe_dump(changed))
+    with pytest.raises(InputError, match=r"states of 8 and actions of 8 numbers\. needed: 14 and 14") as caught:
+        evaluate_subject(str(folder), EvaluationOptions(split="validation", clips=4))
+    assert str(folder) in str(caught.value)
+
+
+def test_the_card_on_the_hub_tells_of_the_fresh_heads(make_robot: MakeConfig, reporter: Any, tmp_path: Path) -> None:
+    folder = train(make_robot(ROBOTS["8/7"], training__steps=1), reporter)
+    card = (export_run(folder, tmp_path / "hub", "hub").path / "README.md").read_text()
+    assert "fresh, for states of 8 and actions of 7 numbers" in card
+    assert "recorded, joined by sum" in card
+    lines = card.split("With PEFT's own loading")[1].split("```python")[1].split("```")[0]
+    names: dict[str, Any] = {}
+    imports = "from vjepa2_ac.config import ModelConfig\nfrom vjepa2_ac.model.checkpoints.loading import load_base\n"
+    exec(imports + lines.replace("FOLDER", str(tmp_path / "hub")), names)  # noqa: S102 - the card's own words
+    generator = torch.Generator().manual_seed(1)
+    latents, states, actions = (torch.randn(1, 2, *shape, generator=generator) for shape in ((4, 24), (8,), (7,)))
+    with torch.no_grad():
+        alone = names["predictor"].eval()(latents, actions, states)
+        trained = load_run(folder).world_model.predictor.eval()(latents, actions, states)
+    assert torch.equal(alone, trained)
+
+
+def test_the_checkpoint_says_which_heads_are_fresh(make_robot: MakeConfig, reporter: Any) -> None:
+    folder = train(make_robot(training__steps=1), reporter)
+    checkpoint = newest_checkpoint(folder / "checkpoints")
+    assert checkpoint is not None
+    card = json.loads((checkpoint / "adapter/vjepa2_ac.json").read_text())
+    assert card["fresh_heads"] == {"action_dim": 14, "state_dim": 14, "seed": 0}

@@ -1,0 +1,72 @@
+"""A stride that is auto is chosen once, by the base model, and belongs to the run from then on."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.folder import read_run_config
+from vjepa2_ac.training.loop import train
+
+Make = Callable[..., Config]
+
+
+def test_a_run_chooses_keeps_and_never_chooses_again(
+    make_config: Make, reporter: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = make_config(data__stride="auto", data__stride_candidates=[2, 3], training__steps=2)
+    folder = train(config, reporter)
+    chosen = json.loads((folder / "calibration.json").read_text())["stride"]
+    assert chosen in {2, 3}
+    assert read_run_config(folder).data.stride == chosen
+    assert any("Best: stride" in note for note in reporter.notes)
+
+    monkeypatch.setattr("vjepa2_ac.training.setup.choose_stride", lambda *_: pytest.fail("chosen again"))
+    more = type(reporter)()
+    train(config, more)  # the same config, auto still
+    assert not [note for note in more.notes if "Best: stride" in note]
+
+
+def test_the_run_equals_one_that_was_told_the_stride(make_config: Make, reporter: Any, tmp_path: Path) -> None:
+    same: dict[str, Any] = {"data__stride_candidates": [2], "training__steps": 2}
+    chosen = train(make_config(run_dir=str(tmp_path / "a"), data__stride="auto", **same), reporter)
+    told = train(make_config(run_dir=str(tmp_path / "b"), data__stride=2, **same), reporter)
+    losses = [
+        [json.loads(line).get("loss") for line in (folder / "metrics.jsonl").read_text().splitlines()]
+        for folder in (chosen, told)
+    ]
+    assert losses[0] == losses[1]
+
+
+def test_only_a_stride_at_which_the_runs_own_clips_fit_is_chosen(make_config: Make, reporter: Any) -> None:
+    # 24 steps hold 12 frames at stride 2 only, though the 8 frames of a calibration at stride 3, too.
+    config = make_config(data__stride="auto", data__stride_candidates=[2, 3], data__frames=12, training__steps=1)
+    assert read_run_config(train(config, reporter)).data.stride == 2
+    assert "  stride 3: not possible: no clip of 12 frames fits" in reporter.notes
+    with pytest.raises(InputError, match="shorter than a clip"):
+        train(
+            make_config(data__stride="auto", data__stride_candidates=[3], data__frames=12, run_dir="unused"), reporter
+        )
+
+
+def test_a_check_only_run_writes_no_choice(make_config: Make, reporter: Any) -> None:
+    config = make_config(data__stride="auto", data__stride_candidates=[2, 3])
+    folder = train(config, reporter, check_only=True)
+    assert not folder.exists()
+
+
+def test_a_model_that_has_learned_nothing_is_not_asked(make_config: Make, reporter: Any) -> None:
+    config = make_config(data__stride="auto", model__base=None, model__random={}, adapter__kind="none")
+    with pytest.raises(InputError, match=r"learned nothing.*Set data\.stride to a number"):
+        train(config, reporter)
+
+
+def test_another_number_than_the_chosen_one_is_another_config(make_config: Make, reporter: Any) -> None:
+    config = make_config(data__stride="auto", data__stride_candidates=[2], training__steps=2)
+    train(config, reporter)
+    with pytest.raises(InputError, match=r"data\.stride"):
+        train(make_config(data__stride=3, data__stride_candidates=[2], training__steps=2), reporter)
