@@ -11,6 +11,7 @@ be: other errors, hangs, memory, crashes, messages without end. These are listed
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import resource
@@ -106,6 +107,8 @@ def _outcomes(name: str, first: int, end: int, options: argparse.Namespace) -> I
         while number < end:
             line = _line(worker, seconds=options.seconds)
             if line is None:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    worker.wait(5)  # one that ends itself closes its pipe first
                 hangs = worker.poll() is None
                 worker.kill()
                 yield number, "hang" if hangs else "crash", f"status {worker.wait()}"

@@ -565,6 +565,11 @@ def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_p
         with pytest.raises(InputError, match=name):
             through_cache(original, NUMBERS)
         flipped(folder / name, place)
+    told = (folder / MANIFEST).read_text()
+    (folder / MANIFEST).write_text(told.replace(f'"{KEPT}"', '"kept.nqz"'))
+    with pytest.raises(InputError, match=r"cache\.json: damaged: no checksum of kept\.npz"):
+        alone(through)
+    (folder / MANIFEST).write_text(told)
     sound = (folder / EPISODES).read_bytes()
     table = EpisodeTable.from_bytes(sound)
     (folder / EPISODES).write_bytes(replace(table, num_steps=table.num_steps + 1).to_bytes())

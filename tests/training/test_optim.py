@@ -124,6 +124,7 @@ def test_the_count_of_steps_of_a_fused_optimizer_is_on_the_device(monkeypatch: p
     with FakeTensorMode(allow_non_fake_inputs=True):
         there = on_imagined_cuda(module)
         fused = make_optimizer(there, TrainingConfig())
+        monkeypatch.setattr(optim, "_is_count", lambda _: True)
         load_moments(fused, moments_of(plain))
         assert {value.device.type for state in fused.state.values() for value in state.values()} == {"cuda"}
 
@@ -219,4 +220,28 @@ def test_moments_that_are_not_finite_are_not_taken_up(name: str) -> None:
     load_moments(optimizer, state)
     state["state"][0][name][1, 1] = float("inf")
     with pytest.raises(ValueError, match=f"{name} of parameter 0 holds NaN or infinity"):
+        load_moments(optimizer, state)
+
+
+@pytest.mark.parametrize("step", [torch.tensor(-2000.0), torch.tensor(1e30), 0, -3, "three", torch.ones(2)], ids=str)
+def test_a_step_that_is_no_count_is_not_taken_up(step: Any) -> None:
+    layer = torch.nn.Linear(2, 3)
+    optimizer = make_optimizer(layer, TrainingConfig())
+    layer(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    state = optimizer.state_dict()
+    state["state"][0]["step"] = step
+    with pytest.raises(ValueError, match="step of parameter 0 is no count of steps"):
+        load_moments(optimizer, state)
+
+
+@pytest.mark.parametrize("name", ["exp_avg", "exp_avg_sq", "step"])
+def test_moments_of_which_a_part_is_missing_are_not_taken_up(name: str) -> None:
+    layer = torch.nn.Linear(2, 3)
+    optimizer = make_optimizer(layer, TrainingConfig())
+    layer(torch.ones(1, 2)).sum().backward()
+    optimizer.step()
+    state = optimizer.state_dict()
+    del state["state"][1][name]
+    with pytest.raises(ValueError, match=f"{name} of parameter 1 is missing|moments are of another"):
         load_moments(optimizer, state)

@@ -13,6 +13,8 @@ from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.finite import first_not_finite
 
+_MOST_STEPS = 2**53  # a float64 counts no further
+
 
 def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, object]]:
     """Split what is trained into matrices, which decay, and biases and norms, which do not.
@@ -76,7 +78,8 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
     Raises:
         ValueError: The state is of another kind of optimizer, or of other parameters, or not finite.
     """
-    first = "exp_avg" if isinstance(optimizer, torch.optim.AdamW) else "state1"  # PyTorch's and bitsandbytes' names
+    # PyTorch's names and those of bitsandbytes.
+    first, second = ("exp_avg", "exp_avg_sq") if isinstance(optimizer, torch.optim.AdamW) else ("state1", "state2")
     known = (
         isinstance(state, dict) and isinstance(state.get("state"), dict) and isinstance(state.get("param_groups"), list)
     )
@@ -87,13 +90,24 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
         raise ValueError("its moments are of another training.optimizer")
     _require_shapes(optimizer, flat, first)
     for number, moments in flat.items():
+        if lacking := {second, "step"} - moments.keys():
+            raise ValueError(f"{min(lacking)} of parameter {number} is missing")
         tensors = {name: value for name, value in moments.items() if isinstance(value, Tensor)}
         if (name := first_not_finite(tensors)) is not None:
             raise ValueError(f"{name} of parameter {number} holds NaN or infinity")
+        if not _is_count(moments["step"]):
+            raise ValueError(f"step of parameter {number} is no count of steps")
     own = [{name: value for name, value in group.items() if name != "params"} for group in optimizer.param_groups]
     groups = [group | settings for group, settings in zip(state["param_groups"], own, strict=False)]
     left = state["param_groups"][len(own) :]  # which PyTorch refuses
     optimizer.load_state_dict({**state, "param_groups": groups + left})
+
+
+def _is_count(step: object) -> bool:
+    """Return whether this can be the number of steps that an optimizer has made: powers of its betas have to exist."""
+    if isinstance(step, Tensor):
+        return step.numel() == 1 and 1 <= float(step) <= _MOST_STEPS
+    return isinstance(step, int | float) and 1 <= step <= _MOST_STEPS
 
 
 def _flat(moments: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import pyarrow as pa
 import pytest
 from pyarrow import parquet as pq
 
+from paths import GOLDEN
 from vjepa2_ac.data.sources.lerobot import bounds, parquet
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows, read_table
 from vjepa2_ac.errors import InputError
@@ -37,6 +38,14 @@ def test_texts_that_repeat_without_end_are_refused_before_python_has_them(
     finally:
         tracemalloc.stop()
     assert read_table(str(path), str(path), lambda name: name == "length") == {"length": list(range(3000))}
+
+
+def test_a_footer_that_contradicts_itself_is_damage_and_does_not_end_the_process() -> None:
+    """Asked for this column's account in the footer, pyarrow 26 would abort this very process."""
+    path = str(GOLDEN / "contradicting_footer.parquet")
+    rows = ParquetRows(lambda name: name, ["observation.state.cartesian_position", "action.joint_velocity"])
+    with pytest.raises(InputError, match=r"contradicting_footer\.parquet: damaged: Definition level histogram"):
+        rows.rows(path, 0)
 
 
 def rows_of(_: Path) -> ParquetRows:

@@ -17,6 +17,8 @@ from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.sources.latents.cache_key import OF_CLIPS, clip_parts
 from vjepa2_ac.data.sources.latents.episode_file import EpisodeFile
 from vjepa2_ac.data.sources.latents.manifest import (
+    KEPT,
+    MANIFEST,
     Manifest,
     path_of,
     read_episodes,
@@ -83,10 +85,16 @@ class LatentSource:
         return self._open().table
 
     def kept_ranges(self) -> FoundRanges:
-        """Return what `data.idle` keeps, as it was found when the cache was made; its rule is not none."""
+        """Return what `data.idle` keeps, as it was found when the cache was made; its rule is not none.
+
+        Raises:
+            InputError: No whole cache, or one of clips that the config does not ask for.
+        """
         kept = self._open().kept
-        if kept is None:
-            raise ValueError("the cache was made with idle.rule none")
+        if kept is None:  # `_require_fit` has compared the rules
+            raise InputError(
+                where=str(self._folder / MANIFEST), found=f"damaged: no checksum of {KEPT}", needed="one", fix=_ENCODE
+            )
         return kept
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched

@@ -35,6 +35,7 @@ Opener = Callable[[str], "str | BlockCachedFile"]  # a path, or a file far away
 EPISODE = "episode_index"
 
 _KEPT_BYTES = 64 << 20  # of decoded row groups, in a process
+_BUFFER_BYTES = 4096  # of a column from which nothing is read
 _KEPT_FOOTERS = 256
 
 
@@ -68,8 +69,9 @@ class ParquetRows:
         Raises:
             InputError: It is missing or damaged.
         """
-        with _opened(self._open(path), path) as file:
-            return list(self._footer(path, file).schema.names)
+        opened = self._open(path)
+        with _opened(opened, path) as file:
+            return list(self._footer(path, file, opened).schema.names)
 
     def rows(self, path: str, episode: int) -> Columns:
         """Return the rows of one episode, as columns of shape [rows, numbers].
@@ -81,8 +83,9 @@ class ParquetRows:
         if self._kept is not None and (known := self._kept.read(path, episode)) is not None:
             return known
         parts, shared = [], False
-        with _opened(self._open(path), path) as file:
-            footer = self._footer(path, file)
+        opened = self._open(path)
+        with _opened(opened, path) as file:
+            footer = self._footer(path, file, opened)
             for number, (first, last) in enumerate(zip(footer.first, footer.last, strict=True)):
                 if (first is None or first <= episode) and (last is None or episode <= last):
                     group = self._group(path, file, number)
@@ -103,19 +106,21 @@ class ParquetRows:
             OSError: A file far away cannot be read.
         """
         found: list[bytes] = []
-        with _opened(self._open(path), path) as file:
-            footer = self._footer(path, file)
+        opened = self._open(path)
+        with _opened(opened, path) as file:
+            footer = self._footer(path, file, opened)
             for number, (first, last) in enumerate(zip(footer.first, footer.last, strict=True)):
                 if (first is None or first <= episode) and (last is None or episode <= last):
                     for part in parts_of(file, path, [EPISODE, column], MOST_PICTURE_BYTES, row_groups=[number]):
                         found += _pictures_in(part[column], part[EPISODE], episode, f"{path}: {column}")
         return found
 
-    def _footer(self, path: str, file: parquet.ParquetFile) -> _Footer:
+    def _footer(self, path: str, file: parquet.ParquetFile, opened: str | BlockCachedFile) -> _Footer:
         with self._lock:
             known = self._footers.get(path)
         if known is not None:
             return known
+        _require_consistent(file, opened, self._columns)
         footer = _footer_of(file, path)
         with self._lock:
             self._footers[path] = footer
@@ -230,6 +235,24 @@ def _footer_of(file: parquet.ParquetFile, path: str) -> _Footer:
         first.append(statistics.min if known else None)
         last.append(statistics.max if known else None)
     return _Footer(metadata, schema, first, last)
+
+
+def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile, columns: Sequence[str]) -> None:
+    """Refuse what contradicts itself in the footer's account of some columns, in every row group.
+
+    Asking pyarrow for that account (`row_group(n).column(p)`) ends the process where it does: a C++ exception that its
+    binding does not expect. A reader of no rows makes the same checks, reads nothing, and raises.
+
+    Raises:
+        pyarrow.ArrowException, OSError: It is damaged.
+    """
+    _, parquet = _library(str(opened))
+    paths = [file.metadata.schema.column(number).path + "." for number in range(file.metadata.num_columns)]
+    places = [number for number, path in enumerate(paths) if any(path.startswith(f"{name}.") for name in columns)]
+    light = parquet.ParquetFile(opened, metadata=file.metadata, buffer_size=_BUFFER_BYTES, pre_buffer=False)
+    for group in range(file.metadata.num_row_groups):
+        for _ in light.reader.iter_batches(0, row_groups=[group], column_indices=places, use_threads=False):
+            break
 
 
 def _require_sane_groups(file: parquet.ParquetFile, path: str) -> None:
