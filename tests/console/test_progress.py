@@ -14,7 +14,8 @@ import vjepa2_ac
 from vjepa2_ac.cli import main
 from vjepa2_ac.console import data
 from vjepa2_ac.console import progress as console_module
-from vjepa2_ac.console.progress import ConsoleReporter, ProgressBar
+from vjepa2_ac.console.progress import ProgressBar
+from vjepa2_ac.console.training import ConsoleReporter
 from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.evaluation.metrics import PredictionErrors
 

@@ -16,8 +16,9 @@ from vjepa2_ac.console.plan import plan_table
 from vjepa2_ac.console.progress import PlainConsole
 from vjepa2_ac.data.inspection.statistics import Inspection
 from vjepa2_ac.evaluation.data_variants.measure import TriedVariant, VariantProbe
-from vjepa2_ac.evaluation.evaluate import Contender, ProbeOptions, evaluate
+from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, TriedStride
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reports.comparison import Comparison

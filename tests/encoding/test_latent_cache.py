@@ -23,10 +23,10 @@ from memory_source import MemorySource
 from synthetic import synthetic_episode, synthetic_states
 from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.clip_reader import clip_at, pictures_of
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, training_loader, validation_batches
-from vjepa2_ac.data.clips.windows import Split
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
 from vjepa2_ac.data.index.episode_table import EpisodeTable

@@ -11,8 +11,7 @@ from same_run import assert_same_run, figures, trained_weights
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import ProbeOptions
-from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel

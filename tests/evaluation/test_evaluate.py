@@ -19,8 +19,9 @@ from vjepa2_ac.evaluation.estimates import (
     stratum_gain,
     stratum_over_persistence,
 )
-from vjepa2_ac.evaluation.evaluate import Contender, ProbeOptions, evaluate
+from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import METRICS, MODES, Errors, Evaluation, Predicted, Stratum
 from vjepa2_ac.evaluation.verdict import improvement, uses_actions, verdict
 from vjepa2_ac.reports.metrics_json import metrics_as_dict

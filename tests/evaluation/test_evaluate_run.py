@@ -14,8 +14,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import ProbeOptions
-from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.write import evaluate_subject

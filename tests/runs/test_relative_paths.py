@@ -8,8 +8,7 @@ import pytest
 
 from vjepa2_ac.config.loading import config_as_dict, load_config, parse_config
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import ProbeOptions
-from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.runs.folder import start_folders
 from vjepa2_ac.runs.loading import load_run

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.evaluation.action_score.measure import PlanningStart, planning_start, study_of
-from vjepa2_ac.evaluation.evaluate import Contender, ProbeOptions, evaluate
+from vjepa2_ac.evaluation.evaluate import Contender, evaluate
+from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
 from worlds import about, actions_of, again, clips_batch
 

@@ -14,7 +14,7 @@ from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, load_config, parse_config
-from vjepa2_ac.console.progress import ConsoleReporter
+from vjepa2_ac.console.training import ConsoleReporter
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.training import optim
 from vjepa2_ac.training.loop import train

@@ -6,8 +6,7 @@ import pytest
 
 from vjepa2_ac.cli import main
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import ProbeOptions
-from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.reports.write import evaluate_subject
 from vjepa2_ac.training.loop import train
 

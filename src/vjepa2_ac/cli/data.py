@@ -10,7 +10,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vjepa2_ac.cli.options import Commands, Handler, as_local, as_model, as_path, command, count, whole_number
+from vjepa2_ac.cli.options import (
+    Commands,
+    Handler,
+    as_local,
+    as_model,
+    as_path,
+    command,
+    count,
+    read_config,
+    require_subject,
+    whole_number,
+)
 from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,11 +67,13 @@ def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from vjepa2_ac.config.loading import load_config
+    config = read_config(options.config, options.overrides)
+    if options.model is not None:
+        require_subject(options.model)
+
     from vjepa2_ac.console.data import print_finding
     from vjepa2_ac.data.inspection.check import check_data
 
-    config = load_config(options.config, options.overrides)
     wrong = 0
     with _progress("looking through the data set") as progress:
         findings = check_data(
@@ -101,13 +114,13 @@ def _add_index(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _index(options: argparse.Namespace) -> None:
-    from vjepa2_ac.config.loading import load_config
+    config = read_config(options.config, options.overrides).data
+
     from vjepa2_ac.console.data import index_lines
     from vjepa2_ac.console.progress import console
     from vjepa2_ac.data.clips.dataset import open_dataset
     from vjepa2_ac.data.index.index_cache import record_usage
 
-    config = load_config(options.config, options.overrides).data
     started = time.perf_counter()
     with _progress("looking through the data set") as progress, record_usage(rebuild=options.rebuild) as watch:
         dataset = open_dataset(config, progress=progress)
@@ -127,7 +140,9 @@ def _add_inspect(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _inspect(options: argparse.Namespace) -> None:
-    from vjepa2_ac.config.loading import load_config
+    config = read_config(options.config, options.overrides)
+    _make_folder(options.out)
+
     from vjepa2_ac.console.data import inspection_lines, motion_table
     from vjepa2_ac.console.progress import console
     from vjepa2_ac.data.clips.dataset import open_dataset
@@ -136,8 +151,6 @@ def _inspect(options: argparse.Namespace) -> None:
     from vjepa2_ac.reports.figures.dataset import plot_dataset
     from vjepa2_ac.storage import write_atomically
 
-    config = load_config(options.config, options.overrides)
-    _make_folder(options.out)
     with _progress("looking through the data set") as progress:
         dataset = at_some_stride(open_dataset(config.data, progress=progress))
     if config.data.stride == "auto":
@@ -171,14 +184,16 @@ def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _calibrate(options: argparse.Namespace) -> None:
-    from vjepa2_ac.config.loading import load_config
+    config = read_config(options.config, options.overrides)
+    if options.model is not None:
+        require_subject(options.model)
+    _make_folder(options.out)
+
     from vjepa2_ac.console.data import calibration_table
     from vjepa2_ac.console.progress import console
     from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
     from vjepa2_ac.storage import write_atomically
 
-    config = load_config(options.config, options.overrides)
-    _make_folder(options.out)
     with _progress("looking through the data set") as indexing, _progress("measuring clips") as measuring:
         calibration = calibrate_config(
             config,

@@ -19,15 +19,17 @@ def add_doctor(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    import torch
-
     from vjepa2_ac.config.loading import load_config
-    from vjepa2_ac.console.memory import memory_lines, verdict
-    from vjepa2_ac.console.progress import console
-    from vjepa2_ac.model.checkpoints.loading import base_sizes
-    from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
 
     config = load_config(options.config, options.overrides)
+
+    import torch
+
+    from vjepa2_ac.console.memory import memory_lines, verdict
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.model.base_model import base_sizes
+    from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
+
     sizes = base_sizes(config.model)
     console.print(f"PyTorch {torch.__version__}, CUDA {torch.version.cuda or 'not in this build'}")
     gpu, available = "a GPU of 24 GB (there is none here)", USUAL_GPU

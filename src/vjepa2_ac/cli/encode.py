@@ -6,7 +6,7 @@ import argparse
 import os
 
 from vjepa2_ac import output
-from vjepa2_ac.cli.options import Commands, as_local, as_path
+from vjepa2_ac.cli.options import Commands, as_local, as_path, read_config
 
 
 def add_encode(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -29,11 +29,11 @@ def add_encode(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _encode(options: argparse.Namespace) -> None:
-    from vjepa2_ac.config.loading import load_config
+    config = read_config(options.config, options.overrides, base=True)
+
     from vjepa2_ac.console.progress import EncodingBar, LateProgress, console
     from vjepa2_ac.encoding.encode_dataset import encode_config
 
-    config = load_config(options.config, options.overrides)
     output.never_wait()
     is_first = os.environ.get("RANK", "0") == "0"
     looking, bar = LateProgress("looking through the data set"), EncodingBar()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli.options import (
     Commands,
@@ -15,11 +17,16 @@ from vjepa2_ac.cli.options import (
     command,
     count,
     number_between,
+    read_config,
     require_overrides,
+    require_subject,
     say_places_elsewhere,
     whole_number,
 )
 from vjepa2_ac.errors import InputError
+
+if TYPE_CHECKING:
+    from vjepa2_ac.evaluation.request import EvaluationOptions
 
 
 def add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -112,13 +119,37 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.evaluation.request import settle
+
+    asked = _asked(options)
+    for subject, how in asked.items():  # wrong words are told before what takes seconds is imported
+        settle(subject, how)
+        require_subject(subject, how.checkpoint)
+
     from vjepa2_ac.console.evaluation import Stages, evaluation_tables
     from vjepa2_ac.console.progress import console
-    from vjepa2_ac.evaluation.evaluate import ProbeOptions
-    from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
     from vjepa2_ac.evaluation.verdict import spread, verdict
     from vjepa2_ac.reports.write import evaluate_subject
+
+    evaluations = []
+    for subject, how in asked.items():
+        say_places_elsewhere(subject)
+        with Stages() as stages:
+            measured = evaluate_subject(subject, how, stage=stages)
+        evaluations.append(measured.evaluation)
+        console.print(f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject)
+        for table in evaluation_tables(measured.evaluation):
+            console.print(table)
+        console.print(verdict(measured.evaluation))
+        for path in measured.files:
+            console.print(f"  {path}")
+    if len(evaluations) > 1:
+        console.print(spread(evaluations))
+
+
+def _asked(options: argparse.Namespace) -> dict[str, EvaluationOptions]:
+    """Return what is asked of each subject."""
+    from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 
     _require_planning(options)
     probes = ProbeOptions(
@@ -131,33 +162,21 @@ def _evaluate(options: argparse.Namespace) -> None:
         at_once=options.at_once,
         planning_clips=0 if options.planning is None else options.planning_clips,
     )
-    data = load_config(options.data, []) if options.data else None
-    several, evaluations = len(options.subjects) > 1, []
-    for subject in options.subjects:
-        say_places_elsewhere(subject)
-        out = options.out / Path(subject).name if options.out and several else options.out
-        asked = EvaluationOptions(
-            split=options.split,
-            clips=options.clips,
-            checkpoint=options.checkpoint,
-            data=data,
-            against=tuple(options.against) if options.against else None,
-            out=out,
-            probes=probes,
-            calibrate=options.calibrate,
-            planning=(*(options.planning or ()), *options.overrides),
-        )
-        with Stages() as stages:
-            measured = evaluate_subject(subject, asked, stage=stages)
-        evaluations.append(measured.evaluation)
-        console.print(f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject)
-        for table in evaluation_tables(measured.evaluation):
-            console.print(table)
-        console.print(verdict(measured.evaluation))
-        for path in measured.files:
-            console.print(f"  {path}")
-    if several:
-        console.print(spread(evaluations))
+    several = len(options.subjects) > 1
+    every = EvaluationOptions(
+        split=options.split,
+        clips=options.clips,
+        checkpoint=options.checkpoint,
+        data=read_config(options.data) if options.data else None,
+        against=tuple(options.against) if options.against else None,
+        probes=probes,
+        calibrate=options.calibrate,
+        planning=(*(options.planning or ()), *options.overrides),
+    )
+    return {
+        subject: replace(every, out=options.out / Path(subject).name if options.out and several else options.out)
+        for subject in options.subjects
+    }
 
 
 def _require_planning(options: argparse.Namespace) -> None:
@@ -184,12 +203,14 @@ def _add_compare(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _compare(options: argparse.Namespace) -> None:
-    from vjepa2_ac.console.evaluation import comparison_table
-    from vjepa2_ac.console.progress import console
     from vjepa2_ac.reports.comparison import compare
-    from vjepa2_ac.reports.figures.evaluation import plot_comparison
 
     comparison = compare(options.runs)
+
+    from vjepa2_ac.console.evaluation import comparison_table
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.reports.figures.evaluation import plot_comparison
+
     console.print(comparison_table(comparison))
     for line in comparison.notes:
         console.print(line)

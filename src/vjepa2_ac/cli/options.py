@@ -8,10 +8,13 @@ import os
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from vjepa2_ac import places
 from vjepa2_ac.errors import InputError, printable
+
+if TYPE_CHECKING:
+    from vjepa2_ac.config import Config
 
 Commands = argparse._SubParsersAction
 Handler = Callable[[argparse.Namespace], int | None]
@@ -46,6 +49,58 @@ def say_places_elsewhere(subject: str) -> None:
     if (Path(subject) / CONFIG).is_file() and os.environ.get("RANK", "0") == "0":  # one of several processes
         for place in places_elsewhere(read_run_config(Path(subject))):
             console.print(f"{subject} names a place elsewhere: {place}")
+
+
+def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool = False) -> Config:
+    """Read a config, and refuse one whose data set is not on this machine, before what takes seconds is imported.
+
+    What lies elsewhere is found out later.
+
+    Args:
+        path: The YAML file.
+        overrides: Such as training.steps=100.
+        base: Whether `model.base` has to be there, too.
+
+    Raises:
+        InputError: The config is wrong, or one of them is not there.
+    """
+    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.model.base_model import find_base
+
+    config = load_config(path, overrides)
+    data = config.data.path
+    if not places.is_url(data) and not Path(data).exists():
+        raise InputError(
+            where=f"data.path: {data}",
+            found=f"no such file or folder, seen from {Path.cwd()}",
+            needed="a data set",
+            fix="Set data.path to the data set; docs/QUICKSTART.md says how to get DROID",
+        )
+    if base and config.model.base is not None:
+        find_base(config.model.base)
+    return config
+
+
+def require_subject(subject: str, checkpoint: str | None = None) -> None:
+    """Refuse a run or a model that is not there, before what takes seconds is imported.
+
+    Args:
+        subject: The folder of a run; or a model: what `model.base` takes.
+        checkpoint: Of a run: newest, best, or a number of optimizer steps; None: it is not looked for.
+
+    Raises:
+        InputError: There is no such run, checkpoint or model.
+    """
+    from vjepa2_ac.model.base_model import find_base
+    from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
+    from vjepa2_ac.runs.folder import is_run, read_run_config
+
+    if not is_run(subject):
+        find_base(subject)
+        return
+    read_run_config(Path(subject))
+    if checkpoint is not None:
+        select_checkpoint(Path(subject), checkpoint)
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:

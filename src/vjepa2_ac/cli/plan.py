@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from vjepa2_ac.cli.evaluate import add_checkpoint
 from vjepa2_ac.cli.options import (
@@ -15,6 +15,7 @@ from vjepa2_ac.cli.options import (
     as_path,
     command,
     require_overrides,
+    require_subject,
     say_places_elsewhere,
     whole_number,
 )
@@ -22,8 +23,6 @@ from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
-
-    from vjepa2_ac.planning.decision import PlanRequest
 
 
 def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
@@ -89,20 +88,29 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _plan(options: argparse.Namespace) -> int:
+    from vjepa2_ac.planning.settings import planning_settings
+    from vjepa2_ac.storage import user_can_write
+
+    # Wrong words are told before what takes seconds is imported.
+    require_overrides(options.overrides, fix="Numbers of --state or --extrinsics go in one word: --state 0.4,0,0.3,...")
+    state, extrinsics = _state(options), _extrinsics(options)
+    require_subject(options.subject, options.checkpoint)
+    planning_settings(options.subject, config=options.config, overrides=options.overrides)
+    with user_can_write(options.out):
+        options.out.mkdir(parents=True, exist_ok=True)
+    images = _images(options)
+
     from vjepa2_ac.console.evaluation import Stages
     from vjepa2_ac.console.plan import plan_table
     from vjepa2_ac.console.progress import console
-    from vjepa2_ac.planning.decision import decide
+    from vjepa2_ac.planning.decision import PlanRequest, decide
     from vjepa2_ac.planning.plan_json import PLAN_FILE, write_plan
     from vjepa2_ac.planning.session import load_to_plan
     from vjepa2_ac.planning.summary import summarize
     from vjepa2_ac.reports.figures.plan import PLAN_IMAGE, plot_plan
-    from vjepa2_ac.storage import user_can_write
 
-    require_overrides(options.overrides, fix="Numbers of --state or --extrinsics go in one word: --state 0.4,0,0.3,...")
-    question, extrinsics = _question(options), _extrinsics(options)
-    with user_can_write(options.out):
-        options.out.mkdir(parents=True, exist_ok=True)
+    durations = _durations(options.durations, len(options.goal)) if options.durations else ()
+    question = PlanRequest(images.start, state, images.goals, durations, images.mask)
     say_places_elsewhere(options.subject)
     steering = load_to_plan(
         options.subject, checkpoint=options.checkpoint, config=options.config, overrides=options.overrides
@@ -126,16 +134,28 @@ def _plan(options: argparse.Namespace) -> int:
     return int(found.decision.why == "no finite energy")
 
 
-def _question(options: argparse.Namespace) -> PlanRequest:
-    """Read what was given and refuse what cannot be planned with, before a model is loaded."""
-    from vjepa2_ac.media.image_file import read_image
-    from vjepa2_ac.planning.decision import PlanRequest
-    from vjepa2_ac.planning.input_checks import require_mask, require_picture, require_pose
+def _state(options: argparse.Namespace) -> np.ndarray:
+    from vjepa2_ac.planning.input_checks import require_pose
 
     state = _numbers(options.state, "--state")
     require_pose(state, where="--state")
-    durations = _durations(options.durations, len(options.goal)) if options.durations else ()
-    goals = [read_image(path) for path in options.goal]
+    if options.durations:
+        _durations(options.durations, len(options.goal))
+    return state
+
+
+class _Images(NamedTuple):
+    start: np.ndarray
+    goals: tuple[np.ndarray, ...]
+    mask: np.ndarray | None
+
+
+def _images(options: argparse.Namespace) -> _Images:
+    """Read what was given and refuse what cannot be planned with, before a model is loaded."""
+    from vjepa2_ac.media.image_file import read_image
+    from vjepa2_ac.planning.input_checks import require_mask, require_picture
+
+    goals = tuple(read_image(path) for path in options.goal)
     for path, picture in zip(options.goal, goals, strict=True):
         require_picture(picture, where=f"--goal {path}", like=goals[0])
     start = read_image(options.start)
@@ -143,7 +163,7 @@ def _question(options: argparse.Namespace) -> PlanRequest:
     mask = None if options.mask is None else read_image(options.mask).max(axis=-1)
     if mask is not None:
         require_mask(mask, where=f"--mask {options.mask}", like=goals[0])
-    return PlanRequest(start, state, tuple(goals), durations, mask)
+    return _Images(start, goals, mask)
 
 
 def _extrinsics(options: argparse.Namespace) -> np.ndarray | None:

@@ -7,7 +7,16 @@ from pathlib import Path
 
 from vjepa2_ac import output, places
 from vjepa2_ac.cli.evaluate import add_checkpoint
-from vjepa2_ac.cli.options import Commands, as_local, as_model, as_path, command, count, whole_number
+from vjepa2_ac.cli.options import (
+    Commands,
+    as_local,
+    as_model,
+    as_path,
+    command,
+    count,
+    require_subject,
+    whole_number,
+)
 from vjepa2_ac.errors import InputError
 
 _RECORD = "record"
@@ -69,7 +78,7 @@ def add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
 def _add_steering(group: argparse._ArgumentGroup) -> None:
     add_checkpoint(group)
     group.add_argument(
-        "--config", metavar="CONFIG", type=as_local, help="of a model: a config whose `planning` is heeded"
+        "--config", metavar="CONFIG", type=as_local, help="of a model: a config whose `planning` is used"
     )
     group.add_argument("--films", metavar="N", type=whole_number(0), help="episodes in the video; 0: none (6)")
     group.add_argument(
@@ -97,8 +106,8 @@ def _simulate(options: argparse.Namespace) -> int:
 
 
 def _record(options: argparse.Namespace) -> int:
-    from vjepa2_ac.console.progress import ProgressBar, console
-    from vjepa2_ac.simulation.recording.record import record_dataset
+    from vjepa2_ac.simulation.world.domains import named_domain
+    from vjepa2_ac.storage import require_new_folder, try_writing_at, user_can_write
 
     if len(options.overrides) != 1:
         found = " ".join(options.overrides) or "no folder"
@@ -109,6 +118,15 @@ def _record(options: argparse.Namespace) -> int:
         raise InputError(
             where="simulate record", found=f"{options.overrides[0]!r} {error}", needed="a folder of this machine"
         ) from None
+    if options.domain != "random":  # wrong words are told before what takes seconds is imported
+        named_domain(options.domain)
+    require_new_folder(target)
+    with user_can_write(target):
+        try_writing_at(target)
+
+    from vjepa2_ac.console.progress import ProgressBar, console
+    from vjepa2_ac.simulation.recording.record import record_dataset
+
     output.never_wait()
     bar = ProgressBar("recording", options.episodes)
     try:
@@ -131,19 +149,25 @@ def _record(options: argparse.Namespace) -> int:
 
 
 def _steer(options: argparse.Namespace) -> int:
+    from vjepa2_ac.planning.settings import planning_settings
+    from vjepa2_ac.runs.folder import is_run
+    from vjepa2_ac.simulation.world.domains import named_domain
+
+    # Wrong words are told before what takes seconds is imported.
+    if options.domain == "random":
+        raise InputError(where="--domain random", found="a model that steers", needed="A or B")
+    named_domain(options.domain)
+    require_subject(options.subject, options.checkpoint)
+    planning_settings(options.subject, config=options.config, overrides=options.overrides)
+
     from vjepa2_ac.console.closed_loop import contest_notes, contest_table
     from vjepa2_ac.console.evaluation import Stages
     from vjepa2_ac.console.progress import console
     from vjepa2_ac.planning.session import load_to_plan
-    from vjepa2_ac.runs.loading import is_run
     from vjepa2_ac.runs.own_files import refuse_links_out
     from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
-    from vjepa2_ac.simulation.world.domains import named_domain
     from vjepa2_ac.simulation.world.scene import load_mujoco
 
-    if options.domain == "random":
-        raise InputError(where="--domain random", found="a model that steers", needed="A or B")
-    named_domain(options.domain)
     load_mujoco()
     asked = BenchmarkOptions(
         task=options.task,

@@ -14,6 +14,7 @@ from vjepa2_ac.places import is_url
 # A serial number is a name, also where YAML takes it for a number.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
+Split = Literal["train", "validation", "test"]
 _STRIDES_AT_15_HZ = (4, 8, 15)
 
 

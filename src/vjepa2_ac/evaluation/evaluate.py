@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_score.measure import PlanningStart, measure_plans, planning_start, study_of
@@ -20,6 +19,7 @@ from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sens
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.examples import chosen_clips, make_example, predicted_rollout
 from vjepa2_ac.evaluation.metrics import Predictor, measured, persistence_of, with_other_actions
+from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
     About,
     Clips,
@@ -52,21 +52,6 @@ class Contender:
     model: Predictor
     switched: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext  # on while it predicts
     to_plan: Callable[[], Predictor] | None = None  # gives what plans in its place, and is held only while it does
-
-
-@dataclass(frozen=True)
-class ProbeOptions:
-    """How much is done beyond the errors; 0 clips: nothing."""
-
-    sensitivity_clips: int = 32
-    samples: int = 64  # other actions per clip, drawn in each of two ways
-    landscape_clips: int = 8
-    nodes: int = 9  # along each axis of a landscape
-    reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
-    examples: int = 4
-    at_once: int = 64  # samples that are computed together
-    planning_clips: int = 0  # of these, plans are held against the demonstration; of poses only
-    planning: PlanningConfig = field(default_factory=PlanningConfig)  # how one step is planned
 
 
 @dataclass(frozen=True)

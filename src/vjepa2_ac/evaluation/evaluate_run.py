@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -15,21 +14,19 @@ import torch
 from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
-from vjepa2_ac.config import Config, PlanningConfig
-from vjepa2_ac.config.loading import config_as_dict, config_from
+from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.clip_reader import pictures_of
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.streams import copies_for
-from vjepa2_ac.data.clips.windows import Split
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.action_score.protocol import FRAMES
-from vjepa2_ac.evaluation.evaluate import ClipName, Contender, Pictures, ProbeOptions, RepeatableClips, evaluate
+from vjepa2_ac.evaluation.evaluate import ClipName, Contender, Pictures, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.examples import seen_by_the_encoder
+from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import About, Evaluation, Role, TrainingCurve
 from vjepa2_ac.evaluation.stride_calibration.measure import calibrate_model
 from vjepa2_ac.model.adapter.merging import base_only, unadapted_copy
@@ -37,30 +34,13 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.places import BUILTIN
-from vjepa2_ac.runs.checkpoint_selection import NEWEST, select_checkpoint
-from vjepa2_ac.runs.folder import METRICS, read_run_config
-from vjepa2_ac.runs.loading import TrainedRun, is_run, load_run
+from vjepa2_ac.runs.folder import METRICS, is_run
+from vjepa2_ac.runs.loading import TrainedRun, load_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
-from vjepa2_ac.runs.relative_paths import DATA, with_paths_from_start
-from vjepa2_ac.storage import user_can_write
+from vjepa2_ac.storage import try_writing_at, user_can_write
 
 BASE = "base"
 _NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
-
-
-@dataclass(frozen=True)
-class EvaluationOptions:
-    """What is asked of an evaluation."""
-
-    split: Split = "test"
-    clips: int = 256  # at most, spread over the episodes
-    checkpoint: str = NEWEST  # of a run: newest, best, or a number of optimizer steps
-    data: Config | None = None  # other data than the run's own; a model has none of its own
-    against: tuple[str, ...] | None = None  # base, runs, models; None: the base of a run, nothing for a model
-    out: Path | None = None  # folder for what is written; None: the run's
-    probes: ProbeOptions = field(default_factory=ProbeOptions)
-    calibrate: bool = False  # measure the error at other strides, too
-    planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
 
 
 @dataclass(frozen=True)
@@ -86,10 +66,10 @@ def measure_subject(
         InputError: The subject, the data, or what to compare with cannot be used; the split is empty.
     """
     asked = asked or EvaluationOptions()
-    config, folder = _config_of(subject, asked)
-    _check_long_enough(config, asked.probes)
-    planning = _planning_of(config, asked)
-    _check_writable(folder)
+    config, planning, folder = settle(subject, asked)
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        try_writing_at(folder)
     accelerator = make_accelerator(config)
     if asked.probes.planning_clips and planning.quantize != "off":
         dtype = getattr(torch, config.model.dtype)
@@ -154,78 +134,6 @@ def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
         TrainingCurve(name, tuple(step for step, _ in found), tuple(value for _, value in found))
         for name, found in points.items()
     )
-
-
-def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
-    """Return the config to measure with, and the folder for what is found."""
-    if is_run(subject):
-        config, needed = read_run_config(Path(subject)), [DATA] if asked.data is None else []
-        config = with_paths_from_start(config, Path(subject), needed=needed)
-        select_checkpoint(Path(subject), asked.checkpoint)
-        if asked.data is None:
-            return config, asked.out or Path(subject)
-        config = config.model_copy(update={"data": asked.data.data})
-    elif asked.data is None:
-        raise _nothing_to_measure(subject)
-    else:
-        config = asked.data
-    if asked.out is None:
-        raise InputError(
-            where="command line",
-            found="--data without --out: metrics.json of a run's own folder tells of its own data",
-            needed="a folder for what is found on these data",
-            fix="Add --out FOLDER",
-        )
-    if config.data.stride == "auto":
-        raise InputError(
-            where="data.stride",
-            found="auto",
-            needed="a number, to evaluate",
-            fix="`vjepa2-ac data calibrate CONFIG` tells which",
-        )
-    return config, asked.out
-
-
-def _nothing_to_measure(subject: str) -> InputError:
-    path = Path(subject)
-    found = "no config.yaml: not the folder of a run" if path.exists() else "no such folder"
-    return InputError(
-        where=subject,
-        found=found,
-        needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
-        fix="To measure a model, name the data with --data CONFIG and a folder with --out",
-    )
-
-
-def _planning_of(config: Config, asked: EvaluationOptions) -> PlanningConfig:
-    """Return how one step is planned: the config's settings, some of them replaced.
-
-    Raises:
-        InputError: A setting is wrong, or is none of planning.
-    """
-    for setting in asked.planning:
-        if not setting.startswith("planning."):
-            raise InputError(
-                where="--planning", found=setting, needed="settings of planning, such as planning.samples=200"
-            )
-    return config_from(config_as_dict(config), asked.planning, where="--planning").planning
-
-
-def _check_long_enough(config: Config, probes: ProbeOptions) -> None:
-    if probes.planning_clips and config.data.states == "pose" and config.data.frames < FRAMES:
-        raise InputError(
-            where="--planning",
-            found=f"clips of {config.data.frames} frames (data.frames)",
-            needed=f"{FRAMES} or more: plans are held against {FRAMES - 1} steps that were demonstrated",
-            fix=f"Give --data a config with data.frames of {FRAMES} or more, and --out",
-        )
-
-
-def _check_writable(folder: Path) -> None:
-    with user_can_write(folder):
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
 
 
 def _load_model(name: str, config: Config) -> WorldModel:

@@ -16,7 +16,6 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
 
 RESAMPLES = 2000
 _SHARE = 0.95  # of what happens, that an interval is to cover
@@ -73,6 +72,8 @@ def bootstrapped(
             return tuple(Estimate(float(value), math.nan, math.nan) for value in values)
         sums = np.einsum("cnf,ne->cef", columns, np.eye(count)[episode_of], optimize=True)
         drawn = of_sums(np.einsum("re,cef->crf", _draws(count, resamples, seed), sums, optimize=True))
+    from scipy import stats  # takes half a second, which wrong words on a command line do not wait for
+
     tail = stats.norm.cdf(-math.sqrt(count / (count - 1)) * stats.t.ppf((1 + _SHARE) / 2, count - 1))
     return tuple(
         _with_interval(float(value), column[np.isfinite(column)], float(tail))
@@ -140,6 +141,8 @@ def share_of(successes: int, tries: int) -> Estimate:
     Raises:
         ValueError: No tries, or more successes than tries.
     """
+    from scipy import stats
+
     found = stats.binomtest(successes, tries)
     low, high = found.proportion_ci(_SHARE, method="wilson")
     return Estimate(float(found.statistic), float(low), float(high))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -30,7 +29,7 @@ from vjepa2_ac.runs.checkpoint_selection import NEWEST
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import TrainedRun, load_run
 from vjepa2_ac.runs.torch_file import write_torch
-from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, user_can_write, write_atomically
+from vjepa2_ac.storage import atomic_writer, folder_writer, is_empty, try_writing_at, user_can_write, write_atomically
 
 Form = Literal["merged", "official", "hub"]
 
@@ -105,9 +104,7 @@ def _check_free(destination: Path, form: Form) -> None:
     with user_can_write(destination):
         if destination.exists() and not (destination.is_dir() and is_empty(destination)):
             raise InputError(where=str(destination), found="something is there already", needed="a new or empty folder")
-        existing = next(path for path in (destination, *destination.absolute().parents) if path.exists())
-        with tempfile.TemporaryFile(dir=existing):
-            pass
+        try_writing_at(destination)
 
 
 def _check_adapter(folder: Path, config: Config) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ from jaxtyping import Float
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import config_from, load_config
 from vjepa2_ac.distributed.device import has_bf16, is_on_cpu, require_type_of_weights
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
@@ -23,15 +21,13 @@ from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.model.quantization import require_8_bits
-from vjepa2_ac.places import literal
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.settings import planning_settings
 from vjepa2_ac.runs.checkpoint_selection import NEWEST
-from vjepa2_ac.runs.folder import CONFIG
-from vjepa2_ac.runs.loading import is_run, load_run
+from vjepa2_ac.runs.folder import is_run
+from vjepa2_ac.runs.loading import load_run
 
 # Settings that planning heeds; the others are of training, and changing them here would do nothing.
-_HEEDED = ("planning.", "seed", "data.crop", "data.stride", "model.dtype", "model.sizes.", "training.device")
-_ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
 
 
 class Fingerprints(NamedTuple):
@@ -124,12 +120,8 @@ def load_to_plan(
     Raises:
         InputError: There is no such thing, it cannot be planned with, or a setting is wrong or does not matter.
     """
-    _require_heeded(overrides)
-    its = _run_config(subject, config, overrides) if is_run(subject) else _model_config(subject, config, overrides)
-    if its.data.states == "vector":
-        raise InputError(
-            where=subject, found="data.states: vector", needed="a model of poses: actions are limited in metres"
-        )
+    dtype = "bfloat16" if torch.cuda.is_available() and has_bf16() else "float32"
+    its = planning_settings(subject, config=config, overrides=overrides, dtype=dtype)
     device = _device_to_plan_on(its)
     if is_run(subject):
         run = load_run(Path(subject), checkpoint, its)
@@ -157,35 +149,3 @@ def _device_to_plan_on(config: Config) -> torch.device:
     if kind != "off":
         require_8_bits(kind, getattr(torch, config.model.dtype), device, where="planning.quantize")
     return device
-
-
-def _run_config(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
-    if config is not None:
-        raise InputError(
-            where=f"--config {config}",
-            found=f"{subject}, a run, which has a config of its own",
-            needed="one config",
-            fix="Change single settings behind the run's name, such as planning.horizon=2",
-        )
-    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(literal(Path(subject)))}", _ANY_TYPE])
-
-
-def _model_config(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
-    if config is None:
-        dtype = "bfloat16" if torch.cuda.is_available() and has_bf16() else "float32"
-        plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
-        return config_from(plain, overrides, where="command line")
-    its = load_config(config, [*overrides, _ANY_TYPE])
-    return its.model_copy(update={"model": its.model.model_copy(update={"base": subject, "random": None})})
-
-
-def _require_heeded(overrides: Sequence[str]) -> None:
-    for override in overrides:
-        key = override.partition("=")[0]
-        is_heeded = any(key == known or (known.endswith(".") and key.startswith(known)) for known in _HEEDED)
-        if key.split(".")[0] in Config.model_fields and not is_heeded:  # of others the config says what is wrong
-            raise InputError(
-                where=f"command line: {override}",
-                found="a setting that planning does not heed",
-                needed=f"one of {', '.join(known + '…' * known.endswith('.') for known in _HEEDED)}",
-            )

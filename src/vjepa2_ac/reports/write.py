@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vjepa2_ac.episode import Progress
-from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions, measure_subject
+from vjepa2_ac.evaluation.evaluate_run import measure_subject
+from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.reports.figures.evaluation import plot_evaluation

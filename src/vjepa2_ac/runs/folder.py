@@ -23,7 +23,6 @@ import re
 import secrets
 import shutil
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -34,7 +33,7 @@ from vjepa2_ac.places import is_url, literal
 from vjepa2_ac.runs.checkpoint import remove_leavings
 from vjepa2_ac.runs.lock import LOCK
 from vjepa2_ac.runs.own_files import refuse_links_out
-from vjepa2_ac.storage import read_bounded, write_atomically
+from vjepa2_ac.storage import read_bounded, try_writing_at, write_atomically
 from vjepa2_ac.storage.structured import read_json_list, shown
 
 CONFIG = "config.yaml"
@@ -156,6 +155,11 @@ def config_changes(config: Config) -> list[str]:
     return [f"{key}: {_setting(old, key)} -> {_setting(config, key)}" for key in keys]
 
 
+def is_run(subject: str) -> bool:
+    """Return whether this is the folder of a run; otherwise it names a model."""
+    return (Path(subject) / CONFIG).is_file()
+
+
 def read_run_config(folder: Path) -> Config:
     """Return the config of a run.
 
@@ -233,10 +237,8 @@ def _refuse_another_config(folder: Path, config: Config) -> None:
 
 
 def _check_writable(folder: Path) -> None:
-    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     try:
-        with tempfile.TemporaryFile(dir=existing):
-            pass
+        try_writing_at(folder)
     except OSError as error:
         raise InputError(
             where=str(folder), found=f"cannot be written ({error.strerror})", fix="Set run_dir to a folder of yours"

@@ -11,7 +11,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import ADAPTER
 from vjepa2_ac.runs.checkpoint_selection import NEWEST, select_checkpoint
-from vjepa2_ac.runs.folder import CONFIG, read_run_config
+from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.relative_paths import BASE, with_paths_from_start
 
 
@@ -23,11 +23,6 @@ class TrainedRun:
     world_model: WorldModel
     checkpoint: Path
     chosen: str  # which checkpoint it is, in words
-
-
-def is_run(subject: str) -> bool:
-    """Return whether this is the folder of a run; otherwise it names a model."""
-    return (Path(subject) / CONFIG).is_file()
 
 
 def load_run(folder: Path, checkpoint: str = NEWEST, config: Config | None = None) -> TrainedRun:

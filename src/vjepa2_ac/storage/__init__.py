@@ -22,7 +22,16 @@ from vjepa2_ac.storage.reading import (
     unreadable,
 )
 from vjepa2_ac.storage.transfer import download, file_sizes, place, remove, remove_folder, try_writing, upload
-from vjepa2_ac.storage.writing import atomic_writer, folder_writer, is_empty, sync, user_can_write, write_atomically
+from vjepa2_ac.storage.writing import (
+    atomic_writer,
+    folder_writer,
+    is_empty,
+    require_new_folder,
+    sync,
+    try_writing_at,
+    user_can_write,
+    write_atomically,
+)
 
 __all__ = [
     "ByteReader",
@@ -50,9 +59,11 @@ __all__ = [
     "read_ranges",
     "remove",
     "remove_folder",
+    "require_new_folder",
     "sha256_of_file",
     "sync",
     "try_writing",
+    "try_writing_at",
     "unreadable",
     "upload",
     "user_can_write",

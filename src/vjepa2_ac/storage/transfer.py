@@ -18,7 +18,7 @@ from vjepa2_ac.places import is_url
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.reading import join
 from vjepa2_ac.storage.remote import RefusedError, UnreachableError
-from vjepa2_ac.storage.writing import atomic_writer
+from vjepa2_ac.storage.writing import atomic_writer, try_writing_at
 
 _AWAY = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC,
@@ -112,9 +112,9 @@ def try_writing(folder: str) -> None:
         UnreachableError: It cannot be written now; a RefusedError where that will not pass.
     """
     if not is_url(folder):
-        existing = next(path for path in (Path(folder), *Path(folder).parents) if path.exists())
-        with _explained(folder), tempfile.TemporaryFile(dir=existing):
-            return
+        with _explained(folder):
+            try_writing_at(Path(folder))
+        return
     trial = join(folder, f".write-check-{secrets.token_hex(8)}")
     with tempfile.TemporaryDirectory() as here:
         source = Path(here) / "trial"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator, Set
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -89,6 +90,31 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
 def is_empty(folder: Path) -> bool:
     """Return whether a folder has nothing in it, but for what writers that were killed have left there."""
     return all(map(is_partial, folder.iterdir()))
+
+
+def require_new_folder(folder: Path) -> None:
+    """Refuse a folder that holds something already.
+
+    Raises:
+        InputError: It does, or it cannot be looked into.
+    """
+    with user_can_write(folder):
+        in_use = folder.is_dir() and not is_empty(folder)
+    if in_use:
+        raise InputError(
+            where=str(folder), found="already there and not empty", fix="Delete it, or name another folder"
+        )
+
+
+def try_writing_at(path: Path) -> None:
+    """Write a temporary file into a folder, or where it would be made. Nothing stays there.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    existing = next(place for place in (path, *path.absolute().parents) if place.exists())
+    with tempfile.TemporaryFile(dir=existing):
+        pass
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from vjepa2_ac.evaluation.action_score import measure
 from vjepa2_ac.evaluation.action_score.measure import WindowCost, measure_plans, planning_start, study_of
 from vjepa2_ac.evaluation.action_score.metrics import differences_of, metrics_of
 from vjepa2_ac.evaluation.action_score.protocol import SCORED
-from vjepa2_ac.evaluation.evaluate import ProbeOptions
+from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.planner import Planner

@@ -17,8 +17,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import evaluate
 from vjepa2_ac.evaluation.action_score import measure
 from vjepa2_ac.evaluation.action_score.protocol import SCORED
-from vjepa2_ac.evaluation.evaluate import ProbeOptions
-from vjepa2_ac.evaluation.evaluate_run import EvaluationOptions
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.write import evaluate_subject
 

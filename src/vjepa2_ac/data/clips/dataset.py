@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt64
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.actions import widths_of
-from vjepa2_ac.data.clips.windows import Split, Windows, windows_of
+from vjepa2_ac.data.clips.windows import Windows, windows_of
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.exclusion import included, with_way_out
 from vjepa2_ac.data.filters.grouping import split_hash

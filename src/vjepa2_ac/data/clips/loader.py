@@ -21,12 +21,13 @@ from torch.utils.data import Dataset as TorchDataset
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.augmentation import draw
 from vjepa2_ac.data.clips.clip_reader import ClipRequest, clip_at, collate, no_clips, read_clip
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.prefetch import Batches, MicroBatch
 from vjepa2_ac.data.clips.streams import NO_COPIES, Copies
-from vjepa2_ac.data.clips.windows import ClipOrder, Split, far_neighbours, spread
+from vjepa2_ac.data.clips.windows import ClipOrder, far_neighbours, spread
 from vjepa2_ac.data.clips.worker_processes import end_with_the_run, end_workers, start_servers_deaf
 from vjepa2_ac.data.filters.exclusion import named
 from vjepa2_ac.data.filters.step_ranges import drawn

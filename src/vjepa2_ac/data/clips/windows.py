@@ -11,12 +11,12 @@ import itertools
 import logging
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Int32, Int64, UInt64
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.permutation import permuted
 from vjepa2_ac.data.filters.exclusion import NAMED, named
 from vjepa2_ac.data.filters.step_ranges import ClipStarts
@@ -24,8 +24,6 @@ from vjepa2_ac.data.index.episode_table import EpisodeTable, identity_hash
 from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)
-
-Split = Literal["train", "validation", "test"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import training_loader
-from vjepa2_ac.data.clips.windows import Split
 from vjepa2_ac.data.inspection.check_excerpts import excerpt_findings
 from vjepa2_ac.data.inspection.check_vectors import has_moved, vector_findings
 from vjepa2_ac.data.inspection.duplicates import find_duplicates

@@ -13,9 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.sources import RAW_CAMERAS
 from vjepa2_ac.data.clips.dataset import Dataset, Removed
-from vjepa2_ac.data.clips.windows import Split, in_split, spread
+from vjepa2_ac.data.clips.windows import in_split, spread
 from vjepa2_ac.data.filters.idle_rules import idle_by_motion
 from vjepa2_ac.data.inspection.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.inspection.statistics_vectors import ChangePerStep, change_per_step

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.windows import Split, spread
+from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.evaluation.data_variants.variants import ChangedSource, RememberingSource, Variant, variants_of
 from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference

@@ -17,10 +17,10 @@ from accelerate import Accelerator
 from jaxtyping import Float
 
 from vjepa2_ac.config import Config, ModelConfig
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.streams import NO_COPIES, Copies, copies_for
-from vjepa2_ac.data.clips.windows import Split
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
-from peft.tuners.lora import LoraLayer
 from torch import Tensor, nn
 
 from vjepa2_ac.config import AdapterConfig
@@ -38,6 +36,11 @@ from vjepa2_ac.model.adapter.lora_linear import LoraLinear
 from vjepa2_ac.model.adapter.targets import lora_arguments, peft_arguments
 from vjepa2_ac.model.network.input_heads import fit_heads, require_trained
 from vjepa2_ac.model.network.world_model import Adaptation, WorldModel, base_weights
+from vjepa2_ac.model.quiet_imports import quiet_imports
+
+with quiet_imports():
+    from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
+    from peft.tuners.lora import LoraLayer
 
 _COMPARED = (
     "r",

@@ -8,9 +8,13 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from peft.tuners.lora import Linear
 from torch import Tensor, nn
 from torch.nn.functional import linear
+
+from vjepa2_ac.model.quiet_imports import quiet_imports
+
+with quiet_imports():
+    from peft.tuners.lora import Linear
 
 
 class LoraLinear(Linear):  # type: ignore[misc]  # PEFT has no types

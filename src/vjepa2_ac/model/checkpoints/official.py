@@ -20,8 +20,9 @@ from vjepa2_ac.model.checkpoints.foreign_file import foreign_kind
 from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.model.network.blocks import mlp_ratio_of
 from vjepa2_ac.model.network.input_heads import widths_of_model
-from vjepa2_ac.model.network.pretrained_folder import check_sizes, check_tensors
+from vjepa2_ac.model.network.pretrained_folder import check_tensors
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.sizes import check_sizes
 
 logger = logging.getLogger(__name__)
 

@@ -9,12 +9,15 @@ from einops import rearrange
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 from torch.nn.functional import layer_norm, linear
-from transformers import VJEPA2Config
-from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.model.network.blocks import NORM_EPSILON, initialise, output_std, without_needless_autocast
 from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables, rotate
+from vjepa2_ac.model.quiet_imports import quiet_imports
+
+with quiet_imports():
+    from transformers import VJEPA2Config
+    from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
 TUBELET = 2  # frames that the encoder sees at once: here the same one twice
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
@@ -18,10 +17,9 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.finite import require_finite
-from vjepa2_ac.storage.structured import message_of, read_json_object
+from vjepa2_ac.model.sizes import CONFIG, FORMAT
 
-FORMAT = "vjepa2-ac world model 1"
-CONFIG, ENCODER, PREDICTOR = "config.json", "encoder.safetensors", "predictor/model.safetensors"
+ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
 
 
 def write_folder(folder: Path, sizes: ModelSizes, encoder: nn.Module, predictor: Any) -> None:
@@ -47,30 +45,6 @@ def write_folder(folder: Path, sizes: ModelSizes, encoder: nn.Module, predictor:
         predictor.config.save_pretrained(fresh / "predictor")
         card = {"format": FORMAT, "sizes": sizes.model_dump(mode="json")}
         (fresh / CONFIG).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-
-
-def read_sizes(folder: Path) -> ModelSizes:
-    """Read the sizes of the model in a folder.
-
-    Raises:
-        InputError: The folder is not a world model.
-    """
-    where = str(folder / CONFIG)
-    needed = "a folder written by `vjepa2-ac export` or WorldModel.save_pretrained"
-    fix = "Of a run, `vjepa2-ac export RUN FOLDER` makes one"
-    try:
-        card = read_json_object(folder / CONFIG, needed=needed, fix=fix)
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
-    except OSError as error:
-        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed, fix=fix) from None
-    if card.get("format") != FORMAT:
-        raise InputError(where=where, found="not the config of a world model", needed=needed, fix=fix)
-    try:
-        return ModelSizes.model_validate_json(json.dumps(card.get("sizes")))
-    except ValidationError as error:
-        said = [f"{'.'.join(map(str, ('sizes', *one['loc'])))}: {message_of(one)}" for one in error.errors()[:4]]
-        raise InputError(where=where, found="; ".join(said), needed=needed, fix=fix) from None
 
 
 def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -> None:
@@ -134,31 +108,6 @@ def check_tensors(found: dict[str, tuple[int, ...]], needed: dict[str, tuple[int
             needed="every tensor of the model, and no other",
             fix="Check model.base and model.sizes",
         )
-
-
-def check_sizes(found: ModelSizes, given: ModelSizes, *, where: str) -> None:
-    """Refuse sizes that were given, and are not those of the model.
-
-    Only those other than the default count as given: a run's own config spells out every default.
-
-    Raises:
-        InputError: Names what differs.
-    """
-    actual, wanted, standard = _flat(found), _flat(given), _flat(ModelSizes())
-    wrong = [key for key in actual if wanted[key] not in (actual[key], standard[key])]
-    if wrong:
-        raise InputError(
-            where=where,
-            found=", ".join(f"{key} {actual[key]}" for key in wrong),
-            needed=", ".join(f"{key} {wanted[key]}" for key in wrong) + ", as model.sizes says",
-            fix="Leave them out of model.sizes: the model tells",
-        )
-
-
-def _flat(sizes: ModelSizes) -> dict[str, Any]:
-    nested = sizes.model_dump()
-    flat = {f"{part}.{key}": value for part in ("encoder", "predictor") for key, value in nested.pop(part).items()}
-    return nested | flat
 
 
 def _whole(module: nn.Module) -> dict[str, torch.Tensor]:

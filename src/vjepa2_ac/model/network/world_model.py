@@ -20,7 +20,8 @@ from vjepa2_ac.model.network.compilation import When
 from vjepa2_ac.model.network.encoder import Encoder
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor, PredictorConfig
-from vjepa2_ac.model.network.pretrained_folder import ENCODER, PREDICTOR, load_safetensors, read_sizes, write_folder
+from vjepa2_ac.model.network.pretrained_folder import ENCODER, PREDICTOR, load_safetensors, write_folder
+from vjepa2_ac.model.sizes import read_sizes
 
 
 @dataclass(frozen=True)

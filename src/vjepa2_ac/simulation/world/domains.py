@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.errors import InputError
 
@@ -77,6 +76,8 @@ class Domain:
     def base_pose(self) -> Float[np.ndarray, "4 4"]:
         """Return the robot base frame in the world."""
         pose = np.eye(4)
+        from scipy.spatial.transform import Rotation  # late: the names of domains are needed before
+
         pose[:3, :3] = Rotation.from_euler("z", self.base_yaw_deg, degrees=True).as_matrix()
         return pose
 

@@ -73,7 +73,7 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
 
     Args:
         config: The run.
-        sizes: Sizes of its model, such as `model.checkpoints.loading.base_sizes` gives.
+        sizes: Sizes of its model, such as `model.base_model.base_sizes` gives.
         device: Whose rules of what is kept are meant.
     """
     parameters = count_parameters(config, sizes)

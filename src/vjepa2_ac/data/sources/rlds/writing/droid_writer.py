@@ -88,12 +88,7 @@ def write_droid_rlds(
         ValueError: An episode's arrays and pictures do not fit together.
     """
     folder = Path(folder)
-    with storage.user_can_write(folder):
-        in_use = folder.is_dir() and not storage.is_empty(folder)
-    if in_use:
-        raise InputError(
-            where=str(folder), found="already there and not empty", fix="Delete it, or name another folder"
-        )
+    storage.require_new_folder(folder)
     with storage.folder_writer(folder, _INFO) as partial:
         counts, num_bytes, sizes = _write_shards(partial, episodes, shards, name)
         if min(counts) == 0:

@@ -1,0 +1,71 @@
+"""The command train."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from vjepa2_ac import output
+from vjepa2_ac.cli.options import Commands, as_local, command, read_config, say_places_elsewhere
+from vjepa2_ac.errors import InputError, printable
+
+
+def add_train(commands: Commands[argparse.ArgumentParser]) -> None:
+    """Add `train` to a parser."""
+    parser = command(
+        commands,
+        "train",
+        _train,
+        "Train an adapter (or the whole predictor) as a config says. SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step,"
+        " write a checkpoint, end with status 75; the same command goes on from there. A second signal: end at once.",
+    )
+    parser.add_argument(
+        "config", metavar="CONFIG", type=as_local, help="a YAML config, or with --resume the folder of a run"
+    )
+    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as training.learning_rate=3e-4")
+    parser.add_argument("--resume", action="store_true", help="go on with the run in the folder CONFIG")
+    parser.add_argument(
+        "--check", action="store_true", help="do everything that can fail and stop before the first step"
+    )
+    parser.add_argument(
+        "--allow-config-change", action="store_true", help="go on with the run in run_dir though its config is another"
+    )
+
+
+def _train(options: argparse.Namespace) -> int:
+    from vjepa2_ac.runs.folder import read_run_config
+
+    path = Path(options.config)
+    if options.resume and options.overrides:
+        raise InputError(
+            where="command line", found="--resume with overrides", needed="the run's own config, unchanged"
+        )
+    if path.is_dir() and not options.resume:
+        raise InputError(
+            where=options.config, found="a folder", needed="a config file", fix="To go on with a run, add --resume"
+        )
+    if options.resume:
+        say_places_elsewhere(options.config)
+    config = read_run_config(path) if options.resume else read_config(path, options.overrides, base=True)
+
+    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.training import ConsoleReporter
+    from vjepa2_ac.distributed.preemption import EXIT_STATUS, StoppedError
+    from vjepa2_ac.training.loop import train
+
+    output.never_wait()
+    reporter = ConsoleReporter()
+    speaks = os.environ.get("RANK", "0") == "0"  # one of several processes
+    try:
+        folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
+    except StoppedError as stopped:
+        if speaks:
+            print(printable(str(stopped)), file=sys.stderr)
+        return EXIT_STATUS
+    finally:
+        reporter.close()
+    if speaks and not options.check:
+        console.print(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
+    return 0

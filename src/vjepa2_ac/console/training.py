@@ -1,0 +1,65 @@
+"""A training run in a terminal: its bar, its validations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from vjepa2_ac.console.progress import EncodingBar, LateProgress, ProgressBar, console
+from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, ratios_by_horizon
+
+_MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
+
+
+class ConsoleReporter:
+    """Shows a training run."""
+
+    def __init__(self) -> None:
+        self._looking = LateProgress("looking through the data set")
+        self._encoding = EncodingBar()
+        self._bar: ProgressBar | None = None
+        self._validation = ""
+
+    def note(self, text: str) -> None:
+        """Say something once."""
+        console.print(text)
+
+    def indexed(self, done: int, total: int) -> None:
+        """Show how far a data set is looked through."""
+        self._looking(done, total)
+
+    def encoded(self, done: int, total: int) -> None:
+        """Show how far the latent cache is."""
+        self._encoding(done, total)
+
+    def started(self, done: int, total: int) -> None:
+        """Begin the bar."""
+        self._bar = ProgressBar("training", total, done)
+
+    def stepped(self, step: int, figures: Mapping[str, float]) -> None:
+        """Move the bar."""
+        if self._bar is not None:
+            speed = figures["samples_per_second"]
+            words = [f"loss {figures['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
+            if "bytes_per_clip" in figures:
+                words.append(f"{figures['bytes_per_clip'] / 1e6:.2f} MB/clip")
+            if figures.get("data_wait_share", 0.0) > _MUCH_WAITING:
+                words.append(f"waits for data {figures['data_wait_share']:.0%} of the time")
+            self._bar.advance_to(step, "  ".join(word for word in words if word))
+
+    def validated(self, step: int, errors: PredictionErrors) -> None:
+        """Print a line of the validation's figures."""
+        one_step = one_step_ratios(errors)
+        self._validation = f"error/persistence {one_step['true'].value:.3f}"
+        horizons = "  ".join(f"{h}: {r.value:.3f}" for h, r in enumerate(ratios_by_horizon(errors), start=1))
+        console.print(
+            f"validation at step {step}: one-step error/persistence {one_step['true'].value:.3f}"
+            f" (zero actions {one_step['zero'].value:.3f}, shuffled {one_step['shuffled'].value:.3f});"
+            f" rollout by horizon  {horizons}"
+        )
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        self._looking.close()
+        self._encoding.close()
+        if self._bar is not None:
+            self._bar.close()

@@ -1,0 +1,121 @@
+"""What is asked of an evaluation: its options, and the config that follows from them. PyTorch is not imported."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from vjepa2_ac.config import Config, PlanningConfig
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.config.loading import config_as_dict, config_from
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.action_score.protocol import FRAMES
+from vjepa2_ac.runs.checkpoint_selection import NEWEST, select_checkpoint
+from vjepa2_ac.runs.folder import is_run, read_run_config
+from vjepa2_ac.runs.relative_paths import DATA, with_paths_from_start
+
+
+@dataclass(frozen=True)
+class ProbeOptions:
+    """How much is done beyond the errors; 0 clips: nothing."""
+
+    sensitivity_clips: int = 32
+    samples: int = 64  # other actions per clip, drawn in each of two ways
+    landscape_clips: int = 8
+    nodes: int = 9  # along each axis of a landscape
+    reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
+    examples: int = 4
+    at_once: int = 64  # samples that are computed together
+    planning_clips: int = 0  # of these, plans are held against the demonstration; of poses only
+    planning: PlanningConfig = field(default_factory=PlanningConfig)  # how one step is planned
+
+
+@dataclass(frozen=True)
+class EvaluationOptions:
+    """What is asked of an evaluation."""
+
+    split: Split = "test"
+    clips: int = 256  # at most, spread over the episodes
+    checkpoint: str = NEWEST  # of a run: newest, best, or a number of optimizer steps
+    data: Config | None = None  # other data than the run's own; a model has none of its own
+    against: tuple[str, ...] | None = None  # base, runs, models; None: the base of a run, nothing for a model
+    out: Path | None = None  # folder for what is written; None: the run's
+    probes: ProbeOptions = field(default_factory=ProbeOptions)
+    calibrate: bool = False  # measure the error at other strides, too
+    planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
+
+
+def settle(subject: str, asked: EvaluationOptions) -> tuple[Config, PlanningConfig, Path]:
+    """Return the config to measure with, how one step is planned, and the folder for what is written.
+
+    Raises:
+        InputError: The subject is no run and no data are named, a setting is wrong, or a folder is missing.
+    """
+    config, folder = _config_of(subject, asked)
+    _check_long_enough(config, asked.probes)
+    return config, _planning_of(config, asked), folder
+
+
+def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
+    """Return the config to measure with, and the folder for what is found."""
+    if is_run(subject):
+        config, needed = read_run_config(Path(subject)), [DATA] if asked.data is None else []
+        config = with_paths_from_start(config, Path(subject), needed=needed)
+        select_checkpoint(Path(subject), asked.checkpoint)
+        if asked.data is None:
+            return config, asked.out or Path(subject)
+        config = config.model_copy(update={"data": asked.data.data})
+    elif asked.data is None:
+        raise _nothing_to_measure(subject)
+    else:
+        config = asked.data
+    if asked.out is None:
+        raise InputError(
+            where="command line",
+            found="--data without --out: metrics.json of a run's own folder tells of its own data",
+            needed="a folder for what is found on these data",
+            fix="Add --out FOLDER",
+        )
+    if config.data.stride == "auto":
+        raise InputError(
+            where="data.stride",
+            found="auto",
+            needed="a number, to evaluate",
+            fix="`vjepa2-ac data calibrate CONFIG` tells which",
+        )
+    return config, asked.out
+
+
+def _nothing_to_measure(subject: str) -> InputError:
+    path = Path(subject)
+    found = "no config.yaml: not the folder of a run" if path.exists() else "no such folder"
+    return InputError(
+        where=subject,
+        found=found,
+        needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
+        fix="To measure a model, name the data with --data CONFIG and a folder with --out",
+    )
+
+
+def _planning_of(config: Config, asked: EvaluationOptions) -> PlanningConfig:
+    """Return how one step is planned: the config's settings, some of them replaced.
+
+    Raises:
+        InputError: A setting is wrong, or is none of planning.
+    """
+    for setting in asked.planning:
+        if not setting.startswith("planning."):
+            raise InputError(
+                where="--planning", found=setting, needed="settings of planning, such as planning.samples=200"
+            )
+    return config_from(config_as_dict(config), asked.planning, where="--planning").planning
+
+
+def _check_long_enough(config: Config, probes: ProbeOptions) -> None:
+    if probes.planning_clips and config.data.states == "pose" and config.data.frames < FRAMES:
+        raise InputError(
+            where="--planning",
+            found=f"clips of {config.data.frames} frames (data.frames)",
+            needed=f"{FRAMES} or more: plans are held against {FRAMES - 1} steps that were demonstrated",
+            fix=f"Give --data a config with data.frames of {FRAMES} or more, and --out",
+        )

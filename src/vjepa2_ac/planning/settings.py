@@ -1,0 +1,71 @@
+"""The settings of a decision: those of a run, of a config, or the defaults. PyTorch is not imported."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_from, load_config
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.places import literal
+from vjepa2_ac.runs.folder import CONFIG, is_run
+
+# Settings that planning uses; the others are of training, and changing them here would do nothing.
+RELEVANT_KEYS = ("planning.", "seed", "data.crop", "data.stride", "model.dtype", "model.sizes.", "training.device")
+_ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
+
+
+def planning_settings(
+    subject: str, *, config: str | Path | None = None, overrides: Sequence[str] = (), dtype: str = "float32"
+) -> Config:
+    """Return the config to plan with: that of a run; for a model the given one, or the defaults.
+
+    Args:
+        subject: The folder of a run; or a model: what `model.base` takes.
+        config: A config file, for a model.
+        overrides: Such as planning.horizon=2.
+        dtype: Of the weights of a model, where no config says it.
+
+    Raises:
+        InputError: A setting is wrong or does not matter, or the model is none of poses.
+    """
+    _require_relevant(overrides)
+    its = _of_run(subject, config, overrides) if is_run(subject) else _of_model(subject, config, overrides, dtype)
+    if its.data.states == "vector":
+        raise InputError(
+            where=subject, found="data.states: vector", needed="a model of poses: actions are limited in metres"
+        )
+    return its
+
+
+def _of_run(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:
+    if config is not None:
+        raise InputError(
+            where=f"--config {config}",
+            found=f"{subject}, a run, which has a config of its own",
+            needed="one config",
+            fix="Change single settings behind the run's name, such as planning.horizon=2",
+        )
+    return load_config(Path(subject) / CONFIG, [*overrides, f"run_dir={json.dumps(literal(Path(subject)))}", _ANY_TYPE])
+
+
+def _of_model(subject: str, config: str | Path | None, overrides: Sequence[str], dtype: str) -> Config:
+    if config is None:
+        plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
+        return config_from(plain, overrides, where="command line")
+    its = load_config(config, [*overrides, _ANY_TYPE])
+    return its.model_copy(update={"model": its.model.model_copy(update={"base": subject, "random": None})})
+
+
+def _require_relevant(overrides: Sequence[str]) -> None:
+    for override in overrides:
+        key = override.partition("=")[0]
+        is_relevant = any(key == known or (known.endswith(".") and key.startswith(known)) for known in RELEVANT_KEYS)
+        if key.split(".")[0] in Config.model_fields and not is_relevant:  # of others the config says what is wrong
+            raise InputError(
+                where=f"command line: {override}",
+                found="a setting that planning does not use",
+                needed=f"one of {', '.join(known + '…' * known.endswith('.') for known in RELEVANT_KEYS)}",
+            )

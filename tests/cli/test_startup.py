@@ -1,0 +1,62 @@
+"""Wrong words are told before PyTorch is imported, which takes seconds; libraries say nothing when imported."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from paths import ROOT
+
+WRONG = """
+train nope.yaml
+train {demo} training.stepz=3
+train {demo}
+train nope --resume
+doctor nope.yaml
+encode nope.yaml
+encode {demo}
+evaluate nope
+evaluate builtin:sim-tiny
+evaluate nope --data {demo} --out out
+compare a b
+data check nope.yaml
+data check {demo}
+data check {demo} data.path=. --model nope
+data inspect nope.yaml
+data index nope.yaml
+data calibrate nope.yaml
+data calibrate {demo} data.path=. --model nope
+plan nope --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
+plan builtin:nope --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
+plan builtin:sim-tiny --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
+plan builtin:sim-tiny planning.horizonn=2 --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
+export nope out
+config show nope.yaml
+simulate nope
+simulate builtin:sim-tiny --domain Q
+simulate builtin:sim-tiny planning.horizonn=2
+simulate record /proc/x --episodes 2
+simulate record out --episodes 2 --domain Q
+download --url foo x.pt
+"""
+CODE = """
+import sys
+from vjepa2_ac.cli import main
+for line in sys.argv[1].strip().splitlines():
+    status = main(line.split())
+    found = {"torch", "transformers", "matplotlib", "mujoco"} & set(sys.modules)
+    if status != 2 or found:
+        sys.exit(f"{line}: status {status}, imported {found}")
+"""
+
+
+def test_wrong_words_are_told_before_pytorch_is_imported(tmp_path: Path) -> None:
+    words = WRONG.format(demo=ROOT / "configs" / "demo.yaml")
+    done = subprocess.run([sys.executable, "-c", CODE, words], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stderr.count("error: ") == len(words.strip().splitlines())
+
+
+def test_libraries_say_nothing_when_they_are_imported() -> None:
+    code = "import vjepa2_ac.training.loop, vjepa2_ac.planning.session, vjepa2_ac.model.quantization"
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout + done.stderr == ""
