@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import http.client
 import logging
-import time
+import math
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -13,12 +13,15 @@ from pathlib import Path
 
 from vjepa2_ac import storage
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.storage.remote.retries import RefusedError, RetryPolicy, with_retries
 
 logger = logging.getLogger(__name__)
 
 OFFICIAL_URL = "https://dl.fbaipublicfiles.com/vjepa2/vjepa2-ac-vitg.pt"
 OFFICIAL_LEAST_BYTES = 10 * 10**9  # it has 11.7 GB; what a proxy answers in its place has not
 CHUNK_BYTES = 2**20
+_POLICY = RetryPolicy(attempts=5, first_wait_s=2.0, total_s=math.inf)
 
 Progress = Callable[[int, int], None]
 """Called with the bytes that are here and the bytes of the whole file."""
@@ -29,9 +32,7 @@ def download(
     path: str | Path,
     *,
     progress: Progress | None = None,
-    attempts: int = 5,
-    wait_s: float = 2.0,
-    timeout_s: float = 30.0,
+    policy: RetryPolicy = _POLICY,
 ) -> Path:
     """Fetch a file to `path`; a part that an earlier call left in `path.part` is gone on with.
 
@@ -40,9 +41,7 @@ def download(
         path: Where the whole file goes; it appears there only when it is whole. One that is there is kept, if it can
             be the file.
         progress: Is told how far it is.
-        attempts: How often in a row the line may break without a byte having come.
-        wait_s: Seconds before the second attempt; doubled for each further one.
-        timeout_s: Seconds without an answer before the line counts as broken.
+        policy: How often in a row the line may break without a byte having come, and the waits.
 
     Raises:
         InputError: The server refuses, cannot be reached, does not say how large the file is, or sends another size
@@ -56,22 +55,20 @@ def download(
             return path
         path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(path.name + ".part")
-    failures = 0
-    while True:
-        before = _size(part)
-        try:
-            whole = _fetch(url, part, progress, timeout_s)
-            break
-        except (http.client.InvalidURL, UnicodeError):
-            raise _no_address(url) from None
-        except (OSError, http.client.HTTPException) as error:
-            if isinstance(error, urllib.error.HTTPError) and error.code < 500 and error.code not in (408, 429):
-                raise _refused(url, error) from None
-            failures = 0 if _size(part) > before else failures + 1
-            if failures >= attempts:
-                raise _unreachable(url, part, error, attempts) from None
-            logger.info("%s: %s; going on from %d bytes", url, error, _size(part))
-            time.sleep(wait_s * 2 ** max(failures - 1, 0))
+    try:
+        whole = with_retries(
+            url,
+            lambda timeout_s: _fetch(url, part, progress, timeout_s),
+            policy=policy,
+            access="Check the URL",
+            progress=lambda: _size(part),
+        )
+    except RefusedError:
+        raise
+    except UnreachableError as error:
+        here = f"{_size(part)} bytes are in {part}"
+        fix = "Check the network and start again: it goes on where it stopped"
+        raise UnreachableError(where=url, found=f"{error.found}; {here}", fix=fix) from None
     _check_size(url, part, whole)
     return part.replace(path)
 
@@ -82,6 +79,8 @@ def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) ->
     request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user's
     try:
         answer = urllib.request.urlopen(request, timeout=timeout_s)  # noqa: S310  # a URL that the user gave
+    except (http.client.InvalidURL, UnicodeError):
+        raise _no_address(url) from None
     except urllib.error.HTTPError as error:
         whole = _whole_of_range(error.headers.get("Content-Range"))
         if error.code == 416 and whole == start:  # nothing is left to fetch
@@ -165,18 +164,3 @@ def _check_size(url: str, part: Path, whole: int) -> None:
 
 def _no_address(url: str) -> InputError:
     return InputError(where=f"URL {url!r}", found="not an address", needed="one such as https://host/model.pt")
-
-
-def _refused(url: str, error: urllib.error.HTTPError) -> InputError:
-    return InputError(
-        where=url, found=f"the server answers {error.code} {error.reason}", needed="a file", fix="Check the URL"
-    )
-
-
-def _unreachable(url: str, part: Path, error: Exception, attempts: int) -> InputError:
-    reason = getattr(error, "reason", None) or error
-    return InputError(
-        where=url,
-        found=f"no answer after {attempts} attempts ({reason}); {_size(part)} bytes are in {part}",
-        fix="Check the network and start again: it goes on where it stopped",
-    )

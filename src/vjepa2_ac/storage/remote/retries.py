@@ -20,7 +20,9 @@ logger = logging.getLogger(__name__)
 
 _T = TypeVar("_T")
 
-_NETWORK_LIBRARIES = frozenset({"aiohttp", "requests", "httpx", "httpx2", "httpcore", "httpcore2", "urllib3"})
+_NETWORK_LIBRARIES = frozenset(
+    {"aiohttp", "http", "httpcore", "httpcore2", "httpx", "httpx2", "requests", "urllib", "urllib3"}
+)
 # 499 is Google's answer to giving up an upload of which a piece failed; gcsfs shows it in place of that failure.
 _PASSING_STATUS = frozenset({408, 425, 429, 499, *range(500, 600)})
 _NO_ACCESS = frozenset({401, 403, 407})
@@ -67,7 +69,13 @@ class RefusedError(UnreachableError):
 
 
 def with_retries(
-    where: str, action: Callable[[float], _T], *, policy: RetryPolicy, access: str, doing: str = "read"
+    where: str,
+    action: Callable[[float], _T],
+    *,
+    policy: RetryPolicy,
+    access: str,
+    doing: str = "read",
+    progress: Callable[[], int] = lambda: 0,
 ) -> _T:
     """Return what an action returns, trying again while its failures are of a kind that passes.
 
@@ -77,29 +85,34 @@ def with_retries(
         policy: How often to try, and how long.
         access: The way out where permission is missing, as a sentence.
         doing: "read" or "written", for messages.
+        progress: How far the action is, where a later attempt goes on from there; attempts and time are counted anew
+            from the last one that came farther.
 
     Raises:
+        InputError: The action raised it.
         OSError: There is no such file, or it is a folder, or the other way round.
         UnreachableError: What failed did not pass in time; a RefusedError where permission is missing, or it does not
             pass.
     """
-    begin = time.monotonic()
-    for failures in range(1, policy.attempts + 1):
+    begin, failures, before = time.monotonic(), 0, progress()
+    while True:
         try:
             return action(policy.timeout_s)
-        except (*_ABSENT, UnreachableError):
+        except (*_ABSENT, InputError):
             raise
         except Exception as error:
             if not _comes_from_outside(error):
                 raise
             if not _passes(error):
                 raise _refused(where, error, access, doing) from error
+            if progress() > before:
+                begin, failures = time.monotonic(), 0
+            before, failures = progress(), failures + 1
             wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
-            if failures == policy.attempts or seconds + wait_s > policy.total_s:
+            if failures >= policy.attempts or seconds + wait_s > policy.total_s:
                 raise _given_up(where, error, failures, seconds) from error
             _say(failures, "%s: %s; trying again in %.1f s", where, _words(error), wait_s)
         time.sleep(wait_s)
-    raise AssertionError("the last attempt returns or raises")
 
 
 @contextmanager
