@@ -75,7 +75,7 @@ HOMES = {
     "google_crc32c": ["data/sources/rlds/tfrecord.py"],
     "h5py": ["data/sources/droid_raw/trajectory.py"],
     "huggingface_hub": ["export/"],
-    "matplotlib": ["reports/figures/"],
+    "matplotlib": ["reports/"],
     "mujoco": ["simulation/world/"],
     "peft": ["model/adapter/"],
     "pyarrow": ["data/sources/lerobot/"],

@@ -11,6 +11,7 @@ import peft
 import pytest
 import torch
 import yaml
+from huggingface_hub import ModelCard
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -202,6 +203,7 @@ def test_the_card_tells_base_data_and_training(trained, base_folder: Path, data_
     card = (tmp_path / "hub" / CARD).read_text()
     front = yaml.safe_load(card.split("---")[1])
     assert front["library_name"] == "peft"
+    assert "model-index" not in front, "nothing was measured"
     base = WorldModel.from_pretrained(base_folder)
     for words in (
         str(base_folder), base.predictor_fingerprint(), base.encoder_fingerprint(), f"rlds, `{data_folder}`",
@@ -263,6 +265,18 @@ def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(traine
     card = (tmp_path / "hub" / CARD).read_text()
     assert measured["verdict"] in card
     assert "another checkpoint**: `step-00000001`, not `step-00000002`" in card
+    assert "model-index" not in card, "results of another checkpoint are not those of this adapter"
+
+
+def test_what_was_measured_are_results_on_the_hub(trained, tmp_path: Path) -> None:
+    run = trained()
+    assert main(["evaluate", str(run), "--clips", "4"]) == 0
+    measured = json.loads((run / METRICS_FILE).read_text())
+    assert main(["export", str(run), str(tmp_path / "hub"), "--to", "hub"]) == 0
+    (entry,) = ModelCard.load(tmp_path / "hub" / CARD).data.to_dict()["model-index"]
+    found = [metric["value"] for result in entry["results"] for metric in result["metrics"]]
+    ratios = measured["models"]["adapter"]["rollout"]["l1"]["over_persistence"]
+    assert found == pytest.approx([ratio["value"] for ratio in ratios], abs=1e-4)
 
 
 def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is_asked_for(

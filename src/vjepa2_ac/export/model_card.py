@@ -4,22 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import PurePath
 from typing import Any
+
+from huggingface_hub import EvalResult, ModelCardData
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.episode import Widths
 
-_FRONT = """---
-library_name: peft
-pipeline_tag: robotics
-tags:
-- v-jepa-2-ac
-- world-model
-- lora
----
-"""
 _NOT_EVALUATED = (
     "**Not evaluated**: there was no `metrics.json` in the run when this card was written. Nothing is known of how"
     " good this adapter is."
@@ -49,7 +43,7 @@ def model_card(config: Config, facts: AdapterFacts) -> str:
         KeyError: The evaluation lacks a figure; likewise TypeError where one is of another kind.
     """
     parts = [
-        f"{_FRONT}\n# {facts.name}: a LoRA adapter for V-JEPA 2-AC",
+        f"---\n{_front(config, facts)}\n---\n\n# {facts.name}: a LoRA adapter for V-JEPA 2-AC",
         f"Written by vjepa2-ac {__version__} from checkpoint {facts.chosen} of the run.",
         _base(config, facts),
         _data(config, facts),
@@ -59,6 +53,41 @@ def model_card(config: Config, facts: AdapterFacts) -> str:
         f"## Every setting\n\n```yaml\n{config_as_yaml(config.model_copy(update={'run_dir': facts.name}))}```",
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _front(config: Config, facts: AdapterFacts) -> str:
+    """Return what the Hub reads of a card: tags, and the errors of the adapter as results of an evaluation."""
+    card = ModelCardData(
+        library_name="peft",
+        pipeline_tag="robotics",
+        tags=["v-jepa-2-ac", "world-model", "lora"],
+        model_name=facts.name,
+        eval_results=_eval_results(config, facts),
+    )
+    return str(card.to_yaml())
+
+
+def _eval_results(config: Config, facts: AdapterFacts) -> list[EvalResult] | None:
+    """Return the rollout errors of this very checkpoint; None where it was not measured."""
+    measured = facts.evaluation
+    if measured is None or measured["about"]["checkpoint_path"] != facts.checkpoint:
+        return None
+    about, models = measured["about"], measured["models"]
+    ratios = models[list(models)[-1]]["rollout"]["l1"]["over_persistence"]  # what was measured comes last
+    return [
+        EvalResult(
+            task_type="robotics",
+            task_name="prediction of latents",
+            dataset_type=config.data.source,
+            dataset_name=PurePath(config.data.path).name,
+            dataset_split=about["split"],
+            metric_type="l1_over_persistence",
+            metric_name=f"L1 error over persistence, {step * about['seconds_per_step']:.2f} s ahead",
+            metric_value=round(ratio["value"], 4),
+        )
+        for step, ratio in enumerate(ratios, start=1)
+        if ratio["value"] is not None
+    ]
 
 
 def _base(config: Config, facts: AdapterFacts) -> str:

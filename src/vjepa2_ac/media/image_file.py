@@ -65,3 +65,10 @@ def _as_rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:
     if image.mode not in _EIGHT_BIT:
         raise ValueError(f"pixels of the kind {image.mode}, not 8 bits a channel")
     return np.array(image.convert("RGB"))
+
+
+def encode_png(pixels: UInt8[np.ndarray, "height width channels"]) -> bytes:
+    """Return pixels (RGB or RGBA) as PNG."""
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "PNG", optimize=True)
+    return file.getvalue()
