@@ -1,8 +1,8 @@
-"""What flows through the program? Episode -> Clip -> Batch -> LatentBatch, and the legend of axes, units and frames.
+"""Data records: Episode -> Clip -> Batch -> LatentBatch, and the legend of axes, units and coordinate frames.
 
 Axes
     batch    clips that are computed together
-    time     model steps: neighbouring model steps are `stride` control steps apart
+    time     model steps: consecutive model steps are `stride` control steps apart
     steps    control steps of an episode (DROID: 15 per second)
     height, width, channel   pixels, RGB, uint8
     tokens   patches of one frame, row by row (256 at 256 px)
@@ -12,8 +12,9 @@ State (7 numbers, a pose): x, y, z in metres; roll, pitch, yaw in radians, as ex
     closedness, 0 open .. 1 closed. All in the robot base frame; the point is the flange, not the finger tip. States are
     *measured*. With `data.states: vector` a state is whatever numbers the source has, state_dim of them.
 
-Action (7 numbers, of poses): what carries a state to the next *model* step's state: metres, extrinsic xyz Euler angles
-    of R[t+1] @ R[t].T, and the change of closedness. See `geometry.actions_from_states`. Of vectors: `data.actions`.
+Action (7 numbers, of poses): the change from a state to the state of the next *model* step: metres, extrinsic xyz Euler
+    angles of R[t+1] @ R[t].T, and the change of closedness. See `geometry.actions_from_states`. Of vectors:
+    `data.actions`.
 
 Extrinsics (6 numbers): the camera in the robot base frame: x, y, z, roll, pitch, yaw.
 

@@ -1,4 +1,4 @@
-"""What does the user read when something they gave cannot be used, or the machine cannot give what is needed?"""
+"""Error types, and their messages for the user: unusable input, or a machine that lacks what is needed."""
 
 import errno
 import resource

@@ -1,6 +1,7 @@
-"""How do poses and actions turn into one another? Euler angles, rotation matrices, camera frame.
+"""Conversions between poses and actions: Euler angles, rotation matrices, camera frame.
 
-Euler angles wrap at pi (a gripper that points down has roll near pi), so differences always go through matrices.
+Euler angles wrap at pi (a gripper that points down has roll near pi), so differences are always computed with rotation
+matrices.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""How does a command talk to whoever reads it? Without ever failing for it, and where it is a run, without waiting.
+"""Terminal output of a command: it never raises, and during a run it never blocks.
 
-`own_streams` puts streams of ours in the place of standard output and standard error, for all that writes there: the
-console, warnings, libraries. What they cannot write is dropped: the reader has left (`| head`), the terminal is gone,
-the disk of a log is full. They never raise, so no text ends what it tells of.
+`own_streams` replaces standard output and standard error with streams of ours, for everything that writes there: the
+console, warnings, libraries. Text that they cannot write is dropped: the reader has closed the pipe (`| head`), the
+terminal is gone, the disk of a log is full. They never raise, so that output cannot end the work that it reports.
 
-After `never_wait` text goes to a thread instead. A pipe that nobody reads, a terminal that was halted with Ctrl-S or a
-disk that stalls then holds up that thread alone; what does not fit into its queue is dropped, and counted.
+After `never_wait` text is written by a thread instead. A pipe that nobody reads, a terminal stopped with Ctrl-S or a
+stalled disk then blocks that thread only; text that does not fit into its queue is dropped and counted.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Where does a path lead that somebody gave? One meaning for all of them: knobs, options and the environment.
+"""Resolution of paths given by the user: the same rules for config knobs, options and environment variables.
 
-`~` is the user's home. Where only a folder of this machine will do, a URL is refused: taken for a path it would become
-a folder called `gs:`. What cannot be meant raises a ValueError, whose message goes on after the name of the knob.
+`~` is the user's home. Where only a local folder is allowed, a URL is refused: taken as a path it would create a
+folder called `gs:`. An invalid path raises a ValueError, whose message continues after the name of the knob.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which knobs has the data? The form it is in, and which clips are made of it."""
+"""Data knobs: the form of the data set, and the clips that are made of it."""
 
 from __future__ import annotations
 

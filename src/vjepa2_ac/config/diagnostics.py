@@ -1,4 +1,4 @@
-"""What is wrong with a config, in words? Everything at once, and what was probably meant."""
+"""Config errors as messages: all of them at once, with suggestions for misspelled names."""
 
 from __future__ import annotations
 

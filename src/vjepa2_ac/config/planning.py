@@ -1,4 +1,4 @@
-"""Which knobs has a decision: how far ahead, by which planner, within which limits, towards what?"""
+"""Planning knobs: horizon, planner, limits and objective of a decision."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which knobs make a complete run?"""
+"""Run config: the sections that make up a complete run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Knobs of the sources: where does each form of data keep what the model needs?"""
+"""Source knobs: where each form of data stores what the model needs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which knobs has the way the weights change, and what is kept of it?"""
+"""Training knobs: optimisation, validation, checkpoints and logging."""
 
 from __future__ import annotations
 

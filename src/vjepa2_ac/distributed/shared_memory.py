@@ -1,4 +1,4 @@
-"""Is there room for the batches that workers send home? They lie in /dev/shm, of which a container has little."""
+"""Shared memory check: room in /dev/shm for the batches of the loader's workers. Containers often have little."""
 
 from __future__ import annotations
 

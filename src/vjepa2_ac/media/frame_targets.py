@@ -1,4 +1,4 @@
-"""Which pictures of a video are still to be decoded, and from what file? The parts of `video` that know no libav."""
+"""Frames of a video that are still to be decoded, and their file. The parts of `video_reader` that need no libav."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does a picture in a file become pixels? PNG and JPEG, in RGB."""
+"""Image files as pixels: PNG and JPEG, in RGB."""
 
 from __future__ import annotations
 

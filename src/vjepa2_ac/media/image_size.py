@@ -1,4 +1,4 @@
-"""How large may a picture be? One bound for every way in which one is decoded, looked at before anything is made."""
+"""Image size limit: one bound for all decoders, checked before memory is allocated."""
 
 from __future__ import annotations
 

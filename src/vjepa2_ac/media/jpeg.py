@@ -1,4 +1,4 @@
-"""How do the JPEGs of a camera become pixels, those that are asked for, and pixels a JPEG?"""
+"""JPEG decoding of the requested camera images, and JPEG encoding."""
 
 from __future__ import annotations
 

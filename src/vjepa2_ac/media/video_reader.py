@@ -1,7 +1,7 @@
-"""Which pictures does a video hold at these places? An MP4 decoded where it must be, and nowhere else.
+"""Video frames at given positions: an MP4 is decoded only where needed.
 
-A picture is known by its presentation time, never by counting at the rate that the header states: the header's rate is
-often wrong (DROID's), and pictures are stored in another order than they are shown (B-frames).
+A frame is identified by its presentation time, never by counting at the rate in the header: that rate is often wrong
+(DROID's), and frames are stored in another order than they are shown (B-frames).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How do pictures become a video that every player shows? H.264 in an MP4, written whole or not at all."""
+"""Video files that every player shows: H.264 in an MP4, written completely or not at all."""
 
 from __future__ import annotations
 

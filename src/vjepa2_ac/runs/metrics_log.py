@@ -1,8 +1,8 @@
-"""Where do the figures of a run go? Into metrics.jsonl always, and on to its trackers.
+"""The metrics log of a run: rows go to metrics.jsonl always, and to its trackers.
 
-`metrics.jsonl` is the run's own record. Where it cannot be written, a full disk for one, rows wait, and are tried again
-at each further one. They have to be on the disk before the run is said to stand behind them: at the next checkpoint at
-the latest, which is due at once then. If even so they cannot be written the run ends, and says of what.
+`metrics.jsonl` is the run's own record. Where it cannot be written, on a full disk for example, rows wait, and are
+retried with each further row. They must be on the disk before the run relies on them: at the next checkpoint at the
+latest, which is then due at once. If they cannot be written even then, the run ends with an error that says why.
 """
 
 from __future__ import annotations

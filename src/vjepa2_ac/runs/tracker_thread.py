@@ -1,4 +1,4 @@
-"""How does a tracker get the figures of a run and never hold it up? In a thread of its own, out of a queue."""
+"""A tracker's thread: it takes the run's metrics from a queue, so that the tracker never blocks the run."""
 
 from __future__ import annotations
 

@@ -1,10 +1,9 @@
-"""Who draws curves of a run? TensorBoard, Weights & Biases and trackio, as the config asks.
+"""Trackers for a run's curves: TensorBoard, Weights & Biases and trackio, as the config asks.
 
-A tracker has a thread of its own (`tracker_thread`): one that cannot be opened, fails or hangs is left
-out with one warning, and training goes on as if it were not there. Only a library that is not installed is an error,
-before the first step.
-`metrics.jsonl` (`runs.metrics_log`) has all figures whatever becomes of trackers. A run that goes on, on whatever
-machine, goes on in the same W&B or trackio run.
+A tracker has a thread of its own (`tracker_thread`): one that cannot be opened, fails or hangs is disabled with one
+warning, and training continues without it. Only a library that is not installed is an error, before the first step.
+`metrics.jsonl` (`runs.metrics_log`) has all metrics regardless of trackers. A resumed run, on whatever machine,
+continues the same W&B or trackio run.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How are the arrays of a file read back that this program wrote, when anybody may have written it?"""
+"""Array files written by this program, read back without trusting their content."""
 
 from __future__ import annotations
 

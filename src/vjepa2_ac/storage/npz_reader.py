@@ -1,4 +1,4 @@
-"""How are single arrays, or single pictures of one, taken out of an .npz file?"""
+"""Partial reads of .npz files: single arrays, or single frames of an array."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""Under which name is something written until it is whole, and who removes it where its writer was killed?
+"""Partial files: the temporary name of a file until it is complete, and their removal after a killed writer.
 
-`.NAME.KERNEL-RANDOM.partial`, in the folder where it is to go. Its writer holds a lock on it (flock), which the kernel
-takes back when the writer is gone, however that went. Whoever next writes into that folder removes what nobody holds.
+The name is `.NAME.KERNEL-RANDOM.partial`, in the target folder. The writer holds a lock on it (flock), which the kernel
+releases when the writer ends, however it ended. The next writer into that folder removes partial files without a lock.
 
-Why a lock: numbers of processes are given again, and mean nothing in another container. But a lock may say nothing to
-another machine that has the same disk. KERNEL tells whose it is: a hash of what the kernel drew when it started, one
-for all containers on it. What another kernel's writer left, or nobody can lock, goes when it has not changed for a day.
+Why a lock: process ids are reused, and mean nothing in another container. But a lock may not be visible to another
+machine that shares the disk. KERNEL identifies the machine: a hash of the kernel's boot id, the same for all containers
+on it. A partial file of another kernel, or one that cannot be locked, is removed when it is unchanged for a day.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""How are files found, read and hashed, on this machine and behind URLs?
+"""Reading files: find, read and hash them, on this machine and behind URLs.
 
-A path is local, or a URL such as `gs://bucket/folder` (see remote). That a file is not there, or ends too soon, is true
-of the file. What a network does is not: it is tried again, and in the end a `UnreachableError`; neither is what
-the system has against a file (see `unreadable`). That is an InputError that must never be booked as a broken episode:
-whoever makes problems of InputErrors lets it pass first.
+A path is local, or a URL such as `gs://bucket/folder` (see `remote`). A missing or truncated file is an error of the
+file. A network failure is not: it is retried, and finally raises an `UnreachableError`; nor is an error of the
+operating system (see `unreadable`). An UnreachableError is an InputError that must never be counted as a broken
+episode: code that turns InputErrors into problems must let it pass first.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""How do files get to another place and back: to a folder of this machine, or a URL that can be written?
+"""File transfer to and from another place: a local folder, or a URL that can be written.
 
-Whatever keeps a file from getting there is a `RefusedError` where it does not pass by itself, and else an
-`UnreachableError`.
+A permanent failure to write a file is a `RefusedError`, any other an `UnreachableError`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How are local files written so that nobody ever sees half of one?"""
+"""Atomic writes of local files: no reader ever sees an incomplete file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How is a large file far away read, here and there, without fetching a piece twice? In blocks, kept on this disk."""
+"""Random access to a large remote file in blocks that are cached on the local disk, so that none is fetched twice."""
 
 from __future__ import annotations
 

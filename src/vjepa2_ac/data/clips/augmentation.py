@@ -1,4 +1,4 @@
-"""How are training clips varied? A random crop and colour jitter, drawn once per clip and applied on the device."""
+"""Augmentation of training clips: a random crop and colour jitter, drawn once per clip and applied on the device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How do the steps and pictures of an episode become a clip, and clips a batch?"""
+"""Clips from the steps and frames of an episode, and batches from clips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which episodes and steps of a data set take part? Opened once, filtered once, and small enough for every worker."""
+"""The data set of a run: its episodes and steps, opened and filtered once, small enough to send to every worker."""
 
 from __future__ import annotations
 

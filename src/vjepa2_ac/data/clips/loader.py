@@ -1,6 +1,6 @@
-"""How do clips become batches, in an order that nothing can disturb?
+"""The clip loader: batches in a deterministic order.
 
-The batch at a place of the run is a pure function of the seed and that place. Workers only decide how soon it is there.
+The batch at a position of the run is a pure function of the seed and the position. Workers only affect the speed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How is a batch on the device before it is asked for? It is fetched ahead, and told of only when its turn has come."""
+"""Prefetching of batches to the device: loaded in advance, their events reported only when their turn has come."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""How does a camera's picture become what the encoder sees? Crop, augmentation, scaling, normalisation.
+"""Camera frames to encoder input: crop, augmentation, scaling, normalisation.
 
-The crop is taken in the loader, on uint8; all else runs on the device, on a whole batch.
+The crop is taken in the loader, on uint8; everything else runs on the device, on a whole batch.
 
 Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/transforms.py and src/datasets/utils/video/transforms.py. The
 recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, is always taken: nothing is random.

@@ -1,7 +1,7 @@
-"""Which clips are there, which split do they belong to, and in which order are they seen?
+"""Clip windows: which clips exist, the split they belong to, and their order.
 
-Everything here is a pure function of the episodes' identities and kept steps, the seed and a position: nothing depends
-on the number of shards, workers or ranks, and nothing needs to be saved to go on where a run stopped.
+Everything here is a pure function of the episodes' identities and remaining steps, the seed and a position: nothing
+depends on the number of shards, workers or ranks, and resuming a run needs no saved state.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which steps does the idle filter keep, in every episode? Looked up or computed once, and kept on disk."""
+"""The steps that the idle filter leaves of every episode: read from its cache, or computed once and cached on disk."""
 
 from __future__ import annotations
 

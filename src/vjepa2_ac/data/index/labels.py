@@ -1,4 +1,4 @@
-"""What does a data set say an episode belongs to, such as a scene or a task? Short names, a few bytes an episode."""
+"""Labels of episodes in a data set, such as scene or task: short names, a few bytes per episode."""
 
 from __future__ import annotations
 

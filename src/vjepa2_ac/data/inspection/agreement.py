@@ -1,9 +1,9 @@
-"""Do the pictures move when the robot does? The change of pictures beside that of states, step for step and shifted.
+"""Agreement of frames and states: correlation of their changes, step by step and shifted.
 
-Where a robot moves faster, its picture changes more. The rank correlation of the two within an episode is 0.5 and more
-on simulated arms at 15 Hz and on BridgeData at 5 Hz (docs/log.md); with the pictures of another episode, at the best of
-21 shifts, it is 0.1 to 0.4. So the shift at which it is highest tells of pictures that are late, pictures that fit
-backwards are reversed, and where nothing fits better than another episode's, they are of another one.
+Where a robot moves faster, its frame changes more. The rank correlation of the two within an episode is 0.5 and more on
+simulated arms at 15 Hz and on BridgeData at 5 Hz (docs/log.md); with the frames of another episode, at the best of 21
+shifts, it is 0.1 to 0.4. So the shift with the highest correlation shows frames that are late, frames that fit
+backwards are reversed, and frames that fit no better than another episode's belong to another episode.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Can this data set be trained on? Open it, load a few batches as training would, and look at every number in them."""
+"""`data check`: opens a data set, loads a few batches as training would, and checks every number in them."""
 
 from __future__ import annotations
 

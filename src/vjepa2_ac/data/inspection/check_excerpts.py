@@ -1,4 +1,4 @@
-"""What does `data check` say of stretches of episodes? Whether pictures and states belong together, and what is odd."""
+"""Checks of episode excerpts for `data check`: whether frames and states belong together, and what is unusual."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is looked at to tell whether pictures and states belong together? A stretch of a few dozen episodes, in grey."""
+"""Excerpts of a few dozen episodes in grey, used to check that frames and states belong together."""
 
 from __future__ import annotations
 

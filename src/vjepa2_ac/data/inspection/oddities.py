@@ -1,14 +1,14 @@
-"""What can be seen of states and pictures that are wrong, without a model? Each sign by itself, on neighbouring steps.
+"""Signs of wrong states and frames that need no model: each is measured by itself, on neighbouring steps.
 
-The limits are set by what was measured (docs/log.md: simulated arms, BridgeData and DROID excerpts as they are, and the
-same spoiled): each lies apart from all clean sets, so that what is only slightly wrong passes. Colours do not: nothing
-tells a blue world from exchanged channels, so there is a hint only.
+The limits follow from measurements (docs/log.md: simulated arms, BridgeData and DROID excerpts, unchanged and spoiled):
+each limit is well away from all clean sets, so slight errors pass. Colours are an exception: nothing distinguishes a
+blue world from swapped channels, so there is a hint only.
 
                                     clean sets                spoiled                              limit
     stale poses, share of steps     0 to 0.01                 0.19 (every 5th), 0.80 (4 of 5)      0.05; error 0.5
     copied steps, share             0                         0.46 and more (each twice)           0.2
-    pictures without motion, share  0                         0.5 (each twice, poses not)          0.2
-    neighbours over far pictures    0.04 to 0.33              1.0 (noise)                          0.9
+    frames without motion, share    0                         0.5 (each twice, poses not)          0.2
+    neighbours over far frames      0.04 to 0.33              1.0 (noise)                          0.9
     autocorrelation of motion       0.67 to 0.97              -0.35 and less (2 cm of noise)       -0.2
     median distance from base       0.33 m to 0.60 m          0.02 m and less (deltas)             0.05 m
     cold episodes, share            0; arm of domain A: 1     1 (BridgeData in BGR)                0.9

@@ -1,4 +1,4 @@
-"""What is in a data set? Lengths, outcomes, idle time, and how far the robot moves in one model step."""
+"""Statistics of a data set: lengths, outcomes, idle time, and the motion of the robot per model step."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What may stand in an adapter_config.json? What this program writes; PEFT itself would take, and do, far more.
+"""Validation of adapter_config.json: only what this program writes is accepted; PEFT itself would accept far more.
 
-The file is read here, strictly, and becomes the knobs that a config has for it, with their types and ranges. PEFT never
-sees it: not a regular expression that runs for ever, not a layer that is no layer of the predictor, not another method.
+The file is read here, strictly, and becomes the config knobs for it, with their types and ranges. PEFT never sees the
+file: no regular expression that runs for ever, no layer outside the predictor, no other method.
 """
 
 from __future__ import annotations

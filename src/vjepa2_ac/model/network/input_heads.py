@@ -1,4 +1,4 @@
-"""What if a robot has other states or actions than the base knows? Fresh encoders for them, which must be trained."""
+"""Input heads for robots with other states or actions than the base: new encoders, which must be trained."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""How does a run get to `checkpoint.remote` while it goes on?
+"""Background upload of a run to `checkpoint.remote`.
 
-A thread brings the place up to date (`runs.mirror.upload`); the loop only tells it, step by step, that time passes.
-Nothing that happens there stops the run. An outage is warned of once, however long it is; and what is only on this
-machine in the end, once more.
+A thread brings the place up to date (`runs.mirror.upload`); the training loop only calls it, step by step, to mark the
+time. Nothing that happens there stops the run. An outage is warned of once, however long it is; and files that are only
+on this machine in the end, once more.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How is a file that lies elsewhere read and sought in, a few ranges of it at a time?"""
+"""Seekable remote file: reads ranges on demand and buffers a few of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which file system of fsspec serves a URL, and as whom does it ask?"""
+"""The fsspec file system for a URL, and its credentials."""
 
 from __future__ import annotations
 

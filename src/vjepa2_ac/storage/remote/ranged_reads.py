@@ -1,7 +1,7 @@
-"""How is data read that lies elsewhere: `gs://`, `hf://`, `s3://` and whatever else fsspec knows?
+"""Reading remote data: `gs://`, `hf://`, `s3://` and every other protocol of fsspec.
 
-All failures of the network are dealt with here (see retries): what comes out is the data, FileNotFoundError as from a
-disk, or UnreachableError. Everything may be called from many threads, and in every process.
+All network failures are handled here (see `retries`): the result is the data, FileNotFoundError as from a disk, or
+UnreachableError. Every function may be called from many threads, and in every process.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is done again when a network fails: which failures pass by themselves, how long to wait, and when to give up?"""
+"""Retries of network operations: which failures are temporary, how long to wait, and when to give up."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""How are files written that lie elsewhere: `gs://`, `s3://` and whatever else fsspec can write?
+"""Writing remote files: `gs://`, `s3://` and every other protocol that fsspec can write.
 
-As in `files`, failures that pass are tried again. Of an object store a file is there whole or not at all.
+As in `ranged_reads`, temporary failures are retried. A file in an object store is either complete or absent.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How is JSON read that anybody may have written?
+"""JSON from untrusted files.
 
-Files are bounded in size, values in depth; a key that is given twice, a number that no computer holds, NaN (where the
-reader does not expect it) and text that cannot be written again are refused. Whatever is wrong is an InputError; that
-a file is not there, or cannot be read, stays the system's OSError.
+File size and nesting depth are bounded. Refused are duplicate keys, numbers out of range, NaN (where the reader does
+not expect it) and text that cannot be encoded again. Invalid content is an InputError; a file that is missing or cannot
+be read stays the system's OSError.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is wrong with a value, said without the inner names of pydantic, which checks it?"""
+"""Validation messages for values, without the internal names of pydantic, which checks them."""
 
 from __future__ import annotations
 

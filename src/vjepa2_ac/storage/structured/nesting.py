@@ -1,4 +1,4 @@
-"""How deep may values lie within one another? So deep that no function that goes through them runs out of stack."""
+"""Nesting limit of values: shallow enough that no recursive function overflows the stack."""
 
 from __future__ import annotations
 

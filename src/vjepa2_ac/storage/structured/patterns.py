@@ -1,4 +1,4 @@
-"""Which regular expressions of a file are used? Those that are done soon, whatever the text."""
+"""Regular expressions from files: only those that terminate quickly on any text are accepted."""
 
 from __future__ import annotations
 

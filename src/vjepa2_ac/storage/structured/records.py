@@ -1,4 +1,4 @@
-"""How do plain values of a file become a record? A dataclass whose annotations say what may be in it."""
+"""Conversion of plain values from a file to a record: a dataclass whose annotations declare the allowed types."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What is a word of YAML: a number, a truth value, nothing, or text? YAML 1.1 as people know it from PyYAML.
+"""YAML scalars: number, boolean, null or text, by the rules of YAML 1.1 as in PyYAML.
 
-But a date is text, 1e-4 is a number, and a number that YAML takes for another than people do is an error.
+Exceptions: a date is text, 1e-4 is a number, and a number that YAML reads differently from people is an error.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""How is YAML read that anybody may have written?
+"""YAML from untrusted files.
 
-Nothing is executed. Keys are text, as it is written; a date is text, too, and 1e-4 a number. What people do not mean is
-refused: a key given twice, a number with a leading zero or with colons (which YAML takes for another), one that no
-computer holds; and what would take for ever: too many values once aliases are followed, or values that lie too deep.
+Nothing is executed. Keys are text, as written; a date is text, too, and 1e-4 is a number. Refused are surprising
+values: duplicate keys, numbers with a leading zero or with colons (which YAML reads as a different number), numbers out
+of range; and what would take too long: too many values once aliases are expanded, or values nested too deep.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How do DROID's raw recordings become `Episode`s? States from HDF5, pictures from MP4, names from JSON."""
+"""Source of DROID's raw recordings: states from HDF5, frames from MP4, names from JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What does the trajectory.h5 of a raw DROID episode hold, and does it fit the pictures?"""
+"""The trajectory.h5 of a raw DROID episode: its content, and whether it matches the frames."""
 
 from __future__ import annotations
 

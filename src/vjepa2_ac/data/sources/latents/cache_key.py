@@ -1,4 +1,4 @@
-"""What must agree for cached latents to be used? Everything that decides them, by the names that users know."""
+"""The key of a latent cache: everything that determines its latents, by the names that users know."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""How does an episode of one camera lie in a latent cache? As a safetensors file, read at random by frame.
+"""The file of one episode and camera in a latent cache: safetensors, with random access by frame.
 
-Tensors (control steps as in `episode`; `frames` are the steps whose pictures were encoded):
+Tensors (control steps as in `episode`; `frames` are the steps whose frames were encoded):
     latents            [frames, tokens, dim] bfloat16, float32 or int8
     scales             [frames, tokens] float32, with int8 only: a latent is its value times the scale of its token
     frame_steps        [frames] int32: the control step of each frame, ascending
-    frame_crc          [frames] int64: CRC-32 of the frame's latents and, behind them, its scales
+    frame_crc          [frames] int64: CRC-32 of the frame's latents followed by its scales
     states             [steps, state_dim], and where the source has them commands, extrinsics, joint_velocities
-    pictures           [bytes] uint8: the frames as small JPEGs, one behind the other; for people to look at
+    pictures           [bytes] uint8: the frames as small JPEGs, concatenated; for people to look at
     picture_ends       [frames] int64: where each of them ends; picture_crc likewise: its CRC-32
 The header's metadata (texts): format, id, camera, num_steps, control_rate_hz, metadata (JSON), key (of the cache), and
 crc: CRC-32 of all these texts and of every tensor but latents, scales and pictures.

@@ -1,4 +1,4 @@
-"""How does a latent cache become `Episode`s? Their latents are read by frame; the data set itself is not needed."""
+"""Source of cached latents: reads them by frame; the data set itself is not needed."""
 
 from __future__ import annotations
 

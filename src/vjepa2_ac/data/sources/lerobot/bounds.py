@@ -1,4 +1,4 @@
-"""How much of a Parquet file is ever unpacked? Equal values pack into next to nothing: some KB may claim any memory."""
+"""Limits on decompressed Parquet data: equal values compress so well that a few KB may claim any memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which episodes does a LeRobot data set have, and where do they lie? v3.0: Parquet tables. v2.1: lines of JSON."""
+"""The episode list of a LeRobot data set, with file locations. v3.0: Parquet tables. v2.1: lines of JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What do the rows of one LeRobot episode hold, and are they all there? States, commands, outcome."""
+"""The rows of one LeRobot episode, checked for completeness: states, commands, outcome."""
 
 from __future__ import annotations
 

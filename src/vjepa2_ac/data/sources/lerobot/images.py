@@ -1,4 +1,4 @@
-"""How do the pictures of a LeRobot episode become pixels? From its part of a video, or from the table itself."""
+"""The frames of a LeRobot episode: decoded from its part of a video, or from images in the table."""
 
 from __future__ import annotations
 

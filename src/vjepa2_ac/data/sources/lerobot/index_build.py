@@ -1,4 +1,4 @@
-"""Which episodes of a LeRobot data set can be used, and where do they lie? A table for `index_cache` to keep."""
+"""Index of the usable episodes of a LeRobot data set and their locations: a table for `index_cache` to store."""
 
 from __future__ import annotations
 

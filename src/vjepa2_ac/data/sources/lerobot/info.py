@@ -1,4 +1,4 @@
-"""What does a LeRobot data set say of itself? meta/info.json: its version, rate, columns, cameras and file names."""
+"""The meta/info.json of a LeRobot data set: version, rate, columns, cameras and file names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How are the rows of one episode read from a Parquet file of many? Its row groups, and the columns that are needed."""
+"""Reading the rows of one episode from a Parquet file of many: only its row groups, and the needed columns."""
 
 from __future__ import annotations
 

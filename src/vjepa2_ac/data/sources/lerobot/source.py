@@ -1,4 +1,4 @@
-"""How do LeRobot data sets become `Episode`s? v3.0 and v2.1, read with pyarrow and PyAV, without lerobot itself."""
+"""Source of LeRobot data sets v3.0 and v2.1, read with pyarrow and PyAV, without lerobot itself."""
 
 from __future__ import annotations
 

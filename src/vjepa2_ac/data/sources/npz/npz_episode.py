@@ -1,11 +1,11 @@
-"""What does an episode look like as an .npz file, and is this one?
+"""The .npz episode format, and its validation.
 
 An episode NAME.npz, as numpy.savez or numpy.savez_compressed writes it, holds
 
     states             [steps, 7]  measured: x, y, z in metres, roll, pitch, yaw in radians (extrinsic xyz Euler),
                                    gripper closedness, 0 open .. 1 closed; all in the robot's base frame
                                    ([steps, any] with data.states: vector: whatever the robot has)
-    frames             [steps, height, width, 3] uint8, RGB: the picture at each step
+    frames             [steps, height, width, 3] uint8, RGB: the frame at each step
     fps_hz             control steps per second, the same in all episodes
 
 and may hold
@@ -15,11 +15,11 @@ and may hold
     joint_velocities   [steps, joints], *commanded*, radians per second: the idle filter's rule `commands` reads them
     actions            [steps, any], *commanded*: read with data.actions: recorded
     success            true or false
-    language           the task in words
+    language           the task as text
     scene, building, operator, day   texts: what `data.split_by` may keep together
 
-Of a file that numpy.savez wrote, only the pictures that are asked for are read, and their checksum is not checked: it
-covers all of them. Of one that numpy.savez_compressed wrote, the pictures before must be unpacked, too: slow for long
+Of a file that numpy.savez wrote, only the requested frames are read, and their checksum is not checked: it covers all
+frames. Of one that numpy.savez_compressed wrote, the preceding frames must be decompressed, too: slow for long
 episodes.
 """
 

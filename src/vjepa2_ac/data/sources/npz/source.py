@@ -1,4 +1,4 @@
-"""How do plain .npz files become `Episode`s? One file each, in a folder or in folders below it."""
+"""Source of plain .npz files: one file per episode, in a folder or in folders below it."""
 
 from __future__ import annotations
 

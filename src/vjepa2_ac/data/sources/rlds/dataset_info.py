@@ -1,4 +1,4 @@
-"""Which TFRecord shards make up an RLDS data set? What its dataset_info.json says."""
+"""The dataset_info.json of an RLDS data set: which TFRecord shards make it up."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What does one record of a data set hold, feature by feature?"""
+"""The content of one record of a data set, feature by feature."""
 
 from __future__ import annotations
 

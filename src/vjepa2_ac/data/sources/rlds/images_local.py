@@ -1,4 +1,4 @@
-"""How are the pictures of one camera read out of a record, those that are asked for?"""
+"""Images of one camera in a local record: only the requested ones are read."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""How is an episode read whose record lies behind a URL, so that later clips of it cost little?
+"""Reading an episode whose record is behind a URL, so that later clips of it are cheap.
 
-Kept on this machine for ever, a few KB each: where the features of a record lie, and the pictures in them. Kept within
-the limit of `data.disk_cache`: states, and the pictures of the steps that clips may come from, some dozens a file.
+Stored on this machine for ever, a few KB each: the positions of a record's features, and of the images in them. Stored
+within the limit of `data.disk_cache`: states, and the images of steps that clips may come from, some dozens per file.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which episodes does an RLDS data set hold, and where does each lie? Found out by hopping, reading almost nothing."""
+"""Index of a local RLDS data set: its episodes and their positions, found by skipping over almost all of the data."""
 
 from __future__ import annotations
 

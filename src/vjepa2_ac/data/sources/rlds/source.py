@@ -1,4 +1,4 @@
-"""How do RLDS episodes become `Episode`s? One tf.train.Example each, read without TensorFlow, pictures on demand."""
+"""Source of RLDS episodes: one tf.train.Example each, read without TensorFlow, images on demand."""
 
 from __future__ import annotations
 

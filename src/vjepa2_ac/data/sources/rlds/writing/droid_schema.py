@@ -1,4 +1,4 @@
-"""What do features.json and dataset_info.json say of a data set in DROID's schema?
+"""The features.json and dataset_info.json of a data set in DROID's schema.
 
 Source: measured on files that TFDS wrote (names, types and layout; no code).
 """

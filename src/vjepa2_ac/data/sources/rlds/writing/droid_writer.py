@@ -1,4 +1,4 @@
-"""How is a data set written that is DROID's RLDS field for field, so that TFDS itself reads it?
+"""Writer of data sets in DROID's RLDS schema, field for field, so that TFDS itself reads them.
 
 Source: measured on files that TFDS wrote in DROID's schema (layout, kinds of lists, names; no code).
 """
