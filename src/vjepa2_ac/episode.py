@@ -52,10 +52,10 @@ POSE_WIDTHS = Widths(STATE_DIM, ACTION_DIM)
 
 @runtime_checkable
 class FrameReader(Protocol):
-    """Reads pictures of one camera of one episode, and only those that are asked for."""
+    """Reads frames of one camera of one episode, and only those that are asked for."""
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order."""
+        """Return the RGB frames at these control steps, in this order."""
         ...
 
 
@@ -82,7 +82,7 @@ class LatentReader(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class EpisodeInfo:
-    """What is known of an episode without reading its pictures: enough to choose clips from it."""
+    """What is known of an episode without reading its frames: enough to choose clips from it."""
 
     id: str  # the same whatever the order of episodes and the number of shards
     num_steps: int
@@ -91,7 +91,7 @@ class EpisodeInfo:
 
 @dataclass(frozen=True)
 class Episode:
-    """One demonstration: states of every control step, and pictures of one camera that are read when asked for."""
+    """One demonstration: states of every control step, and frames of one camera that are read when asked for."""
 
     info: EpisodeInfo
     states: Float[np.ndarray, "steps state_dim"]
@@ -103,8 +103,8 @@ class Episode:
     commands: Float[np.ndarray, "steps action_dim"] | None = (
         None  # recorded actions, where `data.actions` asks for them
     )
-    read_latents: LatentReader | None = None  # of a cache; its `read_frames` gives small pictures for people to look at
-    frame_steps: Int[np.ndarray, " frames"] | None = None  # control steps that have a picture, ascending; None: all
+    read_latents: LatentReader | None = None  # of a cache; its `read_frames` gives small frames for people to look at
+    frame_steps: Int[np.ndarray, " frames"] | None = None  # control steps that have a frame, ascending; None: all
 
 
 @dataclass(frozen=True)
@@ -221,11 +221,11 @@ class EpisodeSource(Protocol):
         ...
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
-        """Return one episode; no picture is read or decoded before `Episode.read_frames` asks for it.
+        """Return one episode; no frame is read or decoded before `Episode.read_frames` asks for it.
 
         Args:
             index: Place in `infos`.
-            camera: Whose pictures; None: the config's (first) camera.
+            camera: Whose frames; None: the config's (first) camera.
             needed: Steps that clips may come from, None: all. A source that fetches from afar keeps no others.
 
         Raises:

@@ -36,14 +36,14 @@ class FileSystem(Protocol):
 
 
 def say_if_shared_memory_is_small(
-    config: Config, dataset: Dataset, pictured: Batch, accelerator: Accelerator, note: Callable[[str], None]
+    config: Config, dataset: Dataset, batch_of_frames: Batch, accelerator: Accelerator, note: Callable[[str], None]
 ) -> None:
     """Note before the first step where batches of this run may not fit. All processes have to call.
 
     Args:
         config: The run.
         dataset: Its clips.
-        pictured: One of them, as it was before they came from a cache of latents.
+        batch_of_frames: A batch of them with frames, from before they came from a cache of latents.
         accelerator: Tells how many processes are on this machine.
         note: Told.
     """
@@ -51,8 +51,8 @@ def say_if_shared_memory_is_small(
     processes = all_gather_object(accelerator, here).count(here)
     if not config.data.workers:
         return
-    clip = pictured
-    if pictured.latents is None and dataset.config.source == "latents":
+    clip = batch_of_frames
+    if batch_of_frames.latents is None and dataset.config.source == "latents":
         clip = next(validation_batches(dataset, "train", clips=_CLIPS_TRIED, batch_size=1))
     text = small_shared_memory(config, clip.nbytes, processes)
     if text is not None:

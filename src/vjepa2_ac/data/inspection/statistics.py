@@ -35,7 +35,7 @@ RELEASED = (
 
 @dataclass(frozen=True, eq=False)
 class ReadEpisode:
-    """An episode of the sample, without pictures."""
+    """An episode of the sample, without frames."""
 
     index: int  # place in the data set's table
     states: Float[np.ndarray, "steps state_dim"]
@@ -174,7 +174,7 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
 
     Args:
         dataset: Its stride is a number.
-        episodes: At most as many are read, without pictures, spread over those that take part.
+        episodes: At most as many are read, without frames, spread over those that take part.
         progress: Told (episodes read, episodes in all).
 
     Raises:

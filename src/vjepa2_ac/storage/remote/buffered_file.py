@@ -15,7 +15,7 @@ class RangedFile(io.RawIOBase):
     """A file to read and seek in, fetched in blocks; the last 16 MB read are kept.
 
     A jump costs one block of 128 KB. Whoever reads on where the last fetch ended gets twice as much each time, up to
-    4 MB. So a video's header, or one group of its pictures, costs little more than its bytes, and a whole file few
+    4 MB. So a video's header, or one group of its frames, costs little more than its bytes, and a whole file few
     reads.
 
     Args:

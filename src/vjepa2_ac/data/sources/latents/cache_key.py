@@ -24,7 +24,7 @@ OF_ENCODING = ("encoder", "image_size", "patch_size", "normalisation", "model.dt
 
 @dataclass(frozen=True)
 class Encoding:
-    """What besides a picture decides its latents, and how many numbers they are; made by `encoding.batch.encoding_of`.
+    """What besides a frame decides its latents, and how many numbers they are; made by `encoding.batch.encoding_of`.
 
     How many frames go through the encoder at once is no part of it: with the encoder in use that changes no bit on a
     CPU (measured, tests/encoding/test_latent_cache.py), and elsewhere no more than the order of a sum.

@@ -69,11 +69,11 @@ def write_episode_file(
     Args:
         path: The file; missing folders are made.
         layout: What all files of the cache have in common.
-        episode: Its states and what else a clip needs; no picture of it is read.
+        episode: Its states and what else a clip needs; no frame of it is read.
         camera: Whose latents they are.
         steps: Control steps of the frames, ascending; there may be none.
         latents: Of these frames, in the type of the layout (`dtypes.pack_latents` makes them so).
-        pictures: Of these frames, square as the encoder sees them and small.
+        pictures: These frames, square as the encoder sees them and small.
 
     Raises:
         InputError: The file cannot be written, or the disk is full.
@@ -86,7 +86,7 @@ def write_episode_file(
         raise ValueError(f"latents of {values.dtype} for a cache of {layout.kind}")
     if any(after <= before for before, after in zip([-1, *steps], [*steps, episode.info.num_steps], strict=True)):
         raise ValueError(f"steps {list(steps)} of {episode.info.num_steps}")
-    jpegs = [encode_jpeg(picture, quality=_JPEG_QUALITY) for picture in pictures]
+    jpegs = [encode_jpeg(frame, quality=_JPEG_QUALITY) for frame in pictures]
     tensors = _small_tensors(episode, steps, jpegs) | {
         "frame_crc": torch.tensor([_crc_of_frame(frame) for frame in _frames_of(values, scales)], dtype=torch.int64)
     }
@@ -201,7 +201,7 @@ class EpisodeFile:
         return frames
 
     def pictures(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
-        """Return the small pictures of frames.
+        """Return the small frames.
 
         Raises:
             InputError: One is damaged.
@@ -212,7 +212,7 @@ class EpisodeFile:
             jpegs = [bytes(data[ends[place - 1] if place else 0 : ends[place]].numpy()) for place in places]
         for place, step, jpeg in zip(places, steps, jpegs, strict=True):
             if zlib.crc32(jpeg) != self._arrays["picture_crc"][place]:
-                raise _damaged(self.path, f"damaged: the CRC of the picture of control step {step} is wrong")
+                raise _damaged(self.path, f"damaged: the CRC of the image of control step {step} is wrong")
         return decode_jpegs(jpegs, steps, self.path)
 
     def _rows(self, name: str, places: Sequence[int]) -> Any:
@@ -230,14 +230,14 @@ class EpisodeFile:
             found = {name: self._file.get_slice(name) for name in names}
             types = {name: slice_.get_dtype() for name, slice_ in found.items()}
             shapes = {name: list(slice_.get_shape()) for name, slice_ in found.items()}
-            pictures = self._file.get_slice("pictures")
-            bytes_of_pictures, type_of_pictures = pictures.get_shape(), pictures.get_dtype()
+            images = self._file.get_slice("pictures")
+            image_bytes, image_type = images.get_shape(), images.get_dtype()
         if shapes != names or types["latents"] != _SAFETENSORS_NAMES[layout.kind]:
             raise _damaged(self.path, f"{types} {shapes}", f"latents of {_SAFETENSORS_NAMES[layout.kind]}, {names}")
         if "scales" in names and types["scales"] != "F32":
             raise _damaged(self.path, f"scales of {types['scales']}", "F32")
-        if type_of_pictures != "U8" or bytes_of_pictures != [max(self._arrays["picture_ends"], default=0)]:
-            said = f"pictures of {bytes_of_pictures} values of {type_of_pictures}"
+        if image_type != "U8" or image_bytes != [max(self._arrays["picture_ends"], default=0)]:
+            said = f"pictures of {image_bytes} values of {image_type}"
             raise _damaged(self.path, said, "as many bytes as picture_ends says")
 
 
@@ -263,7 +263,7 @@ def _require_fitting(path: str, tensors: Mapping[str, Tensor]) -> None:
     within = torch.cat([torch.tensor([-1]), tensors["frame_steps"], torch.tensor([steps])])
     ends = torch.cat([torch.tensor([0]), tensors["picture_ends"]])
     if (within.diff() <= 0).any() or (ends.diff() < 0).any():
-        raise _damaged(path, f"frames that are not in the order of the {steps} steps, or pictures that overlap")
+        raise _damaged(path, f"frames that are not in the order of the {steps} steps, or images that overlap")
 
 
 _SAFETENSORS_NAMES: dict[CacheType, str] = {"bf16": "BF16", "fp32": "F32", "int8": "I8"}

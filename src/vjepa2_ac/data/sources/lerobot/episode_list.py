@@ -29,11 +29,11 @@ _STATISTICS = ("min", "max", "mean", "std")
 
 @dataclass(frozen=True)
 class VideoPlace:
-    """Where the pictures of one camera of an episode lie."""
+    """Where the frames of one camera of an episode lie."""
 
     chunk: int
     file: int
-    start_s: float  # of the episode's first picture
+    start_s: float  # of the episode's first frame
     length_s: float | None  # None: the data set does not say
 
 
@@ -118,7 +118,7 @@ def data_file(info: DatasetInfo, row: EpisodeRow) -> str:
 
 
 def video_file(info: DatasetInfo, place: VideoPlace, key: str) -> str:
-    """Return the path, within the data set, of the file with an episode's pictures."""
+    """Return the path, within the data set, of the file with an episode's frames."""
     return filled(info.video_path or "", place.chunk, place.file, key)
 
 

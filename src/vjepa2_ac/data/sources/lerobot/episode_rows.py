@@ -21,7 +21,7 @@ _FIX = "Copy the file again, or leave the episode out"
 
 @dataclass(frozen=True)
 class EpisodeContent:
-    """What is read of an episode beside its pictures."""
+    """What is read of an episode beside its frames."""
 
     states: Float[np.ndarray, "steps state_dim"]
     joint_velocities: Float[np.ndarray, "steps joints"] | None

@@ -159,7 +159,7 @@ def _require_usable(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: S
             raise InputError(
                 where=f"{storage.join(info.root, shown_in)}: {row.id}",
                 found=f"no such video, for {row.length} rows in {rows_in}",
-                needed=f"the pictures of {key}",
+                needed=f"the frames of {key}",
                 fix="Copy the data set again, or leave the episode out",
             )
         needed_s = (row.length - 0.5) / info.fps

@@ -16,7 +16,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
 from vjepa2_ac.data.sources.lerobot.bounds import (
     FIX,
-    MOST_PICTURE_BYTES,
+    MOST_IMAGE_BYTES,
     MOST_TABLE_BYTES,
     parts_of,
     require_few,
@@ -98,11 +98,11 @@ class ParquetRows:
             self._kept.write(path, episode, rows)
         return rows
 
-    def pictures(self, path: str, column: str, episode: int) -> list[bytes]:
-        """Return the encoded pictures of one episode from a column of {bytes, path}.
+    def images(self, path: str, column: str, episode: int) -> list[bytes]:
+        """Return the encoded images of one episode from a column of {bytes, path}.
 
         Raises:
-            InputError: The file is missing or damaged, or the column does not hold pictures.
+            InputError: The file is missing or damaged, or the column does not hold images.
             OSError: A file far away cannot be read.
         """
         found: list[bytes] = []
@@ -111,8 +111,8 @@ class ParquetRows:
             footer = self._footer(path, file, opened)
             for number, (first, last) in enumerate(zip(footer.first, footer.last, strict=True)):
                 if (first is None or first <= episode) and (last is None or episode <= last):
-                    for part in parts_of(file, path, [EPISODE, column], MOST_PICTURE_BYTES, row_groups=[number]):
-                        found += _pictures_in(part[column], part[EPISODE], episode, f"{path}: {column}")
+                    for part in parts_of(file, path, [EPISODE, column], MOST_IMAGE_BYTES, row_groups=[number]):
+                        found += _images_in(part[column], part[EPISODE], episode, f"{path}: {column}")
         return found
 
     def _footer(self, path: str, file: parquet.ParquetFile, opened: str | BlockCachedFile) -> _Footer:
@@ -260,17 +260,17 @@ def _require_sane_groups(file: parquet.ParquetFile, path: str) -> None:
     require_sane([metadata.row_group(n).num_rows for n in range(metadata.num_row_groups)], path, metadata.num_rows)
 
 
-def _pictures_in(rows: list[Any], episodes: list[Any], episode: int, where: str) -> list[bytes]:
+def _images_in(rows: list[Any], episodes: list[Any], episode: int, where: str) -> list[bytes]:
     stored = [row.get("bytes") if isinstance(row, dict) else row for row in rows]
-    chosen = [picture for picture, its in zip(stored, episodes, strict=True) if its == episode]
-    pictures = [picture for picture in chosen if isinstance(picture, bytes)]
-    if len(pictures) != len(chosen):
+    chosen = [image for image, its in zip(stored, episodes, strict=True) if its == episode]
+    images = [image for image in chosen if isinstance(image, bytes)]
+    if len(images) != len(chosen):
         raise InputError(
             where=where,
-            found="no pictures, or names of files in their place",
+            found="no images, or names of files in their place",
             needed="PNG or JPEG bytes in the column",
         )
-    return pictures
+    return images
 
 
 def _no_numbers(where: str, kind: str, gaps: int) -> InputError:

@@ -82,7 +82,7 @@ def index_remote(
     Args:
         shards: All of the data set's.
         config: Names of the features, and what a state is.
-        cameras: Features with pictures that episodes must have; looked for in a few of them.
+        cameras: Features with images that episodes must have; looked for in a few of them.
         threads: Shards that are read at once, at least `FEWEST_IN_FLIGHT`.
         progress: Told how many of the episodes have been found.
 

@@ -82,7 +82,7 @@ def features_behind(name: str, piece: bytes, offset: int) -> dict[str, Located]:
 
 
 def locate_items(read: Read, feature: Located, count: int | None = None) -> tuple[list[int], list[int]]:
-    """Return offsets and lengths of the texts or pictures of a feature that is a list of bytes; of the first `count`.
+    """Return offsets and lengths of the texts or images of a feature that is a list of bytes; of the first `count`.
 
     Raises:
         NotAnExampleError: It is not a list of bytes, or damaged.

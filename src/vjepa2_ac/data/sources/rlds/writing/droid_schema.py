@@ -12,7 +12,7 @@ _TFDS = "tensorflow_datasets.core.features"
 
 
 def droid_features(sizes: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """Return features.json of DROID's schema, for pictures of these heights and widths."""
+    """Return features.json of DROID's schema, for images of these heights and widths."""
     position = {
         "cartesian_position": _tensor("float64", 6),
         "gripper_position": _tensor("float64", 1),
