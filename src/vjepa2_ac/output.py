@@ -24,7 +24,7 @@ from typing import Any
 
 MOST_BYTES = 1 << 20  # that wait for a reader
 LAST_S = 5.0  # how long the end of a run waits for a reader
-_LAST_WORDS_S = 1.0
+_LAST_WARNING_S = 1.0
 
 _LEFT = frozenset({errno.EPIPE, errno.ECONNRESET})  # the reader did not want any more
 _NAMES = {"stdout": "standard output", "stderr": "standard error"}
@@ -165,9 +165,9 @@ class Streams:
             writer.finish(max(0.0, until - time.monotonic()))
         for name, writer in self.writers.items() if not self._waits else ():
             for other in self.writers.values():
-                if other is not writer and (words := _what_is_missing(writer)):
-                    other.write(f"warning: {_NAMES[name]}: {words}\n".encode())
-                    other.finish(_LAST_WORDS_S)
+                if other is not writer and (missing := _what_is_missing(writer)):
+                    other.write(f"warning: {_NAMES[name]}: {missing}\n".encode())
+                    other.finish(_LAST_WARNING_S)
 
     def what_was_lost(self) -> str:
         """Return what is wrong where a command that is there for its output could not write it; empty: nothing is."""

@@ -43,7 +43,7 @@ class Config(Section):
     checkpoint: CheckpointConfig = CheckpointConfig()
     """What is kept of a run."""
     tracking: TrackingConfig = TrackingConfig()
-    """Where figures go."""
+    """Where metrics go."""
     planning: PlanningConfig = PlanningConfig()
     """How a robot is steered afterwards; training does not heed it."""
 

@@ -124,7 +124,7 @@ class CheckpointConfig(Section):
 
 
 class TrackingConfig(Section):
-    """Where figures go, besides metrics.jsonl in the run folder."""
+    """Where metrics go, besides metrics.jsonl in the run folder."""
 
     tensorboard: bool = True
     """Event files in RUN/tensorboard."""

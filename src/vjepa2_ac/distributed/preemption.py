@@ -42,8 +42,8 @@ class StopRequest:
     """Says whether a signal has asked to stop, and which.
 
     Args:
-        same_within_s: Another signal so soon is the same wish: `timeout` and some launchers signal the process and its
-            group, which gets two to the process.
+        same_within_s: Another signal within this time is the same request: `timeout` and some launchers signal both the
+            process and its group, so the process gets two.
     """
 
     def __init__(self, same_within_s: float) -> None:

@@ -16,7 +16,7 @@ from vjepa2_ac.distributed.collectives import all_gather_object
 from vjepa2_ac.episode import Batch
 
 SHARED_MEMORY = "/dev/shm"  # noqa: S108  # where PyTorch puts them on Linux
-_CLIPS_TRIED = 8  # one is read; the others are for where data.broken_episodes passes over it
+_MOST_CLIPS_READ = 8  # one is read; the others are for where data.broken_episodes passes over it
 _GIGABYTE, _MEGABYTE = 10**9, 10**6
 
 
@@ -35,7 +35,7 @@ class FileSystem(Protocol):
         ...
 
 
-def say_if_shared_memory_is_small(
+def warn_if_shared_memory_is_small(
     config: Config, dataset: Dataset, batch_of_frames: Batch, accelerator: Accelerator, note: Callable[[str], None]
 ) -> None:
     """Note before the first step where batches of this run may not fit. All processes have to call.
@@ -53,7 +53,7 @@ def say_if_shared_memory_is_small(
         return
     clip = batch_of_frames
     if batch_of_frames.latents is None and dataset.config.source == "latents":
-        clip = next(validation_batches(dataset, "train", clips=_CLIPS_TRIED, batch_size=1))
+        clip = next(validation_batches(dataset, "train", clips=_MOST_CLIPS_READ, batch_size=1))
     text = small_shared_memory(config, clip.nbytes, processes)
     if text is not None:
         note(text)

@@ -19,7 +19,7 @@ STALLED_S = 60.0
 
 
 @contextmanager
-def said_if_stalled(path: Path, *, after_s: float | None = None) -> Iterator[None]:
+def warn_if_stalled(path: Path, *, after_s: float | None = None) -> Iterator[None]:
     """Warn where the block, which writes a file, lasts longer than that; and, when it ends, how long it took.
 
     Args:

@@ -245,7 +245,7 @@ def test_batches_reach_a_cuda_device_as_they_are(droid: Path, workers: int) -> N
     copies = copies_for(torch.device("cuda"))
     with closing(training_loader(dataset, seed=1, batch_size=2, copies=copies)) as batches:
         found = [next(batches)]
-        batches.fetch_ahead()
+        batches.prefetch_next()
         found.append(next(batches))
     assert all(batch.frames.is_pinned() for batch in found)
     there = [batch.on_device() for batch in found]

@@ -115,18 +115,18 @@ def _stacked(latents: Sequence[StoredLatents]) -> StoredLatents:
     return StoredLatents(torch.stack([one.values for one in latents]), torch.stack(scales) if scales else None)
 
 
-def read_clip(dataset: Dataset, wish: ClipRequest) -> Clip:
+def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
     """Return a clip; its errors do not say how to leave the episode out, as those of `clip_at` do."""
     config = dataset.config
-    steps = range(wish.start, wish.start + config.clip_steps, config.model_stride)
-    recording = dataset.source.read(wish.episode, wish.camera, dataset.needed_steps(wish.episode))
+    steps = range(request.start, request.start + config.clip_steps, config.model_stride)
+    recording = dataset.source.read(request.episode, request.camera, dataset.needed_steps(request.episode))
     require_widths(recording, dataset.widths)
     frames = latents = augmentation = None
     if recording.read_latents is not None:
         latents = recording.read_latents(steps)
     else:
         frames = view(recording.read_frames(steps), config.crop)
-        draw_change = wish.augmentation
+        draw_change = request.augmentation
         augmentation = None if draw_change is None else draw_change(frames.shape[1], frames.shape[2])
     states, extrinsics = _states(recording, list(steps), in_camera_frame=config.pose_frame == "camera")
     return Clip(
@@ -135,11 +135,11 @@ def read_clip(dataset: Dataset, wish: ClipRequest) -> Clip:
         actions=actions_of(states, recording.commands, steps, config).astype(np.float32),
         extrinsics=None if extrinsics is None else extrinsics.astype(np.float32),
         episode_id=recording.info.id,
-        start=wish.start,
+        start=request.start,
         stride=config.model_stride,
         augmentation=augmentation,
         latents=latents,
-        camera=wish.camera,
+        camera=request.camera,
     )
 
 

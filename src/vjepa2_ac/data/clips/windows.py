@@ -136,7 +136,7 @@ def windows_of(
         _warn_of_short(config.path, split, config.clip_steps, int(members.sum()), len(short), names)
     own = starts[members[starts.episode]]
     if not own.windows:
-        raise _nothing_kept(config, split)
+        raise _no_steps_left(config, split)
     return Windows(own, np.cumsum(own.count, dtype=np.int64), short, table.id_hash, config.idle.keep_share)
 
 
@@ -195,7 +195,7 @@ def _too_short(
     )
 
 
-def _nothing_kept(config: DataConfig, split: Split) -> InputError:
+def _no_steps_left(config: DataConfig, split: Split) -> InputError:
     return InputError(
         where=f"data.path: {config.path}",
         found=f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})",

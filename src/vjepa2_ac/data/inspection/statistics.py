@@ -59,7 +59,7 @@ class MotionPerStep:
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What was found; figures of motion are those of a sample of the episodes that take part."""
+    """What was found; values of motion are those of a sample of the episodes that take part."""
 
     config: DataConfig
     control_rate_hz: float

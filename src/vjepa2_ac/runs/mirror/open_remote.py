@@ -35,7 +35,9 @@ class Remote:
     def mirror(self, run_id: str) -> Mirror:
         """Return what keeps the place up to date from now on."""
         folder, checkpoint = Path(self.config.run_dir), self.config.checkpoint
-        return Mirror(self.place, folder, run_id, checkpoint, damaged=self.damaged, outage_said=not self.is_reachable)
+        return Mirror(
+            self.place, folder, run_id, checkpoint, damaged=self.damaged, outage_reported=not self.is_reachable
+        )
 
 
 def open_remote(

@@ -7,8 +7,8 @@ from collections import OrderedDict
 from collections.abc import Callable
 
 _BLOCK_BYTES = 128 << 10
-_AHEAD_BLOCKS = 32  # most that is fetched at once for someone who reads on and on
-_KEPT_BLOCKS = 128
+_READ_AHEAD_BLOCKS = 32  # most that is fetched at once for someone who reads on and on
+_CACHED_BLOCKS = 128
 
 
 class RangedFile(io.RawIOBase):
@@ -28,7 +28,7 @@ class RangedFile(io.RawIOBase):
         self._fetch, self._size = fetch, size
         self._position = 0
         self._blocks: OrderedDict[int, bytes] = OrderedDict()
-        self._fetched_to, self._ahead = -1, 1
+        self._fetched_to, self._read_ahead = -1, 1
 
     def readable(self) -> bool:
         """Return that it can be read."""
@@ -87,14 +87,14 @@ class RangedFile(io.RawIOBase):
         if number in self._blocks:
             self._blocks.move_to_end(number)
             return {number: self._blocks[number]}
-        self._ahead = min(2 * self._ahead, _AHEAD_BLOCKS) if number == self._fetched_to else 1
-        stop = max(last + 1, number + self._ahead)
+        self._read_ahead = min(2 * self._read_ahead, _READ_AHEAD_BLOCKS) if number == self._fetched_to else 1
+        stop = max(last + 1, number + self._read_ahead)
         stop = next((other for other in range(number + 1, stop) if other in self._blocks), stop)
         start = number * _BLOCK_BYTES
         data = self._fetch(start, min(stop * _BLOCK_BYTES, self._size) - start)
         blocks = {number + i: data[i * _BLOCK_BYTES : (i + 1) * _BLOCK_BYTES] for i in range(stop - number)}
         self._fetched_to = stop
         self._blocks |= blocks
-        while len(self._blocks) > _KEPT_BLOCKS:
+        while len(self._blocks) > _CACHED_BLOCKS:
             self._blocks.popitem(last=False)
         return blocks

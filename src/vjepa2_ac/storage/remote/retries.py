@@ -25,9 +25,9 @@ _NETWORK_LIBRARIES = frozenset({"aiohttp", "requests", "httpx", "httpx2", "httpc
 _PASSING_STATUS = frozenset({408, 425, 429, 499, *range(500, 600)})
 _NO_ACCESS = frozenset({401, 403, 407})
 _ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
-_LONGEST_WORDS = 300
-_FAILURES_UNSAID = 3
-_SAID_EVERY_S = 30.0
+_LONGEST_SUMMARY = 300
+_FAILURES_BEFORE_WARNING = 3
+_WARNING_INTERVAL_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def with_retries(
             wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
             if failures == policy.attempts or seconds + wait_s > policy.total_s:
                 raise _given_up(where, error, failures, seconds) from error
-            _say(failures, "%s: %s; trying again in %.1f s", where, _words(error), wait_s)
+            _log_failure(failures, "%s: %s; trying again in %.1f s", where, _summary(error), wait_s)
         time.sleep(wait_s)
     raise AssertionError("the last attempt returns or raises")
 
@@ -115,16 +115,16 @@ def quietly() -> Iterator[None]:
 _quiet = ContextVar("_quiet", default=False)
 
 
-def _say(failures: int, text: str, *arguments: object) -> None:
+def _log_failure(failures: int, text: str, *arguments: object) -> None:
     """Log a failure; aloud when it is the third of a call, and no more than once in half a minute."""
     now = time.monotonic()
-    aloud = failures >= _FAILURES_UNSAID and now - _last_said[0] > _SAID_EVERY_S and not _quiet.get()
+    aloud = failures >= _FAILURES_BEFORE_WARNING and now - _last_warning_s[0] > _WARNING_INTERVAL_S and not _quiet.get()
     if aloud:
-        _last_said[0] = now
+        _last_warning_s[0] = now
     logger.log(logging.WARNING if aloud else logging.INFO, text, *arguments)
 
 
-_last_said = [-_SAID_EVERY_S]
+_last_warning_s = [-_WARNING_INTERVAL_S]
 
 
 def status_of(error: BaseException) -> int | None:
@@ -164,22 +164,22 @@ def _passes(error: Exception) -> bool:
 
 def _refused(where: str, error: Exception, access: str, doing: str) -> RefusedError:
     if status_of(error) in _NO_ACCESS or _is_of_google_login(error):
-        return RefusedError(where=where, found=f"no permission ({_words(error)})", fix=access)
-    return RefusedError(where=where, found=f"cannot be {doing} ({_words(error)})", fix="Check the address")
+        return RefusedError(where=where, found=f"no permission ({_summary(error)})", fix=access)
+    return RefusedError(where=where, found=f"cannot be {doing} ({_summary(error)})", fix="Check the address")
 
 
 def _given_up(where: str, error: Exception, attempts: int, seconds: float) -> UnreachableError:
     return UnreachableError(
         where=where,
-        found=f"not reached in {attempts} attempts over {seconds:.0f} s; the last: {_words(error)}",
+        found=f"not reached in {attempts} attempts over {seconds:.0f} s; the last: {_summary(error)}",
         fix="Check the network, and start again: a run goes on from its last checkpoint",
     )
 
 
-def _words(error: Exception) -> str:
+def _summary(error: Exception) -> str:
     """Say in one line what a library says in many, or not at all."""
     status = status_of(error)
     text = re.sub(r"\s+", " ", str(getattr(error, "message", "") or error)).strip()
-    text = text if len(text) <= _LONGEST_WORDS else f"{text[:_LONGEST_WORDS]}…"
+    text = text if len(text) <= _LONGEST_SUMMARY else f"{text[:_LONGEST_SUMMARY]}…"
     name = "time-out" if isinstance(error, TimeoutError) else type(error).__name__
     return ": ".join(part for part in (f"HTTP {status}" if status else name, text) if part)

@@ -150,14 +150,14 @@ class EpisodeFile:
         _require_fitting(self.path, tensors)
         self._arrays = {name: np.array(tensor.numpy()) for name, tensor in tensors.items()}
         self.frame_steps: Int[np.ndarray, " frames"] = self._arrays["frame_steps"]
-        self.id, self.camera, self.metadata = self._told()
+        self.id, self.camera, self.metadata = self._read_identity()
         self._require_shapes(layout)
 
     def __getitem__(self, name: str) -> Any:
         """Return states, or commands, extrinsics or joint_velocities; None where there are none."""
         return self._arrays.get(name)
 
-    def _told(self) -> tuple[str, str, dict[str, str]]:
+    def _read_identity(self) -> tuple[str, str, dict[str, str]]:
         """Return identity and camera, and the language instruction and the like."""
         if absent := [name for name in ("id", "camera", "metadata") if name not in self.about]:
             raise _damaged(self.path, f"no {absent[0]} in its header")

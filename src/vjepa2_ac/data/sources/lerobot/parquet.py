@@ -34,9 +34,9 @@ Opener = Callable[[str], "str | BlockCachedFile"]  # a path, or a file far away
 
 EPISODE = "episode_index"
 
-_KEPT_BYTES = 64 << 20  # of decoded row groups, in a process
+_CACHED_BYTES = 64 << 20  # of decoded row groups, in a process
 _BUFFER_BYTES = 4096  # of a column from which nothing is read
-_KEPT_FOOTERS = 256
+_CACHED_FOOTERS = 256
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class ParquetRows:
     """
 
     def __init__(self, open_file: Opener, columns: Sequence[str], kept: RowCache | None = None) -> None:
-        self._kept = kept
+        self._row_cache = kept
         self._open, self._columns = open_file, list(dict.fromkeys([EPISODE, *columns]))
         self._lock = threading.Lock()
         self._footers: OrderedDict[str, _Footer] = OrderedDict()
@@ -80,7 +80,7 @@ class ParquetRows:
             InputError: The file is missing or damaged, or a column holds something other than numbers.
             OSError: A file far away cannot be read.
         """
-        if self._kept is not None and (known := self._kept.read(path, episode)) is not None:
+        if self._row_cache is not None and (known := self._row_cache.read(path, episode)) is not None:
             return known
         parts, shared = [], False
         opened = self._open(path)
@@ -94,8 +94,8 @@ class ParquetRows:
                     shared |= len(parts[-1][EPISODE]) < len(group[EPISODE])
                     require_sane([sum(len(part[EPISODE]) for part in parts)], path)
         rows = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
-        if self._kept is not None and shared:
-            self._kept.write(path, episode, rows)
+        if self._row_cache is not None and shared:
+            self._row_cache.write(path, episode, rows)
         return rows
 
     def images(self, path: str, column: str, episode: int) -> list[bytes]:
@@ -124,7 +124,7 @@ class ParquetRows:
         footer = _footer_of(file, path)
         with self._lock:
             self._footers[path] = footer
-            if len(self._footers) > _KEPT_FOOTERS:
+            if len(self._footers) > _CACHED_FOOTERS:
                 self._footers.popitem(last=False)
         return footer
 
@@ -141,7 +141,7 @@ class ParquetRows:
             raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=FIX)
         with self._lock:
             self._groups[path, number] = group
-            while len(self._groups) > 1 and sum(map(_size_of, self._groups.values())) > _KEPT_BYTES:
+            while len(self._groups) > 1 and sum(map(_size_of, self._groups.values())) > _CACHED_BYTES:
                 self._groups.popitem(last=False)
         return group
 

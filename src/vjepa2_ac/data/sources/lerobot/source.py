@@ -17,7 +17,7 @@ from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import get_or_build, key_of
 from vjepa2_ac.data.sources.lerobot.episode_list import (
     EpisodeRow,
-    Told,
+    StatisticsColumns,
     data_file,
     read_episodes,
     tables_of_episodes,
@@ -164,8 +164,8 @@ class LeRobotSource:
     ) -> EpisodeTable:
         info, fields = self._info, self._config.lerobot
         known = info.known_keys(fields)
-        told = Told(tuple(fields.state) if self._is_far else (), fields.success)
-        rows = read_episodes(info, tables, known, told, self._open)
+        statistics = StatisticsColumns(tuple(fields.state) if self._is_far else (), fields.success)
+        rows = read_episodes(info, tables, known, statistics, self._open)
         problems = find_problems(info, rows, files.keys(), keys)
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
         if not self._is_far or (self._config.outcome != "all" and outcome_unknown):

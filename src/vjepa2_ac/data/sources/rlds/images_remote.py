@@ -145,12 +145,12 @@ class RemoteImages:
         """
         require_steps(steps, self.num_steps, self.where)
         try:
-            found = self._kept_or_fetched(sorted(set(steps)))
+            found = self._cached_or_fetched(sorted(set(steps)))
         except OSError as error:
             raise unreadable(self.shard, error) from None
         return decode_jpegs([found[step] for step in steps], steps, self.where)
 
-    def _kept_or_fetched(self, steps: Sequence[int]) -> dict[int, bytes]:
+    def _cached_or_fetched(self, steps: Sequence[int]) -> dict[int, bytes]:
         table = self.cache.places.read(self.key)
         if table is None:
             return self._first_time(steps)
