@@ -15,18 +15,18 @@ from vjepa2_ac.storage.structured.messages import message_of
 
 T = TypeVar("T")
 
-_MOST_PROBLEMS = 5  # problems of one file
+_MOST_PROBLEMS = 5  # shown of one file
 
 
 def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: str = "", fix: str = "") -> T:
-    """Return a dataclass of values as JSON gives them: nothing is taken for another type than it is.
+    """Return a dataclass of values from JSON: no value is converted to another type.
 
     Args:
         kind: The dataclass; its annotations may have pydantic's bounds.
-        values: Of its fields; those with a default may be left out.
+        values: Of its fields; those with a default may be missing.
         where: The file, for messages.
         needed: What it should be.
-        fix: The way out.
+        fix: How to fix it.
 
     Raises:
         InputError: A value is missing, unknown, of another type or beyond its bounds.
