@@ -1,8 +1,8 @@
-"""What flows through the program? Episode -> Clip -> Batch -> LatentBatch, and the legend of axes, units and frames.
+"""Data records: Episode -> Clip -> Batch -> LatentBatch, and the legend of axes, units and coordinate frames.
 
 Axes
     batch    clips that are computed together
-    time     model steps: neighbouring model steps are `stride` control steps apart
+    time     model steps: consecutive model steps are `stride` control steps apart
     steps    control steps of an episode (DROID: 15 per second)
     height, width, channel   pixels, RGB, uint8
     tokens   patches of one frame, row by row (256 at 256 px)
@@ -12,8 +12,9 @@ State (7 numbers, a pose): x, y, z in metres; roll, pitch, yaw in radians, as ex
     closedness, 0 open .. 1 closed. All in the robot base frame; the point is the flange, not the finger tip. States are
     *measured*. With `data.states: vector` a state is whatever numbers the source has, state_dim of them.
 
-Action (7 numbers, of poses): what carries a state to the next *model* step's state: metres, extrinsic xyz Euler angles
-    of R[t+1] @ R[t].T, and the change of closedness. See `geometry.actions_from_states`. Of vectors: `data.actions`.
+Action (7 numbers, of poses): the change from a state to the state of the next *model* step: metres, extrinsic xyz Euler
+    angles of R[t+1] @ R[t].T, and the change of closedness. See `geometry.actions_from_states`. Of vectors:
+    `data.actions`.
 
 Extrinsics (6 numbers): the camera in the robot base frame: x, y, z, roll, pitch, yaw.
 
@@ -51,19 +52,19 @@ POSE_WIDTHS = Widths(STATE_DIM, ACTION_DIM)
 
 @runtime_checkable
 class FrameReader(Protocol):
-    """Reads pictures of one camera of one episode, and only those that are asked for."""
+    """Reads the requested frames of one camera of one episode."""
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order."""
+        """Return the RGB frames at these control steps, in this order."""
         ...
 
 
 @dataclass(frozen=True)
 class StoredLatents:
-    """Latents of frames as a cache keeps them; `dtypes.unpack_latents` makes float32 of them, on the device."""
+    """Latents of frames as a cache stores them; `dtypes.unpack_latents` converts them to float32 on the device."""
 
     values: Num[Tensor, "*batch time tokens dim"]  # bfloat16, float32 or int8
-    scales: Float32[Tensor, "*batch time tokens"] | None = None  # of int8: what a value of 1 means, for each token
+    scales: Float32[Tensor, "*batch time tokens"] | None = None  # of int8: the value of 1, for each token
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> StoredLatents:
         """Return the same with each tensor replaced."""
@@ -72,7 +73,7 @@ class StoredLatents:
 
 @runtime_checkable
 class LatentReader(Protocol):
-    """Reads latents of one camera of one episode from a cache, and only those that are asked for."""
+    """Reads the requested latents of one camera of one episode from a cache."""
 
     def __call__(self, steps: Sequence[int]) -> StoredLatents:
         """Return the latents at these control steps, in this order."""
@@ -81,16 +82,16 @@ class LatentReader(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class EpisodeInfo:
-    """What is known of an episode without reading its pictures: enough to choose clips from it."""
+    """Facts about an episode that are known without its frames: enough to choose clips from it."""
 
-    id: str  # the same whatever the order of episodes and the number of shards
+    id: str  # independent of the order of episodes and the number of shards
     num_steps: int
     success: bool | None = None  # None: the data set does not say
 
 
 @dataclass(frozen=True)
 class Episode:
-    """One demonstration: states of every control step, and pictures of one camera that are read when asked for."""
+    """One demonstration: states of every control step, and frames of one camera that are read on request."""
 
     info: EpisodeInfo
     states: Float[np.ndarray, "steps state_dim"]
@@ -99,16 +100,14 @@ class Episode:
     extrinsics: Float[np.ndarray, "steps 6"] | None = None  # of the camera
     joint_velocities: Float[np.ndarray, "steps joints"] | None = None  # *commanded*, radians per second
     metadata: Mapping[str, str] = field(default_factory=dict)  # language instruction and the like; never interpreted
-    commands: Float[np.ndarray, "steps action_dim"] | None = (
-        None  # recorded actions, where `data.actions` asks for them
-    )
-    read_latents: LatentReader | None = None  # of a cache; its `read_frames` gives small pictures for people to look at
-    frame_steps: Int[np.ndarray, " frames"] | None = None  # control steps that have a picture, ascending; None: all
+    commands: Float[np.ndarray, "steps action_dim"] | None = None  # recorded actions, if `data.actions` requests them
+    read_latents: LatentReader | None = None  # of a cache; its `read_frames` gives small frames for people to look at
+    frame_steps: Int[np.ndarray, " frames"] | None = None  # control steps that have a frame, ascending; None: all
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What is changed in a training clip, the same for all its frames; done on the device."""
+    """Changes of a training clip, the same for all its frames; applied on the device."""
 
     box: tuple[int, int, int, int]  # top, left, height, width within the clip's frames, in pixels
     brightness: float = 1.0  # factors; 1: unchanged
@@ -118,7 +117,7 @@ class Augmentation:
 
 @dataclass(frozen=True)
 class Skipped:
-    """A clip that was to be in a batch and could not be read (`data.broken_episodes: skip`)."""
+    """A clip of a batch that could not be read (`data.broken_episodes: skip`)."""
 
     episode_id: str
     reason: str
@@ -154,7 +153,7 @@ class Batch:
     bytes_fetched: int = 0  # over the network, for these clips
     latents: StoredLatents | None = None
     cameras: tuple[str | None, ...] = ()  # one per clip; None: the config's first
-    on_device: Callable[[], Batch | None] | None = None  # gives, once, the copy of it that is on its way to the device
+    on_device: Callable[[], Batch | None] | None = None  # returns, once, its copy that is being sent to the device
 
     def mapped(self, change: Callable[[Tensor], Tensor]) -> Batch:
         """Return the batch with each tensor replaced."""
@@ -168,9 +167,9 @@ class Batch:
         )
 
     def pin_memory(self) -> Batch:
-        """Return the batch in pinned memory, where a copy to the device starts from without the host's waiting.
+        """Return the batch in pinned memory, from which copies to the device do not block the host.
 
-        DataLoader calls a method of this name, where it pins.
+        DataLoader calls a method of this name to pin.
         """
         return self.mapped(lambda tensor: tensor.pin_memory())
 
@@ -204,15 +203,15 @@ StepRanges = Sequence[tuple[int, int]]  # [start, end) of control steps, ascendi
 
 @runtime_checkable
 class EpisodeSource(Protocol):
-    """A set of episodes in a fixed order. It knows nothing of clips, crops or batches.
+    """A set of episodes in a fixed order, independent of clips, crops and batches.
 
     It can be pickled to a loader worker, and read from several threads at once.
     """
 
     def infos(self, progress: Progress | None = None) -> Sequence[EpisodeInfo]:
-        """Return what is known of every episode that can be used, in the order of `read`.
+        """Return the facts about every usable episode, in the order of `read`.
 
-        Long work the first time (`progress` is told), at once afterwards: what was found out is kept on disk.
+        Slow the first time (`progress` is called), fast afterwards: the result is cached on disk.
 
         Raises:
             InputError: There is no such data set, or it is damaged beyond what `data.broken_episodes` allows.
@@ -220,14 +219,14 @@ class EpisodeSource(Protocol):
         ...
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
-        """Return one episode; no picture is read or decoded before `Episode.read_frames` asks for it.
+        """Return one episode; no frame is read or decoded before `Episode.read_frames` requests it.
 
         Args:
             index: Place in `infos`.
-            camera: Whose pictures; None: the config's (first) camera.
-            needed: Steps that clips may come from, None: all. A source that fetches from afar keeps no others.
+            camera: Whose frames; None: the config's (first) camera.
+            needed: Steps that clips may come from, None: all. A remote source caches no others.
 
         Raises:
-            InputError: The episode cannot be read, or is not what the data set promises.
+            InputError: The episode cannot be read, or does not match the data set's description.
         """
         ...

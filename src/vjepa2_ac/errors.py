@@ -1,24 +1,26 @@
-"""What does the user read when something they gave cannot be used, or the machine cannot give what is needed?"""
+"""Error types, and their messages for the user: unusable input, or a machine that lacks what is needed."""
 
 import errno
 import resource
 import unicodedata
 
-_MOST_CHARACTERS = 8_000  # of a part of a message: what is quoted in it may be of any length
-_CONTROL = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})  # terminals obey some of these; lone surrogates cannot be written
+_MOST_CHARACTERS = 8_000  # of a part of a message: quoted input may have any length
+_CONTROL = frozenset(
+    {"Cc", "Cf", "Cs", "Zl", "Zp"}
+)  # some of these control terminals; lone surrogates cannot be encoded
 
 
 class InputError(Exception):
-    """Something the user gave cannot be used: where it is, what was found, what was needed, and the way out.
+    """User input that cannot be used: where it is, what was found, what was needed, and how to fix it.
 
-    The command line prints the message without a traceback and exits with status 2. What is quoted in it may come from
-    anybody: control characters are written out, and a part is cut where it is endless.
+    The command line prints the message without a traceback and exits with status 2. Quoted input is untrusted: control
+    characters are escaped, and long parts are cut.
 
     Args:
-        where: A config key, file, episode or command: what the user can go and look at.
-        found: What is there.
+        where: A config key, file, episode or command that the user can look at.
+        found: What was found.
         needed: What should be there; may be empty where `found` already says it.
-        fix: The way out, as a sentence.
+        fix: How to fix it, as a sentence.
     """
 
     def __init__(self, *, where: str, found: str, needed: str = "", fix: str = "") -> None:
@@ -28,7 +30,7 @@ class InputError(Exception):
         super().__init__(printable(text))
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
-        """Survive the trip from a loader worker to the main process."""
+        """Pickle the error, for the way from a loader worker to the main process."""
         return (_rebuild, (type(self), self.where, self.found, self.needed, self.fix))
 
 
@@ -37,16 +39,16 @@ def _rebuild(kind: type[InputError], where: str, found: str, needed: str, fix: s
 
 
 def _sentence(text: str) -> str:
-    """End a part of the message; a part that begins on a new line brings its own layout."""
+    """End a part of the message as a sentence; a part that ends with a new line has its own layout."""
     if text.endswith("\n"):
         return text
     return text + (" " if text.endswith((".", "?", "!")) else ". ")
 
 
 def printable(text: str) -> str:
-    r"""Return a text that a terminal shows and does not obey: control characters are written out, as \x1b.
+    r"""Return a text that is safe to show on a terminal: control characters are escaped, as \x1b.
 
-    Ends of lines and tabs stay.
+    Line ends and tabs stay.
     """
     if text.isprintable():
         return text
@@ -67,7 +69,7 @@ def _short(text: str) -> str:
 
 
 def in_words(error: BaseException) -> str:
-    """Return what to tell of an error: of files and memory that the system does not give, with the way out."""
+    """Return the message of an error; for a lack of files or memory, with a fix."""
     if isinstance(error, OSError) and error.errno in {errno.EMFILE, errno.ENFILE}:
         return str(too_few_files(str(error.filename or "")))
     if is_out_of_memory(error):
@@ -76,7 +78,7 @@ def in_words(error: BaseException) -> str:
 
 
 def too_few_files(where: str = "") -> InputError:
-    """Return the error of a process that may not open as many files as it needs."""
+    """Return the error of a process that has reached its limit of open files."""
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     return InputError(
         where=where or "ulimit -n",
@@ -86,5 +88,5 @@ def too_few_files(where: str = "") -> InputError:
 
 
 def is_out_of_memory(error: BaseException) -> bool:
-    """Tell whether the machine's memory, not the GPU's, was not enough: PyTorch has no error of its own for that."""
+    """Return whether the machine's memory, not the GPU's, was too small: PyTorch has no error type for that."""
     return isinstance(error, MemoryError) or "DefaultCPUAllocator: can't allocate memory" in str(error)

@@ -1,6 +1,7 @@
-"""How do poses and actions turn into one another? Euler angles, rotation matrices, camera frame.
+"""Conversions between poses and actions: Euler angles, rotation matrices, camera frame.
 
-Euler angles wrap at pi (a gripper that points down has roll near pi), so differences always go through matrices.
+Euler angles wrap at pi (a gripper that points down has roll near pi), so differences are always computed with rotation
+matrices.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ def euler_from_matrices(matrices: Float[np.ndarray, "*batch 3 3"]) -> Float[np.n
 
 
 def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray, "time-1 7"]:
-    """Return the action that carries each state to the next.
+    """Return the action from each state to the next.
 
     Translation and gripper subtract; rotation is R[t+1] @ R[t].T as extrinsic xyz Euler angles, so an action acts on
     the left. Legend of states and actions: `vjepa2_ac.episode`.

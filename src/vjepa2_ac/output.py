@@ -1,11 +1,11 @@
-"""How does a command talk to whoever reads it? Without ever failing for it, and where it is a run, without waiting.
+"""Terminal output of a command: it never raises, and during a run it never blocks.
 
-`own_streams` puts streams of ours in the place of standard output and standard error, for all that writes there: the
-console, warnings, libraries. What they cannot write is dropped: the reader has left (`| head`), the terminal is gone,
-the disk of a log is full. They never raise, so no text ends what it tells of.
+`own_streams` replaces standard output and standard error with streams of ours, for everything that writes there: the
+console, warnings, libraries. Text that they cannot write is dropped: the reader has closed the pipe (`| head`), the
+terminal is gone, the disk of a log is full. They never raise, so that output cannot end the work that it reports.
 
-After `never_wait` text goes to a thread instead. A pipe that nobody reads, a terminal that was halted with Ctrl-S or a
-disk that stalls then holds up that thread alone; what does not fit into its queue is dropped, and counted.
+After `never_wait` text is written by a thread instead. A pipe that nobody reads, a terminal stopped with Ctrl-S or a
+stalled disk then blocks that thread only; text that does not fit into its queue is dropped and counted.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
-MOST_BYTES = 1 << 20  # that wait for a reader
-LAST_S = 5.0  # how long the end of a run waits for a reader
-_LAST_WORDS_S = 1.0
+MOST_BYTES = 1 << 20  # that may wait for a reader
+LAST_S = 5.0  # that the end of a run waits for a reader
+_LAST_WARNING_S = 1.0
 
-_LEFT = frozenset({errno.EPIPE, errno.ECONNRESET})  # the reader did not want any more
+_LEFT = frozenset({errno.EPIPE, errno.ECONNRESET})  # the reader has closed the stream
 _NAMES = {"stdout": "standard output", "stderr": "standard error"}
 
 
@@ -39,22 +39,22 @@ class Writer:
 
     def __init__(self, handle: int) -> None:
         self.handle = handle
-        self.problem: OSError | None = None  # after which nothing is written any more
-        self.lines_dropped = 0  # because nobody read
+        self.problem: OSError | None = None  # nothing is written after it
+        self.lines_dropped = 0  # because they were not read in time
         self._is_terminal = os.isatty(handle)
         self._process = os.getpid()
         self._thread: threading.Thread | None = None
         self._waiting: deque[bytes] = deque()
-        self._bytes, self._lines = 0, 0  # that wait, or are being written by the thread
+        self._bytes, self._lines = 0, 0  # waiting, or being written by the thread
         self._changed = threading.Condition()
 
     @property
     def has_lost(self) -> bool:
-        """Whether somebody who would have read it did not get all of it: the disk of a file is full."""
+        """Whether output is missing that would have been read: the disk of a file is full."""
         return self.problem is not None and self.problem.errno not in _LEFT and not self._is_terminal
 
     def write(self, data: bytes) -> None:
-        """Write, or hand to the thread where there is one; drop what there is no room for."""
+        """Write, or queue for the thread if there is one; drop what does not fit."""
         if self._thread is None or os.getpid() != self._process:  # a forked process has no thread
             self._write(data)
             return
@@ -67,13 +67,13 @@ class Writer:
             self._changed.notify_all()
 
     def never_wait(self) -> None:
-        """Let a thread do the writing from now on."""
+        """Write in a thread from now on."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._serve, name="console", daemon=True)
             self._thread.start()
 
     def finish(self, within_s: float) -> None:
-        """Wait until what waits is written, but no longer than that: what is left then is dropped."""
+        """Wait until queued data is written, at most `within_s`: the rest is dropped."""
         with self._changed:
             if not self._changed.wait_for(lambda: not self._bytes, within_s):
                 self.lines_dropped += self._lines
@@ -98,7 +98,7 @@ class Writer:
         while left and self.problem is None:
             try:
                 left = left[os.write(self.handle, left) :]
-            except BlockingIOError:  # whoever shares this file has made it so
+            except BlockingIOError:  # another process that shares this file has made it non-blocking
                 ready = select.poll()
                 ready.register(self.handle, select.POLLOUT)
                 ready.poll()
@@ -107,7 +107,7 @@ class Writer:
 
 
 class _Raw(io.RawIOBase):
-    """What a text stream writes through."""
+    """The raw stream below a text stream."""
 
     def __init__(self, writer: Writer, handle: int) -> None:
         self._writer, self._handle = writer, handle
@@ -127,50 +127,50 @@ class _Raw(io.RawIOBase):
 
 
 class Streams:
-    """Standard output and standard error of this process, by the names that `sys` has for them."""
+    """Standard output and standard error of this process, by their names in `sys`."""
 
     def __init__(self) -> None:
         self.writers: dict[str, Writer] = {}
-        self._waits = True  # for readers
+        self._waits = True  # whether writes wait for readers
         self._before: dict[str, Any] = {}
         self._by_file: dict[tuple[int, int, int], Writer] = {}
 
     def put_in_place(self) -> None:
-        """Let all that this process writes go through here; streams that were put in place before stay."""
+        """Send all output of this process through these streams; streams that others have replaced stay."""
         for number, name in enumerate(_NAMES, start=1):
             stream = getattr(sys, name)
             if stream is None:  # it was closed when the process started
                 _occupy_closed_numbers()
                 self._replace(name, number, "utf-8")
             elif stream is getattr(sys, f"__{name}__"):
-                with contextlib.suppress(OSError, ValueError):  # no file behind it, or none any more
+                with contextlib.suppress(OSError, ValueError):  # it has no file, or a closed one
                     stream.flush()
                     self._replace(name, stream.fileno(), stream.encoding)
 
     def put_back(self) -> None:
-        """Let `sys` have its own again, in which nothing waits for the end of the process."""
+        """Restore the streams of `sys`, which hold no buffered text."""
         for name, stream in self._before.items():
             setattr(sys, name, stream)
 
     def never_wait(self) -> None:
-        """Hold up nobody from now on."""
+        """Never block from now on."""
         self._waits = False
         for writer in self.writers.values():
             writer.never_wait()
 
     def finish(self) -> None:
-        """Give readers a last moment; of a run, tell in the one stream what is not to be seen in the other."""
+        """Give readers some time to finish; in a run, report in one stream what is missing in the other."""
         until = time.monotonic() + LAST_S
         for writer in self.writers.values():
             writer.finish(max(0.0, until - time.monotonic()))
         for name, writer in self.writers.items() if not self._waits else ():
             for other in self.writers.values():
-                if other is not writer and (words := _what_is_missing(writer)):
-                    other.write(f"warning: {_NAMES[name]}: {words}\n".encode())
-                    other.finish(_LAST_WORDS_S)
+                if other is not writer and (missing := _what_is_missing(writer)):
+                    other.write(f"warning: {_NAMES[name]}: {missing}\n".encode())
+                    other.finish(_LAST_WARNING_S)
 
     def what_was_lost(self) -> str:
-        """Return what is wrong where a command that is there for its output could not write it; empty: nothing is."""
+        """Return the error of a command whose output could not be written; empty: there is none."""
         writer = self.writers.get("stdout")
         return f"{_NAMES['stdout']}: {_what_is_missing(writer)}" if self._waits and writer and writer.has_lost else ""
 
@@ -187,9 +187,9 @@ _streams: Streams | None = None
 
 @contextlib.contextmanager
 def own_streams() -> Iterator[Streams]:
-    """Let all that this process writes go through streams that never raise, as long as the context lasts.
+    """Send all output of this process through streams that never raise, within the context.
 
-    Streams that are not the process's own, such as those of a test or a notebook, stay as they are.
+    Streams that are not the process's own, such as those of a test or a notebook, are not changed.
     """
     global _streams
     before, _streams = _streams, Streams()
@@ -203,16 +203,16 @@ def own_streams() -> Iterator[Streams]:
 
 
 def never_wait() -> None:
-    """Let no reader hold up this process from now on: it does work that is worth more than what it tells of it."""
+    """Never let a reader block this process from now on: its work matters more than its output."""
     global _streams
-    if _streams is None:  # a process that others started for a part of their work
+    if _streams is None:  # a worker process of another one
         _streams = Streams()
         _streams.put_in_place()
     _streams.never_wait()
 
 
 def _occupy_closed_numbers() -> None:
-    """Open nothing as 0, 1 and 2 where they are free: else the next file is, and what libraries say goes into it."""
+    """Open /dev/null as 0, 1 and 2 where free: else the next file gets that number, and libraries write into it."""
     while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(handle)

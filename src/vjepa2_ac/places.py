@@ -1,7 +1,7 @@
-"""Where does a path lead that somebody gave? One meaning for all of them: knobs, options and the environment.
+"""Resolution of paths given by the user: the same rules for config knobs, options and environment variables.
 
-`~` is the user's home. Where only a folder of this machine will do, a URL is refused: taken for a path it would become
-a folder called `gs:`. What cannot be meant raises a ValueError, whose message goes on after the name of the knob.
+`~` is the user's home. Where only a local folder is allowed, a URL is refused: taken as a path it would create a
+folder called `gs:`. An invalid path raises a ValueError, whose message continues after the name of the knob.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from pathlib import Path
 
 BUILTIN = "builtin:"  # models that come with the package
 
-_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # with one slash, too: what a Path makes of a URL
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")  # with one slash, too: a Path turns a URL into that
 
 
 def is_url(path: str | Path) -> bool:
@@ -21,10 +21,10 @@ def is_url(path: str | Path) -> bool:
 
 
 def anywhere(path: str) -> str:
-    """Return a path of this machine, from the user's home where it begins with `~`, or a URL; no slash behind it.
+    """Return a local path, with `~` expanded, or a URL; without a trailing slash.
 
     Raises:
-        ValueError: It is empty, of nobody's home, no path, or neither a URL nor a path.
+        ValueError: It is empty, of an unknown user's home, no path, or neither a URL nor a path.
     """
     if is_url(path):
         return path.rstrip("/")
@@ -34,10 +34,10 @@ def anywhere(path: str) -> str:
 
 
 def on_this_machine(path: str) -> str:
-    """Return a path of this machine, from the user's home where it begins with `~`; no slash behind it.
+    """Return a local path, with `~` expanded; without a trailing slash.
 
     Raises:
-        ValueError: It is a URL, empty, of nobody's home, or no path.
+        ValueError: It is a URL, empty, of an unknown user's home, or no path.
     """
     if not path.strip():
         raise ValueError("is empty")
@@ -52,7 +52,7 @@ def on_this_machine(path: str) -> str:
 
 
 def of_a_model(name: str) -> str:
-    """Return what names a model: one of the package as it is, any other as `on_this_machine` does.
+    """Return the name of a model: unchanged for one of the package, any other as `on_this_machine` does.
 
     Raises:
         ValueError: As `on_this_machine`.
@@ -61,5 +61,5 @@ def of_a_model(name: str) -> str:
 
 
 def literal(path: Path) -> str:
-    """Return a path such that it means the same when it is read as a knob: a folder may be called `~`."""
+    """Return a path that means the same when it is read as a knob: a folder may be called `~`."""
     return f"./{path}" if str(path).startswith("~") else str(path)

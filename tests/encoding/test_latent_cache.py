@@ -24,7 +24,7 @@ from synthetic import synthetic_episode, synthetic_states
 from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.clip_reader import clip_at, pictures_of
+from vjepa2_ac.data.clips.clip_reader import clip_at, frames_of
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, training_loader, validation_batches
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
@@ -143,7 +143,7 @@ def test_a_flipped_bit_in_a_picture_is_found_when_it_is_read(tmp_path: Path) -> 
     flipped(path, place_of(path, "pictures", byte=40))
     record = EpisodeFile(path, layout)
     record.pictures([2])
-    with pytest.raises(InputError, match="CRC of the picture of control step 0"):
+    with pytest.raises(InputError, match="CRC of the image of control step 0"):
         record.pictures([0])
 
 
@@ -398,7 +398,7 @@ def test_the_pictures_of_a_cached_clip_are_small_ones_of_the_same_frames(
     original, through = cached(droid_with_rests, tmp_path, camera=("exterior_1_left", "wrist_left"))
     for one, other in zip(first_batches(original, 4), first_batches(through, 4), strict=True):
         for row in range(2):
-            large, small = pictures_of(original, one, row), pictures_of(through, other, row)
+            large, small = frames_of(original, one, row), frames_of(through, other, row)
             assert small.shape == (3, 16, 16, 3)
             np.testing.assert_allclose(small.mean(axis=(1, 2)), large.mean(axis=(1, 2)), atol=12)
 

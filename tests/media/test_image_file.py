@@ -1,4 +1,4 @@
-"""A picture in a file becomes its RGB pixels, or the user reads what is in the file."""
+"""An image in a file becomes its RGB pixels, or the user reads what is in the file."""
 
 import io
 import struct
@@ -46,10 +46,10 @@ def test_grey_and_transparent_pictures_become_rgb() -> None:
 @pytest.mark.parametrize(
     ("data", "complaint"),
     [
-        (b"", "0 bytes that are no picture"),
-        (b"x,y,z\n1,2,3\n", "no picture, starting with b'x,y,'"),
-        (png(Image.fromarray(PIXELS))[:60], "no picture"),
-        (simplejpeg.encode_jpeg(PIXELS)[:60], "no picture"),
+        (b"", "0 bytes that are no image"),
+        (b"x,y,z\n1,2,3\n", "no image, starting with b'x,y,'"),
+        (png(Image.fromarray(PIXELS))[:60], "no image"),
+        (simplejpeg.encode_jpeg(PIXELS)[:60], "no image"),
         (png(Image.fromarray(PIXELS[..., 0].astype(np.uint16))), "not 8 bits a channel"),
     ],
 )
@@ -82,7 +82,7 @@ def test_a_picture_that_claims_to_be_huge_is_refused_before_anything_is_made(
         pytest.skip("a JPEG cannot say so")
     monkeypatch.setattr(simplejpeg, "decode_jpeg", None)
     monkeypatch.setattr(Image.Image, "convert", None)
-    with pytest.raises(InputError, match=f"goal: a picture of {size[0]} x {size[1]} pixels.*100 megapixels"):
+    with pytest.raises(InputError, match=f"goal: an image of {size[0]} x {size[1]} pixels.*100 megapixels"):
         decode_image(claimed(*size), "goal")
 
 
@@ -99,7 +99,7 @@ def test_a_jpeg_that_goes_over_its_pixels_again_and_again_is_refused() -> None:
 
 def test_pictures_that_are_too_many_of_their_size_are_not_decoded_together() -> None:
     require_bounded(720, 1280, "clip", count=256)
-    with pytest.raises(InputError, match="clip: 64 pictures of 10000 x 10000 pixels at once"):
+    with pytest.raises(InputError, match="clip: 64 images of 10000 x 10000 pixels at once"):
         require_bounded(10_000, 10_000, "clip", count=64)
 
 

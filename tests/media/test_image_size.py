@@ -1,4 +1,4 @@
-"""One bound on pictures holds for every form of data, before room is made, and as an error that breaks one episode."""
+"""One bound on images holds for every form of data, before room is made, and as an error that breaks one episode."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -47,7 +47,7 @@ def of_npz(folder: Path) -> FrameReader:
 FORMS: dict[str, Callable[[Path], FrameReader]] = {
     "rlds": of_rlds,
     "lerobot videos": lambda folder: of_lerobot(folder, "video"),
-    "lerobot pictures": lambda folder: of_lerobot(folder, "png"),
+    "lerobot images": lambda folder: of_lerobot(folder, "png"),
     "npz": of_npz,
 }
 
@@ -59,11 +59,11 @@ def test_every_form_of_data_refuses_pictures_beyond_the_bound(
     read = FORMS[form](tmp_path)
     assert read([0, 2]).shape == (2, 32, 64, 3)
     monkeypatch.setattr(image_size, "MOST_PIXELS", 2_000)
-    with pytest.raises(InputError, match="a picture of 32 x 64 pixels"):
+    with pytest.raises(InputError, match="an image of 32 x 64 pixels"):
         read([0, 2])
     monkeypatch.undo()
     monkeypatch.setattr(image_size, "_MOST_BYTES", 10_000)
-    with pytest.raises(InputError, match="2 pictures of 32 x 64 pixels at once"):
+    with pytest.raises(InputError, match="2 images of 32 x 64 pixels at once"):
         read([0, 2])
 
 
@@ -72,7 +72,7 @@ def test_a_short_jpeg_that_claims_65500_pixels_each_way_breaks_an_episode_and_no
     place = data.index(b"\xff\xc0") + 5
     huge = data[:place] + (65_500).to_bytes(2, "big") * 2 + data[place + 4 :]
     assert len(huge) < 700
-    with pytest.raises(InputError, match="episode 3: step 5: a picture of 65500 x 65500 pixels"):
+    with pytest.raises(InputError, match="episode 3: step 5: an image of 65500 x 65500 pixels"):
         decode_jpegs([huge], [5], "episode 3")
 
 
@@ -83,5 +83,5 @@ def test_libav_itself_makes_no_room_for_a_picture_beyond_the_bound(
     assert read_frames(path, [0, 2], where="a.mp4").shape == (2, 32, 64, 3)
     assert video_reader._STRICT["max_pixels"] == "100000000"
     monkeypatch.setitem(video_reader._STRICT, "max_pixels", "1000")
-    with pytest.raises(InputError, match=r"a\.mp4: (cannot be read as a video|no picture)"):
+    with pytest.raises(InputError, match=r"a\.mp4: (cannot be read as a video|no image)"):
         read_frames(path, [0, 2], where="a.mp4")

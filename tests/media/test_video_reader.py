@@ -1,4 +1,4 @@
-"""A picture at a place is the same picture, however little else is decoded."""
+"""A frame at a place is the same frame, however little else is decoded."""
 
 import io
 import sys
@@ -39,7 +39,7 @@ def test_asked_pictures_equal_those_of_decoding_everything(tmp_path: Path, gop: 
 def test_an_open_group_of_pictures_is_entered_where_its_pictures_can_be_decoded(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """x265's key frames are preceded by pictures that are stored after them."""
+    """x265's key frames are preceded by frames that are stored after them."""
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12, codec="libx265")
     frames = every_frame(path)
     capfd.readouterr()  # what the encoder says
@@ -139,7 +139,7 @@ def cut(data: bytes, share: float) -> bytes:
 
 
 def blanked(data: bytes) -> bytes:
-    """A stretch of zeros in the middle of the pictures."""
+    """A stretch of zeros in the middle of the frames."""
     start = data.index(b"mdat") + 4000
     return data[:start] + bytes(3000) + data[start + 3000 :]
 
@@ -170,7 +170,7 @@ def test_a_damaged_video_is_named_and_libav_is_silent(
 @pytest.mark.parametrize("clock", [None, Clock(0.0, 15.0)])
 def test_a_picture_past_the_end_is_named(tmp_path: Path, clock: Clock | None) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES)
-    with pytest.raises(InputError, match=r"40 pictures. needed: at least 43|no picture at 2.800 s"):
+    with pytest.raises(InputError, match=r"40 frames. needed: at least 43|no frame at 2.800 s"):
         read_frames(path, [3, 42], where="a", clock=clock)
 
 
@@ -205,11 +205,11 @@ def test_pictures_that_are_moved_without_a_word_in_the_header_are_found_by_time(
 
 
 def test_a_clock_too_coarse_for_its_pictures_shows_none_twice(tmp_path: Path) -> None:
-    """Of a time scale of 0 libav makes whole seconds: all pictures of one would be taken for the same."""
+    """Of a time scale of 0 libav makes whole seconds: all frames of one would be taken for the same."""
     path = write_mp4(tmp_path / "a.mp4", FRAMES)
     data = bytearray(path.read_bytes())
     scale = data.index(b"mdhd") + 16
     data[scale : scale + 4] = bytes(4)
     path.write_bytes(data)
-    with pytest.raises(InputError, match=r"times in units of 1 s for 15 pictures a second\. needed: a time for each"):
+    with pytest.raises(InputError, match=r"times in units of 1 s for 15 frames a second\. needed: a time for each"):
         read_frames(path, [0, 5], where="a", clock=Clock(0.0, 15.0))

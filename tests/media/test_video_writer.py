@@ -36,7 +36,7 @@ def test_what_was_written_is_what_is_shown(tmp_path: Path) -> None:
 
 
 def test_nothing_is_left_of_a_video_that_cannot_be(tmp_path: Path) -> None:
-    for made, wrong in (([], "without pictures"), ([*pictures(1), *pictures(1, 20)], "in one video")):
+    for made, wrong in (([], "without frames"), ([*pictures(1), *pictures(1, 20)], "in one video")):
         with pytest.raises(ValueError, match=wrong):
             write_video(tmp_path / "film.mp4", made, rate_hz=4.0)
         assert not list(tmp_path.iterdir())

@@ -102,8 +102,8 @@ def test_a_folder_that_cannot_be_made_is_the_users_to_mend(tmp_path: Path) -> No
 def test_a_run_holds_its_folder_while_it_trains_and_gives_it_back(make_config, reporter) -> None:
     refused = []
 
-    def try_to_train_too(step: int, figures: object) -> None:
-        del figures
+    def try_to_train_too(step: int, metrics: object) -> None:
+        del metrics
         with pytest.raises(InputError, match=rf"by process {os.getpid()}"):
             train(make_config(training__steps=2), other)
         refused.append(step)

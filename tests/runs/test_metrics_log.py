@@ -21,19 +21,19 @@ def steps(folder: Path) -> list[int]:
 
 
 def test_rows_read_back(tmp_path: Path) -> None:
-    with MetricsLog(tmp_path, first_step=0) as journal:
-        journal.write("train", 1, {"loss": 0.5, "by_horizon": [1.0, 2.0]})
+    with MetricsLog(tmp_path, first_step=0) as log:
+        log.write("train", 1, {"loss": 0.5, "by_horizon": [1.0, 2.0]})
     assert list(read_metrics_log(tmp_path / "metrics.jsonl")) == [
         {"kind": "train", "step": 1, "loss": 0.5, "by_horizon": [1.0, 2.0]}
     ]
 
 
 def test_steps_that_will_be_done_again_are_dropped_on_resume(tmp_path: Path) -> None:
-    with MetricsLog(tmp_path, first_step=0) as journal:
+    with MetricsLog(tmp_path, first_step=0) as log:
         for step in range(6):
-            journal.write("train", step, {"loss": 0.5})
-    with MetricsLog(tmp_path, first_step=3) as journal:
-        journal.write("train", 4, {"loss": 0.4})
+            log.write("train", step, {"loss": 0.5})
+    with MetricsLog(tmp_path, first_step=3) as log:
+        log.write("train", 4, {"loss": 0.4})
     assert steps(tmp_path) == [0, 1, 2, 3, 4]
 
 
@@ -90,8 +90,8 @@ class FullDisk:
 def full_from(disk: FullDisk, reporter, at: int):
     stepped = reporter.stepped
 
-    def step_on(step: int, figures: dict) -> None:
-        stepped(step, figures)
+    def step_on(step: int, metrics: dict) -> None:
+        stepped(step, metrics)
         disk.is_full = step >= at
 
     reporter.stepped = step_on
@@ -133,15 +133,15 @@ def test_where_neither_record_nor_checkpoint_can_be_written_both_are_named(tmp_p
     disk = FullDisk(monkeypatch)
 
     def no_checkpoint() -> None:
-        with journal.before_a_checkpoint():
+        with log.before_a_checkpoint():
             raise InputError(where="step-00000001", found="it cannot be written")
 
-    with MetricsLog(tmp_path, first_step=0) as journal:
+    with MetricsLog(tmp_path, first_step=0) as log:
         with pytest.raises(InputError, match=r"^step-00000001: it cannot be written"):
             no_checkpoint()
         disk.is_full = True
-        journal.write("train", 1, {"loss": 0.5})
-        assert journal.is_behind
+        log.write("train", 1, {"loss": 0.5})
+        assert log.is_behind
         with pytest.raises(InputError, match=r"metrics\.jsonl: .*No space left.*step-00000001: it cannot be written"):
             no_checkpoint()
 
@@ -156,18 +156,18 @@ def test_a_flush_that_failed_is_not_taken_for_done_when_the_next_one_is(tmp_path
         real(handle)
 
     def checkpoint() -> None:
-        with journal.before_a_checkpoint():
+        with log.before_a_checkpoint():
             pass
 
-    with MetricsLog(tmp_path, first_step=0) as journal:
+    with MetricsLog(tmp_path, first_step=0) as log:
         monkeypatch.setattr(os, "fsync", fsync)
         with pytest.raises(InputError, match="Input/output error"):
             checkpoint()
 
 
 def test_what_json_cannot_hold_becomes_null(tmp_path: Path) -> None:
-    with MetricsLog(tmp_path, first_step=0) as journal:
-        journal.write("train", 1, {"loss": float("nan")})
+    with MetricsLog(tmp_path, first_step=0) as log:
+        log.write("train", 1, {"loss": float("nan")})
     assert next(read_metrics_log(tmp_path / "metrics.jsonl"))["loss"] is None
 
 
@@ -176,19 +176,19 @@ def test_trackers_get_each_row_and_are_closed_with_the_journal(tmp_path: Path) -
         def __init__(self) -> None:
             self.said: list[object] = []
 
-        def log(self, figures: Mapping[str, float], step: int) -> None:
-            self.said.append((step, dict(figures)))
+        def log(self, metrics: Mapping[str, float], step: int) -> None:
+            self.said.append((step, dict(metrics)))
             raise RuntimeError("disk quota")
 
         def close(self) -> None:
             self.said.append("closed")
 
     working, broken = Tracker(), Tracker()
-    working.log = lambda figures, step: working.said.append((step, dict(figures)))  # type: ignore[method-assign]
+    working.log = lambda metrics, step: working.said.append((step, dict(metrics)))  # type: ignore[method-assign]
     trackers = Trackers({"working": lambda: working, "broken": lambda: broken})
-    with MetricsLog(tmp_path, first_step=0, trackers=trackers) as journal:
-        journal.write("train", 1, {"loss": 0.5})
-        journal.write("train", 2, {"loss": 0.25})
+    with MetricsLog(tmp_path, first_step=0, trackers=trackers) as log:
+        log.write("train", 1, {"loss": 0.5})
+        log.write("train", 2, {"loss": 0.25})
     assert steps(tmp_path) == [1, 2]
     assert working.said == [(1, {"train/loss": 0.5}), (2, {"train/loss": 0.25}), "closed"]
     assert broken.said == [(1, {"train/loss": 0.5})], "one that failed is left alone"

@@ -37,7 +37,7 @@ def config(make_config, home: Path):  # type: ignore[no-untyped-def]
     return parse_config({**values, "run_dir": "run"}, where=str(home))
 
 
-def test_a_run_is_measured_from_anywhere_with_the_same_figures(config, home, reporter, monkeypatch) -> None:
+def test_a_run_is_measured_from_anywhere_with_the_same_metrics(config, home, reporter, monkeypatch) -> None:
     train(config, reporter)
     as_written = (home / "run/config.yaml").read_text()
     here = evaluate_subject("run", ASKED).evaluation

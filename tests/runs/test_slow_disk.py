@@ -11,7 +11,7 @@ import pytest
 
 from same_run import assert_same_run
 from vjepa2_ac.runs import slow_disk
-from vjepa2_ac.runs.slow_disk import said_if_stalled
+from vjepa2_ac.runs.slow_disk import warn_if_stalled
 from vjepa2_ac.training.loop import train
 
 
@@ -58,7 +58,7 @@ def test_a_run_on_a_disk_that_stalls_says_so_and_goes_on(
 def test_a_disk_that_answers_is_not_spoken_of(said, tmp_path: Path) -> None:
     before = threading.active_count()
     for _ in range(3):
-        with said_if_stalled(tmp_path, after_s=60.0):
+        with warn_if_stalled(tmp_path, after_s=60.0):
             pass
     wait_until(lambda: threading.active_count() <= before)
     assert said() == []
@@ -66,7 +66,7 @@ def test_a_disk_that_answers_is_not_spoken_of(said, tmp_path: Path) -> None:
 
 def test_what_stalls_and_then_fails_is_said_and_fails(said, tmp_path: Path) -> None:
     def stall_and_fail() -> None:
-        with said_if_stalled(tmp_path, after_s=0.01):
+        with warn_if_stalled(tmp_path, after_s=0.01):
             wait_until(said)
             raise OSError(5, "Input/output error")
 

@@ -1,4 +1,4 @@
-"""Trackers get the figures, and go on in the same run; one that fails costs a warning and nothing else."""
+"""Trackers get the metrics, and go on in the same run; one that fails costs a warning and nothing else."""
 
 import logging
 import sys
@@ -48,10 +48,10 @@ class Kept:
         self.fails_in = fails_in
         self.closed = 0
 
-    def log(self, figures: Mapping[str, float], step: int) -> None:
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
         if self.fails_in == "log":
             raise ConnectionError("the network\nis away")
-        self.rows.append((step, dict(figures)))
+        self.rows.append((step, dict(metrics)))
 
     def close(self) -> None:
         self.closed += 1
@@ -71,7 +71,7 @@ def warnings_in(caplog: pytest.LogCaptureFixture) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_figures_come_by_name_and_lists_number_by_number() -> None:
+def test_metrics_come_by_name_and_lists_number_by_number() -> None:
     kept = Kept()
     trackers = Trackers({"one": lambda: kept})
     trackers.log("validation", 7, {"error": 0.5, "by_horizon": [1.0, 2.0], "nothing": float("nan"), "words": "no"})
@@ -122,9 +122,9 @@ def test_one_that_takes_minutes_holds_up_nothing_and_gets_all_in_the_end(caplog)
     slow, goes_on = Kept(), threading.Event()
     taken = slow.log
 
-    def log(figures: Mapping[str, float], step: int) -> None:
+    def log(metrics: Mapping[str, float], step: int) -> None:
         assert goes_on.wait(60)
-        taken(figures, step)
+        taken(metrics, step)
 
     slow.log = log  # type: ignore[method-assign]
     trackers = Trackers({"slow": lambda: slow}, opening_s=0.05, closing_s=60.0)
@@ -135,7 +135,7 @@ def test_one_that_takes_minutes_holds_up_nothing_and_gets_all_in_the_end(caplog)
     trackers.log("train", 100, {"loss": 0.5})
     trackers.log("train", 101, {"loss": 0.5})
     assert time.monotonic() - started < 30, "none was waited for"
-    assert warnings_in(caplog) == ["slow failed (no answer within 0.05 s); its figures wait"]
+    assert warnings_in(caplog) == ["slow failed (no answer within 0.05 s); its metrics wait"]
     goes_on.set()
     trackers.close()
     assert [step for step, _ in slow.rows] == list(range(102))

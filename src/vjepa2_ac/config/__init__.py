@@ -1,4 +1,4 @@
-"""Which knobs are there? Every one, once: its type, range, default and meaning. `config.loading` reads them."""
+"""Config knobs: each is defined once, with type, range, default and meaning. `config.loading` reads them."""
 
 from vjepa2_ac.config.data import AugmentConfig, DataConfig, DiskCacheConfig, IdleConfig
 from vjepa2_ac.config.model import AdapterConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes

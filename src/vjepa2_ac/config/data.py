@@ -1,4 +1,4 @@
-"""Which knobs has the data? The form it is in, and which clips are made of it."""
+"""Data knobs: the form of the data set, and the clips that are made of it."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class AugmentConfig(Section):
     """Random changes of training clips, the same for all frames of a clip. The released recipe has none."""
 
     crop_scale: tuple[Annotated[float, Field(gt=0.0, le=1.0)], Annotated[float, Field(gt=0.0, le=1.0)]] | None = None
-    """Random resized crop: least and greatest share of the picture's area; null: no random crop."""
+    """Random resized crop: least and greatest share of the frame's area; null: no random crop."""
     crop_aspect: tuple[Annotated[float, Field(gt=0.0)], Annotated[float, Field(gt=0.0)]] = (0.75, 1.35)
     """Random resized crop: narrowest and widest width over height."""
     brightness: Share = 0.0
@@ -100,7 +100,7 @@ class DiskCacheConfig(Section):
     dir: Local | None = None
     """Folder; null: $VJEPA2_AC_CACHE, or vjepa2-ac in the user's cache folder."""
     limit_gb: Annotated[float, Field(ge=0.0)] = 50.0
-    """Pictures beyond this size go, least recently used first; 0: none are kept. Indexes do not count."""
+    """Frames beyond this size go, least recently used first; 0: none are kept. Indexes do not count."""
 
 
 class DataConfig(Section):
@@ -121,7 +121,7 @@ class DataConfig(Section):
     camera: _CameraName | tuple[_CameraName, ...] | None = None
     """Which camera the model sees; of several, one is drawn for each clip. null: the source's first, for DROID the left
     exterior camera, which the released weights saw. rlds, lerobot: a name in `cameras`. droid_raw: left, right, wrist,
-    ext1, ext2 or a serial number. npz: the name of an array of pictures."""
+    ext1, ext2 or a serial number. npz: the name of an array of frames."""
     states: Literal["pose", "vector"] = "pose"
     """What a state is. pose: 7 numbers, position, rotation and gripper, which the released weights know. vector: the
     source's own numbers as they are, of any width, for other robots: two arms, joints, a mobile base."""
@@ -163,7 +163,7 @@ class DataConfig(Section):
     pose_frame: Literal["base", "camera"] = "base"
     """Frame of the poses: the robot's base (the released recipe), or the camera, where its extrinsics are known."""
     crop: Literal["released", "square", "letterbox"] = "released"
-    """What becomes of a picture that is not square. released: its centre, 1.35 times as wide as high at most, squashed.
+    """What becomes of a frame that is not square. released: its centre, 1.35 times as wide as high at most, squashed.
     square: its central square (upstream's evaluation). letterbox: all of it, with black bars."""
     augment: AugmentConfig = AugmentConfig()
     """Random changes of training clips."""
@@ -202,7 +202,7 @@ class DataConfig(Section):
         if self.source == "latents" and (self.cache != "off" or is_url(self.path)):
             raise ValueError("source latents is itself a cache, in a folder on this machine: set cache: off")
         if self.augment.is_on and (self.source == "latents" or self.cache != "off"):
-            raise ValueError("augment changes pictures, and latents that are cached are of unchanged ones: choose one")
+            raise ValueError("augment changes frames, and latents that are cached are of unchanged ones: choose one")
         if self.validation_share + self.test_share >= 1.0:
             raise ValueError("validation_share and test_share leave nothing to train on")
         if self.pose_frame == "camera" and self.source in {"rlds", "lerobot"}:

@@ -1,4 +1,4 @@
-"""What is wrong with a config, in words? Everything at once, and what was probably meant."""
+"""Config errors as messages: all of them at once, with suggestions for misspelled names."""
 
 from __future__ import annotations
 
@@ -60,8 +60,8 @@ def wrong_values(values: Mapping[str, Any], error: ValidationError) -> list[str]
     left, found, taken = json.loads(json.dumps(values)), error.errors(include_url=False)[:_MOST_LINES], set[str]()
     lines: list[str] = []
     for _ in range(_ROUNDS):
-        told = _told_once([one for one in found if not _is_about(one, taken)])
-        lines += [line for line in told if line not in lines]
+        messages = _messages_of([one for one in found if not _is_about(one, taken)])
+        lines += [line for line in messages if line not in lines]
         if len(lines) >= _MOST_LINES:
             return [*lines[:_MOST_LINES], "and more, which are not looked at before these are right"]
         before = json.dumps(left)
@@ -88,8 +88,8 @@ def all_keys(section: type[BaseModel] = Config, prefix: str = "") -> list[str]:
     return keys
 
 
-def _told_once(details: Sequence[Any]) -> list[str]:
-    """Return a line for each value that is wrong: what may be of several kinds is told once, not for each kind."""
+def _messages_of(details: Sequence[Any]) -> list[str]:
+    """Return a line for each value that is wrong: what may be of several kinds is messages once, not for each kind."""
     kinds: dict[tuple[Any, ...], list[Any]] = {}
     for detail in details:
         kinds.setdefault(_union_of(detail["loc"]) or (*detail["loc"], detail["msg"]), []).append(detail)
@@ -106,7 +106,7 @@ def _told_once(details: Sequence[Any]) -> list[str]:
 def _explain(detail: Any) -> str:
     path = ".".join(_places(detail["loc"]))
     if detail["type"] == "extra_forbidden":
-        meant = _meant(detail["loc"])
+        meant = _probably_meant(detail["loc"])
         hint = f"did you mean {meant}?" if meant else f"known here: {', '.join(_keys_at(detail['loc'][:-1]))}"
         return f"{path}: unknown key; {hint}"
     if detail["type"] == "missing" and isinstance(detail["loc"][-1], int):
@@ -133,7 +133,7 @@ def _union_of(location: Sequence[Any]) -> tuple[Any, ...] | None:
     return None
 
 
-def _meant(location: Sequence[Any]) -> str | None:
+def _probably_meant(location: Sequence[Any]) -> str | None:
     """Return the key that was probably meant by an unknown one; with its section where that is another."""
     name, here = str(location[-1]), "".join(f"{part}." for part in location[:-1])
     known = [key.removeprefix(here) for key, names in _ALSO_CALLED.items() if name in names]
@@ -160,7 +160,7 @@ def _take_out(values: dict[str, Any], detail: Any) -> set[str]:
             names |= _delete(values, path, whole=True)
         return names
     names |= _delete(values, location, whole=False)
-    if detail["type"] == "extra_forbidden" and (meant := _meant(location)):
+    if detail["type"] == "extra_forbidden" and (meant := _probably_meant(location)):
         names.add(meant.split(".")[-1])
     return names
 

@@ -1,4 +1,4 @@
-"""How is a config read? Strict YAML with dotted overrides; all that is wrong is reported at once, with its path."""
+"""Config loading: strict YAML with dotted overrides; all errors are reported at once, with their paths."""
 
 from __future__ import annotations
 

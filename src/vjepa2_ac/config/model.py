@@ -1,4 +1,4 @@
-"""Which knobs has the model, and what is trained of it?"""
+"""Model knobs: the base model, and which parts of it are trained."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which knobs has a decision: how far ahead, by which planner, within which limits, towards what?"""
+"""Planning knobs: horizon, planner, limits and objective of a decision."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ class PlanningConfig(Section):
     """The same of the gripper, in closedness: beyond its limit as upstream, where samples then gather."""
     budget_s: Positive | None = None
     """Seconds of search after which the best plan so far is taken: no iteration begins that would not end by then. The
-    first always runs. Encoding the picture is not counted. null: all iterations run."""
+    first always runs. Encoding the frame is not counted. null: all iterations run."""
     warm_start: bool = False
     """Whether a decision begins from the last one's plan, shifted by what was done of it. Not at horizon 1, where the
     last action is all there is of it: the arm overshoots (docs/log.md)."""

@@ -1,4 +1,4 @@
-"""Which knobs make a complete run?"""
+"""Run config: the sections that make up a complete run."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Config(Section):
     checkpoint: CheckpointConfig = CheckpointConfig()
     """What is kept of a run."""
     tracking: TrackingConfig = TrackingConfig()
-    """Where figures go."""
+    """Where metrics go."""
     planning: PlanningConfig = PlanningConfig()
     """How a robot is steered afterwards; training does not heed it."""
 

@@ -1,4 +1,4 @@
-"""What is a group of knobs? Frozen, strict, every knob documented."""
+"""Base class of config sections: frozen, strict, every knob documented."""
 
 from __future__ import annotations
 

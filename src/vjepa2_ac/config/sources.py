@@ -1,4 +1,4 @@
-"""Knobs of the sources: where does each form of data keep what the model needs?"""
+"""Source knobs: where each form of data stores what the model needs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class RldsFields(Section):
         "exterior_2_left": "steps/observation/exterior_image_2_left",
         "wrist_left": "steps/observation/wrist_image_left",
     }
-    """Camera name -> feature with its pictures."""
+    """Camera name -> feature with its frames."""
     language: str | None = "steps/language_instruction"
     """Feature kept in the episode's metadata; the model does not use it."""
     joint_velocity: str | None = "steps/action_dict/joint_velocity"

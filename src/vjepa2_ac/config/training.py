@@ -1,4 +1,4 @@
-"""Which knobs has the way the weights change, and what is kept of it?"""
+"""Training knobs: optimisation, validation, checkpoints and logging."""
 
 from __future__ import annotations
 
@@ -124,7 +124,7 @@ class CheckpointConfig(Section):
 
 
 class TrackingConfig(Section):
-    """Where figures go, besides metrics.jsonl in the run folder."""
+    """Where metrics go, besides metrics.jsonl in the run folder."""
 
     tensorboard: bool = True
     """Event files in RUN/tensorboard."""

@@ -1,1 +1,1 @@
-"""Which clips, and in which order?"""
+"""Data sets as clips: sources, filters, clip order, inspection."""

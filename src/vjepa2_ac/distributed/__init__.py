@@ -1,1 +1,1 @@
-"""Processes and devices: how is a run launched, and how do its processes work together?"""
+"""Processes and devices: how a run is launched, and how its processes work together."""

@@ -1,7 +1,7 @@
-"""How do several processes make one run? They share the row of clips, add up their gradients, and the first one writes.
+"""Collective operations of a run's processes: they share the clips, sum their gradients, and the first one writes.
 
 Started by torchrun, by `accelerate launch`, or by anything else that sets RANK, LOCAL_RANK, WORLD_SIZE, MASTER_ADDR and
-MASTER_PORT. Gradients are added up once an optimizer step, after the last micro-batch, and not by a wrapper around the
+MASTER_PORT. Gradients are summed once per optimizer step, after the last micro-batch, and not by a wrapper around the
 model: a process may have no clip in a micro-batch (`data.broken_episodes: skip`), and would leave a wrapper waiting.
 """
 

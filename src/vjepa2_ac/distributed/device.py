@@ -1,4 +1,4 @@
-"""On what does a config compute, and does that compute in its types? Asked before anything is loaded."""
+"""The device of a config, and whether it supports the config's types: checked before anything is loaded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The launch: on which device and in which precision does a run compute, and in how many processes?"""
+"""The launch of a run: its device, precision and number of processes."""
 
 from __future__ import annotations
 

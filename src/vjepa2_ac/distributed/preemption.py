@@ -1,11 +1,11 @@
-"""Was the run asked to stop? SIGTERM, SIGINT (Ctrl-C), SIGUSR1 and SIGHUP ask; the loop stops where it can go on from.
+"""Stop requests by SIGTERM, SIGINT (Ctrl-C), SIGUSR1 and SIGHUP: the loop stops where it can be resumed.
 
-The first signal is noted: the loop finishes its optimizer step, and the validation that is due after it, writes a
-checkpoint and raises `StoppedError`. The command line then exits with `EXIT_STATUS`. A second signal means now: it does
-what it would do without this file, which ends the process; checkpoints are whole or absent, whenever that happens.
+The first signal is recorded: the loop finishes its optimizer step, and the validation that is due after it, writes a
+checkpoint and raises `StoppedError`. The command line then exits with `EXIT_STATUS`. A second signal stops at once: it
+has its default effect, which ends the process; checkpoints are complete or absent, whenever that happens.
 
-SIGHUP says that the terminal is gone, which nobody means twice: shell and kernel send one each, and only the first
-counts. Who wants the run to outlive its terminal starts it with `nohup` or in tmux.
+SIGHUP means that the terminal is gone: shell and kernel send one each, so only the first counts. To let a run outlive
+its terminal, start it with `nohup` or in tmux.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class StopRequest:
     """Says whether a signal has asked to stop, and which.
 
     Args:
-        same_within_s: Another signal so soon is the same wish: `timeout` and some launchers signal the process and its
-            group, which gets two to the process.
+        same_within_s: Another signal within this time is the same request: `timeout` and some launchers signal both the
+            process and its group, so the process gets two.
     """
 
     def __init__(self, same_within_s: float) -> None:

@@ -1,4 +1,4 @@
-"""Is there room for the batches that workers send home? They lie in /dev/shm, of which a container has little."""
+"""Shared memory check: room in /dev/shm for the batches of the loader's workers. Containers often have little."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vjepa2_ac.distributed.collectives import all_gather_object
 from vjepa2_ac.episode import Batch
 
 SHARED_MEMORY = "/dev/shm"  # noqa: S108  # where PyTorch puts them on Linux
-_CLIPS_TRIED = 8  # one is read; the others are for where data.broken_episodes passes over it
+_MOST_CLIPS_READ = 8  # one is read; the others are for where data.broken_episodes passes over it
 _GIGABYTE, _MEGABYTE = 10**9, 10**6
 
 
@@ -35,15 +35,15 @@ class FileSystem(Protocol):
         ...
 
 
-def say_if_shared_memory_is_small(
-    config: Config, dataset: Dataset, pictured: Batch, accelerator: Accelerator, note: Callable[[str], None]
+def warn_if_shared_memory_is_small(
+    config: Config, dataset: Dataset, batch_of_frames: Batch, accelerator: Accelerator, note: Callable[[str], None]
 ) -> None:
     """Note before the first step where batches of this run may not fit. All processes have to call.
 
     Args:
         config: The run.
         dataset: Its clips.
-        pictured: One of them, as it was before they came from a cache of latents.
+        batch_of_frames: A batch of them with frames, from before they came from a cache of latents.
         accelerator: Tells how many processes are on this machine.
         note: Told.
     """
@@ -51,9 +51,9 @@ def say_if_shared_memory_is_small(
     processes = all_gather_object(accelerator, here).count(here)
     if not config.data.workers:
         return
-    clip = pictured
-    if pictured.latents is None and dataset.config.source == "latents":
-        clip = next(validation_batches(dataset, "train", clips=_CLIPS_TRIED, batch_size=1))
+    clip = batch_of_frames
+    if batch_of_frames.latents is None and dataset.config.source == "latents":
+        clip = next(validation_batches(dataset, "train", clips=_MOST_CLIPS_READ, batch_size=1))
     text = small_shared_memory(config, clip.nbytes, processes)
     if text is not None:
         note(text)

@@ -15,7 +15,7 @@ from jaxtyping import UInt8
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.clips.clip_reader import pictures_of
+from vjepa2_ac.data.clips.clip_reader import frames_of
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.streams import copies_for
@@ -227,7 +227,7 @@ def _clips(
 
 def _pictures(dataset: Dataset, batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"]:
     """Return what the encoder sees of a clip; of cached latents, small pictures made large."""
-    return seen_by_the_encoder(torch.from_numpy(pictures_of(dataset, batch, row)), size)
+    return seen_by_the_encoder(torch.from_numpy(frames_of(dataset, batch, row)), size)
 
 
 def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:

@@ -1,1 +1,1 @@
-"""Images and video: how are they decoded and written? JPEG, image files, MP4."""
+"""Images and video, decoded and written: JPEG, image files, MP4."""

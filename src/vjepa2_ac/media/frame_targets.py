@@ -1,4 +1,4 @@
-"""Which pictures of a video are still to be decoded, and from what file? The parts of `video` that know no libav."""
+"""Frames of a video that are still to be decoded, and their file. The parts of `video_reader` that need no libav."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Any
 
 
 class FrameTargets:
-    """The times whose pictures are wanted, and the pictures found so far.
+    """The times whose frames are wanted, and the frames found so far.
 
     Args:
         targets: Times, ascending.
-        tolerance: How far from a target a picture's time may lie.
+        tolerance: How far from a target a frame's time may lie.
     """
 
     def __init__(self, targets: list[int], tolerance: int) -> None:
@@ -21,12 +21,12 @@ class FrameTargets:
 
     @property
     def count(self) -> int:
-        """How many pictures are wanted."""
+        """How many frames are wanted."""
         return len(self._targets)
 
     @property
     def first(self) -> int | None:
-        """The first time whose picture is missing."""
+        """The first time whose frame is missing."""
         return next((target for target in self._targets if target not in self.frames), None)
 
     @property
@@ -41,7 +41,7 @@ class FrameTargets:
         return self._targets[place] if found else None
 
     def feed(self, time: int) -> None:
-        """Note that the decoder is given the packet of the picture that is shown at a time."""
+        """Note that the decoder is given the packet of the frame that is shown at a time."""
         target = self.target_of(time)
         if target is not None:
             self._fed.add(target)

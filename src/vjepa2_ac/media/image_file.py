@@ -1,4 +1,4 @@
-"""How does a picture in a file become pixels? PNG and JPEG, in RGB."""
+"""Image files as pixels: PNG and JPEG, in RGB."""
 
 from __future__ import annotations
 
@@ -25,40 +25,40 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
     """Return the RGB pixels of a PNG or JPEG file.
 
     Raises:
-        InputError: There is no such file, it cannot be read, or it is no such picture.
+        InputError: There is no such file, it cannot be read, or it is no such image.
     """
     try:
         data = read_bytes(path)
     except OSError as error:
-        raise unreadable(str(path), error, needed="a picture: PNG or JPEG") from None
+        raise unreadable(str(path), error, needed="an image: PNG or JPEG") from None
     return decode_image(data, str(path))
 
 
-def decode_image(picture: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
     """Return the RGB pixels of PNG or JPEG bytes; transparency is left out.
 
     Raises:
         InputError: They are neither, damaged, too large, or of more than 8 bits a channel.
     """
     try:
-        if picture.startswith(_JPEG):
-            return _jpeg(picture, where)
-        with PngImageFile(io.BytesIO(picture)) as image:  # which reads the header only
+        if data.startswith(_JPEG):
+            return _jpeg(data, where)
+        with PngImageFile(io.BytesIO(data)) as image:  # which reads the header only
             require_bounded(image.height, image.width, where)
             return _as_rgb(image)
     except (OSError, ValueError, SyntaxError, struct.error, zlib.error, EOFError, IndexError) as error:
         raise InputError(
             where=where,
-            found=f"{len(picture)} bytes that are no picture, starting with {picture[:4]!r} ({error})",
+            found=f"{len(data)} bytes that are no image, starting with {data[:4]!r} ({error})",
             needed="PNG or JPEG",
         ) from None
 
 
-def _jpeg(picture: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    height, width, _, _ = simplejpeg.decode_jpeg_header(picture)
+def _jpeg(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
+    height, width, _, _ = simplejpeg.decode_jpeg_header(data)
     require_bounded(height, width, where)
-    require_few_scans(picture, height, width, where)
-    return np.asarray(simplejpeg.decode_jpeg(picture, colorspace="RGB"))
+    require_few_scans(data, height, width, where)
+    return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB"))
 
 
 def _as_rgb(image: Image.Image) -> UInt8[np.ndarray, "height width 3"]:

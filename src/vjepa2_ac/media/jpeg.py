@@ -1,4 +1,4 @@
-"""How do the JPEGs of a camera become pixels, those that are asked for, and pixels a JPEG?"""
+"""JPEG decoding of the requested camera images, and JPEG encoding."""
 
 from __future__ import annotations
 
@@ -12,61 +12,59 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_size import require_bounded, require_few_scans
 
 
-def decode_jpegs(
-    pictures: Sequence[bytes], steps: Sequence[int], where: str
-) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return pictures as RGB, equal to TensorFlow's decoder bit for bit.
+def decode_jpegs(images: Sequence[bytes], steps: Sequence[int], where: str) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return images as RGB, equal to TensorFlow's decoder bit for bit.
 
     Args:
-        pictures: One JPEG or more, all of one size.
+        images: One JPEG or more, all of one size.
         steps: Control step of each, for messages.
         where: File, episode and camera, for messages.
 
     Raises:
-        InputError: A picture is not a JPEG, is too large, or differs in size from the first one.
+        InputError: An image is not a JPEG, is too large, or differs in size from the first one.
     """
-    height, width = _size_of(pictures[0], steps[0], where)
-    require_bounded(height, width, f"{where}: step {steps[0]}", count=len(pictures))
-    frames = np.empty((len(pictures), height, width, 3), np.uint8)  # decoded in place: half the time of stacking
-    for frame, picture, step in zip(frames, pictures, steps, strict=True):
-        size = _size_of(picture, step, where)
+    height, width = _size_of(images[0], steps[0], where)
+    require_bounded(height, width, f"{where}: step {steps[0]}", count=len(images))
+    frames = np.empty((len(images), height, width, 3), np.uint8)  # decoded in place: half the time of stacking
+    for frame, image, step in zip(frames, images, steps, strict=True):
+        size = _size_of(image, step, where)
         if size != (height, width):
             raise InputError(
                 where=f"{where}: step {step}",
-                found=f"a picture of {size[0]}x{size[1]}",
+                found=f"an image of {size[0]}x{size[1]}",
                 needed=f"{height}x{width} as at step {steps[0]}",
             )
-        require_few_scans(picture, height, width, f"{where}: step {step}")
+        require_few_scans(image, height, width, f"{where}: step {step}")
         try:
-            simplejpeg.decode_jpeg(picture, colorspace="RGB", fastdct=True, buffer=frame)
+            simplejpeg.decode_jpeg(image, colorspace="RGB", fastdct=True, buffer=frame)
         except ValueError as error:
-            raise _no_jpeg(picture, step, where, error) from None
+            raise _no_jpeg(image, step, where, error) from None
     return frames
 
 
-def _size_of(picture: bytes, step: int, where: str) -> tuple[int, int]:
+def _size_of(image: bytes, step: int, where: str) -> tuple[int, int]:
     try:
-        height, width, _, _ = simplejpeg.decode_jpeg_header(picture)
+        height, width, _, _ = simplejpeg.decode_jpeg_header(image)
     except ValueError as error:
-        raise _no_jpeg(picture, step, where, error) from None
+        raise _no_jpeg(image, step, where, error) from None
     return height, width
 
 
-def _no_jpeg(picture: bytes, step: int, where: str, error: ValueError) -> InputError:
+def _no_jpeg(image: bytes, step: int, where: str, error: ValueError) -> InputError:
     return InputError(
         where=f"{where}: step {step}",
-        found=f"{len(picture)} bytes that are not a JPEG, starting with {bytes(picture[:4])!r} ({error})",
-        needed="a JPEG picture",
+        found=f"{len(image)} bytes that are not a JPEG, starting with {bytes(image[:4])!r} ({error})",
+        needed="a JPEG image",
     )
 
 
-def looks_like_jpeg(picture: bytes) -> bool:
+def looks_like_jpeg(image: bytes) -> bool:
     """Return whether bytes begin and end as a JPEG does."""
-    return picture.startswith(b"\xff\xd8\xff") and picture.endswith(b"\xff\xd9")
+    return image.startswith(b"\xff\xd8\xff") and image.endswith(b"\xff\xd9")
 
 
 def encode_jpeg(frame: UInt8[np.ndarray, "height width 3"], *, quality: int = 95) -> bytes:
-    """Return an RGB picture as JPEG; the default quality is TFDS's."""
+    """Return an RGB image as JPEG; the default quality is TFDS's."""
     return bytes(
         simplejpeg.encode_jpeg(np.ascontiguousarray(frame), quality=quality, colorspace="RGB", colorsubsampling="420")
     )

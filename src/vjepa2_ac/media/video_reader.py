@@ -1,7 +1,7 @@
-"""Which pictures does a video hold at these places? An MP4 decoded where it must be, and nowhere else.
+"""Video frames at given positions: an MP4 is decoded only where needed.
 
-A picture is known by its presentation time, never by counting at the rate that the header states: the header's rate is
-often wrong (DROID's), and pictures are stored in another order than they are shown (B-frames).
+A frame is identified by its presentation time, never by counting at the rate in the header: that rate is often wrong
+(DROID's), and frames are stored in another order than they are shown (B-frames).
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
 
 _DEMUXER = "mp4"  # by name: libav would otherwise follow play lists to other files
 _STRICT = {
-    "err_detect": "crccheck+bitstream+buffer+explode",  # an error rather than a guessed picture
+    "err_detect": "crccheck+bitstream+buffer+explode",  # an error rather than a guessed frame
     "max_pixels": str(MOST_PIXELS),
 }
-_START = -(1 << 40)  # before every picture
+_START = -(1 << 40)  # before every frame
 _FIX = "Copy the file again, or leave the episode out"
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Where an episode's pictures lie in a file that holds many: step k is shown at start_s + k / rate_hz."""
+    """Where an episode's frames lie in a file that holds many: step k is shown at start_s + k / rate_hz."""
 
     start_s: float
     rate_hz: float
@@ -49,18 +49,18 @@ class Clock:
 def read_frames(
     file: str | Path | ByteReader, steps: Sequence[int], *, where: str, clock: Clock | None = None
 ) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return the RGB pictures at these places of a video, in this order; places may repeat.
+    """Return the RGB frames at these places of a video, in this order; places may repeat.
 
-    From the key frame before a picture, everything up to it must be decoded; only what was asked for becomes RGB.
+    Decoding starts at the key frame before a requested frame; only requested frames become RGB.
 
     Args:
         file: Local path, URL, or a file that is open to read; an open one stays open.
-        steps: Places in the order in which pictures are shown, the first being 0; with a clock, its steps.
+        steps: Places in the order in which frames are shown, the first being 0; with a clock, its steps.
         where: The file and its episode, as an error names them.
-        clock: The times of the steps, where places do not tell the pictures.
+        clock: The times of the steps, where places do not tell the frames.
 
     Raises:
-        InputError: Not a video, damaged, without such pictures, or of a codec that cannot be decoded.
+        InputError: Not a video, damaged, without such frames, or of a codec that cannot be decoded.
         OSError: A file behind a URL cannot be read.
         ValueError: No steps, or one before the first.
     """
@@ -70,13 +70,13 @@ def read_frames(
         targets = video.targets_at(steps) if clock is None else video.targets_by(clock, steps)
         frames = video.decode(sorted(set(targets)), clock)
         if len(sizes := {frame.shape for frame in frames.values()}) > 1:
-            found = f"pictures of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
-            raise InputError(where=where, found=found, needed="pictures of one size", fix=_FIX)
+            found = f"frames of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
+            raise InputError(where=where, found=found, needed="frames of one size", fix=_FIX)
         return np.stack([frames[target] for target in targets])
 
 
 def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
-    """Return how many pictures a video shows: what its index says, counted packet by packet where it has none.
+    """Return how many frames a video shows: what its index says, counted packet by packet where it has none.
 
     Raises:
         InputError: Not a video, or damaged.
@@ -133,7 +133,7 @@ def _require_readable(path: str | Path, where: str) -> None:
 def _video_of(container: InputContainer, converter: VideoReformatter, where: str) -> _Video:
     stream = container.streams.best("video")
     if stream is None:
-        raise InputError(where=where, found="no video in the file", needed="an MP4 with pictures", fix=_FIX)
+        raise InputError(where=where, found="no video in the file", needed="an MP4 with frames", fix=_FIX)
     if stream.codec_context is None:
         raise InputError(
             where=where,
@@ -152,20 +152,20 @@ class _Video:
 
     container: InputContainer
     stream: VideoStream
-    converter: VideoReformatter  # one for all pictures: making one takes as long as using it
+    converter: VideoReformatter  # one for all frames: making one takes as long as using it
     where: str
 
     @property
     def is_indexed(self) -> bool:
-        """Whether the file's header lists every picture (a fragmented MP4's does not)."""
+        """Whether the file's header lists every frame (a fragmented MP4's does not)."""
         return 0 < self.stream.frames == len(self.stream.index_entries)
 
     def stored_times(self) -> list[int]:
-        """Return when each picture is decoded, from the header: when it is shown, too, if no picture is moved."""
+        """Return when each frame is decoded, from the header: when it is shown, too, if no frame is moved."""
         return [entry.timestamp for entry in self.stream.index_entries if not entry.is_discard]
 
     def shown_times(self) -> list[int]:
-        """Return when each picture is shown, in order; goes through the whole file, decoding nothing."""
+        """Return when each frame is shown, in order; goes through the whole file, decoding nothing."""
         return sorted(int(packet.pts) for packet in self.packets() if packet.pts is not None and not packet.is_discard)
 
     def packets(self, seek_to: int = _START) -> Iterator[Packet[VideoStream]]:
@@ -174,21 +174,21 @@ class _Video:
         yield from (packet for packet in self.container.demux(self.stream) if packet.dts is not None)
 
     def is_reordered(self) -> bool:
-        """Return whether pictures are shown in another order than they are stored, as far as the start tells."""
+        """Return whether frames are shown in another order than they are stored, as far as the start tells."""
         first = next(self.packets(), None)
         return bool(self.stream.codec_context.has_b_frames) or first is None or first.pts != first.dts
 
     def targets_at(self, steps: Sequence[int]) -> list[int]:
-        """Return the times at which the pictures at these places are shown."""
+        """Return the times at which the frames at these places are shown."""
         in_header = self.is_indexed and not self.is_reordered()
         times = self.stored_times() if in_header else self.shown_times()
         if max(steps) >= len(times):
             raise InputError(
-                where=self.where, found=f"{len(times)} pictures", needed=f"at least {max(steps) + 1}", fix=_FIX
+                where=self.where, found=f"{len(times)} frames", needed=f"at least {max(steps) + 1}", fix=_FIX
             )
         if len(set(times)) < len(times):
             raise InputError(
-                where=self.where, found="pictures shown at the same time", needed="a time for each", fix=_FIX
+                where=self.where, found="frames shown at the same time", needed="a time for each", fix=_FIX
             )
         return [times[step] for step in steps]
 
@@ -196,12 +196,12 @@ class _Video:
         """Return the times that a clock gives to these steps."""
         times = {step: round((clock.start_s + step / clock.rate_hz) / self._unit_s) for step in steps}
         if len(set(times.values())) < len(times):
-            found = f"times in units of {self._unit_s:g} s for {clock.rate_hz:g} pictures a second"
+            found = f"times in units of {self._unit_s:g} s for {clock.rate_hz:g} frames a second"
             raise InputError(where=self.where, found=found, needed="a time for each", fix=_FIX)
         return [times[step] for step in steps]
 
     def decode(self, targets: list[int], clock: Clock | None) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
-        """Return the pictures shown at these ascending times; with a clock, the first within half a step of each."""
+        """Return the frames shown at these ascending times; with a clock, the first within half a step of each."""
         require_bounded(self.stream.height or 1, self.stream.width or 1, self.where, count=len(targets))
         wanted = FrameTargets(targets, 0 if clock is None else max(0, int(0.49 / clock.rate_hz / self._unit_s)))
         while (target := wanted.first) is not None:
@@ -211,7 +211,7 @@ class _Video:
                 seconds = target * self._unit_s
                 raise InputError(
                     where=self.where,
-                    found=f"no picture at {seconds:.3f} s",
+                    found=f"no frame at {seconds:.3f} s",
                     needed=f"one for each of {len(targets)} times from {targets[0] * self._unit_s:.3f} s on",
                     fix=_FIX,
                 )
@@ -260,10 +260,10 @@ class _Video:
                 continue
             if frame.is_corrupt:
                 time = f"{target * self._unit_s:.3f} s"
-                raise InputError(where=self.where, found=f"a damaged picture at {time}", needed="a whole MP4", fix=_FIX)
+                raise InputError(where=self.where, found=f"a damaged frame at {time}", needed="a whole MP4", fix=_FIX)
             require_bounded(frame.height, frame.width, self.where, count=wanted.count)
-            picture = self.converter.reformat(frame, format="rgb24", threads=1)
-            wanted.frames[target] = np.asarray(picture.to_ndarray())
+            converted = self.converter.reformat(frame, format="rgb24", threads=1)
+            wanted.frames[target] = np.asarray(converted.to_ndarray())
 
     @property
     def _unit_s(self) -> float:

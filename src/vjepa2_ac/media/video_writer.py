@@ -1,4 +1,4 @@
-"""How do pictures become a video that every player shows? H.264 in an MP4, written whole or not at all."""
+"""Video files that every player shows: H.264 in an MP4, written completely or not at all."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from vjepa2_ac.storage import atomic_writer
 _QUALITY = "20"  # x264's constant rate factor: text stays sharp
 
 
-def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height width 3"]], *, rate_hz: float) -> Path:
-    """Write RGB pictures as a video and return its path; an odd last row or column of pixels is left out.
+def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 3"]], *, rate_hz: float) -> Path:
+    """Write RGB frames as a video and return its path; an odd last row or column of pixels is left out.
 
     Args:
         path: A local file; missing folders are made.
-        pictures: Of one size, at least one.
+        frames: Of one size, at least one.
         rate_hz: How many are shown in a second.
 
     Raises:
         InputError: PyAV is not installed.
-        ValueError: No pictures, or of different sizes.
+        ValueError: No frames, or of different sizes.
     """
     av = video_library()
     size: tuple[int, int] | None = None
@@ -35,17 +35,17 @@ def write_video(path: str | Path, pictures: Iterable[UInt8[np.ndarray, "height w
             "libx264", rate=Fraction(rate_hz).limit_denominator(1000), options={"crf": _QUALITY, "preset": "medium"}
         )
         stream.pix_fmt = "yuv420p"  # what browsers can show
-        for picture in pictures:
-            even = picture[: picture.shape[0] // 2 * 2, : picture.shape[1] // 2 * 2]
+        for frame in frames:
+            even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
             if size is None:
                 size = even.shape[:2]
                 stream.height, stream.width = size
             elif even.shape[:2] != size:
-                raise ValueError(f"pictures of {size} and {even.shape[:2]} pixels in one video")
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
-            container.mux(stream.encode(frame))
+                raise ValueError(f"frames of {size} and {even.shape[:2]} pixels in one video")
+            encoded = av.VideoFrame.from_ndarray(np.ascontiguousarray(even), format="rgb24")
+            container.mux(stream.encode(encoded))
         if size is None:
-            raise ValueError("a video without pictures")
+            raise ValueError("a video without frames")
         container.mux(stream.encode(None))
     return Path(path)
 

@@ -1,1 +1,1 @@
-"""What does the network compute? Frames become latents, and latents and actions the latents of the next step."""
+"""The world model: frames become latents, and latents and actions become the latents of the next step."""

@@ -1,4 +1,4 @@
-"""Is every weight a finite number? Looked at where weights come in, and before they go out."""
+"""Check that every weight is finite, when weights are loaded and before they are saved."""
 
 from __future__ import annotations
 

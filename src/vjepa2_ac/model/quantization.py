@@ -1,8 +1,8 @@
-"""How does a predictor compute in 8 bits? A copy whose blocks have 8-bit weights and round what they are given.
+"""8-bit predictor for inference: a copy whose blocks have 8-bit weights and quantize their inputs.
 
-torchao's home. For inference only: weights have one scale an output, what goes into a layer one a token, found anew
-each time. Heads, norms and attention stay as they are, and compute in bfloat16: torchao's fp8 takes no other weights,
-and a model that may be rounded to 8 bits has no use for float32 around them.
+The only module that uses torchao. Weights have one scale per output, a layer's input one per token, computed each time.
+Heads, norms and attention are not quantized, and compute in bfloat16: torchao's fp8 accepts no other weights, and a
+model that may be rounded to 8 bits does not need float32 around them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What is kept of a run, so that it can go on exactly? Adapter, optimizer and step; never the frozen base.
+"""Checkpoints for an exact resume of a run: adapter, optimizer and step; never the frozen base.
 
 A checkpoint is a folder `step-00001000` with `manifest.json`, which holds the SHA-256 of every other file. It is
-written under a temporary name and renamed, so a folder that carries the final name is whole or was damaged later;
-the manifest tells. What is called otherwise, `step-00001000.bak` for one, is somebody's own and is left alone.
+written under a temporary name and renamed, so a folder with the final name is complete or was damaged later; the
+manifest shows which. A folder with any other name, such as `step-00001000.bak`, is the user's own and is left alone.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which checkpoint of a run is meant? The newest, the best by validation, or that of a step."""
+"""Checkpoint selection: the newest, the best by validation, or that of a step."""
 
 from __future__ import annotations
 

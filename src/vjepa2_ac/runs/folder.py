@@ -1,10 +1,10 @@
-"""What does a run's folder hold, and whose is it?
+"""The folder of a run: its files, and its owner.
 
 RUN/config.yaml         the resolved config, defaults and a chosen stride included
 RUN/environment.json    versions, machine, command and folder of every start
-RUN/calibration.json    figures of each stride, where data.stride was auto
+RUN/calibration.json    metrics of each stride, where data.stride was auto
 RUN/run_id              a name that no other run has
-RUN/metrics.jsonl       figures, a row per line
+RUN/metrics.jsonl       metrics, a row per line
 RUN/metrics.json        what `evaluate` measured; report.html and evaluation.png show it
 RUN/checkpoints/        step-XXXXXXXX folders
 RUN/tensorboard/        event files; RUN/wandb/ likewise

@@ -1,4 +1,4 @@
-"""What has a run learned? Load the model of one of its checkpoints."""
+"""Loading the model of a run's checkpoint."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Is another process training in this run's folder right now? Two would write over each other's checkpoints.
+"""The lock of a run's folder: two training processes would overwrite each other's checkpoints.
 
-The lock is on `RUN/.lock` and the kernel's (flock): it is gone when its process is, however that ended. The file stays,
-and says who was there last. It is never opened through a link: what that leads to would be cut off.
+The lock is a kernel lock (flock) on `RUN/.lock`: it is released when its process ends, however it ended. The file
+remains, and says who held it last. It is never opened through a link: the target of the link would be truncated.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Is every file of a folder what it was when it was written? A manifest with the SHA-256 of each tells."""
+"""Manifest of a folder: the SHA-256 of every file, to verify that none has changed since it was written."""
 
 from __future__ import annotations
 

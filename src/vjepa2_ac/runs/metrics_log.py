@@ -1,8 +1,8 @@
-"""Where do the figures of a run go? Into metrics.jsonl always, and on to its trackers.
+"""The metrics log of a run: rows go to metrics.jsonl always, and to its trackers.
 
-`metrics.jsonl` is the run's own record. Where it cannot be written, a full disk for one, rows wait, and are tried again
-at each further one. They have to be on the disk before the run is said to stand behind them: at the next checkpoint at
-the latest, which is due at once then. If even so they cannot be written the run ends, and says of what.
+`metrics.jsonl` is the run's own record. Where it cannot be written, on a full disk for example, rows wait, and are
+retried with each further row. They must be on the disk before the run relies on them: at the next checkpoint at the
+latest, which is then due at once. If they cannot be written even then, the run ends with an error that says why.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import METRICS
-from vjepa2_ac.runs.slow_disk import said_if_stalled
+from vjepa2_ac.runs.slow_disk import warn_if_stalled
 from vjepa2_ac.runs.trackers import Trackers
 from vjepa2_ac.storage import read_bounded, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import json_object
@@ -36,7 +36,7 @@ class MetricsLog:
     Args:
         run_dir: The run's folder.
         first_step: Rows after this step are from a part of the run that is now done again; they are dropped.
-        trackers: Closed with the journal; None: there are none.
+        trackers: Closed with the metrics log; None: there are none.
 
     Raises:
         InputError: The file cannot be written.
@@ -51,12 +51,12 @@ class MetricsLog:
         self._waiting = b""  # rows that could not be written yet; the first may be there by halves
         self._trackers = trackers or Trackers({})
 
-    def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
-        """Append one row: its kind (train, validation), its optimizer step, and figures (numbers or lists of them)."""
-        row = {"kind": kind, "step": step, **{key: _plain(value) for key, value in figures.items()}}
+    def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
+        """Append one row: its kind (train, validation), its optimizer step, and metrics (numbers or lists of them)."""
+        row = {"kind": kind, "step": step, **{key: _plain(value) for key, value in metrics.items()}}
         self._waiting += (json.dumps(row) + "\n").encode()
         self._write()
-        self._trackers.log(kind, step, figures)
+        self._trackers.log(kind, step, metrics)
 
     @property
     def is_behind(self) -> bool:
@@ -89,7 +89,7 @@ class MetricsLog:
         if not self._waiting:
             return None
         try:
-            with said_if_stalled(self.path):
+            with warn_if_stalled(self.path):
                 while self._waiting:
                     self._waiting = self._waiting[os.write(self._handle, self._waiting) :]
         except OSError as error:
@@ -100,14 +100,14 @@ class MetricsLog:
         if error := self._write():
             return error
         try:
-            with said_if_stalled(self.path):
+            with warn_if_stalled(self.path):
                 os.fsync(self._handle)
         except OSError as error:
             return error
         return None
 
     def __enter__(self) -> MetricsLog:
-        """Return the journal, open."""
+        """Return the metrics log, open."""
         return self
 
     def __exit__(
@@ -135,13 +135,13 @@ def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
         if type(row.get("step")) is int and isinstance(row.get("kind"), str):
             yield row
         else:
-            logger.warning("%s: a line is not a row of figures, or was left by halves; it is dropped", path)
+            logger.warning("%s: a line is not a row of metrics, or was left by halves; it is dropped", path)
 
 
 def _unwritable(path: Path, error: OSError, checkpoint: str) -> InputError:
     return InputError(
         where=str(path),
-        found=f"the latest figures cannot be written ({error.strerror or error}), and are lost",
+        found=f"the latest metrics cannot be written ({error.strerror or error}), and are lost",
         fix=f"{checkpoint}. Make room on the disk of the run, then resume: the same command goes on",
     )
 
@@ -152,7 +152,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def warnings_of(journal: Path) -> list[str]:
+def warnings_of(path: Path) -> list[str]:
     """Return what was said of a run, by its metrics.jsonl."""
-    rows = (row for row in read_metrics_log(journal) if row.get("kind") == WARNING)
+    rows = (row for row in read_metrics_log(path) if row.get("kind") == WARNING)
     return [row["text"] for row in rows if isinstance(row.get("text"), str)]

@@ -1,6 +1,6 @@
-"""Do the files of a run stay in its folder? What a link leads to elsewhere is not the run's to write, whoever made it.
+"""Link checks for the files of a run: a link to elsewhere is never written through, whoever made it.
 
-The folder itself may be a link, to another disk for one.
+The folder itself may be a link, to another disk for example.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From where are the relative paths in a run's config meant? From the folder that the run was started in."""
+"""Base folder of the relative paths in a run's config: the folder that the run was started in."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What is said while training waits for a disk that does not answer? A network disk may do so for minutes.
+"""Messages while training waits for a disk that does not answer: a network disk may block for minutes.
 
-A checkpoint and the figures before it have to be on the disk before training goes on: nobody can spare it the wait. But
-a run that stands still and says nothing looks like one that hangs.
+A checkpoint and the metrics before it must be on the disk before training continues: the wait cannot be avoided. But a
+run that stops without a message looks like one that hangs.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ STALLED_S = 60.0
 
 
 @contextmanager
-def said_if_stalled(path: Path, *, after_s: float | None = None) -> Iterator[None]:
+def warn_if_stalled(path: Path, *, after_s: float | None = None) -> Iterator[None]:
     """Warn where the block, which writes a file, lasts longer than that; and, when it ends, how long it took.
 
     Args:

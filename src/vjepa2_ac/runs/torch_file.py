@@ -1,4 +1,4 @@
-"""How is a torch file written on a disk that may be full, and read when anybody may have written it?"""
+"""Torch files: written on a disk that may be full, and read without trusting their content."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does a tracker get the figures of a run and never hold it up? In a thread of its own, out of a queue."""
+"""A tracker's thread: it takes the run's metrics from a queue, so that the tracker never blocks the run."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ MOST_ROWS = 10_000  # that wait: some 15 MB
 
 @runtime_checkable
 class Tracker(Protocol):
-    """Takes figures; may raise anything, and take any time."""
+    """Takes metrics; may raise anything, and take any time."""
 
-    def log(self, figures: Mapping[str, float], step: int) -> None:
-        """Take the figures of a row, named kind/figure, and its optimizer step."""
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
+        """Take the metrics of a row, named kind/metric, and its optimizer step."""
         ...
 
     def close(self) -> None:
@@ -42,21 +42,21 @@ class TrackerThread:
     def __init__(self, name: str, opening: Opening, *, patience_s: float) -> None:
         self._name, self._opening, self._patience_s = name, opening, patience_s
         self._rows: queue.SimpleQueue[tuple[Mapping[str, float], int] | None] = queue.SimpleQueue()
-        self._trouble, self._since_s = "cannot be opened", time.monotonic()  # of the call that is under way
+        self._problem, self._since_s = "cannot be opened", time.monotonic()  # of the call that is under way
         self._warned, self._dropped = False, 0
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
 
-    def log(self, figures: Mapping[str, float], step: int) -> None:
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
         """Let a row wait for its turn."""
         if not self._thread.is_alive():
             return
         if self._rows.qsize() < MOST_ROWS:
-            self._rows.put((figures, step))
+            self._rows.put((metrics, step))
         else:
             self._dropped += 1
         if time.monotonic() - self._since_s > self._patience_s:
-            self._warn(f"no answer within {self._patience_s:g} s", "its figures wait")
+            self._warn(f"no answer within {self._patience_s:g} s", "its metrics wait")
 
     def end(self) -> None:
         """Let it close when it has all rows; does not wait."""
@@ -71,7 +71,7 @@ class TrackerThread:
         """
         self._thread.join(within_s)
         if self._thread.is_alive():
-            self._warn(f"no answer within {limit_s:g} s", "its last figures may be missing there")
+            self._warn(f"no answer within {limit_s:g} s", "its last metrics may be missing there")
         if self._dropped:
             logger.warning("%s was too slow for %d rows, which are missing there", self._name, self._dropped)
 
@@ -84,14 +84,14 @@ class TrackerThread:
                 self._call("failed")
                 tracker.log(*row)
                 self._idle()
-            after = "its last figures may be missing there"
+            after = "its last metrics may be missing there"
             self._call("did not close")
             tracker.close()
         except BaseException as error:  # also what would end the program: a tracker never stops training
-            self._warn(_words(error), after)
+            self._warn(_summary(error), after)
 
-    def _call(self, trouble: str) -> None:
-        self._trouble, self._since_s = trouble, time.monotonic()
+    def _call(self, problem: str) -> None:
+        self._problem, self._since_s = problem, time.monotonic()
 
     def _idle(self) -> None:
         self._since_s = float("inf")
@@ -99,9 +99,9 @@ class TrackerThread:
     def _warn(self, reason: str, after: str) -> None:
         if not self._warned:
             self._warned = True
-            logger.warning("%s %s (%s); %s", self._name, self._trouble, reason, after)
+            logger.warning("%s %s (%s); %s", self._name, self._problem, reason, after)
 
 
-def _words(error: BaseException) -> str:
+def _summary(error: BaseException) -> str:
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0]}" if lines else type(error).__name__

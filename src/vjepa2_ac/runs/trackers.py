@@ -1,10 +1,9 @@
-"""Who draws curves of a run? TensorBoard, Weights & Biases and trackio, as the config asks.
+"""Trackers for a run's curves: TensorBoard, Weights & Biases and trackio, as the config asks.
 
-A tracker has a thread of its own (`tracker_thread`): one that cannot be opened, fails or hangs is left
-out with one warning, and training goes on as if it were not there. Only a library that is not installed is an error,
-before the first step.
-`metrics.jsonl` (`runs.metrics_log`) has all figures whatever becomes of trackers. A run that goes on, on whatever
-machine, goes on in the same W&B or trackio run.
+A tracker has a thread of its own (`tracker_thread`): one that cannot be opened, fails or hangs is disabled with one
+warning, and training continues without it. Only a library that is not installed is an error, before the first step.
+`metrics.jsonl` (`runs.metrics_log`) has all metrics regardless of trackers. A resumed run, on whatever machine,
+continues the same W&B or trackio run.
 """
 
 from __future__ import annotations
@@ -48,9 +47,9 @@ class Trackers:
         self._closing_s = closing_s
         self._guests = [TrackerThread(name, opening, patience_s=opening_s) for name, opening in openings.items()]
 
-    def log(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
+    def log(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Hand on a row: its numbers; lists, such as errors by horizon, number by number from 1."""
-        numbers = {f"{kind}/{key}": value for key, value in _numbers(figures).items()}
+        numbers = {f"{kind}/{key}": value for key, value in _numbers(metrics).items()}
         for guest in self._guests:
             guest.log(numbers, step)
 
@@ -111,8 +110,8 @@ class _TensorBoard:
 
         self._writer: Any = SummaryWriter(str(folder), purge_step=first_step + 1)
 
-    def log(self, figures: Mapping[str, float], step: int) -> None:
-        for name, value in figures.items():
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
+        for name, value in metrics.items():
             self._writer.add_scalar(name, value, step)
 
     def close(self) -> None:
@@ -120,7 +119,7 @@ class _TensorBoard:
 
 
 class _WeightsAndBiases:
-    """W&B drops rows of steps that it has already: what a resumed run does again are the same figures."""
+    """W&B drops rows of steps that it has already: what a resumed run does again are the same metrics."""
 
     def __init__(self, config: Config, folder: Path, run_id: str) -> None:
         import wandb
@@ -140,8 +139,8 @@ class _WeightsAndBiases:
             settings=wandb.Settings(**{name: value for name, value in bounds.items() if name in known}),
         )
 
-    def log(self, figures: Mapping[str, float], step: int) -> None:
-        self._run.log(dict(figures), step=step)
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
+        self._run.log(dict(metrics), step=step)
 
     def close(self) -> None:
         self._run.finish()
@@ -161,16 +160,16 @@ class _Trackio:
             embed=False,
         )
 
-    def log(self, figures: Mapping[str, float], step: int) -> None:
-        self._run.log(dict(figures), step=step)
+    def log(self, metrics: Mapping[str, float], step: int) -> None:
+        self._run.log(dict(metrics), step=step)
 
     def close(self) -> None:
         self._run.finish()
 
 
-def _numbers(figures: Mapping[str, Any]) -> dict[str, float]:
+def _numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
     numbers: dict[str, float] = {}
-    for key, value in figures.items():
+    for key, value in metrics.items():
         values = {f"{key}/{n}": v for n, v in enumerate(value, start=1)} if isinstance(value, list) else {key: value}
         numbers |= {name: float(v) for name, v in values.items() if isinstance(v, int | float) and math.isfinite(v)}
     return numbers

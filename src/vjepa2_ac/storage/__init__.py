@@ -1,4 +1,4 @@
-"""How are files listed, read, written and hashed, on this machine and behind URLs?"""
+"""File access on this machine and behind URLs: listing, reading, writing and hashing."""
 
 from vjepa2_ac.places import is_url
 from vjepa2_ac.storage.reading import (

@@ -1,4 +1,4 @@
-"""How are the arrays of a file read back that this program wrote, when anybody may have written it?"""
+"""Array files written by this program, read back without trusting their content."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from vjepa2_ac.storage.npz_reader import NpzFile
 
 
 def read_arrays(data: bytes, where: str = "its arrays") -> dict[str, np.ndarray]:
-    """Return the arrays that `numpy.savez` wrote; nothing is unpickled, nor unpacked to more than there is.
+    """Return the arrays that `numpy.savez` wrote; nothing is unpickled, and nothing expands beyond the file's size.
 
     Raises:
-        InputError: It is another file, damaged, compressed, or contradicts itself.
+        InputError: It is another kind of file, damaged, compressed, or inconsistent.
     """
     file = NpzFile(io.BytesIO(data), where)
     headers = {name: file.header(name) for name in file.names}

@@ -1,4 +1,4 @@
-"""How are single arrays, or single pictures of one, taken out of an .npz file?"""
+"""Partial reads of .npz files: single arrays, or single frames of an array."""
 
 from __future__ import annotations
 
@@ -21,11 +21,13 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import ByteReader
 
 _LOCAL_HEADER_BYTES = 30
-_MOST_BYTES = 1 << 30  # of an array that is read whole
-_DEFLATE_LIMIT = 1040  # DEFLATE shortens a thousandfold at most: what claims more is damaged
+_MOST_BYTES = 1 << 30  # of an array that is read completely
+_DEFLATE_LIMIT = 1040  # DEFLATE compresses a thousandfold at most: a higher ratio is damage
 _CHUNK_BYTES = 1 << 20
-_MOST_HEADER_BYTES = 1 << 14  # numpy reads what a header claims, gigabytes, and refuses 10,000 bytes of it then
-_KINDS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # as numpy writes; others shorten without a bound
+_MOST_HEADER_BYTES = 1 << 14  # numpy reads as much as a header claims, gigabytes, before it refuses 10,000 bytes
+_KINDS = frozenset(
+    {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
+)  # as numpy writes; other methods have no bound on the ratio
 _FIX = "Write the file again, with numpy.savez"
 _DAMAGE = (
     zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError, SyntaxError, EOFError, KeyError, ValueError,
@@ -35,7 +37,7 @@ _DAMAGE = (
 
 @dataclass(frozen=True)
 class ArrayHeader:
-    """What an array is, and where in its member of the archive the values begin."""
+    """Shape and type of an array, and where its values begin in the archive's member."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -49,10 +51,10 @@ class ArrayHeader:
 
 
 class NpzFile:
-    """An .npz file that is open to read. Nothing in it is ever unpickled.
+    """An .npz file open for reading. Nothing in it is ever unpickled.
 
     Raises:
-        InputError: It is not an .npz file; likewise each method, where something is damaged.
+        InputError: It is not an .npz file; each method raises it for damage, too.
     """
 
     def __init__(self, file: ByteReader, where: str) -> None:
@@ -86,7 +88,7 @@ class NpzFile:
             return header
 
     def header_of_rows(self, name: str) -> ArrayHeader:
-        """Return likewise what has to lie in rows, one behind the other."""
+        """Return the header of an array that must be stored row by row (C order)."""
         header = self.header(name)
         if header.by_columns and len(header.shape) > 1:
             raise InputError(
@@ -98,7 +100,7 @@ class NpzFile:
         return header
 
     def array(self, name: str) -> Shaped[np.ndarray, ...]:
-        """Return a whole array; its checksum is checked."""
+        """Return a complete array; its checksum is verified."""
         header = self.header(name)
         with self._damage_is_named(name), self._archive.open(self._members[name]) as member:
             if prod(header.shape) * header.dtype.itemsize > _MOST_BYTES:
@@ -109,8 +111,8 @@ class NpzFile:
     def rows(self, name: str, rows: Sequence[int]) -> Shaped[np.ndarray, "rows ..."]:
         """Return some rows of an array, in this order.
 
-        Of an array that is stored as it is, only these rows are read, and no checksum is checked: it covers the whole
-        array. One that is compressed is gone through up to the last of these rows; no others are kept.
+        Of an uncompressed array only these rows are read, and the checksum is not verified: it covers the whole array.
+        A compressed one is decompressed up to the last of these rows; other rows are not stored.
         """
         header = self.header_of_rows(name)
         member = self._members[name]
@@ -123,7 +125,7 @@ class NpzFile:
 
     @staticmethod
     def _head(member: ByteReader) -> io.BytesIO:
-        """Read what numpy reads of an array's header, but not before its length is known to be one."""
+        """Read an array's header for numpy, after checking its length."""
         start = member.read(np.lib.format.MAGIC_LEN)
         size = member.read(2 if start[-2:] == b"\x01\x00" else 4)
         length = int.from_bytes(size, "little")
@@ -132,7 +134,7 @@ class NpzFile:
         return io.BytesIO(start + size + member.read(length))
 
     def _stored(self, member: zipfile.ZipInfo, header: ArrayHeader, rows: list[int]) -> Iterator[bytes]:
-        """Yield rows of an array that is not compressed, each from its place in the file."""
+        """Yield rows of an uncompressed array, each from its position in the file."""
         self._file.seek(member.header_offset)
         local = self._exactly(self._file, _LOCAL_HEADER_BYTES)
         names = int.from_bytes(local[26:28], "little") + int.from_bytes(local[28:30], "little")
@@ -142,7 +144,7 @@ class NpzFile:
             yield self._exactly(self._file, header.row_bytes)
 
     def _unpacked(self, member: zipfile.ZipInfo, header: ArrayHeader, rows: list[int]) -> Iterator[bytes]:
-        """Yield rows of an array that is compressed, going through it from its start."""
+        """Yield rows of a compressed array, decompressing it from its start."""
         with self._archive.open(member) as values:
             place = 0
             for row in rows:
@@ -160,7 +162,7 @@ class NpzFile:
         return data
 
     def _require_fitting(self, member: zipfile.ZipInfo, header: ArrayHeader) -> None:
-        """Refuse sizes that contradict each other before anything of that size is made room for."""
+        """Refuse inconsistent sizes before memory of that size is allocated."""
         promised = header.start + prod(header.shape) * header.dtype.itemsize
         if promised != member.file_size or member.file_size > member.compress_size * _DEFLATE_LIMIT + _CHUNK_BYTES:
             raise ValueError(f"shape {header.shape} of {header.dtype} in {member.file_size} bytes")
@@ -170,7 +172,7 @@ class NpzFile:
         try:
             yield
         except (*_DAMAGE, OSError) as error:
-            if isinstance(error, OSError) and error.errno != errno.EINVAL:  # EINVAL: sent to a place before the start
+            if isinstance(error, OSError) and error.errno != errno.EINVAL:  # EINVAL: a seek before the start
                 raise
             place = f"{self._where}: {name}" if name else self._where
             found = f"cannot be read ({str(error)[:200] or type(error).__name__})"

@@ -1,11 +1,11 @@
-"""Under which name is something written until it is whole, and who removes it where its writer was killed?
+"""Partial files: the temporary name of a file until it is complete, and their removal after a killed writer.
 
-`.NAME.KERNEL-RANDOM.partial`, in the folder where it is to go. Its writer holds a lock on it (flock), which the kernel
-takes back when the writer is gone, however that went. Whoever next writes into that folder removes what nobody holds.
+The name is `.NAME.KERNEL-RANDOM.partial`, in the target folder. The writer holds a lock on it (flock), which the kernel
+releases when the writer ends, however it ended. The next writer into that folder removes partial files without a lock.
 
-Why a lock: numbers of processes are given again, and mean nothing in another container. But a lock may say nothing to
-another machine that has the same disk. KERNEL tells whose it is: a hash of what the kernel drew when it started, one
-for all containers on it. What another kernel's writer left, or nobody can lock, goes when it has not changed for a day.
+Why a lock: process ids are reused, and mean nothing in another container. But a lock may not be visible to another
+machine that shares the disk. KERNEL identifies the machine: a hash of the kernel's boot id, the same for all containers
+on it. A partial file of another kernel, or one that cannot be locked, is removed when it is unchanged for a day.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _looked_at: set[Path] = set()
 
 @contextlib.contextmanager
 def partial_file(target: Path) -> Iterator[Path]:
-    """Give a new empty file beside a target, locked as long as the block lasts; it stays.
+    """Yield a new empty file beside a target, locked within the block; it is not removed.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: It cannot be created.
     """
     with _held(
         target.parent, target.name, lambda path: os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
@@ -49,10 +49,10 @@ def partial_file(target: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def partial_folder(parent: Path, name: str) -> Iterator[Path]:
-    """Give a new empty folder in another, for what is to be called `name`; it stays.
+    """Yield a new empty folder in `parent`, to be renamed to `name`; it is not removed.
 
     Raises:
-        OSError: It cannot be made.
+        OSError: It cannot be created.
     """
     parent.mkdir(parents=True, exist_ok=True)
     with _held(parent, name, _open_new_folder) as path:
@@ -66,7 +66,7 @@ def _open_new_folder(path: Path) -> int:
 
 @contextlib.contextmanager
 def _held(parent: Path, name: str, make: Callable[[Path], int]) -> Iterator[Path]:
-    """Make what does not exist yet, and hold a lock on it for as long as the block lasts."""
+    """Create a partial file or folder, and hold a lock on it within the block."""
     _remove_abandoned_once(parent)
     while True:
         path = _new_name(parent, name)
@@ -80,12 +80,12 @@ def _held(parent: Path, name: str, make: Callable[[Path], int]) -> Iterator[Path
 
 
 def is_partial(path: Path) -> bool:
-    """Return whether this is the name of something that is being written, or was when its writer was killed."""
+    """Return whether this is the name of a partial file: one being written, or left by a killed writer."""
     return _NAME.fullmatch(path.name) is not None
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove what writers that are gone left in a folder; what cannot be removed stays."""
+    """Remove the partial files of dead writers in a folder; those that cannot be removed stay."""
     with contextlib.suppress(OSError):
         for path in [path for path in folder.iterdir() if is_partial(path)]:
             with contextlib.suppress(OSError):
@@ -93,7 +93,7 @@ def remove_abandoned(folder: Path) -> None:
 
 
 def _remove_abandoned_once(folder: Path) -> None:
-    """Look at a folder the first time that this process writes there: it may hold thousands of files."""
+    """Scan a folder only the first time that this process writes there: it may hold thousands of files."""
     place = folder.absolute()
     if place not in _looked_at:
         _looked_at.add(place)
@@ -103,7 +103,7 @@ def _remove_abandoned_once(folder: Path) -> None:
 def _remove_if_abandoned(path: Path) -> None:
     is_folder = stat.S_ISDIR(path.lstat().st_mode)
     found = _NAME.fullmatch(path.name)
-    way = os.O_RDONLY if is_folder else os.O_RDWR  # some file systems lock only what is open for writing
+    way = os.O_RDONLY if is_folder else os.O_RDWR  # some file systems lock only files open for writing
     handle = os.open(path, way | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         if found is not None and found[1] == _kernel():
@@ -128,11 +128,11 @@ def _is_old(path: Path) -> bool:
 
 
 def _locked(path: Path, handle: int) -> bool:
-    """Lock what was just made; return whether it is ours: whoever removes may have come between; then it is closed."""
+    """Lock a new partial file; return whether it still exists (another process may have removed it) or close it."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         ours = path.exists()
-    except OSError as error:  # most often a file system without locks
+    except OSError as error:  # usually a file system without locks
         ours = error.errno not in _HELD
     if not ours:
         os.close(handle)

@@ -1,9 +1,9 @@
-"""How are files found, read and hashed, on this machine and behind URLs?
+"""Reading files: find, read and hash them, on this machine and behind URLs.
 
-A path is local, or a URL such as `gs://bucket/folder` (see remote). That a file is not there, or ends too soon, is true
-of the file. What a network does is not: it is tried again, and in the end a `UnreachableError`; neither is what
-the system has against a file (see `unreadable`). That is an InputError that must never be booked as a broken episode:
-whoever makes problems of InputErrors lets it pass first.
+A path is local, or a URL such as `gs://bucket/folder` (see `remote`). A missing or truncated file is an error of the
+file. A network failure is not: it is retried, and finally raises an `UnreachableError`; nor is an error of the
+operating system (see `unreadable`). An UnreachableError is an InputError that must never be counted as a broken
+episode: code that turns InputErrors into problems must let it pass first.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ _ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, err
 
 
 class ShortReadError(OSError):
-    """A file ends before the bytes that were asked for."""
+    """A file ends before the requested bytes."""
 
 
 @runtime_checkable
 class ByteReader(Protocol):
-    """What a file that is open to read can do, wherever it is."""
+    """A file open for reading, local or remote."""
 
     def read(self, size: int = -1, /) -> bytes:
-        """Return the next bytes, all that are left with -1."""
+        """Return the next bytes; all remaining ones with -1."""
         ...
 
     def seek(self, offset: int, /) -> int:
@@ -43,7 +43,7 @@ class ByteReader(Protocol):
         ...
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close the file."""
         ...
 
 
@@ -53,7 +53,7 @@ def join(folder: str | Path, name: str) -> str:
 
 
 def absolute(path: str | Path) -> str:
-    """Return the same path, whatever the working directory and through whatever links it was named; a URL as it is."""
+    """Return the absolute path with links resolved, independent of the working directory; a URL unchanged."""
     return str(path) if is_url(path) else str(Path(path).resolve())
 
 
@@ -72,7 +72,7 @@ def file_size(path: str | Path) -> int:
 
 
 def file_version(path: str | Path) -> str:
-    """Return a word for a file's content that differs when the content does, as far as that is known without reading.
+    """Return a version of a file's content that changes with the content, as far as is known without reading it.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
@@ -82,11 +82,11 @@ def file_version(path: str | Path) -> str:
 
 @dataclass(frozen=True)
 class FileInfo:
-    """What a listing says of a file."""
+    """A file in a listing."""
 
     name: str
     size: int
-    version: str  # differs when the content does, as far as can be known without reading it
+    version: str  # changes with the content, as far as is known without reading it
 
 
 def list_files(folder: str | Path) -> list[FileInfo]:
@@ -110,9 +110,9 @@ def list_names(folder: str | Path) -> list[str]:
 
 
 def open_to_read(path: str | Path) -> ByteReader:
-    """Open a file to read and seek in; the caller closes it.
+    """Open a file for reading and seeking; the caller closes it.
 
-    Of a URL only what is read is fetched, in blocks, so that one can hand it to a reader of videos or tables.
+    Of a URL only the blocks that are read are fetched, so it can be given to a reader of videos or tables.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
@@ -121,16 +121,16 @@ def open_to_read(path: str | Path) -> ByteReader:
 
 
 def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -> InputError:
-    """Return what to tell the user of a file that is not there, that ends too soon, or that the system does not give.
+    """Return the error of a file that is missing, truncated, or refused by the operating system.
 
-    The last (no permission, too many open files, a disk that went away) says nothing of what is in the file, and leaves
-    no trace in it when it has passed: it is an UnreachableError, which nobody keeps.
+    The last (no permission, too many open files, a disk that went away) is temporary and says nothing about the file's
+    content: it is an UnreachableError, which is never stored.
 
     Args:
         where: The file, and its episode.
-        error: What the system said.
+        error: The system's error.
         needed: What should be there.
-        fix: The way out where it is the file.
+        fix: How to fix it where the file is wrong.
     """
     if isinstance(error, ShortReadError) or error.errno in _ABSENT:
         return InputError(where=where, found=f"cannot be read: {error.strerror or error}", needed=needed, fix=fix)
@@ -139,7 +139,7 @@ def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Return a whole file.
+    """Return the content of a file.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
@@ -150,10 +150,10 @@ def read_bytes(path: str | Path) -> bytes:
 
 
 def read_bounded(path: str | Path, most_bytes: int) -> bytes:
-    """Return a whole file that is small, whoever wrote it: no more than so many bytes are ever read.
+    """Return the content of an untrusted small file: at most `most_bytes` are ever read.
 
     Raises:
-        InputError: It is larger, or no file but something that may never end, such as a pipe.
+        InputError: It is larger, or may never end, such as a pipe.
         OSError: There is no such file, or it cannot be read.
     """
     if is_url(path):
@@ -170,7 +170,7 @@ def read_bounded(path: str | Path, most_bytes: int) -> bytes:
 
 
 def read_range(path: str | Path, start: int, length: int) -> bytes:
-    """Return `length` bytes from `start`; fewer where the file ends before.
+    """Return `length` bytes from `start`; fewer if the file ends before.
 
     Raises:
         OSError: There is no such file, or it cannot be read.
@@ -183,7 +183,7 @@ def read_range(path: str | Path, start: int, length: int) -> bytes:
 
 
 def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-    """Return several (start, length) pieces of a file, each whole; those of a URL are fetched at the same time.
+    """Return several (start, length) pieces of a file, each complete; those of a URL are fetched concurrently.
 
     Raises:
         OSError: There is no such file, it cannot be read, or it ends within a piece.
@@ -215,7 +215,7 @@ def bytes_fetched() -> int:
 
 
 def sha256_of_file(path: str | Path) -> str:
-    """Return the SHA-256 of a file as hexadecimal digits, reading it piece by piece.
+    """Return the SHA-256 of a file as hexadecimal digits, read in chunks.
 
     Raises:
         OSError: There is no such file, or it cannot be read.

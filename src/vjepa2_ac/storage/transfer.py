@@ -1,7 +1,6 @@
-"""How do files get to another place and back: to a folder of this machine, or a URL that can be written?
+"""File transfer to and from another place: a local folder, or a URL that can be written.
 
-Whatever keeps a file from getting there is a `RefusedError` where it does not pass by itself, and else an
-`UnreachableError`.
+A permanent failure to write a file is a `RefusedError`, any other an `UnreachableError`.
 """
 
 from __future__ import annotations
@@ -28,17 +27,17 @@ _PIECE_BYTES = 32 << 20
 
 
 def place(path: str) -> str:
-    """Return the one name of a folder: an absolute path, also for `file://`, or a URL; no slash behind it."""
+    """Return the canonical name of a folder: an absolute path, also for `file://`, or a URL; no trailing slash."""
     path = path.removeprefix("file://")
     return path.rstrip("/") if is_url(path) else str(Path(path).resolve())
 
 
 def upload(source: Path, target: str) -> None:
-    """Copy a file of this machine to another place, over whatever is there; never seen by halves.
+    """Copy a local file to another place, replacing any file there; readers never see a part of it.
 
     Raises:
-        FileNotFoundError: There is no such file on this machine.
-        UnreachableError: It cannot be written; a RefusedError where that will not pass.
+        FileNotFoundError: There is no such local file.
+        UnreachableError: It cannot be written; a RefusedError if that is permanent.
     """
     if is_url(target):
         return remote.upload_file(source, target)
@@ -48,7 +47,7 @@ def upload(source: Path, target: str) -> None:
 
 
 def download(source: str, target: Path) -> None:
-    """Copy a file from another place to this machine; it appears whole, and is on the disk.
+    """Copy a file from another place to this machine, atomically, and synced to the disk.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -66,10 +65,10 @@ def download(source: str, target: Path) -> None:
 
 
 def remove(path: str) -> None:
-    """Remove a file at another place; it may be gone already.
+    """Remove a file at another place; it may not exist.
 
     Raises:
-        UnreachableError: It cannot be removed; a RefusedError where that will not pass.
+        UnreachableError: It cannot be removed; a RefusedError if that is permanent.
     """
     if is_url(path):
         return remote.remove_file(path)
@@ -79,10 +78,10 @@ def remove(path: str) -> None:
 
 
 def remove_folder(folder: str, *, first: str) -> None:
-    """Remove all files below a folder, the one without which it does not count before the others.
+    """Remove all files below a folder; first the one without which it does not count.
 
     Raises:
-        UnreachableError: It cannot be removed; a RefusedError where that will not pass.
+        UnreachableError: It cannot be removed; a RefusedError if that is permanent.
     """
     remove(join(folder, first))
     for name in file_sizes(folder):
@@ -93,10 +92,10 @@ def remove_folder(folder: str, *, first: str) -> None:
 
 
 def file_sizes(folder: str) -> dict[str, int]:
-    """Return the sizes of all files below a folder by their paths from there; none where there is no such folder.
+    """Return the sizes of all files below a folder by their relative paths; none if there is no such folder.
 
     Raises:
-        UnreachableError: It cannot be listed; a RefusedError where that will not pass.
+        UnreachableError: It cannot be listed; a RefusedError if that is permanent.
     """
     if is_url(folder):
         return remote.file_sizes(folder)
@@ -106,10 +105,10 @@ def file_sizes(folder: str) -> dict[str, int]:
 
 
 def try_writing(folder: str) -> None:
-    """Find out whether a place can be written and removed from: do it. Nothing stays there.
+    """Test whether files can be written to and removed from a place. Nothing remains there.
 
     Raises:
-        UnreachableError: It cannot be written now; a RefusedError where that will not pass.
+        UnreachableError: It cannot be written now; a RefusedError if that is permanent.
     """
     if not is_url(folder):
         with _explained(folder):

@@ -1,4 +1,4 @@
-"""How are local files written so that nobody ever sees half of one?"""
+"""Atomic writes of local files: no reader ever sees an incomplete file."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _UNWRITABLE = _FULL | {
 
 @contextmanager
 def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
-    """Open a local file that appears under its name, whole, when the block ends, and not at all when it fails.
+    """Open a local file that gets its name, complete, when the block ends, and never if the block fails.
 
-    Missing folders are made. The bytes are on the disk (fsync) before the file gets its name.
+    Missing folders are created. The bytes are on the disk (fsync) before the file gets its name.
     """
     target = Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     with partial_file(target) as temporary:
         try:
-            with temporary.open("wb") as file:  # by its name, by which some libraries tell what it is
+            with temporary.open("wb") as file:  # opened by name: some libraries determine the format by it
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
@@ -39,31 +39,32 @@ def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
         except BaseException as error:
             with suppress(FileNotFoundError):
                 temporary.unlink()
-            if isinstance(error, OSError) and error.filename is None:  # a full disk does not say of what
+            if isinstance(error, OSError) and error.filename is None:  # the error of a full disk has no file name
                 error.filename = str(target)
             raise
     sync(target.parent)
 
 
 def write_atomically(path: str | Path, data: bytes | str) -> None:
-    """Write a local file so that it is never seen in part; text is written as UTF-8."""
+    """Write a local file atomically; text is written as UTF-8."""
     with atomic_writer(path) as file:
         file.write(data.encode() if isinstance(data, str) else data)
 
 
 @contextmanager
 def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
-    """Give an empty local folder to fill, whose files go to `folder` when the block ends, and nowhere when it fails.
+    """Yield an empty local folder to fill; its files move to `folder` when the block ends, and nowhere if it fails.
 
-    A new folder appears whole. One that is there stays itself (it may be the working directory, or mounted) and keeps
-    its other files: the old manifest goes first and the new one comes last, so with a manifest the folder is whole.
+    A new folder appears complete. An existing one is not replaced (it may be the working directory, or mounted) and
+    keeps its other files: the old manifest is removed first and the new one comes last, so a folder with a manifest is
+    complete.
 
     Args:
-        folder: Where the files go; missing folders are made.
+        folder: Where the files go; missing folders are created.
         manifest: Name of the file without which the folder does not count.
 
     Raises:
-        InputError: The folder cannot be made or written, or the disk is full.
+        InputError: The folder cannot be created or written, or the disk is full.
     """
     with ExitStack() as while_writing:
         with user_can_write(folder):
@@ -74,7 +75,7 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
             parent = target if there else target.parent
             partial = while_writing.enter_context(partial_folder(parent, target.name))
         try:
-            with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's own
+            with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's
                 yield partial
             with user_can_write(folder):
                 if there:
@@ -88,7 +89,7 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
 
 
 def is_empty(folder: Path) -> bool:
-    """Return whether a folder has nothing in it, but for what writers that were killed have left there."""
+    """Return whether a folder is empty, apart from partial files of killed writers."""
     return all(map(is_partial, folder.iterdir()))
 
 
@@ -119,10 +120,10 @@ def try_writing_at(path: Path) -> None:
 
 @contextmanager
 def user_can_write(path: str | Path, errors: Set[int] = _UNWRITABLE) -> Iterator[None]:
-    """Say in the user's words that a local path cannot be written, or that the disk is full.
+    """Raise an error for the user if a local path cannot be written, or the disk is full.
 
     Raises:
-        InputError: In place of an OSError of one of these numbers; other errors pass.
+        InputError: Instead of an OSError with one of these numbers; other errors pass.
     """
     try:
         yield

@@ -21,7 +21,7 @@ from vjepa2_ac.data.inspection.duplicates import find_duplicates
 from vjepa2_ac.distributed.collectives import all_gather_object, broadcast_object
 from vjepa2_ac.distributed.device import PRECISIONS
 from vjepa2_ac.distributed.launch import make_accelerator
-from vjepa2_ac.distributed.shared_memory import say_if_shared_memory_is_small
+from vjepa2_ac.distributed.shared_memory import warn_if_shared_memory_is_small
 from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for
 from vjepa2_ac.encoding.training_cache import with_latents
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
@@ -39,7 +39,7 @@ from vjepa2_ac.runs.checkpoint import (
     write_checkpoint,
 )
 from vjepa2_ac.runs.folder import CHECKPOINTS, with_stride
-from vjepa2_ac.runs.slow_disk import said_if_stalled
+from vjepa2_ac.runs.slow_disk import warn_if_stalled
 from vjepa2_ac.runs.torch_file import write_torch
 from vjepa2_ac.training.best_checkpoint import best_so_far, measured_on
 from vjepa2_ac.training.fsdp import full_optimizer_state_dict, full_state_dict, shard_predictor
@@ -149,7 +149,7 @@ def set_up(
     world_model = world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, first_clip)
     dataset = with_latents(config, dataset, world_model, accelerator, note, encoding=encoding, check_only=check_only)
-    say_if_shared_memory_is_small(config, dataset, first_clip, accelerator, note)
+    warn_if_shared_memory_is_small(config, dataset, first_clip, accelerator, note)
     fit_to_data(world_model, config, dataset, note)
     add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
     note(str(trainable_report(world_model)))
@@ -221,7 +221,7 @@ def save_checkpoint(run: Run, folder: Path) -> None:
         loss_scale=run.scaler.state_dict() if run.scaler.is_enabled() else None,
     )
     if writes:
-        with said_if_stalled(folder / CHECKPOINTS / checkpoint_name(run.state.step)):
+        with warn_if_stalled(folder / CHECKPOINTS / checkpoint_name(run.state.step)):
             write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
 
 

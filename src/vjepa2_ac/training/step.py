@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.distributed.tensor import DTensor
 
-from vjepa2_ac.data.clips.prefetch import fetch_ahead
+from vjepa2_ac.data.clips.prefetch import prefetch_next
 from vjepa2_ac.distributed.collectives import all_reduce_gradients, all_reduce_sum
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
@@ -94,7 +94,7 @@ def gradients(
     with run.cast_matrices.current():
         totals, seen, fetched = _accumulate(run, batches, look_back)
     if more:
-        fetch_ahead(batches)
+        prefetch_next(batches)
     *losses, clips, fetched_by_all = all_reduce_sum(run.accelerator, [*totals.tolist(), len(seen), fetched])
     if not clips:
         return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(fetched_by_all))

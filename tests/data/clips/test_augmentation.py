@@ -1,4 +1,4 @@
-"""A drawn change is a pure function, stays inside the picture, and is the same for all frames of a clip."""
+"""A drawn change is a pure function, stays inside the frame, and is the same for all frames of a clip."""
 
 import numpy as np
 import pytest

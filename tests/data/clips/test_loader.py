@@ -163,7 +163,7 @@ def test_an_error_in_a_worker_is_the_error_the_user_reads(spoiled: Callable[...,
         take(60, config)
     assert type(caught.value) is InputError
     assert "tfrecord-00000-of-00002: record 0 at byte 0" in caught.value.where
-    assert caught.value.needed == "a JPEG picture"
+    assert caught.value.needed == "a JPEG image"
     exclude = tuple(json.loads(caught.value.fix.split("data.exclude: ")[1]))
     assert len(exclude) == 1
     assert exclude[0] not in {name for name, _ in names(take(60, config.model_copy(update={"exclude": exclude})))}
@@ -245,7 +245,7 @@ def test_batches_reach_a_cuda_device_as_they_are(droid: Path, workers: int) -> N
     copies = copies_for(torch.device("cuda"))
     with closing(training_loader(dataset, seed=1, batch_size=2, copies=copies)) as batches:
         found = [next(batches)]
-        batches.fetch_ahead()
+        batches.prefetch_next()
         found.append(next(batches))
     assert all(batch.frames.is_pinned() for batch in found)
     there = [batch.on_device() for batch in found]
@@ -265,14 +265,14 @@ def test_an_error_passes_the_pinning_unharmed(
     with pytest.raises(InputError, match="not a JPEG") as caught:
         take(60, config, copies=copies)
     assert type(caught.value) is InputError
-    assert caught.value.needed == "a JPEG picture"
+    assert caught.value.needed == "a JPEG image"
 
 
 def test_pictures_of_two_sizes_do_not_stack(droid: Path) -> None:
     config = config_of(droid)
     clip = clip_at(open_dataset(config), 0, 0)
     other = replace(clip, frames=clip.frames[:, :20], episode_id="the other")
-    with pytest.raises(InputError, match=r"the other: pictures of 20x65.*48x65") as caught:
+    with pytest.raises(InputError, match=r"the other: frames of 20x65.*48x65") as caught:
         collate([clip, other])
     assert "broken_episodes" not in caught.value.fix, "that would not help"
 

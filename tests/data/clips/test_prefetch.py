@@ -7,7 +7,7 @@ import torch
 
 from recording_cuda import RecordingCuda, recorded_copies
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.clips.prefetch import Batches, MicroBatch, fetch_ahead
+from vjepa2_ac.data.clips.prefetch import Batches, MicroBatch, prefetch_next
 from vjepa2_ac.data.clips.streams import NO_COPIES, Copies
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.episode import Batch, Skipped
@@ -55,8 +55,8 @@ def test_a_batch_fetched_ahead_is_copied_at_once_and_comes_in_its_turn(cuda: Rec
     first = next(batches)
     assert rows.fetched == 1
     cuda.told.clear()
-    fetch_ahead(batches)
-    fetch_ahead(batches)  # one is enough
+    prefetch_next(batches)
+    prefetch_next(batches)  # one is enough
     assert rows.fetched == 2
     assert cuda.told == [*TO_DEVICE * 2, "side 1: event 2"]
     second = next(batches)
@@ -81,7 +81,7 @@ def test_what_goes_wrong_ahead_is_raised_when_its_turn_has_come(cuda: RecordingC
     batches = batches_of(rows, recorded_copies(cuda))
     for number in range(2):
         assert next(batches).starts == (number,)
-        fetch_ahead(batches)
+        prefetch_next(batches)
     with pytest.raises(StopIteration if error is None else type(error)) as caught:
         next(batches)
     assert error is None or caught.value is error
@@ -94,7 +94,7 @@ def test_clips_left_out_ahead_are_noted_when_their_turn_has_come(cuda: Recording
     broken = BrokenEpisodes(DataConfig(path="x", broken_episodes="skip"), 1000)
     batches = Batches(Rows(2, skipped=(1,))(), broken, recorded_copies(cuda))
     next(batches)
-    fetch_ahead(batches)
+    prefetch_next(batches)
     assert broken.reasons == {}
     next(batches)
     assert broken.reasons == {"e1": "damaged"}
@@ -104,17 +104,17 @@ def test_on_a_cpu_nothing_is_fetched_ahead_and_batches_are_as_they_were() -> Non
     rows = Rows(2)
     batches = batches_of(rows, NO_COPIES)
     assert next(batches).on_device is None
-    fetch_ahead(batches)
+    prefetch_next(batches)
     assert rows.fetched == 1
     assert next(batches).starts == (1,)
-    fetch_ahead(iter([batch(0)]))  # batches of another kind
+    prefetch_next(iter([batch(0)]))  # batches of another kind
 
 
 def test_closing_ends_the_rows_and_lets_go_of_what_was_fetched_ahead(cuda: RecordingCuda) -> None:
     rows = Rows(3)
     batches = batches_of(rows, recorded_copies(cuda))
     next(batches)
-    fetch_ahead(batches)
+    prefetch_next(batches)
     batches.close()
     assert rows.closed
     with pytest.raises(StopIteration):

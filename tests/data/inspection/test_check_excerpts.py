@@ -67,7 +67,7 @@ SPOILS: dict[str, Spoil] = {
     "deltas": each(lambda s, f: (np.diff(s, axis=0, append=s[-1:]), f)),
     "noise": each(lambda s, f: (s, noise_like(f))),
     "each step twice": each(lambda s, f: (twice(s), twice(f))),
-    "each picture twice": each(lambda s, f: (s, f[np.arange(len(f)) // 2 * 2])),
+    "each frame twice": each(lambda s, f: (s, f[np.arange(len(f)) // 2 * 2])),
     "too fast": each(lambda s, f: (np.concatenate([s[:, :3] * 5, s[:, 3:]], axis=1), f)),
     "near the base": each(lambda s, f: (s - np.append(s[0, :3], [0, 0, 0, 0]) * [1, 1, 1, 0, 0, 0, 0], f)),
 }
@@ -87,23 +87,23 @@ def alarms_in(pairs: list[Pair], **about: object) -> list[Finding]:
 def test_what_belongs_together_gives_no_alarm(seed: int, is_pose: bool) -> None:
     findings = found_in(recorded(seed), is_pose=is_pose)
     assert not [finding for finding in findings if finding.level != "ok"]
-    assert findings[-1].text.startswith("pictures change when the robot moves: rank correlation")
+    assert findings[-1].text.startswith("frames change when the robot moves: rank correlation")
 
 
 @pytest.mark.parametrize(
     ("how", "level", "about", "words"),
     [
-        ("late", "error", "agreement", "pictures are 8 steps late (0.53 s)"),
-        ("early", "warning", "agreement", "pictures are 2 steps early (0.13 s)"),
+        ("late", "error", "agreement", "frames are 8 steps late (0.53 s)"),
+        ("early", "warning", "agreement", "frames are 2 steps early (0.13 s)"),
         ("reversed", "error", "agreement", "against each other in time"),
         ("foreign", "warning", "agreement", "do not change when the robot moves"),
-        ("stale poses", "warning", "stale poses", "while the picture changes"),
-        ("held poses", "error", "stale poses", "while the picture changes"),
+        ("stale poses", "warning", "stale poses", "while the frame changes"),
+        ("held poses", "error", "stale poses", "while the frame changes"),
         ("2 cm of noise", "warning", "noise", "shake by 2.0 cm"),
         ("deltas", "error", "position", "differences, not poses"),
         ("noise", "error", "pictures", "differ as much as far ones"),
         ("each step twice", "warning", "repeated", "recorded at a lower rate"),
-        ("each picture twice", "warning", "repeated", "filmed at a lower rate"),
+        ("each frame twice", "warning", "repeated", "filmed at a lower rate"),
         ("too fast", "warning", "speed", "faster than common arms"),
     ],
 )
@@ -118,7 +118,7 @@ def test_positions_around_the_base_that_drift_are_no_differences() -> None:
 
 
 def test_a_camera_that_is_one_step_behind_is_none_but_at_stride_1_it_is_a_whole_model_step() -> None:
-    assert found_in(SPOILS["a step late"](recorded()))[-1].text.endswith("best where pictures are 1 step late")
+    assert found_in(SPOILS["a step late"](recorded()))[-1].text.endswith("best where frames are 1 step late")
     (alarm,) = alarms_in(SPOILS["a step late"](recorded()), stride=1)
     assert (alarm.level, "are 1 step late (0.07 s)" in alarm.text) == ("error", True)
 

@@ -112,7 +112,7 @@ def test_the_camera_with_the_fewest_pictures_sets_the_steps(tmp_path: Path) -> N
 def test_every_camera_must_have_a_picture_for_every_step(tmp_path: Path, right: int) -> None:
     write(tmp_path, pictures={LEFT: FRAMES[LEFT][:-1], RIGHT: (FRAMES[RIGHT] * 2)[:right]})
     assert source(tmp_path).infos()[0].num_steps == STEPS - 1
-    with pytest.raises(InputError, match=f"24 steps, but {right} pictures in {RIGHT}.mp4"):
+    with pytest.raises(InputError, match=f"24 steps, but {right} frames in {RIGHT}.mp4"):
         source(tmp_path, camera=("left", "right")).infos()
 
 
@@ -208,7 +208,7 @@ BROKEN = {
     "cut video": (cut(MP4, 0.5), f"{LEFT}.mp4"),
     "empty video": (cut(MP4, 0.0), f"{LEFT}.mp4"),
     "no video in it": (lambda folder: (folder / MP4).write_text("a page that says 404" * 99), f"{LEFT}.mp4"),
-    "video two pictures short": (lambda folder: write_mp4(folder / MP4, FRAMES[LEFT][:-2]), "but 22 pictures"),
+    "video two frames short": (lambda folder: write_mp4(folder / MP4, FRAMES[LEFT][:-2]), "but 22 frames"),
 }  # fmt: skip
 
 

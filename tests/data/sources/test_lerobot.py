@@ -1,4 +1,4 @@
-"""LeRobot data sets: the same states and the right pictures from v3.0 and v2.1, conventions, and what can be wrong."""
+"""LeRobot data sets: the same states and the right frames from v3.0 and v2.1, conventions, and what can be wrong."""
 
 import json
 import pickle
@@ -220,7 +220,7 @@ def test_a_picture_in_the_table_that_is_none_is_named(episodes: list[Recorded], 
     rows[4]["bytes"] = None
     kind = pa.struct({"bytes": pa.binary(), "path": pa.string()})
     change_table(first_rows(root), **{KEY: pa.array([*rows[:4], rows[5], *rows[5:]], type=kind)})
-    with pytest.raises(InputError, match=r"episode_000000.*step 3: 40 bytes that are no picture"):
+    with pytest.raises(InputError, match=r"episode_000000.*step 3: 40 bytes that are no image"):
         source_of(root).read(0).read_frames([3])
     change_table(first_rows(root), **{KEY: pa.array(rows, type=kind)})
     with pytest.raises(InputError, match="names of files in their place"):
@@ -230,7 +230,7 @@ def test_a_picture_in_the_table_that_is_none_is_named(episodes: list[Recorded], 
 def test_the_rate_is_the_configs_where_it_names_one(v30: Path) -> None:
     source = source_of(v30, lerobot={"fps": 12.5})
     assert source.read(0).control_rate_hz == 12.5
-    assert numbers_of(source.read(1).read_frames([9])[0]) == (1, 9, 0), "pictures stay where info.json says"
+    assert numbers_of(source.read(1).read_frames([9])[0]) == (1, 9, 0), "frames stay where info.json says"
 
 
 def test_progress_is_told(either: Path, tmp_path: Path) -> None:
@@ -503,7 +503,7 @@ def test_a_video_that_is_shorter_than_its_rows_is_found_when_it_is_read(
     write_mp4(first_video(root), episodes[0].frames[KEY][:9], rate=FPS, gop=2)
     episode = source_of(root).read(0)
     assert numbers_of(episode.read_frames([8])[0]) == (0, 8, 0)
-    with pytest.raises(InputError, match=r"episode_000000\.mp4: episode_000000: no picture at 0\.600 s"):
+    with pytest.raises(InputError, match=r"episode_000000\.mp4: episode_000000: no frame at 0\.600 s"):
         episode.read_frames([3, 9])
 
 
@@ -515,7 +515,7 @@ def test_pictures_that_come_at_other_times_are_not_taken_for_the_right_ones(
     write_mp4(first_video(root), episodes[0].frames[KEY], rate=FPS, gop=2, times=late)
     episode = source_of(root).read(0)
     assert numbers_of(episode.read_frames([4])[0]) == (0, 4, 0)
-    with pytest.raises(InputError, match="no picture at"):
+    with pytest.raises(InputError, match="no frame at"):
         episode.read_frames([7])
 
 

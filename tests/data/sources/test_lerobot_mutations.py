@@ -111,7 +111,7 @@ def pictures_are_equal(before: Seen, after: Seen, case: str) -> None:
 
 
 def nothing_more(*_: object) -> None:
-    """H.264 has no checksums: most damage is an error of the decoder, some makes another picture."""
+    """H.264 has no checksums: most damage is an error of the decoder, some makes another frame."""
 
 
 @pytest.mark.parametrize(

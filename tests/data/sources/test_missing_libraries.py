@@ -43,7 +43,7 @@ def test_without_its_reader_no_episode_is_called_broken(tmp_path: Path, monkeypa
 
 
 def test_without_its_decoder_a_set_of_videos_is_not_indexed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Or the states of a hundred thousand episodes would be read before the first picture is missed."""
+    """Or the states of a hundred thousand episodes would be read before the first frame is missed."""
     folder, told = write_v21(tmp_path / "set", [recorded(0, 20)]), []
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r"PyAV, which decodes video, is not installed.*pip install"):

@@ -151,12 +151,12 @@ BROKEN: dict[str, tuple[Callable[[Path], object], str]] = {
     "no rate worth the name": (lambda path: write(path, fps_hz=0.0), "fps_hz: 0"),
     "another rate": (lambda path: write(path, fps_hz=30.0), "fps_hz: 30. needed: 15"),
     "no such camera": (lambda path: write(path, without="frames", wrist=WRIST), "frames: no such array"),
-    "too few pictures": (lambda path: write(path, frames=FRAMES[:-1]), r"frames: shape \(19, 36, 64, 3\)"),
-    "float pictures": (lambda path: write(path, frames=FRAMES / 255), "frames: shape .* float64"),
-    "wide pictures": (lambda path: write(path, frames=FRAMES.astype(np.uint16)), "pictures of uint16"),
-    "grey pictures": (lambda path: write(path, frames=FRAMES[..., 0]), "frames: shape"),
-    "pickled pictures": (lambda path: write(path, frames=np.array([{}, []], object)), "frames: .*objects"),
-    "turned pictures": (
+    "too few frames": (lambda path: write(path, frames=FRAMES[:-1]), r"frames: shape \(19, 36, 64, 3\)"),
+    "float frames": (lambda path: write(path, frames=FRAMES / 255), "frames: shape .* float64"),
+    "wide frames": (lambda path: write(path, frames=FRAMES.astype(np.uint16)), "frames of uint16"),
+    "grey frames": (lambda path: write(path, frames=FRAMES[..., 0]), "frames: shape"),
+    "pickled frames": (lambda path: write(path, frames=np.array([{}, []], object)), "frames: .*objects"),
+    "turned frames": (
         lambda path: write(path, frames=np.asfortranarray(FRAMES)),
         r"frames: an array in Fortran order.*needed: C order.*ascontiguousarray",
     ),

@@ -64,7 +64,7 @@ BOMBS: dict[str, tuple[Callable[[Path], None], str]] = {
         ),
         "frames: cannot be read .*in another way than numpy",
     ),
-    "pictures that are not there": (
+    "frames that are not there": (
         lambda path: add(without(path, "frames"), "frames", described((STEPS, 4_000_000, 4_000_000, 3), "|u1"), 1000),
         "frames: cannot be read .*in 1128 bytes",
     ),

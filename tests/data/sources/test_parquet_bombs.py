@@ -81,7 +81,7 @@ def test_pictures_that_repeat_without_end_are_refused(tmp_path: Path, monkeypatc
     path, picture = tmp_path / "rows.parquet", b"\xff\xd8" + bytes(99_998)
     table = pa.table({"episode_index": np.repeat([0, 1], 50), "image": repeated(picture, 100)})
     pq.write_table(table, path, compression="zstd")
-    assert rows_of(path).pictures(str(path), "image", 1) == [picture] * 50
-    monkeypatch.setattr(parquet, "MOST_PICTURE_BYTES", 5 * _MB)
+    assert rows_of(path).images(str(path), "image", 1) == [picture] * 50
+    monkeypatch.setattr(parquet, "MOST_IMAGE_BYTES", 5 * _MB)
     with pytest.raises(InputError, match="more than 5,242,880 bytes of episode_index, image"):
-        rows_of(path).pictures(str(path), "image", 1)
+        rows_of(path).images(str(path), "image", 1)

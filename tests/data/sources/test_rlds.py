@@ -225,10 +225,10 @@ def test_a_state_of_the_wrong_width_says_what_it_is_made_of(droid: Path) -> None
 
 @pytest.mark.parametrize("check_crc", ["once", "always", "never"])
 def test_a_picture_too_few_is_named(spoiled: Spoil, check_crc: str) -> None:
-    """The CRC is right, so only a count can tell; without it all later pictures would be those of other states."""
+    """The CRC is right, so only a count can tell; without it all later images would be those of other states."""
     folder = spoiled(lambda features: features["steps/observation/exterior_image_1_left"][1].pop(3) and None)
     for camera in ("exterior_1_left", "wrist_left"):  # the config's camera, and one that is asked for
-        with pytest.raises(InputError, match=r"11 pictures.*12 steps"):
+        with pytest.raises(InputError, match=r"11 images.*12 steps"):
             open_droid(folder, check_crc=check_crc, camera=camera).read(0, "exterior_1_left")
 
 

@@ -31,7 +31,7 @@ URL = "gs://robots/droid/1.0.0"
 
 @pytest.fixture(scope="module")
 def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four episodes of 80 steps in one shard, with the proportions of DROID: nearly all bytes are pictures."""
+    """Four episodes of 80 steps in one shard, with the proportions of DROID: nearly all bytes are images."""
     return write_synthetic_droid(
         tmp_path_factory.mktemp("long") / "1.0.0", episodes=4, steps=80, size=(96, 160), shards=1
     )
@@ -303,7 +303,7 @@ def test_what_no_length_tells_is_found_when_the_episode_is_read(
     with pytest.raises(InputError, match=r"record 0 .*step 1: .*within 5 m"):
         source.read(0)
     odd = far(folder, fields=RldsFields(state=("steps/action",)))
-    with pytest.raises(InputError, match=r"wrist_image_left: 11 pictures.*12 steps"):
+    with pytest.raises(InputError, match=r"wrist_image_left: 11 images.*12 steps"):
         odd.read(0, "wrist_left").read_frames([0])
     for _ in range(2):  # also where its neighbours are kept
         assert len(odd.read(0, "exterior_2_left").read_frames([3, 5])) == 2

@@ -371,7 +371,7 @@ def test_an_outage_costs_a_warning_and_what_is_new_is_sent_after_it(
 
 
 def test_what_is_only_here_in_the_end_is_said(bucket: Gcs, run: Path, caplog: pytest.LogCaptureFixture) -> None:
-    mirror = mirror_of(run, outage_said=True)
+    mirror = mirror_of(run, outage_reported=True)
     write(run, 10)
     bucket.fail_next(503, times=99)
     mirror.finish(lambda: False)

@@ -284,7 +284,7 @@ def test_a_check_fetches_elsewhere_and_leaves_the_runs_folder_alone(
 
 
 def test_a_folder_is_claimed_before_anything_is_fetched_into_it(bucket: Gcs, config: Config) -> None:
-    """Two that start at once in a new folder: the second would put older figures over those of the first."""
+    """Two that start at once in a new folder: the second would put older metrics over those of the first."""
     run_there(bucket, config, 10)
     with RunLock(local(config)) as first, RunLock(local(config)) as second:
         first.take()

@@ -65,8 +65,8 @@ def at_step(reporter, step: int, action: Callable[[], None]):
     other = type(reporter)()
     stepped = other.stepped
 
-    def then(done: int, figures: dict) -> None:
-        stepped(done, figures)
+    def then(done: int, metrics: dict) -> None:
+        stepped(done, metrics)
         if done == step:
             action()
 

@@ -41,7 +41,7 @@ STEPS = st.lists(
 def test_reading_and_seeking_equal_those_of_a_file_in_memory(size: int, steps: list[tuple[str, int]]) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(buffered_file, "_BLOCK_BYTES", 64)
-        patch.setattr(buffered_file, "_KEPT_BLOCKS", 8)
+        patch.setattr(buffered_file, "_CACHED_BLOCKS", 8)
         data = DATA[:size]
         ours, theirs = Served(data).file, io.BytesIO(data)
         for kind, number in steps:

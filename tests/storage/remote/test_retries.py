@@ -106,7 +106,7 @@ def test_a_network_that_stays_away_is_spoken_of_once(
             with_retries("gs://a/b", action, policy=policy, access="")
         return sum(record.levelname == "WARNING" for record in caplog.records)
 
-    monkeypatch.setattr(retries, "_last_said", [float("-inf")])
+    monkeypatch.setattr(retries, "_last_warning_s", [float("-inf")])
     assert spoken(attempts=3) == 0  # two failures are nothing
     assert spoken(attempts=6) == 1
     assert spoken(attempts=6) == 0  # said already

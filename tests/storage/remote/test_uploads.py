@@ -193,7 +193,7 @@ def test_a_place_has_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 def test_failures_are_said_below_warnings_where_that_is_asked_for(
     bucket: Gcs, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(retries, "_last_said", [-1e9])
+    monkeypatch.setattr(retries, "_last_warning_s", [-1e9])
     bucket.fail_next(503, times=4)
     with remote.quietly():
         assert storage.file_sizes("gs://bucket/run") == {}

@@ -80,14 +80,14 @@ def test_batches_are_timed_also_when_they_are_fetched_ahead() -> None:
             machine.host_s += 2.0
             return no_clips(2, POSE_WIDTHS, bytes_fetched=0)
 
-        def fetch_ahead(self) -> None:
+        def prefetch_next(self) -> None:
             machine.host_s += 3.0
 
     batches = TimedBatches(Loader(), IdleStopwatch(machine))
     next(batches)
     assert batches.waited_s == 2.0
     machine.works(1.0)
-    batches.fetch_ahead()
+    batches.prefetch_next()
     assert batches.waited_s == 4.0
 
 

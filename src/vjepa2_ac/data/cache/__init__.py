@@ -1,1 +1,1 @@
-"""The cache of fetched data: what was read from far away, and is kept on this disk?"""
+"""The data cache: remote data that was fetched once and is stored on the local disk."""

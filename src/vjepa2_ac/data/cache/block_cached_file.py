@@ -1,4 +1,4 @@
-"""How is a large file far away read, here and there, without fetching a piece twice? In blocks, kept on this disk."""
+"""Random access to a large remote file in blocks that are cached on the local disk, so that none is fetched twice."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class BlockCachedFile(RangedFile):
 
     def __init__(self, path: str, *, version: str, size: int, kept: DiskCache) -> None:
         super().__init__(self._fetched, size)
-        self._path, self._kept = path, kept
+        self._path, self._cache = path, kept
         self._bytes, self._key = size, f"{path} {version} {size}"
         self.failure: Exception | None = None
 
@@ -40,7 +40,7 @@ class BlockCachedFile(RangedFile):
 
     def _blocks_of(self, first: int, last: int) -> list[bytes]:
         """Return blocks from the disk; those that lack are fetched, neighbours together."""
-        found = {number: self._at_hand(number) for number in range(first, last + 1)}
+        found = {number: self._cached(number) for number in range(first, last + 1)}
         lacking = [number for number, block in found.items() if block is None]
         runs = [
             [number for _, number in run] for _, run in groupby(enumerate(lacking), key=lambda pair: pair[1] - pair[0])
@@ -49,12 +49,12 @@ class BlockCachedFile(RangedFile):
         for run, data in zip(runs, storage.read_ranges(self._path, ranges), strict=True):
             for place, number in enumerate(run):
                 block = data[place * _BLOCK_BYTES :][: self._length_of(number)]
-                self._kept.write(f"{self._key} {number}", block)
+                self._cache.write(f"{self._key} {number}", block)
                 found[number] = block
         return [block for block in found.values() if block is not None]
 
-    def _at_hand(self, number: int) -> bytes | None:
-        block = self._kept.read(f"{self._key} {number}")
+    def _cached(self, number: int) -> bytes | None:
+        block = self._cache.read(f"{self._key} {number}")
         return block if block is not None and len(block) == self._length_of(number) else None
 
     def _length_of(self, number: int) -> int:

@@ -1,4 +1,4 @@
-"""How are an episode's files read, whole or in parts, and not fetched twice when they lie elsewhere?"""
+"""Cached reads of an episode's files, whole or in parts: remote data is fetched once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How is data that lies elsewhere kept on this machine, within a limit, for all loader processes at once?"""
+"""The disk cache of remote data: bounded in size, shared by all loader processes."""
 
 from __future__ import annotations
 

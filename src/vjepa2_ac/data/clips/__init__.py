@@ -1,1 +1,1 @@
-"""Clips: how do episodes become batches, in which order?"""
+"""Clips: how episodes become batches, and in which order."""

@@ -1,4 +1,4 @@
-"""Which action belongs to a model step? A difference of states, or the commands that were recorded."""
+"""The action of a model step: a difference of states, or the recorded commands."""
 
 from __future__ import annotations
 

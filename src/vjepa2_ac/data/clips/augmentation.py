@@ -1,4 +1,4 @@
-"""How are training clips varied? A random crop and colour jitter, drawn once per clip and applied on the device."""
+"""Augmentation of training clips: a random crop and colour jitter, drawn once per clip and applied on the device."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def draw(config: AugmentConfig, height: int, width: int, *, seed: int, position:
     """Return what is changed in the clip at a position of the run, or None where nothing is to change.
 
     A pure function of its arguments: neither workers nor resuming change it. The crop's share of the area is uniform,
-    the logarithm of its aspect likewise, among the aspects with which that area fits into the picture; where none of
-    `crop_aspect` fits, it takes the nearest that does. So no draw falls back to the whole picture.
+    the logarithm of its aspect likewise, among the aspects with which that area fits into the frame; where none of
+    `crop_aspect` fits, it takes the nearest that does. So no draw falls back to the whole frame.
 
     Args:
         config: What may be changed, and how much.
@@ -68,8 +68,8 @@ def jittered(
 ) -> Float[Tensor, "time 3 height width"]:
     """Return a clip, 0..255, with other brightness, contrast and saturation; a factor of 1 changes nothing.
 
-    Each blends the picture with a plainer one and clamps: brightness with black, contrast with the mean grey,
-    saturation with the picture in grey. The mean grey is the whole clip's, so that every frame changes alike.
+    Each blends the frame with a plainer one and clamps: brightness with black, contrast with the mean grey,
+    saturation with the frame in grey. The mean grey is the whole clip's, so that every frame changes alike.
 
     Source: the formulas of torchvision's adjust_brightness, adjust_contrast and adjust_saturation, in this order.
     """

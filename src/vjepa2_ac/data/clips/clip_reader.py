@@ -1,4 +1,4 @@
-"""How do the steps and pictures of an episode become a clip, and clips a batch?"""
+"""Clips from the steps and frames of an episode, and batches from clips."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ def clip_at(
         dataset: Where it comes from.
         episode: Index into the data set's table.
         start: First control step.
-        camera: Whose pictures; None: the config's (first) camera.
+        camera: Whose frames; None: the config's (first) camera.
         augmentation: Draws what is to be changed, once the size of the frames is known.
 
     Raises:
-        InputError: The episode or one of the pictures cannot be read; says how to leave the episode out.
+        InputError: The episode or one of the frames cannot be read; says how to leave the episode out.
     """
     try:
         return read_clip(dataset, ClipRequest(episode, start, camera, augmentation))
@@ -58,7 +58,7 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
     """Stack clips into a batch; it has camera poses if each of the clips has.
 
     Raises:
-        InputError: The pictures of two clips differ in size.
+        InputError: The frames of two clips differ in size.
     """
     frames = [clip.frames for clip in clips if clip.frames is not None]
     latents = [clip.latents for clip in clips if clip.latents is not None]
@@ -80,11 +80,11 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
     )
 
 
-def pictures_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return the frames of a clip of a batch, cropped, for people to look at; of cached latents, small pictures.
+def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
+    """Return the frames of a clip of a batch, cropped, for people to look at; of cached latents, small frames.
 
     Raises:
-        InputError: The pictures of a cache cannot be read.
+        InputError: The frames of a cache cannot be read.
         ValueError: The clip is of another data set.
     """
     if batch.frames is not None:
@@ -103,7 +103,7 @@ def _require_one_size(clips: Sequence[Clip]) -> None:
         if shape != first_shape:
             error = InputError(
                 where=f"episode {clip.episode_id}",
-                found=f"pictures of {'x'.join(map(str, shape[1:3]))} after the crop",
+                found=f"frames of {'x'.join(map(str, shape[1:3]))} after the crop",
                 needed=f"{'x'.join(map(str, first_shape[1:3]))}, as in episode {first.episode_id}",
                 fix="Train on episodes of one size, or set training.batch_size: 1",
             )
@@ -115,18 +115,18 @@ def _stacked(latents: Sequence[StoredLatents]) -> StoredLatents:
     return StoredLatents(torch.stack([one.values for one in latents]), torch.stack(scales) if scales else None)
 
 
-def read_clip(dataset: Dataset, wish: ClipRequest) -> Clip:
+def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
     """Return a clip; its errors do not say how to leave the episode out, as those of `clip_at` do."""
     config = dataset.config
-    steps = range(wish.start, wish.start + config.clip_steps, config.model_stride)
-    recording = dataset.source.read(wish.episode, wish.camera, dataset.needed_steps(wish.episode))
+    steps = range(request.start, request.start + config.clip_steps, config.model_stride)
+    recording = dataset.source.read(request.episode, request.camera, dataset.needed_steps(request.episode))
     require_widths(recording, dataset.widths)
     frames = latents = augmentation = None
     if recording.read_latents is not None:
         latents = recording.read_latents(steps)
     else:
         frames = view(recording.read_frames(steps), config.crop)
-        draw_change = wish.augmentation
+        draw_change = request.augmentation
         augmentation = None if draw_change is None else draw_change(frames.shape[1], frames.shape[2])
     states, extrinsics = _states(recording, list(steps), in_camera_frame=config.pose_frame == "camera")
     return Clip(
@@ -135,11 +135,11 @@ def read_clip(dataset: Dataset, wish: ClipRequest) -> Clip:
         actions=actions_of(states, recording.commands, steps, config).astype(np.float32),
         extrinsics=None if extrinsics is None else extrinsics.astype(np.float32),
         episode_id=recording.info.id,
-        start=wish.start,
+        start=request.start,
         stride=config.model_stride,
         augmentation=augmentation,
         latents=latents,
-        camera=wish.camera,
+        camera=request.camera,
     )
 
 

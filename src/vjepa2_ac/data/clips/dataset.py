@@ -1,4 +1,4 @@
-"""Which episodes and steps of a data set take part? Opened once, filtered once, and small enough for every worker."""
+"""The data set of a run: its episodes and steps, opened and filtered once, small enough to send to every worker."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from vjepa2_ac.storage.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
-_TRIED = 8  # episodes that are read for their widths, where some are broken
+_MOST_EPISODES_READ = 8  # episodes that are read for their widths, where some are broken
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class Dataset:
         if said := self.table.texts.get("widths"):
             return Widths(*map(int, said.split()))
         first_error: InputError | None = None
-        for episode in self.episodes[:_TRIED].tolist():
+        for episode in self.episodes[:_MOST_EPISODES_READ].tolist():
             try:
                 return widths_of(self.source.read(episode))
             except UnreachableError:
@@ -209,8 +209,8 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
             ranges = source.kept_ranges()
         else:
             ranges = find_ranges(source, table, config, progress)
-        kept = _kept_of(ranges, table, taking_part, broken)
-        _say_how_many_are_listed(ranges, table, config)
+        kept = _select_steps(ranges, table, taking_part, broken)
+        _log_listed_episodes(ranges, table, config)
     dataset = Dataset(config, source, table, kept, broken, split_hash(table, kept.taking_part, config))
     if not len(dataset.episodes):
         raise _nothing_left(dataset)
@@ -250,7 +250,7 @@ def _nothing_left(dataset: Dataset) -> InputError:
     )
 
 
-def _kept_of(
+def _select_steps(
     found: FoundRanges, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], broken: BrokenEpisodes
 ) -> StepSelection:
     met = [(place, problem) for place, problem in found.problems if taking_part[place]]
@@ -273,7 +273,7 @@ def _of_outcome(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " e
     return np.asarray(table.success == (config.outcome == "success"))
 
 
-def _say_how_many_are_listed(found: FoundRanges, table: EpisodeTable, config: DataConfig) -> None:
+def _log_listed_episodes(found: FoundRanges, table: EpisodeTable, config: DataConfig) -> None:
     if config.idle.rule != "published":
         return
     logger.log(

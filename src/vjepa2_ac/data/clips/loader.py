@@ -1,6 +1,6 @@
-"""How do clips become batches, in an order that nothing can disturb?
+"""The clip loader: batches in a deterministic order.
 
-The batch at a place of the run is a pure function of the seed and that place. Workers only decide how soon it is there.
+The batch at a position of the run is a pure function of the seed and the position. Workers only affect the speed.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def _some_of(batches: Iterator[Batch], dataset: Dataset) -> Iterator[Batch]:
 
 
 @runtime_checkable
-class _Wishes(Protocol):
+class _Requests(Protocol):
     """Says which clip stands at a position; a pure function, the same in every worker."""
 
     def at(self, position: int) -> ClipRequest: ...
@@ -171,7 +171,7 @@ class _Clips(TorchDataset[MicroBatch]):
     """Clips by position, read a micro-batch at a time."""
 
     dataset: Dataset
-    wishes: _Wishes
+    requests: _Requests
 
     def __getitems__(self, positions: list[int]) -> MicroBatch | InputError:
         """Return a micro-batch, or the error that prevents it: DataLoader could not carry that one home unharmed."""
@@ -195,15 +195,17 @@ class _Clips(TorchDataset[MicroBatch]):
             return list(pool.map(self._clip, positions))
 
     def _clip(self, position: int) -> Clip | Skipped:
-        wish = self.wishes.at(position)
+        request = self.requests.at(position)
         if self.dataset.config.broken_episodes == "error":
-            return clip_at(self.dataset, wish.episode, wish.start, camera=wish.camera, augmentation=wish.augmentation)
+            return clip_at(
+                self.dataset, request.episode, request.start, camera=request.camera, augmentation=request.augmentation
+            )
         try:
-            return read_clip(self.dataset, wish)
+            return read_clip(self.dataset, request)
         except UnreachableError:
             raise  # the network's fault, not the episode's
         except InputError as error:
-            return Skipped(self.dataset.table.identity(wish.episode), str(error))
+            return Skipped(self.dataset.table.identity(request.episode), str(error))
 
 
 def _rows(first: int, length: int, distance: int) -> Iterator[list[int]]:
@@ -226,7 +228,7 @@ def _read(
     loader = DataLoader(
         clips,
         batch_sampler=positions,
-        collate_fn=_as_it_is,
+        collate_fn=_identity,
         generator=torch.Generator(),  # else the loader draws from the generator that dropout draws from
         num_workers=workers,
         multiprocessing_context=context,
@@ -247,5 +249,5 @@ def _read(
         atexit.unregister(at_exit)
 
 
-def _as_it_is(batch: Any) -> Any:
+def _identity(batch: Any) -> Any:
     return batch

@@ -1,4 +1,4 @@
-"""A keyed permutation of any size: where does an index go, without the whole order in memory?"""
+"""A keyed permutation of any size: maps an index to its position without storing the whole order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How is a batch on the device before it is asked for? It is fetched ahead, and told of only when its turn has come."""
+"""Prefetching of batches to the device: loaded in advance, their events reported only when their turn has come."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ class MicroBatch:
 
 
 @runtime_checkable
-class FetchesAhead(Protocol):
+class SupportsPrefetch(Protocol):
     """Batches of which the next one can be fetched before it is asked for."""
 
-    def fetch_ahead(self) -> None:
+    def prefetch_next(self) -> None:
         """Fetch it now."""
         ...
 
 
-def fetch_ahead(batches: Iterator[Batch]) -> None:
+def prefetch_next(batches: Iterator[Batch]) -> None:
     """Fetch the next batch where these batches can do so ahead: to be called before the host waits for the device."""
-    if isinstance(batches, FetchesAhead):
-        batches.fetch_ahead()
+    if isinstance(batches, SupportsPrefetch):
+        batches.prefetch_next()
 
 
 class Batches(Iterator[Batch]):
@@ -55,7 +55,7 @@ class Batches(Iterator[Batch]):
         self, rows: Generator[MicroBatch | InputError, None, None], broken: BrokenEpisodes, copies: Copies
     ) -> None:
         self._rows, self._broken, self._copies = rows, broken, copies
-        self._ahead: Exception | _Fetched | None = None
+        self._prefetched: Exception | _Fetched | None = None
 
     def __next__(self) -> Batch:
         """Return the next batch.
@@ -63,7 +63,7 @@ class Batches(Iterator[Batch]):
         Raises:
             InputError: A clip cannot be read, also where a worker met it; or too many cannot.
         """
-        fetched, self._ahead = self._ahead or self._fetched(), None
+        fetched, self._prefetched = self._prefetched or self._fetched(), None
         if isinstance(fetched, Exception):
             self.close()
             raise fetched
@@ -71,14 +71,14 @@ class Batches(Iterator[Batch]):
             self._broken.met(one.episode_id, one.reason)
         return replace(fetched.row.batch, on_device=fetched.on_device)
 
-    def fetch_ahead(self) -> None:
+    def prefetch_next(self) -> None:
         """Fetch the next batch and start its way to the device."""
-        if self._copies.overlap and self._ahead is None:
-            self._ahead = self._fetched()
+        if self._copies.overlap and self._prefetched is None:
+            self._prefetched = self._fetched()
 
     def close(self) -> None:
         """End the workers; what was fetched ahead is nobody's."""
-        self._ahead = None
+        self._prefetched = None
         self._rows.close()
 
     def _fetched(self) -> Exception | _Fetched:
@@ -86,7 +86,7 @@ class Batches(Iterator[Batch]):
             row = next(self._rows)
             if isinstance(row, InputError):
                 return row
-            on_device = _given_once(self._copies.to_device.start(row.batch.mapped)) if self._copies.overlap else None
+            on_device = _take_once(self._copies.to_device.start(row.batch.mapped)) if self._copies.overlap else None
         except Exception as error:  # also the end of the rows
             return error
         return _Fetched(row, on_device)
@@ -98,7 +98,7 @@ class _Fetched:
     on_device: Callable[[], Batch | None] | None
 
 
-def _given_once(taken: Callable[[], Batch]) -> Callable[[], Batch | None]:
+def _take_once(taken: Callable[[], Batch]) -> Callable[[], Batch | None]:
     """Return what gives a copy and forgets it, so that it lives no longer than it is used."""
     held = [taken]
     return lambda: held.pop()() if held else None

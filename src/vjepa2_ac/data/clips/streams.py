@@ -1,4 +1,4 @@
-"""How do tensors cross between host and device while the device computes? On streams of their own, by pinned memory."""
+"""Asynchronous copies between host and device: own CUDA streams and pinned memory, while the device computes."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""How does a camera's picture become what the encoder sees? Crop, augmentation, scaling, normalisation.
+"""Camera frames to encoder input: crop, augmentation, scaling, normalisation.
 
-The crop is taken in the loader, on uint8; all else runs on the device, on a whole batch.
+The crop is taken in the loader, on uint8; everything else runs on the device, on a whole batch.
 
 Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/transforms.py and src/datasets/utils/video/transforms.py. The
 recipe's random crop never fits a 16:9 frame, so its fallback, a central crop, is always taken: nothing is random.
@@ -31,7 +31,7 @@ _STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
 
 @dataclass(frozen=True)
 class CropBox:
-    """A part of a picture, in pixels."""
+    """A part of a frame, in pixels."""
 
     top: int
     left: int
@@ -40,7 +40,7 @@ class CropBox:
 
 
 def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
-    """Return the part of a picture that the model sees: all of it, or the centre cut to an aspect (width over height).
+    """Return the part of a frame that the model sees: all of it, or the centre cut to an aspect (width over height).
 
     released: an aspect between 0.75 and 1.35. square: 1, as upstream evaluates. letterbox: all.
     """
@@ -60,7 +60,7 @@ def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
 def view(
     frames: UInt8[np.ndarray, "time height width 3"], kind: Crop = "released"
 ) -> UInt8[np.ndarray, "time seen_height seen_width 3"]:
-    """Return what the model sees of the pictures, in their own pixels; see `DataConfig.crop`.
+    """Return what the model sees of the frames, in their own pixels; see `DataConfig.crop`.
 
     A slice of the same memory, but for letterbox where bars must be added.
     """
@@ -86,7 +86,7 @@ def pixels_to_input(
     image_size: int,
     augmentations: Sequence[Augmentation] = (),
 ) -> Float[Tensor, "batch time 3 size size"]:
-    """Return cropped pictures as the encoder wants them: squashed to a square (bilinear), ImageNet mean 0 and std 1.
+    """Return cropped frames as the encoder wants them: squashed to a square (bilinear), ImageNet mean 0 and std 1.
 
     Args:
         frames: What `view` returned, stacked, on any device.

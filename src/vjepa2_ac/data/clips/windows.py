@@ -1,7 +1,7 @@
-"""Which clips are there, which split do they belong to, and in which order are they seen?
+"""Clip windows: which clips exist, the split they belong to, and their order.
 
-Everything here is a pure function of the episodes' identities and kept steps, the seed and a position: nothing depends
-on the number of shards, workers or ranks, and nothing needs to be saved to go on where a run stopped.
+Everything here is a pure function of the episodes' identities and remaining steps, the seed and a position: nothing
+depends on the number of shards, workers or ranks, and resuming a run needs no saved state.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ def windows_of(
         _warn_of_short(config.path, split, config.clip_steps, int(members.sum()), len(short), names)
     own = starts[members[starts.episode]]
     if not own.windows:
-        raise _nothing_kept(config, split)
+        raise _no_steps_left(config, split)
     return Windows(own, np.cumsum(own.count, dtype=np.int64), short, table.id_hash, config.idle.keep_share)
 
 
@@ -193,7 +193,7 @@ def _too_short(
     )
 
 
-def _nothing_kept(config: DataConfig, split: Split) -> InputError:
+def _no_steps_left(config: DataConfig, split: Split) -> InputError:
     return InputError(
         where=f"data.path: {config.path}",
         found=f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})",

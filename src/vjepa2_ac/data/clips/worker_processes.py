@@ -1,4 +1,4 @@
-"""Worker processes of the loader: how are they started deaf to the run's signals, and how do they end with it?"""
+"""Worker processes of the loader: they ignore the run's signals and end with the run."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Filters: which episodes and steps take part?"""
+"""Filters: which episodes and steps are used."""

@@ -1,4 +1,4 @@
-"""How is a regular expression from a config matched without it running for ever? In a process that can be ended."""
+"""Regular expressions from a config, matched in a process that can be killed, so that none runs for ever."""
 
 from __future__ import annotations
 

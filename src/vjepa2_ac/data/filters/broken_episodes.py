@@ -1,4 +1,4 @@
-"""What becomes of episodes that cannot be used? One policy for all sources: stop, or leave them out and count them."""
+"""Broken episodes: one policy for all sources: stop, or skip and count them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does a run go on without an episode that cannot be used? By its identity, in `data.exclude`."""
+"""Exclusion of single episodes from a run, by their identity in `data.exclude`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which episodes belong together, so that they land in one split? Those of a scene, a day, as `data.split_by` says."""
+"""Episode groups that stay in one split: the episodes of a scene, a day, as `data.split_by` says."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which steps does the idle filter keep, in every episode? Looked up or computed once, and kept on disk."""
+"""The steps that the idle filter leaves of every episode: read from its cache, or computed once and cached on disk."""
 
 from __future__ import annotations
 
@@ -115,11 +115,11 @@ def find_ranges(
     }
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
-        return _kept(config, parts | {"list": _version(path)}, lambda: _published(path, table))
-    return _kept(config, parts, lambda: _computed(source, table, config, progress))
+        return _cached(config, parts | {"list": _version(path)}, lambda: _published(path, table))
+    return _cached(config, parts, lambda: _computed(source, table, config, progress))
 
 
-def _kept(config: DataConfig, parts: dict[str, object], make: Callable[[], FoundRanges]) -> FoundRanges:
+def _cached(config: DataConfig, parts: dict[str, object], make: Callable[[], FoundRanges]) -> FoundRanges:
     return get_or_make(
         config.disk_cache, key_of(parts), make, to_bytes=FoundRanges.to_bytes, from_bytes=FoundRanges.from_bytes
     )

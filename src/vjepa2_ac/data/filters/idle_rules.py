@@ -1,4 +1,4 @@
-"""When does the robot stand still? Runs of idle steps, from commanded joint velocities or from the measured motion."""
+"""Idle rules: ranges where the robot stands still, from commanded joint velocities or measured motion."""
 
 from __future__ import annotations
 

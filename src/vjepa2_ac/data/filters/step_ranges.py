@@ -1,4 +1,4 @@
-"""Which control steps may clips come from? Ranges of episodes, a few bytes each, and the starts that fit into them."""
+"""Step ranges that clips may come from: a few bytes per episode, and the clip starts that fit into them."""
 
 from __future__ import annotations
 

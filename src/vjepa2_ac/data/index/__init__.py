@@ -1,1 +1,1 @@
-"""The index of a data set: what is known of every episode, and where is that cached?"""
+"""The index of a data set: facts about every episode, and their cache."""

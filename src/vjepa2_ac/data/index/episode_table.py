@@ -1,6 +1,6 @@
-"""What is known of every episode of a data set, in a few bytes each?
+"""The episode table: facts about every episode of a data set, in a few bytes each.
 
-DROID has 95,658 episodes: a list of as many objects is slow to load and to send to workers. Here are columns instead.
+DROID has 95,658 episodes: a list of as many objects is slow to load and to send to workers. This is columns instead.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where is kept what was found out about a data set, so that it is found out once?"""
+"""The index cache: results of scanning a data set, so that it is scanned once."""
 
 from __future__ import annotations
 

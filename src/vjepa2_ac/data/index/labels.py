@@ -1,4 +1,4 @@
-"""What does a data set say an episode belongs to, such as a scene or a task? Short names, a few bytes an episode."""
+"""Labels of episodes in a data set, such as scene or task: short names, a few bytes per episode."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int32
 
-_UNSAID = -1
+_MISSING = -1
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class Labels:
         """Refuse numbers of no name, which a damaged file may hold."""
         if not all(isinstance(name, str) for name in self.names):
             raise ValueError("labels that are no text")
-        if len(self.number) and not _UNSAID <= self.number.min() <= self.number.max() < len(self.names):
+        if len(self.number) and not _MISSING <= self.number.min() <= self.number.max() < len(self.names):
             raise ValueError(f"labels of {len(self.names)} names with numbers up to {self.number.max()}")
 
     @classmethod
@@ -30,21 +30,21 @@ class Labels:
         """Make labels; None or an empty name: the data set does not say."""
         names = sorted({value for value in values if value})
         place = {name: number for number, name in enumerate(names)}
-        return cls(tuple(names), np.array([place.get(value or "", _UNSAID) for value in values], np.int32))
+        return cls(tuple(names), np.array([place.get(value or "", _MISSING) for value in values], np.int32))
 
     @property
-    def is_said(self) -> bool:
+    def is_present(self) -> bool:
         """Whether there is a name for any episode."""
         return bool(self.names)
 
     def of_episode(self, index: int) -> str | None:
         """Return the name of one episode, or None where the data set does not say."""
         number = int(self.number[index])
-        return None if number == _UNSAID else self.names[number]
+        return None if number == _MISSING else self.names[number]
 
 
 def labels_of(values: Sequence[Mapping[str, str | None]]) -> dict[str, Labels]:
     """Return the labels of episodes, each given as {label: name}; labels that no episode has are left out."""
     every = {label for of_one in values for label in of_one}
     found = {label: Labels.of([of_one.get(label) for of_one in values]) for label in sorted(every)}
-    return {label: labels for label, labels in found.items() if labels.is_said}
+    return {label: labels for label, labels in found.items() if labels.is_present}

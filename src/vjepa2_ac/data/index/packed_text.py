@@ -1,4 +1,4 @@
-"""How do as many short texts as there are episodes fit into columns of a table?"""
+"""Packed text: table columns of one short text per episode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Are two episodes the same one? By a hash of their measured states, which a copy under another name shares."""
+"""State hashes: identify copies of an episode under another name by their measured states."""
 
 from __future__ import annotations
 

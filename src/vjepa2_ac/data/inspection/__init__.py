@@ -1,1 +1,1 @@
-"""Inspection: what is in a data set, and what is wrong with it?"""
+"""Inspection: the content of a data set, and its errors."""

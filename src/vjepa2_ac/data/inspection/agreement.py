@@ -1,9 +1,9 @@
-"""Do the pictures move when the robot does? The change of pictures beside that of states, step for step and shifted.
+"""Agreement of frames and states: correlation of their changes, step by step and shifted.
 
-Where a robot moves faster, its picture changes more. The rank correlation of the two within an episode is 0.5 and more
-on simulated arms at 15 Hz and on BridgeData at 5 Hz (docs/log.md); with the pictures of another episode, at the best of
-21 shifts, it is 0.1 to 0.4. So the shift at which it is highest tells of pictures that are late, pictures that fit
-backwards are reversed, and where nothing fits better than another episode's, they are of another one.
+Where a robot moves faster, its frame changes more. The rank correlation of the two within an episode is 0.5 and more on
+simulated arms at 15 Hz and on BridgeData at 5 Hz (docs/log.md); with the frames of another episode, at the best of 21
+shifts, it is 0.1 to 0.4. So the shift with the highest correlation shows frames that are late, frames that fit
+backwards are reversed, and frames that fit no better than another episode's belong to another episode.
 """
 
 from __future__ import annotations
@@ -25,36 +25,36 @@ _SHIFTS = 20  # pairings with other episodes, each of all episodes
 FEWEST_EPISODES = 8  # of fewer, chance is not known well enough
 _SURE = 3.0  # standard errors, or deviations of chance
 _GAIN = 0.25  # of what is above chance, that another shift must add
-_ABOVE = 0.15  # chance, at least, of a robot with its own pictures: 0.3 and more was seen
+_ABOVE = 0.15  # chance, at least, of a robot with its own frames: 0.3 and more was seen
 
 Verdict = Literal["together", "late", "reversed", "foreign", "unknown"]
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well pictures and states fit."""
+    """How well frames and states fit."""
 
     verdict: Verdict
     episodes: int
-    lag: int = 0  # control steps by which pictures lag behind states where they fit best; below 0: are ahead
+    lag: int = 0  # control steps by which frames lag behind states where they fit best; below 0: are ahead
     best: float = 0.0  # mean rank correlation there
     unshifted: float = 0.0
-    backwards: float = 0.0  # with the pictures in reverse, at the best shift
-    chance: float = 0.0  # with pictures of other episodes, at the best shift
+    backwards: float = 0.0  # with the frames in reverse, at the best shift
+    chance: float = 0.0  # with frames of other episodes, at the best shift
     is_farthest: bool = False  # no wider shift was tried
 
 
 def agreement_of(
     excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]], *, least_lag: int = 2
 ) -> Agreement:
-    """Compare the change of pictures with that of states.
+    """Compare the change of frames with that of states.
 
     Args:
         excerpts: Some episodes.
         moved: How far each has moved at each step, in any unit.
         least_lag: Control steps that are called late; a camera is soon one step behind.
     """
-    pairs = [(one, other.picture_change) for one, other in zip(moved, excerpts, strict=True)]
+    pairs = [(one, other.frame_change) for one, other in zip(moved, excerpts, strict=True)]
     pairs = [pair for pair in pairs if all(len(values) and np.ptp(values) > 0 for values in pair)]
     usual = float(np.median([len(one) for one, _ in pairs])) if pairs else 0.0
     pairs = [pair for pair in pairs if len(pair[0]) >= usual / 2]  # shorter ones would tell of few shifts only

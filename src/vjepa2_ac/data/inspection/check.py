@@ -1,4 +1,4 @@
-"""Can this data set be trained on? Open it, load a few batches as training would, and look at every number in them."""
+"""`data check`: opens a data set, loads a few batches as training would, and checks every number in them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
 
 _MOVED_M = 0.01  # of the flange: it should be seen
-_DARK = 8  # of 255: mean of pictures that show next to nothing
+_DARK = 8  # of 255: mean of frames that show next to nothing
 _STILL_CM, _FAR_CM = 0.2, 30.0  # medians of |dxyz| per model step that are worth a word
 _REACH_M = 1.6  # beyond the reach of common arms
 _LONGEST = 300  # letters of a reason
@@ -151,11 +151,11 @@ def findings_in(batches: Sequence[Batch], *, is_pose: bool = True) -> Iterator[F
     if not is_pose:
         ranges = torch.from_numpy((states.max(axis=0) - states.min(axis=0)).astype(np.float32))
         if has_pixels:
-            yield _still_pictures(batches, [has_moved(batch.states, ranges) for batch in batches])
+            yield _still_frames(batches, [has_moved(batch.states, ranges) for batch in batches])
         yield from vector_findings(states, actions)
         return
     if has_pixels:
-        yield _still_pictures(batches, [batch.actions[..., :3].norm(dim=-1) > _MOVED_M for batch in batches])
+        yield _still_frames(batches, [batch.actions[..., :3].norm(dim=-1) > _MOVED_M for batch in batches])
     yield _positions(states)
     yield _rotations(states, actions)
     yield _gripper(states[:, 6], clips)
@@ -170,7 +170,7 @@ def _pixels(batches: Sequence[Batch]) -> Finding:
     if low == high:
         return Finding("error", "pixels", f"all are {low}: there is nothing to see. Check data.camera")
     if mean < _DARK:
-        return Finding("warning", "pixels", f"{text}: the pictures are nearly black. Check data.camera")
+        return Finding("warning", "pixels", f"{text}: the frames are nearly black. Check data.camera")
     return Finding("ok", "pixels", text)
 
 
@@ -180,15 +180,15 @@ def _frames(batch: Batch) -> Tensor:
     return batch.frames
 
 
-def _still_pictures(batches: Sequence[Batch], has_moved: Sequence[Tensor]) -> Finding:
-    """Compare pictures with the ones before them, where the robot has moved."""
+def _still_frames(batches: Sequence[Batch], has_moved: Sequence[Tensor]) -> Finding:
+    """Compare frames with the ones before them, where the robot has moved."""
     same = moved = 0
     for batch, far in zip(batches, has_moved, strict=True):
         frames = _frames(batch)
         equal = (frames[:, 1:] == frames[:, :-1]).flatten(2).all(dim=-1)
         moved += int(far.sum())
         same += int((far & equal).sum())
-    text = f"{same} of {moved} pictures equal the one before although the robot moved"
+    text = f"{same} of {moved} frames equal the one before although the robot moved"
     if same > moved / 2:
         return Finding("error", "pictures", f"{text}: they do not show it. Check data.camera and the control rate")
     return Finding("warning" if same > moved / 20 else "ok", "pictures", text)

@@ -1,4 +1,4 @@
-"""What does `data check` say of stretches of episodes? Whether pictures and states belong together, and what is odd."""
+"""Checks of episode excerpts for `data check`: whether frames and states belong together, and what is unusual."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def excerpt_findings(dataset: Dataset) -> Iterator[Finding]:
 
 
 def signs_in(excerpts: Sequence[Excerpt], *, is_pose: bool, stride: int, control_rate_hz: float) -> Iterator[Finding]:
-    """Yield what is odd in stretches of episodes, and whether pictures and states belong together; nothing is read."""
+    """Yield what is odd in stretches of episodes, and whether frames and states belong together; nothing is read."""
     excerpts = [one for one in excerpts if len(one.states) > 1]
     if not excerpts:
         return
     moved = oddities.motion_in(excerpts, is_pose=is_pose)
-    found = [oddities.noise_as_pictures(excerpts), *oddities.repetitions(excerpts, moved)]
+    found = [oddities.noise_as_frames(excerpts), *oddities.repetitions(excerpts, moved)]
     if is_pose:
         deltas = oddities.deltas_for_poses(excerpts)
         found += [deltas or oddities.shaking(excerpts), oddities.too_fast(excerpts, control_rate_hz)]
@@ -55,32 +55,30 @@ def signs_in(excerpts: Sequence[Excerpt], *, is_pose: bool, stride: int, control
 
 def _agreement(found: Agreement, stride: int, control_rate_hz: float, *, is_sound: bool) -> Finding:
     said = f"rank correlation of their changes over {found.episodes} episodes"
-    text = f"{said} {found.best:.2f}, {found.chance:.2f} with another episode's pictures"
+    text = f"{said} {found.best:.2f}, {found.chance:.2f} with another episode's frames"
     if found.episodes < FEWEST_EPISODES:
-        needed = f"{FEWEST_EPISODES} are needed to tell whether pictures and states belong together"
+        needed = f"{FEWEST_EPISODES} are needed to tell whether frames and states belong together"
         return Finding("ok", "agreement", f"not known of {found.episodes} moving episodes of enough steps: {needed}")
     if found.verdict == "reversed":
-        text = f"{said} {found.backwards:.2f} with the pictures backwards, {found.best:.2f} forwards"
-        return Finding("error", "agreement", f"pictures and states run against each other in time: {text}")
+        text = f"{said} {found.backwards:.2f} with the frames backwards, {found.best:.2f} forwards"
+        return Finding("error", "agreement", f"frames and states run against each other in time: {text}")
     if found.verdict == "late":
         steps = abs(found.lag)
         text = f"{said} {found.best:.2f} so, {found.unshifted:.2f} as they are"
-        fix = f"Give each picture the state of {_steps(steps)} {'before' if found.lag > 0 else 'after'}"
-        level: Level = (
-            "error" if steps >= stride else "warning"
-        )  # then each action stands beside another one's pictures
-        by = f"pictures are {'at least ' * found.is_farthest}{_shift(found.lag)} ({steps / control_rate_hz:.2f} s)"
+        fix = f"Give each frame the state of {_steps(steps)} {'before' if found.lag > 0 else 'after'}"
+        level: Level = "error" if steps >= stride else "warning"  # then each action stands beside another one's frames
+        by = f"frames are {'at least ' * found.is_farthest}{_shift(found.lag)} ({steps / control_rate_hz:.2f} s)"
         return Finding(level, "agreement", f"{by}: {text}. {fix}")
     if found.verdict == "foreign" and is_sound:
         return Finding(
             "warning",
             "agreement",
-            f"pictures do not change when the robot moves: {text}. Are they of these episodes, and of this robot?",
+            f"frames do not change when the robot moves: {text}. Are they of these episodes, and of this robot?",
         )
     if found.verdict == "together":
-        shift = f", best where pictures are {_shift(found.lag)}" if found.lag else ""
-        return Finding("ok", "agreement", f"pictures change when the robot moves: {text}{shift}")
-    return Finding("ok", "agreement", f"not known whether pictures and states belong together: {text}")
+        shift = f", best where frames are {_shift(found.lag)}" if found.lag else ""
+        return Finding("ok", "agreement", f"frames change when the robot moves: {text}{shift}")
+    return Finding("ok", "agreement", f"not known whether frames and states belong together: {text}")
 
 
 def _steps(count: int) -> str:

@@ -1,4 +1,4 @@
-"""What do the numbers of a robot say whose states are vectors (`data.states: vector`)? What they mean, nobody knows."""
+"""Checks of vector states (`data.states: vector`), whose meaning is unknown."""
 
 from __future__ import annotations
 

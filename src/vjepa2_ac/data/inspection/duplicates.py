@@ -1,4 +1,4 @@
-"""Is an episode there under several names? Then it may be trained on under one, and measured on under another."""
+"""Duplicates: an episode under several names, which could be in both the training and the validation split."""
 
 from __future__ import annotations
 

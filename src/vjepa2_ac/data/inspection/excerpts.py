@@ -1,4 +1,4 @@
-"""What is looked at to tell whether pictures and states belong together? A stretch of a few dozen episodes, in grey."""
+"""Excerpts of a few dozen episodes in grey, used to check that frames and states belong together."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vjepa2_ac.errors import InputError
 
 EPISODES = 24
 STEPS = 64
-_ROWS, _COLUMNS = 24, 32  # of a small picture: an arm is still some pixels wide, and a camera's noise is averaged out
+_ROWS, _COLUMNS = 24, 32  # of a small frame: an arm is still some pixels wide, and a camera's noise is averaged out
 _STRONG, _STRONG_SHARE = 40, 0.01  # difference of red and blue, of 255; of the pixels
 
 
@@ -30,8 +30,8 @@ class Excerpt:
     warmth: float  # of what is strongly coloured: 1 all of it more red than blue, -1 more blue; 0 where nothing is
 
     @property
-    def picture_change(self) -> Float[np.ndarray, " changes"]:
-        """How much each picture differs from the one before: the mean over its pixels."""
+    def frame_change(self) -> Float[np.ndarray, " changes"]:
+        """How much each frame differs from the one before: the mean over its pixels."""
         return np.asarray(np.abs(np.diff(self.grey, axis=0)).mean(axis=(1, 2)), np.float64)
 
 
@@ -82,7 +82,7 @@ def warmth_of(frames: UInt8[np.ndarray, "steps height width 3"]) -> float:
 
 
 def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.ndarray, "steps rows columns"]:
-    """Return pictures in grey, each pixel the mean of a part; those that are smaller than that stay as they are."""
+    """Return frames in grey, each pixel the mean of a part; those that are smaller than that stay as they are."""
     grey = frames.mean(axis=3, dtype=np.float32)
     for axis, wanted in ((1, _ROWS), (2, _COLUMNS)):
         size = grey.shape[axis]

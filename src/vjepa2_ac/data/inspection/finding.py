@@ -1,4 +1,4 @@
-"""What is one line of `data check`?"""
+"""Finding: one line of `data check`."""
 
 from __future__ import annotations
 

@@ -1,14 +1,14 @@
-"""What can be seen of states and pictures that are wrong, without a model? Each sign by itself, on neighbouring steps.
+"""Signs of wrong states and frames that need no model: each is measured by itself, on neighbouring steps.
 
-The limits are set by what was measured (docs/log.md: simulated arms, BridgeData and DROID excerpts as they are, and the
-same spoiled): each lies apart from all clean sets, so that what is only slightly wrong passes. Colours do not: nothing
-tells a blue world from exchanged channels, so there is a hint only.
+The limits follow from measurements (docs/log.md: simulated arms, BridgeData and DROID excerpts, unchanged and spoiled):
+each limit is well away from all clean sets, so slight errors pass. Colours are an exception: nothing distinguishes a
+blue world from swapped channels, so there is a hint only.
 
                                     clean sets                spoiled                              limit
     stale poses, share of steps     0 to 0.01                 0.19 (every 5th), 0.80 (4 of 5)      0.05; error 0.5
     copied steps, share             0                         0.46 and more (each twice)           0.2
-    pictures without motion, share  0                         0.5 (each twice, poses not)          0.2
-    neighbours over far pictures    0.04 to 0.33              1.0 (noise)                          0.9
+    frames without motion, share    0                         0.5 (each twice, poses not)          0.2
+    neighbours over far frames      0.04 to 0.33              1.0 (noise)                          0.9
     autocorrelation of motion       0.67 to 0.97              -0.35 and less (2 cm of noise)       -0.2
     median distance from base       0.33 m to 0.60 m          0.02 m and less (deltas)             0.05 m
     cold episodes, share            0; arm of domain A: 1     1 (BridgeData in BGR)                0.9
@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac.data.inspection.excerpts import Excerpt
 from vjepa2_ac.data.inspection.finding import Finding
 
-_STILL_PICTURE = 0.1  # of an episode's median change: what a codec leaves of a picture that is shown twice
+_STILL_FRAME = 0.1  # of an episode's median change: what a codec leaves of a frame that is shown twice
 _STALE, _MOSTLY_STALE = 0.05, 0.5
 _COPIED = 0.2
 _FAR_LIKE_NEAR, _FEWEST_STEPS = 0.9, 8
@@ -51,14 +51,14 @@ def _change_of_pose(states: Float[np.ndarray, "steps 7"]) -> Float[np.ndarray, "
     return change
 
 
-def noise_as_pictures(excerpts: Sequence[Excerpt]) -> Finding | None:
-    """Say so where neighbouring pictures differ as much as those half an excerpt apart."""
+def noise_as_frames(excerpts: Sequence[Excerpt]) -> Finding | None:
+    """Say so where neighbouring frames differ as much as those half an excerpt apart."""
     excerpts = [one for one in excerpts if len(one.grey) >= _FEWEST_STEPS]
-    near = sum(float(one.picture_change.sum()) for one in excerpts)
+    near = sum(float(one.frame_change.sum()) for one in excerpts)
     far = sum(_far_change(one) * (len(one.grey) - 1) for one in excerpts)
     if not far > 0 or near < _FAR_LIKE_NEAR * far:
         return None
-    text = f"neighbouring pictures differ as much as far ones ({near / far:.0%}): noise, or pictures in no order"
+    text = f"neighbouring frames differ as much as far ones ({near / far:.0%}): noise, or frames in no order"
     return Finding("error", "pictures", text)
 
 
@@ -68,20 +68,20 @@ def _far_change(excerpt: Excerpt) -> float:
 
 
 def repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]]) -> Iterator[Finding]:
-    """Yield what only repeats: poses while pictures change, pictures while poses do, or single steps of both.
+    """Yield what only repeats: poses while frames change, frames while poses do, or single steps of both.
 
     Args:
         excerpts: Some episodes.
         moved: How far each has moved at each step, in any unit.
     """
     held = np.concatenate([(np.diff(one.states, axis=0) == 0).all(axis=1) for one in excerpts])
-    still = np.concatenate([_is_still(one.picture_change) for one in excerpts])
+    still = np.concatenate([_is_still(one.frame_change) for one in excerpts])
     fast = np.concatenate([one > np.median(one) for one in moved])
     if (stale := _share(held, ~still)) > _STALE:
-        text = f"{stale:.0%} repeat the one before while the picture changes: measured more seldom, or stale"
+        text = f"{stale:.0%} repeat the one before while the frame changes: measured more seldom, or stale"
         yield Finding("error" if stale > _MOSTLY_STALE else "warning", "stale poses", text)
     if (shown_again := _share(still, fast & ~held)) > _COPIED:
-        text = f"{shown_again:.0%} of the pictures repeat the one before while the robot moves"
+        text = f"{shown_again:.0%} of the frames repeat the one before while the robot moves"
         yield Finding("warning", "repeated", f"{text}: filmed at a lower rate. Check the control rate")
     singly = np.concatenate([_alone(one) for one in _by_episode(held & still, excerpts)])
     if len(singly) and (copied := float(singly.mean())) > _COPIED:
@@ -91,7 +91,7 @@ def repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, "
 
 def _is_still(change: Float[np.ndarray, " changes"]) -> Bool[np.ndarray, " changes"]:
     changing = change[change > 0]
-    return np.asarray(change <= (_STILL_PICTURE * np.median(changing) if len(changing) else 0.0))
+    return np.asarray(change <= (_STILL_FRAME * np.median(changing) if len(changing) else 0.0))
 
 
 def _share(mask: Bool[np.ndarray, " changes"], among: Bool[np.ndarray, " changes"]) -> float:

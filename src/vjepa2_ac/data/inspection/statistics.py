@@ -1,4 +1,4 @@
-"""What is in a data set? Lengths, outcomes, idle time, and how far the robot moves in one model step."""
+"""Statistics of a data set: lengths, outcomes, idle time, and the motion of the robot per model step."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ RELEASED = (
 
 @dataclass(frozen=True, eq=False)
 class ReadEpisode:
-    """An episode of the sample, without pictures."""
+    """An episode of the sample, without frames."""
 
     index: int  # place in the data set's table
     states: Float[np.ndarray, "steps state_dim"]
@@ -60,7 +60,7 @@ class MotionPerStep:
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What was found; figures of motion are those of a sample of the episodes that take part."""
+    """What was found; values of motion are those of a sample of the episodes that take part."""
 
     config: DataConfig
     control_rate_hz: float
@@ -175,7 +175,7 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
 
     Args:
         dataset: Its stride is a number.
-        episodes: At most as many are read, without pictures, spread over those that take part.
+        episodes: At most as many are read, without frames, spread over those that take part.
         progress: Told (episodes read, episodes in all).
 
     Raises:

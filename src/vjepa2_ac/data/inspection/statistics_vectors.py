@@ -1,4 +1,4 @@
-"""How do vectors change from one model step to the next? In shares of the range that each of their numbers has."""
+"""Change of vector states per model step, as shares of each number's range."""
 
 from __future__ import annotations
 

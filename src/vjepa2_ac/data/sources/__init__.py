@@ -1,1 +1,1 @@
-"""Where do episodes come from?"""
+"""Sources: readers of episodes, one per form of data."""

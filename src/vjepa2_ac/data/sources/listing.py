@@ -1,4 +1,4 @@
-"""Which files lie in a folder and the folders below it, here or behind a URL?"""
+"""Recursive listing of a folder's files, local or behind a URL."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The registry of sources: which class reads which form of data?"""
+"""The registry of sources: which class reads which form of data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Can these be a robot's states? The check that every source makes of them."""
+"""Validation of robot states: the check that every source runs."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""The adapter: LoRA around the predictor's layers, its start, its files, and merging."""
+"""The adapter: LoRA on the predictor's layers, its initialisation, files and merging."""

@@ -1,7 +1,7 @@
-"""What may stand in an adapter_config.json? What this program writes; PEFT itself would take, and do, far more.
+"""Validation of adapter_config.json: only what this program writes is accepted; PEFT itself would accept far more.
 
-The file is read here, strictly, and becomes the knobs that a config has for it, with their types and ranges. PEFT never
-sees it: not a regular expression that runs for ever, not a layer that is no layer of the predictor, not another method.
+The file is read here, strictly, and becomes the config knobs for it, with their types and ranges. PEFT never sees the
+file: no regular expression that runs for ever, no layer outside the predictor, no other method.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _KNOBS = {  # PEFT's names, and ours
     "alpha_pattern": "alpha_pattern",
 }
 _FIXED = {"peft_type": "LORA", "bias": "none"}
-_TOLD = frozenset({  # where it comes from, and for what
+_INFORMATIONAL = frozenset({  # where it comes from, and for what
     "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_version", "revision",
     "task_type",
 })  # fmt: skip
@@ -77,7 +77,7 @@ def _require_plain_lora(values: Mapping[str, Any], defaults: Mapping[str, Any], 
     for name in ("r", "lora_alpha", "target_modules"):
         if name not in values:
             raise InputError(where=str(path), found=f"no {name}", needed=_NEEDED, fix=_FIX)
-    others = {name: value for name, value in values.items() if name not in {*_KNOBS, *_FIXED, *_TOLD}}
+    others = {name: value for name, value in values.items() if name not in {*_KNOBS, *_FIXED, *_INFORMATIONAL}}
     for name, value in others.items():
         is_off = value is None or value is False or value in ([], {})
         if not is_off and (name not in defaults or value != defaults[name]):

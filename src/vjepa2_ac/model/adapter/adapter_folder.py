@@ -1,4 +1,4 @@
-"""How does what was trained lie in a folder? Weights, and a card that says which base they belong to."""
+"""The folder of trained weights: an adapter or a predictor, with a card that names its base."""
 
 from __future__ import annotations
 

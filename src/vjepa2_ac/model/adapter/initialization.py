@@ -1,4 +1,4 @@
-"""From which values does an adapter start? Drawn from a seed, or cut out of the weights that it adapts."""
+"""Initial values of an adapter: drawn from a seed, or computed from the weights that it adapts."""
 
 from __future__ import annotations
 

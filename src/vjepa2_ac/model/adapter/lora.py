@@ -1,6 +1,6 @@
-"""What is trained? A LoRA adapter on the predictor, or all of the predictor: add, save, load.
+"""Trainable weights: a LoRA adapter on the predictor, or the whole predictor: add, save, load.
 
-PEFT's home, beside the layer in `lora_linear`. How an adapter becomes part of the base: `merging`.
+The only modules that use PEFT are this one and the layer in `lora_linear`. Merging an adapter into the base: `merging`.
 """
 
 from __future__ import annotations

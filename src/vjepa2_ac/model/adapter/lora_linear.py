@@ -1,4 +1,4 @@
-"""How does a layer with an adapter compute? The update is added inside the matrix products, in the layer's own type."""
+"""Linear layer with a LoRA adapter: the update is added inside the matrix products, in the layer's own type."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does a model predict without its adapter again, and how does the adapter become part of it for good?"""
+"""Disabling an adapter temporarily, and merging it into the model for good."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which layers of the predictor get an adapter, and of which rank? The knobs, checked, as PEFT wants them."""
+"""Target layers and ranks of the adapter: the knobs, checked, in PEFT's form."""
 
 from __future__ import annotations
 

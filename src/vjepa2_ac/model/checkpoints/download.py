@@ -1,4 +1,4 @@
-"""How does a large file get here over a line that breaks? Resumed where it stopped, its size checked, then renamed."""
+"""Download of a large file over an unstable connection: resumed where it stopped, its size checked, then renamed."""
 
 from __future__ import annotations
 

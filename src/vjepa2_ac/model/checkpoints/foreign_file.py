@@ -1,4 +1,4 @@
-"""What is a file that was given as a checkpoint and is none? Told by its first bytes; nothing in it is executed."""
+"""Identification of files that are no checkpoints, by their first bytes; nothing in them is executed."""
 
 from __future__ import annotations
 

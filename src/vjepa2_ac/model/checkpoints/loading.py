@@ -1,4 +1,4 @@
-"""Which world model does `model.base` name? The official checkpoint, a folder, one that ships with the package."""
+"""Loading the world model of `model.base`: the official checkpoint, a folder, or one that ships with the package."""
 
 from __future__ import annotations
 

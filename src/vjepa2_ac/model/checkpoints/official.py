@@ -1,4 +1,4 @@
-"""How do official weights come in and go out? Meta's checkpoint, its names and fused layers, in little memory."""
+"""Official weights in Meta's checkpoint format, read and written: its names and fused layers, in little memory."""
 
 from __future__ import annotations
 

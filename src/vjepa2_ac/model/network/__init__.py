@@ -1,1 +1,1 @@
-"""The network: encoder, predictor, and what they are made of."""
+"""The network: encoder, predictor, and their building blocks."""

@@ -1,4 +1,4 @@
-"""Who may look at whom? Block-causal attention: a token of step t sees every token of steps up to t.
+"""Block-causal attention: a token of step t sees every token of steps up to t.
 
 There may be more keys than queries: the queries are then those of the last steps.
 

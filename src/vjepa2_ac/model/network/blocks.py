@@ -1,4 +1,4 @@
-"""What is a block of the predictor made of? Attention with rotary positions, MLP, pre-norm residuals."""
+"""Predictor block: attention with rotary positions, MLP, pre-norm residuals."""
 
 from __future__ import annotations
 

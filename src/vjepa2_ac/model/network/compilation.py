@@ -1,12 +1,12 @@
-"""What is compiled? Halves of a predictor block, what comes before attention and what after it, once for all blocks.
+"""Compilation of predictor blocks in halves, before and after attention, once for all blocks.
 
-Attention stays as it is: SDPA is one kernel already, and FlexAttention is compiled by itself (`attention`). So no
+Attention is not compiled here: SDPA is one kernel already, and FlexAttention is compiled by itself (`attention`). So no
 half sees keys of earlier steps, whose number grows with every step, and a mask is no part of it. Weights are arguments:
 all blocks with the same kind of layers share what was compiled for the first of them. PyTorch compiles again for
 another number of tokens or clips (then for any), with and without gradients, and where nothing before a block is
 trained.
 
-What cannot be compiled, or not once more, is an error: PyTorch would go on without, which is slow for a block, and for
+A failed compilation or recompilation is an error: PyTorch would continue without it, which is slow for a block, and for
 FlexAttention holds all scores in memory.
 """
 

@@ -1,4 +1,4 @@
-"""What does a frame look like to the model? The frozen V-JEPA 2 encoder, one frame at a time."""
+"""The frozen V-JEPA 2 encoder: latents of one frame at a time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What if a robot has other states or actions than the base knows? Fresh encoders for them, which must be trained."""
+"""Input heads for robots with other states or actions than the base: new encoders, which must be trained."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def require_trained(heads: tuple[str, ...], config: AdapterConfig) -> None:
     whole = ", ".join([*config.modules_to_save, *missing])
     raise InputError(
         where="adapter.modules_to_save",
-        found=f"nothing that trains the {_in_words(missing)}, fresh because the data has other widths than the base",
+        found=f"nothing that trains the {_as_text(missing)}, fresh because the data has other widths than the base",
         needed="fresh heads are trained whole, beside the adapter",
         fix=f"Set adapter.modules_to_save=[{whole}]",
     )
@@ -65,7 +65,7 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
         own, width = getattr(predictor, name), widths.action if name == "action_encoder" else widths.state
         replaced |= {f"{name}.{key}": value.detach().cpu() for key, value in own.state_dict().items()}
         setattr(predictor, name, _fresh(own, width, _generator(seed, name)))
-        lines.append(f"{_in_words([name])}: {width} numbers instead of the base's {own.in_features}: initialised anew")
+        lines.append(f"{_as_text([name])}: {width} numbers instead of the base's {own.in_features}: initialised anew")
     dims = {"action_dim": widths.action, "state_dim": widths.state}
     predictor.config.update(dims)
     sizes = model.sizes.predictor.model_copy(update=dims)
@@ -90,5 +90,5 @@ def _generator(seed: int, name: str) -> Generator:
     return torch.Generator().manual_seed(int.from_bytes(digest, "big") >> 1)
 
 
-def _in_words(names: list[str]) -> str:
+def _as_text(names: list[str]) -> str:
     return " and the ".join(name.replace("_", " ") for name in names)

@@ -1,4 +1,4 @@
-"""What do later steps need to know of earlier ones? Keys and values of every layer, computed once."""
+"""KV cache: the keys and values of every layer for earlier steps, computed once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where will the scene be after this action? The action-conditioned predictor of V-JEPA 2-AC."""
+"""The action-conditioned predictor of V-JEPA 2-AC: the latents of the next step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does a world model lie in a folder? config.json, encoder.safetensors and predictor/ as transformers writes it."""
+"""The folder of a world model: config.json, encoder.safetensors and predictor/ as transformers writes it."""
 
 from __future__ import annotations
 

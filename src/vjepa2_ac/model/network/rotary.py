@@ -1,4 +1,4 @@
-"""Where does a token stand? Rotary tables over time, height and width, computed once per shape."""
+"""Rotary position tables over time, height and width, computed once per shape."""
 
 from __future__ import annotations
 

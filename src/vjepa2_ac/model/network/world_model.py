@@ -1,4 +1,4 @@
-"""What will be seen after these actions? Encoder and predictor together: encode, predict, roll out, save and load."""
+"""The world model: encoder and predictor together: encode, predict, roll out, save and load."""
 
 from __future__ import annotations
 

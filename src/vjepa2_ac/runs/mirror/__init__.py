@@ -1,1 +1,1 @@
-"""How is a run kept in another place, and how does it go on from there? `checkpoint.remote`."""
+"""The mirror of a run in another place, and how the run resumes from it: `checkpoint.remote`."""

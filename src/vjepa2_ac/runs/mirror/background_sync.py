@@ -1,8 +1,8 @@
-"""How does a run get to `checkpoint.remote` while it goes on?
+"""Background upload of a run to `checkpoint.remote`.
 
-A thread brings the place up to date (`runs.mirror.upload`); the loop only tells it, step by step, that time passes.
-Nothing that happens there stops the run. An outage is warned of once, however long it is; and what is only on this
-machine in the end, once more.
+A thread brings the place up to date (`runs.mirror.upload`); the training loop only calls it, step by step, to mark the
+time. Nothing that happens there stops the run. An outage is warned of once, however long it is; and files that are only
+on this machine in the end, once more.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Mirror:
         run_id: Whose checkpoints may be there.
         config: How often, and how many are kept there, as here.
         damaged: Names of checkpoints that were found damaged there; they are removed.
-        outage_said: Whether the user was told that the place cannot be reached.
+        outage_reported: Whether the user was told that the place cannot be reached.
         now_s: Tells the time, in seconds since whenever.
     """
 
@@ -48,13 +48,13 @@ class Mirror:
         config: CheckpointConfig,
         *,
         damaged: Collection[str] = (),
-        outage_said: bool = False,
+        outage_reported: bool = False,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._place, self._folder = place, folder
         self._every_minutes, self._wait_s = config.remote_every_minutes, config.remote_wait_seconds
         self._update = RemoteUpdate(RemoteCheckpoints(place), folder, run_id, config.keep, damaged)
-        self._outage_said, self._now_s = outage_said, now_s
+        self._outage_reported, self._now_s = outage_reported, now_s
         self._thread: threading.Thread | None = None
         self._hurry, self._stop = threading.Event(), threading.Event()
         self._begun_s, self._is_off = -float("inf"), False
@@ -123,7 +123,7 @@ class Mirror:
         try:
             with quietly():
                 self._sent = self._update(self._go_on)
-            self._outage_said = False
+            self._outage_reported = False
         except _BrokenOffError:
             pass
         except ForeignRunError as error:
@@ -141,12 +141,12 @@ class Mirror:
                 self._place, error,
             )  # fmt: skip
         except (InputError, OSError) as error:
-            say = logger.info if self._outage_said else logger.warning
+            say = logger.info if self._outage_reported else logger.warning
             say(
                 "checkpoint.remote is not up to date: %s. Training goes on; tried again in %g minutes, and in the end",
                 reason_of(error), self._every_minutes,
             )  # fmt: skip
-            self._outage_said = True
+            self._outage_reported = True
         except Exception:  # whatever it is, the run is worth more
             logger.exception("checkpoint.remote: %s is not up to date; training goes on", self._place)
         finally:

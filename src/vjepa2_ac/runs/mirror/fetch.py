@@ -1,8 +1,8 @@
-"""How does a machine get a run from `checkpoint.remote`, to go on with it?
+"""Download of a run from `checkpoint.remote`, to resume it on this machine.
 
-The newest checkpoint there whose every file is what its manifest says; those that are damaged are named and passed
-over. The best one comes, too, and the run's small files. The checkpoint comes last, so that whoever is killed on the
-way begins again.
+Fetched is the newest checkpoint there whose every file matches its manifest; damaged ones are named and skipped. The
+best one is fetched, too, and the run's small files. The checkpoint comes last, so that an interrupted download starts
+again.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""What does a run do with `checkpoint.remote` before its first step? Try it, see whose it is, and go on from there.
+"""Preparation of `checkpoint.remote` before a run's first step: test it, check its owner, and resume from it.
 
-Where the place cannot be reached, that is a warning. Where it can never be written, or is another run's, it is an
-error.
+A place that cannot be reached is a warning. A place that can never be written, or is another run's, is an error.
 """
 
 from __future__ import annotations
@@ -36,7 +35,9 @@ class Remote:
     def mirror(self, run_id: str) -> Mirror:
         """Return what keeps the place up to date from now on."""
         folder, checkpoint = Path(self.config.run_dir), self.config.checkpoint
-        return Mirror(self.place, folder, run_id, checkpoint, damaged=self.damaged, outage_said=not self.is_reachable)
+        return Mirror(
+            self.place, folder, run_id, checkpoint, damaged=self.damaged, outage_reported=not self.is_reachable
+        )
 
 
 def open_remote(

@@ -1,8 +1,8 @@
-"""Which checkpoints of a run lie at another place, and how do they get there and back?
+"""Remote checkpoints of a run: list, send and fetch them.
 
 The place looks like a run's folder: `config.yaml`, `metrics.jsonl` and so on, and `checkpoints/step-XXXXXXXX/`. There a
-checkpoint exists when its `manifest.json` does, which is sent last and removed first. While one is being sent its
-manifest is there under another name, so that whoever goes on sending knows whose files they are: those that have come
+checkpoint exists when its `manifest.json` does, which is sent last and removed first. While a checkpoint is being sent,
+its manifest is there under another name, which tells a resumed transfer whose files they are: those that have arrived
 are not sent again.
 """
 

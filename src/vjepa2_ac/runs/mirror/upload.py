@@ -1,8 +1,9 @@
-"""What is done to bring `checkpoint.remote` up to date, once?
+"""One upload pass that brings `checkpoint.remote` up to date.
 
-First whose it is: where another run's checkpoints lie, nothing is written. Then halves of older checkpoints go, which
-take the room of what comes: the run's small files, the newest checkpoint that is whole, the best one. Last, what is
-kept no longer goes. What is being sent is held by hard links, so that training may remove it meanwhile.
+First the owner is checked: where another run's checkpoints are, nothing is written. Then incomplete older checkpoints
+are removed, which frees room for what follows: the run's small files, the newest complete checkpoint, the best one.
+Last, checkpoints that are no longer kept are removed. Files being sent are held by hard links, so that training may
+remove them meanwhile.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How is data read and written elsewhere, when networks fail? `files`, `uploads`; `retries` does not give up."""
+"""Remote storage: `ranged_reads` and `uploads` over networks that fail, with the policy of `retries`."""
 
 from vjepa2_ac.storage.remote.ranged_reads import (
     Entry,

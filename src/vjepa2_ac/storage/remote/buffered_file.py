@@ -1,4 +1,4 @@
-"""How is a file that lies elsewhere read and sought in, a few ranges of it at a time?"""
+"""Seekable remote file: reads ranges on demand and buffers a few of them."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ from collections import OrderedDict
 from collections.abc import Callable
 
 _BLOCK_BYTES = 128 << 10
-_AHEAD_BLOCKS = 32  # most that is fetched at once for someone who reads on and on
-_KEPT_BLOCKS = 128
+_READ_AHEAD_BLOCKS = 32  # at most, for sequential reads
+_CACHED_BLOCKS = 128
 
 
 class RangedFile(io.RawIOBase):
-    """A file to read and seek in, fetched in blocks; the last 16 MB read are kept.
+    """A seekable file that is fetched in blocks; the last 16 MB read are cached.
 
-    A jump costs one block of 128 KB. Whoever reads on where the last fetch ended gets twice as much each time, up to
-    4 MB. So a video's header, or one group of its pictures, costs little more than its bytes, and a whole file few
-    reads.
+    A seek costs one block of 128 KB. Sequential reads fetch twice as much each time, up to 4 MB. So a video's header,
+    or one group of its frames, costs little more than its bytes, and a whole file few reads.
 
     Args:
-        fetch: Returns `length` bytes from `start`, all of them: called with (start, length).
+        fetch: Returns exactly `length` bytes from `start`: called with (start, length).
         size: Size of the file.
     """
 
@@ -28,14 +27,14 @@ class RangedFile(io.RawIOBase):
         self._fetch, self._size = fetch, size
         self._position = 0
         self._blocks: OrderedDict[int, bytes] = OrderedDict()
-        self._fetched_to, self._ahead = -1, 1
+        self._fetched_to, self._read_ahead = -1, 1
 
     def readable(self) -> bool:
         """Return that it can be read."""
         return True
 
     def seekable(self) -> bool:
-        """Return that one can seek in it."""
+        """Return that it can seek."""
         return True
 
     def tell(self) -> int:
@@ -43,7 +42,7 @@ class RangedFile(io.RawIOBase):
         return self._position
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Go to an offset from the start, from here, or from the end; return it from the start."""
+        """Go to an offset from the start, the current position or the end; return it from the start."""
         base = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
         if base + offset < 0:
             raise ValueError(f"negative position {base + offset}")
@@ -51,7 +50,7 @@ class RangedFile(io.RawIOBase):
         return self._position
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """Return the next `size` bytes, fewer where the file ends; all that are left with -1."""
+        """Return the next `size` bytes, fewer if the file ends; all remaining ones with -1."""
         if self.closed:
             raise ValueError("the file is closed")
         start = min(self._position, self._size)
@@ -61,7 +60,7 @@ class RangedFile(io.RawIOBase):
         return data
 
     def readall(self) -> bytes:
-        """Return all that is left."""
+        """Return all remaining bytes."""
         return self.read()
 
     def readinto(self, buffer: bytearray | memoryview, /) -> int:  # type: ignore[override] # any writable buffer
@@ -83,18 +82,18 @@ class RangedFile(io.RawIOBase):
         return data[start - first * _BLOCK_BYTES : end - first * _BLOCK_BYTES]
 
     def _load(self, number: int, last: int) -> dict[int, bytes]:
-        """Return the block of a number, and where it must be fetched all that are wanted up to the next one at hand."""
+        """Return a block by number; if it must be fetched, also the wanted ones up to the next cached block."""
         if number in self._blocks:
             self._blocks.move_to_end(number)
             return {number: self._blocks[number]}
-        self._ahead = min(2 * self._ahead, _AHEAD_BLOCKS) if number == self._fetched_to else 1
-        stop = max(last + 1, number + self._ahead)
+        self._read_ahead = min(2 * self._read_ahead, _READ_AHEAD_BLOCKS) if number == self._fetched_to else 1
+        stop = max(last + 1, number + self._read_ahead)
         stop = next((other for other in range(number + 1, stop) if other in self._blocks), stop)
         start = number * _BLOCK_BYTES
         data = self._fetch(start, min(stop * _BLOCK_BYTES, self._size) - start)
         blocks = {number + i: data[i * _BLOCK_BYTES : (i + 1) * _BLOCK_BYTES] for i in range(stop - number)}
         self._fetched_to = stop
         self._blocks |= blocks
-        while len(self._blocks) > _KEPT_BLOCKS:
+        while len(self._blocks) > _CACHED_BLOCKS:
             self._blocks.popitem(last=False)
         return blocks

@@ -1,4 +1,4 @@
-"""Which file system of fsspec serves a URL, and as whom does it ask?"""
+"""The fsspec file system for a URL, and its credentials."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ GOOGLE = frozenset({"gs", "gcs"})
 _LOG_IN = {"gs": "gcloud auth application-default login", "hf": "hf auth login", "s3": "aws configure"}
 _EXTRAS = {"gs": "gcs", "hf": "lerobot"}
 _KNOWN = "a folder of this machine, or gs://, hf://, s3://"
-_NO_PLACES = frozenset({  # they lead to files of any other kind, some by templates that are executed
+_NO_PLACES = frozenset({  # they lead to other file systems, some by templates that are executed
     "async_wrapper", "asyncwrapper", "blockcache", "cached", "dask", "data", "dir", "filecache", "generic",
     "libarchive", "reference", "simplecache", "tar", "zip",
 })  # fmt: skip
 _EMULATOR = "STORAGE_EMULATOR_HOST"
 _MACHINE = Path("/sys/class/dmi/id/product_name")
-_PIECE_BYTES = 16 << 20  # of an upload; it is read while reads of others wait
+_PIECE_BYTES = 16 << 20  # of an upload; it is read while other reads wait
 
 
 def ask(url: str, method: str, timeout_s: float, **arguments: Any) -> Any:
-    """Call a method of the URL's file system with the URL's path, once; cut it off in time where that is possible.
+    """Call a method of the URL's file system with the URL's path, once; with a time-out where that is possible.
 
     Raises:
         Exception: Whatever the library raises.
-        InputError: The library is not installed, or there is none.
+        InputError: The library is not installed, or does not exist.
     """
     filesystem = _filesystem(url)
     return _once(filesystem, method, timeout_s, filesystem._strip_protocol(url), **arguments)
 
 
 def send(source: Path, url: str, timeout_s: float) -> None:
-    """Write a file of this machine to a URL, once; folders are made where the place has such things.
+    """Write a local file to a URL, once; folders are created where the file system has them.
 
     Raises:
         Exception: Whatever the library raises.
@@ -58,7 +58,7 @@ def discard(url: str, timeout_s: float) -> None:
 
 
 def sizes_below(url: str, timeout_s: float) -> dict[str, int]:
-    """Return the sizes of all files below a folder by their paths from there, asked once and not remembered.
+    """Return the sizes of all files below a folder by their relative paths; one request, not cached.
 
     Raises:
         Exception: Whatever the library raises.
@@ -80,7 +80,7 @@ def _once(filesystem: Any, method: str, timeout_s: float, *arguments: Any, **opt
 
 
 def size_of(url: str, timeout_s: float) -> int:
-    """Ask for the size of a file, once; of Google without looking, too, whether it is a folder.
+    """Return the size of a file, with one request; at Google without checking whether it is a folder.
 
     Raises:
         Exception: Whatever the library raises.
@@ -90,12 +90,12 @@ def size_of(url: str, timeout_s: float) -> int:
 
 
 def is_asynchronous(url: str) -> bool:
-    """Return whether the URL's file system reads ranges as they are asked for, and can be cut off."""
+    """Return whether the URL's file system is asynchronous: it reads exact ranges, and supports time-outs."""
     return bool(_filesystem(url).async_impl)
 
 
 def login_hint(url: str) -> str:
-    """Return what to do where permission is missing, as a sentence."""
+    """Return what to do when permission is missing, as a sentence."""
     protocol = _protocol(url)
     log_in = f"Log in with `{_LOG_IN[protocol]}`, or check the name" if protocol in _LOG_IN else "Check the login"
     if protocol == "hf":
@@ -104,9 +104,9 @@ def login_hint(url: str) -> str:
 
 
 def google_token() -> str:
-    """Return as whom Google is asked: the user's default login where there is one, else the machine's, else nobody.
+    """Return the kind of Google login: the user's default login if there is one, else the machine's, else anonymous.
 
-    DROID needs no login. A local emulator is never shown one.
+    DROID needs no login. A local emulator never receives one.
     """
     if os.environ.get(_EMULATOR):
         return "anon"
@@ -117,7 +117,7 @@ def google_token() -> str:
 
 
 def _is_google_machine() -> bool:
-    """Look at what the firmware says: asking the network for it takes seconds everywhere else."""
+    """Check the firmware: a network request would take seconds on any other machine."""
     try:
         return _MACHINE.read_text().startswith("Google")
     except OSError:
@@ -129,9 +129,9 @@ _opening = threading.Lock()
 
 
 def _filesystem(url: str, *, writing: bool = False) -> Any:
-    """Return the file system of a URL: one for all threads of a process, where fsspec would give one to each.
+    """Return the file system of a URL: one for all threads of a process; fsspec would create one for each.
 
-    Who only reads asks for no more than that: there are logins that may not write.
+    Readers request read access only: some logins may not write.
 
     Raises:
         InputError: The library for it is not installed, or there is none.
@@ -174,12 +174,12 @@ def _kind(url: str, protocol: str) -> Any:
 def _plain(kind: Any, options: dict[str, Any], url: str) -> Any:
     try:
         return kind(**options, skip_instance_cache=True)
-    except TypeError as error:  # it wants more than an address
+    except TypeError as error:  # it needs more than an address
         raise InputError(where=url, found=f"an address alone does not do ({error})", needed=_KNOWN) from None
 
 
 def _google(kind: Any, options: dict[str, Any]) -> Any:
-    """Open Google's without its own retries: six for each of ours, of up to half a minute together."""
+    """Open Google's file system without its own retries: six for each of ours, up to half a minute in total."""
     once = getattr(kind._request, "__wrapped__", kind._request)
     kind = type(kind.__name__, (kind,), {"_request": once})
     options = {"use_listings_cache": False, **options}

@@ -1,7 +1,7 @@
-"""How is data read that lies elsewhere: `gs://`, `hf://`, `s3://` and whatever else fsspec knows?
+"""Reading remote data: `gs://`, `hf://`, `s3://` and every other protocol of fsspec.
 
-All failures of the network are dealt with here (see retries): what comes out is the data, FileNotFoundError as from a
-disk, or UnreachableError. Everything may be called from many threads, and in every process.
+All network failures are handled here (see `retries`): the result is the data, FileNotFoundError as from a disk, or
+UnreachableError. Every function may be called from many threads, and in every process.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from vjepa2_ac.storage.remote.retries import UnreachableError
 
 _T = TypeVar("_T")
 
-_THREADS = 64  # reads of `read_ranges` in flight, all callers of a process together
-_PIECE_BYTES = 16 << 20  # longer reads are cut: each piece has the whole time-out
+_THREADS = 64  # concurrent reads of `read_ranges` in a process
+_PIECE_BYTES = 16 << 20  # longer reads are split: each piece has the full time-out
 _VERSION_KEYS = ("generation", "etag", "ETag", "blob_id", "mtime", "last_modified", "LastModified", "created")
 
 
 class Entry(NamedTuple):
-    """What a listing says of a file or folder."""
+    """A file or folder in a listing."""
 
     name: str
     is_file: bool
     size: int
-    version: str  # the server's own word for it
+    version: str  # as the server gives it
 
 
 def exists(url: str) -> bool:
     """Return whether there is a file or folder.
 
     Raises:
-        UnreachableError: That cannot be found out.
+        UnreachableError: The server cannot be reached.
     """
     try:
         _call(url, "info")
@@ -58,7 +58,7 @@ def file_size(url: str) -> int:
 
 
 def file_version(url: str) -> str:
-    """Return the server's own word for a file's content, another for another content; empty where it has none.
+    """Return the server's version of a file's content, which changes with the content; empty if it has none.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -68,7 +68,7 @@ def file_version(url: str) -> str:
 
 
 def list_folder(url: str) -> list[Entry]:
-    """Return what is in a folder, sorted by name: one listing, a call for each of its pages.
+    """Return the entries of a folder, sorted by name: one listing, one call per page.
 
     Raises:
         FileNotFoundError: There is no such folder.
@@ -87,7 +87,7 @@ def list_folder(url: str) -> list[Entry]:
 
 
 def read_range(url: str, start: int, length: int) -> bytes:
-    """Return `length` bytes from `start`; fewer only where the file ends.
+    """Return `length` bytes from `start`; fewer only if the file ends.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -100,7 +100,7 @@ def read_range(url: str, start: int, length: int) -> bytes:
 
 
 def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-    """Return several (start, length) pieces of a file, read at the same time; shorter only where the file ends.
+    """Return several (start, length) pieces of a file, read concurrently; shorter only if the file ends.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -112,7 +112,7 @@ def read_ranges(url: str, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
 
 
 def open_to_read(url: str) -> RangedFile:
-    """Open a file to read and seek in; every read behind it is tried again as all others are.
+    """Open a file for reading and seeking; its reads are retried, too.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -130,7 +130,7 @@ def open_to_read(url: str) -> RangedFile:
 
 
 def bytes_fetched() -> int:
-    """Return how many bytes of files this process has read so far, those of vain attempts included."""
+    """Return how many bytes of files this process has read so far, including failed attempts."""
     return _fetched.total
 
 
@@ -160,14 +160,14 @@ def _version_of(found: Mapping[str, Any]) -> str:
 
 
 def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
-    """Read a range; believe an answer that is not as long as it should be only where the file ends."""
-    bare = {} if is_asynchronous(url) else {"cache_type": "none"}  # or megabytes are read ahead
+    """Read a range; accept a short answer only at the end of the file."""
+    bare = {} if is_asynchronous(url) else {"cache_type": "none"}  # else megabytes are prefetched
     try:
         data: bytes = ask(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
     except Exception as error:
         if retries.status_of(error) != 416:
             raise
-        data = b""  # nothing at `start`, says the server
+        data = b""  # the server has nothing at `start`
     _fetched.add(len(data))
     if len(data) == length:
         return data
@@ -186,7 +186,7 @@ def _persist(url: str, action: Callable[[float], _T]) -> _T:
 
 
 def _require_bucket(url: str) -> None:
-    """Tell a bucket that does not exist from a file that does not; Google's answers are the same.
+    """Distinguish a missing bucket from a missing file; Google's answers are the same.
 
     Raises:
         UnreachableError: There is no such bucket.

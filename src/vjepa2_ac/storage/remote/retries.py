@@ -1,4 +1,4 @@
-"""What is done again when a network fails: which failures pass by themselves, how long to wait, and when to give up?"""
+"""Retries of network operations: which failures are temporary, how long to wait, and when to give up."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ _T = TypeVar("_T")
 _NETWORK_LIBRARIES = frozenset(
     {"aiohttp", "http", "httpcore", "httpcore2", "httpx", "httpx2", "requests", "urllib", "urllib3"}
 )
-# 499 is Google's answer to giving up an upload of which a piece failed; gcsfs shows it in place of that failure.
+# 499 is Google's answer to cancelling an upload after a failed piece; gcsfs raises it instead of that failure.
 _PASSING_STATUS = frozenset({408, 425, 429, 499, *range(500, 600)})
 _NO_ACCESS = frozenset({401, 403, 407})
 _ABSENT = (FileNotFoundError, IsADirectoryError, NotADirectoryError)
-_LONGEST_WORDS = 300
-_FAILURES_UNSAID = 3
-_SAID_EVERY_S = 30.0
+_LONGEST_SUMMARY = 300
+_FAILURES_BEFORE_WARNING = 3
+_WARNING_INTERVAL_S = 30.0
 
 
 @dataclass(frozen=True)
 class RetryPolicy:
-    """How long something is tried: at most `attempts` times `timeout_s`, and the waits between.
+    """How long an operation is retried: at most `attempts` times `timeout_s`, plus the waits between.
 
-    The waits double from the first to the longest. Half of each is chance, so that many processes do not come back at
-    the same moment. A library that cannot be cut off, or tries again by itself (huggingface_hub: six times), takes
-    longer over an attempt: none begins after `total_s`.
+    The waits double from the first to the longest. Half of each is random, so that many processes do not retry at the
+    same moment. A library without time-outs, or with its own retries (huggingface_hub: six), takes longer per attempt:
+    none begins after `total_s`.
     """
 
     attempts: int = 8
@@ -54,18 +54,18 @@ class RetryPolicy:
     def wait_s(self, failures: int) -> float:
         """Return how long to wait after so many failures."""
         longest: float = min(self.first_wait_s * 2 ** (failures - 1), self.longest_wait_s)
-        return longest * (1 + secrets.randbelow(1001) / 1000) / 2  # chance of its own: no generator of a run is touched
+        return longest * (1 + secrets.randbelow(1001) / 1000) / 2  # own randomness: no generator of a run is used
 
 
-DEFAULT = RetryPolicy()  # fails within a minute where errors come at once, within five where nothing answers
+DEFAULT = RetryPolicy()  # fails within a minute on immediate errors, within five on no answer
 
 
 class UnreachableError(InputError):
-    """Data cannot be had now. Nothing is known of the data itself: never call it broken."""
+    """Data cannot be reached now. This says nothing about the data itself: never treat it as broken."""
 
 
 class RefusedError(UnreachableError):
-    """A server, or a disk, says no, and will say no again: no permission, no such bucket."""
+    """A server or a disk refuses permanently: no permission, no such bucket."""
 
 
 def with_retries(
@@ -77,13 +77,13 @@ def with_retries(
     doing: str = "read",
     progress: Callable[[], int] = lambda: 0,
 ) -> _T:
-    """Return what an action returns, trying again while its failures are of a kind that passes.
+    """Return the result of an action, retried while its failures are temporary.
 
     Args:
-        where: What is read or written, for messages.
-        action: Called with the seconds that it may take.
-        policy: How often to try, and how long.
-        access: The way out where permission is missing, as a sentence.
+        where: The file that is read or written, for messages.
+        action: Called with its time-out in seconds.
+        policy: Number of attempts, waits and time-outs.
+        access: What to do when permission is missing, as a sentence.
         doing: "read" or "written", for messages.
         progress: How far the action is, where a later attempt goes on from there; attempts and time are counted anew
             from the last one that came farther.
@@ -91,8 +91,7 @@ def with_retries(
     Raises:
         InputError: The action raised it.
         OSError: There is no such file, or it is a folder, or the other way round.
-        UnreachableError: What failed did not pass in time; a RefusedError where permission is missing, or it does not
-            pass.
+        UnreachableError: The failure lasted too long; a RefusedError if permission is missing or it is permanent.
     """
     begin, failures, before = time.monotonic(), 0, progress()
     while True:
@@ -111,13 +110,13 @@ def with_retries(
             wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
             if failures >= policy.attempts or seconds + wait_s > policy.total_s:
                 raise _given_up(where, error, failures, seconds) from error
-            _say(failures, "%s: %s; trying again in %.1f s", where, _words(error), wait_s)
+            _log_failure(failures, "%s: %s; trying again in %.1f s", where, _summary(error), wait_s)
         time.sleep(wait_s)
 
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Log failures that are tried again below warnings, in this thread: for whoever can do without what he asks for."""
+    """Log retried failures below warnings, in this thread: for callers that can do without the result."""
     token = _quiet.set(True)
     try:
         yield
@@ -128,30 +127,34 @@ def quietly() -> Iterator[None]:
 _quiet = ContextVar("_quiet", default=False)
 
 
-def _say(failures: int, text: str, *arguments: object) -> None:
-    """Log a failure; aloud when it is the third of a call, and no more than once in half a minute."""
+def _log_failure(failures: int, text: str, *arguments: object) -> None:
+    """Log a failure; as a warning from the third of a call on, at most once in half a minute."""
     now = time.monotonic()
-    aloud = failures >= _FAILURES_UNSAID and now - _last_said[0] > _SAID_EVERY_S and not _quiet.get()
-    if aloud:
-        _last_said[0] = now
-    logger.log(logging.WARNING if aloud else logging.INFO, text, *arguments)
+    is_warning = (
+        failures >= _FAILURES_BEFORE_WARNING and now - _last_warning_s[0] > _WARNING_INTERVAL_S and not _quiet.get()
+    )
+    if is_warning:
+        _last_warning_s[0] = now
+    logger.log(logging.WARNING if is_warning else logging.INFO, text, *arguments)
 
 
-_last_said = [-_SAID_EVERY_S]
+_last_warning_s = [-_WARNING_INTERVAL_S]
 
 
 def status_of(error: BaseException) -> int | None:
-    """Return the HTTP status that an error of any library tells of, or None."""
+    """Return the HTTP status of an error of any library, or None."""
     for holder in (error, getattr(error, "response", None)):
         for name in ("code", "status", "status_code"):
             found = getattr(holder, name, None)
             if isinstance(found, int | str) and str(found).isdigit():
                 return int(found)
-    return 403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None  # as gcsfs says it
+    return (
+        403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None
+    )  # as gcsfs reports it
 
 
 def _comes_from_outside(error: Exception) -> bool:
-    """Tell failures of the world from mistakes of ours."""
+    """Distinguish external failures from bugs."""
     is_of_a_library = _is_of_network(error) or _is_of_google_login(error)
     return isinstance(error, OSError | ValueError | EOFError) or status_of(error) is not None or is_of_a_library
 
@@ -170,29 +173,29 @@ def _passes(error: Exception) -> bool:
         return status in _PASSING_STATUS
     if _is_of_google_login(error):
         return type(error).__name__ == "TransportError" or bool(getattr(error, "retryable", False))
-    # JSON: a listing that was cut short. What is wrong with JSON of the user's is found elsewhere.
+    # JSON: a truncated listing. Errors in the user's JSON are found elsewhere.
     kinds = TimeoutError | ConnectionError | EOFError | socket.gaierror | json.JSONDecodeError
     return isinstance(error, kinds) or _is_of_network(error)
 
 
 def _refused(where: str, error: Exception, access: str, doing: str) -> RefusedError:
     if status_of(error) in _NO_ACCESS or _is_of_google_login(error):
-        return RefusedError(where=where, found=f"no permission ({_words(error)})", fix=access)
-    return RefusedError(where=where, found=f"cannot be {doing} ({_words(error)})", fix="Check the address")
+        return RefusedError(where=where, found=f"no permission ({_summary(error)})", fix=access)
+    return RefusedError(where=where, found=f"cannot be {doing} ({_summary(error)})", fix="Check the address")
 
 
 def _given_up(where: str, error: Exception, attempts: int, seconds: float) -> UnreachableError:
     return UnreachableError(
         where=where,
-        found=f"not reached in {attempts} attempts over {seconds:.0f} s; the last: {_words(error)}",
+        found=f"not reached in {attempts} attempts over {seconds:.0f} s; the last: {_summary(error)}",
         fix="Check the network, and start again: a run goes on from its last checkpoint",
     )
 
 
-def _words(error: Exception) -> str:
-    """Say in one line what a library says in many, or not at all."""
+def _summary(error: Exception) -> str:
+    """Return a library's error in one line."""
     status = status_of(error)
     text = re.sub(r"\s+", " ", str(getattr(error, "message", "") or error)).strip()
-    text = text if len(text) <= _LONGEST_WORDS else f"{text[:_LONGEST_WORDS]}…"
+    text = text if len(text) <= _LONGEST_SUMMARY else f"{text[:_LONGEST_SUMMARY]}…"
     name = "time-out" if isinstance(error, TimeoutError) else type(error).__name__
     return ": ".join(part for part in (f"HTTP {status}" if status else name, text) if part)

@@ -1,6 +1,6 @@
-"""How are files written that lie elsewhere: `gs://`, `s3://` and whatever else fsspec can write?
+"""Writing remote files: `gs://`, `s3://` and every other protocol that fsspec can write.
 
-As in `files`, failures that pass are tried again. Of an object store a file is there whole or not at all.
+As in `ranged_reads`, temporary failures are retried. A file in an object store is either complete or absent.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from vjepa2_ac.storage.remote.retries import RefusedError, RetryPolicy
 
 _T = TypeVar("_T")
 
-_SLOWEST_BYTES_PER_S = 1 << 20  # an upload may take this long, besides the time-out of any request
+_SLOWEST_BYTES_PER_S = 1 << 20  # allowed in addition to the time-out of any request
 
 
 def upload_file(source: Path, url: str) -> None:
-    """Write a file of this machine to a URL, over whatever is there.
+    """Write a local file to a URL, replacing any file there.
 
-    An attempt has the policy's time-out, and a second for each MB.
+    An attempt has the policy's time-out, plus a second for each MB.
 
     Raises:
-        FileNotFoundError: The file of this machine is not there.
+        FileNotFoundError: The local file does not exist.
         RefusedError: No permission, no such bucket, or the place cannot be written at all.
         UnreachableError: It cannot be reached.
     """
@@ -40,7 +40,7 @@ def upload_file(source: Path, url: str) -> None:
 
 
 def remove_file(url: str) -> None:
-    """Remove the file of a URL; it may be gone already.
+    """Remove the file of a URL; it may not exist.
 
     Raises:
         RefusedError: No permission.
@@ -53,7 +53,7 @@ def remove_file(url: str) -> None:
 
 
 def file_sizes(url: str) -> dict[str, int]:
-    """Return the sizes of all files below a folder by their paths from there; none where there is no such folder.
+    """Return the sizes of all files below a folder by their relative paths; none if there is no such folder.
 
     Raises:
         RefusedError: No permission, or there is no such bucket.
@@ -62,7 +62,7 @@ def file_sizes(url: str) -> dict[str, int]:
     try:
         return _persist(url, lambda timeout_s: sizes_below(url, timeout_s), retries.DEFAULT, doing="read")
     except FileNotFoundError:
-        if url.startswith(("gs://", "gcs://")):  # which has no folders: only buckets can be absent
+        if url.startswith(("gs://", "gcs://")):  # which has no folders: only buckets can be missing
             raise _no_place(url) from None
         return {}
 

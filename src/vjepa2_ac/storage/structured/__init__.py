@@ -1,4 +1,4 @@
-"""How is JSON and YAML read that anybody may have written? Within bounds, each key once, every value of its type."""
+"""JSON and YAML from untrusted files: bounded, no duplicate keys, every value of its declared type."""
 
 from vjepa2_ac.storage.structured.json_text import (
     MOST_BYTES,

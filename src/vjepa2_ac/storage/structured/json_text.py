@@ -1,8 +1,8 @@
-"""How is JSON read that anybody may have written?
+"""JSON from untrusted files.
 
-Files are bounded in size, values in depth; a key that is given twice, a number that no computer holds, NaN (where the
-reader does not expect it) and text that cannot be written again are refused. Whatever is wrong is an InputError; that
-a file is not there, or cannot be read, stays the system's OSError.
+File size and nesting depth are bounded. Refused are duplicate keys, numbers out of range, NaN (where the reader does
+not expect it) and text that cannot be encoded again. Invalid content is an InputError; a file that is missing or cannot
+be read stays the system's OSError.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ def json_object(
         data: The text.
         where: The file, for messages.
         needed: What it should be.
-        fix: The way out.
-        allow_nan: Take NaN and Infinity, which are not JSON, but which Python's own writer writes.
+        fix: How to fix it.
+        allow_nan: Accept NaN and Infinity, which are not JSON, but which Python's writer writes.
 
     Raises:
-        InputError: It is not JSON, or not within the bounds; or no object.
+        InputError: It is not JSON, not within the bounds, or no object.
     """
     value: dict[str, Any] = _parsed(data, dict, where, needed, fix, allow_nan=allow_nan)
     return value
@@ -128,6 +128,6 @@ def _refuse_constant(name: str) -> NoReturn:
 
 
 def _require_writable(text: str, value: Any) -> None:
-    """Refuse text that no file can be called: with a zero, or with half a surrogate pair."""
+    """Refuse text that cannot be a file name: with a zero, or with half a surrogate pair."""
     if _NOT_WRITABLE.search(text) and _ZERO.search(json.dumps(value, ensure_ascii=False).encode().decode()):
         raise ValueError("text with a zero character")

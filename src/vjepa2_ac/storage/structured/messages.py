@@ -1,4 +1,4 @@
-"""What is wrong with a value, said without the inner names of pydantic, which checks it?"""
+"""Validation messages for values, without the internal names of pydantic, which checks them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 from typing import Any
 
 _MOST_SHOWN = 120  # characters of a value
-_NAMES = (  # pydantic speaks of JSON, the user reads YAML as often
+_NAMES = (  # pydantic uses JSON's terms; the user may have written YAML
     (re.compile(r"^Value error, "), ""),
     (re.compile(r"\ba valid array\b"), "a list"),
     (re.compile(r"\ba valid dictionary\b|\ban object\b|\bof type dict\b"), "a mapping of keys to values"),
@@ -17,7 +17,7 @@ _NAMES = (  # pydantic speaks of JSON, the user reads YAML as often
 
 
 def message_of(detail: Any) -> str:
-    """Return what pydantic says of one value, in the words of this program, with what was found.
+    """Return pydantic's message for one value in this program's terms, with the value found.
 
     Args:
         detail: One of `ValidationError.errors()`.
@@ -29,6 +29,6 @@ def message_of(detail: Any) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value as it would be written in Python, cut where it is long."""
+    """Return a value as Python source, cut if it is long."""
     text = repr(value)
     return text if len(text) <= _MOST_SHOWN else f"{text[:_MOST_SHOWN]}…"

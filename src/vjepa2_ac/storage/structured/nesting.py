@@ -1,4 +1,4 @@
-"""How deep may values lie within one another? So deep that no function that goes through them runs out of stack."""
+"""Nesting limit of values: shallow enough that no recursive function overflows the stack."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ MOST_DEPTH = 64
 
 
 def require_shallow(value: Any, *, where: str, fix: str = "") -> None:
-    """Refuse mappings and lists that lie deeper than `MOST_DEPTH` within one another.
+    """Refuse mappings and lists nested deeper than `MOST_DEPTH`.
 
     Raises:
-        InputError: They do.
+        InputError: They are.
     """
     level = [value]
     for _ in range(MOST_DEPTH):
@@ -25,7 +25,7 @@ def require_shallow(value: Any, *, where: str, fix: str = "") -> None:
 
 
 def too_deep(where: str, fix: str = "") -> InputError:
-    """Return the error of values that lie too deep within one another."""
+    """Return the error of values that are nested too deep."""
     needed = f"at most {MOST_DEPTH} mappings and lists within one another"
     return InputError(where=where, found="values that lie too deep within one another", needed=needed, fix=fix)
 

@@ -1,4 +1,4 @@
-"""Which regular expressions of a file are used? Those that are done soon, whatever the text."""
+"""Regular expressions from files: only those that terminate quickly on any text are accepted."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from vjepa2_ac.errors import InputError
 
 _MOST_CHARACTERS = 100
 _MOST_GROUPS = 2
-_MOST_REPEATS = 2  # the time grows with the text's length to this power
+_MOST_REPEATS = 2  # the run time grows with the text's length to this power
 _ESCAPED = re.compile(r"\\.", re.DOTALL)
 _SET = re.compile(r"\[\^?\]?[^\]]*\]")
 _REPEAT = re.compile(r"[*+?{]")
 _REPEATED_GROUP = re.compile(r"\)[*+?{]")
-_NOT_PLAIN = re.compile(r"\(\?|\\\d")  # look-around, names, flags; references back
+_NOT_PLAIN = re.compile(r"\(\?|\\\d")  # look-around, names, flags; back references
 
 NEEDED = (
     f"at most {_MOST_CHARACTERS} characters, {_MOST_GROUPS} groups, and {_MOST_REPEATS} of * + ? {{}}, none of them"
@@ -22,12 +22,12 @@ NEEDED = (
 
 
 def require_quick(pattern: str, *, where: str) -> None:
-    """Refuse a regular expression that may take for ever: of a search that goes back, the time is a power of choices.
+    """Refuse a regular expression that may run for ever: backtracking time is a power of its choices.
 
     Raises:
-        InputError: It repeats a group, chooses or repeats too often, or refers back to itself; or it is none at all.
+        InputError: It repeats a group, has too many choices or repeats, has a back reference, or is not a pattern.
     """
-    plain = _SET.sub("x", _ESCAPED.sub("x", pattern))  # there, signs are themselves
+    plain = _SET.sub("x", _ESCAPED.sub("x", pattern))  # in these, special characters are literal
     too_long = len(pattern) > _MOST_CHARACTERS or len(_REPEAT.findall(plain)) > _MOST_REPEATS
     nested = _REPEATED_GROUP.search(plain) or _NOT_PLAIN.search(pattern) or plain.count("(") > _MOST_GROUPS
     if too_long or nested:

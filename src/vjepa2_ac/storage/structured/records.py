@@ -1,4 +1,4 @@
-"""How do plain values of a file become a record? A dataclass whose annotations say what may be in it."""
+"""Conversion of plain values from a file to a record: a dataclass whose annotations declare the allowed types."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from vjepa2_ac.storage.structured.messages import message_of
 
 T = TypeVar("T")
 
-_SAID = 5  # problems of one file
+_MOST_PROBLEMS = 5  # shown of one file
 
 
 def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: str = "", fix: str = "") -> T:
-    """Return a dataclass of values as JSON gives them: nothing is taken for another type than it is.
+    """Return a dataclass of values from JSON: no value is converted to another type.
 
     Args:
         kind: The dataclass; its annotations may have pydantic's bounds.
-        values: Of its fields; those with a default may be left out.
+        values: Of its fields; those with a default may be missing.
         where: The file, for messages.
         needed: What it should be.
-        fix: The way out.
+        fix: How to fix it.
 
     Raises:
         InputError: A value is missing, unknown, of another type or beyond its bounds.
@@ -36,10 +36,10 @@ def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: s
     try:
         record: T = _adapter(cast("Any", kind)).validate_json(json.dumps(dict(values)), strict=True)
     except ValidationError as error:
-        problems += [f"{_place(detail)}: {_said(detail)}" for detail in error.errors()]
+        problems += [f"{_place(detail)}: {_problem_of(detail)}" for detail in error.errors()]
     if problems:
-        more = f"; and {len(problems) - _SAID} more" if len(problems) > _SAID else ""
-        raise InputError(where=where, found="; ".join(problems[:_SAID]) + more, needed=needed, fix=fix)
+        more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
+        raise InputError(where=where, found="; ".join(problems[:_MOST_PROBLEMS]) + more, needed=needed, fix=fix)
     return record
 
 
@@ -52,5 +52,5 @@ def _place(detail: Any) -> str:
     return ".".join(str(part) for part in detail["loc"])
 
 
-def _said(detail: Any) -> str:
+def _problem_of(detail: Any) -> str:
     return "missing" if detail["type"] == "missing" else message_of(detail)

@@ -1,6 +1,6 @@
-"""What is a word of YAML: a number, a truth value, nothing, or text? YAML 1.1 as people know it from PyYAML.
+"""YAML scalars: number, boolean, null or text, by the rules of YAML 1.1 as in PyYAML.
 
-But a date is text, 1e-4 is a number, and a number that YAML takes for another than people do is an error.
+Exceptions: a date is text, 1e-4 is a number, and a number that YAML reads differently from people is an error.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _BASES = {"0b": 2, "0x": 16}
 
 
 class NotAValueError(ValueError):
-    """A word that is none of what it looks like, or is said to be."""
+    """A scalar that is not what it looks like, or what its tag says."""
 
     def __init__(self, found: str, fix: str) -> None:
         super().__init__(found)
@@ -37,10 +37,10 @@ class NotAValueError(ValueError):
 
 
 def plain_value(text: str) -> Scalar:
-    """Return what a word means that stands without quotes.
+    """Return the value of a scalar without quotes.
 
     Raises:
-        NotAValueError: It is a number that YAML takes for another than people do, or beyond all bounds.
+        NotAValueError: It is a number that YAML reads differently from people, or out of range.
     """
     if text in _NOTHING:
         return None
@@ -56,10 +56,10 @@ def plain_value(text: str) -> Scalar:
 
 
 def tagged_value(tag: str, text: str) -> Scalar:
-    """Return what a word means that is said to be of a kind, as in `!!int "3"`.
+    """Return the value of a scalar with a tag, as in `!!int "3"`.
 
     Raises:
-        NotAValueError: It is not of this kind, or there is no such kind in a config.
+        NotAValueError: It is not of this type, or the type is not allowed in a config.
     """
     if tag == "str":
         return text

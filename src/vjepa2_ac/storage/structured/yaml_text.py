@@ -1,8 +1,8 @@
-"""How is YAML read that anybody may have written?
+"""YAML from untrusted files.
 
-Nothing is executed. Keys are text, as it is written; a date is text, too, and 1e-4 a number. What people do not mean is
-refused: a key given twice, a number with a leading zero or with colons (which YAML takes for another), one that no
-computer holds; and what would take for ever: too many values once aliases are followed, or values that lie too deep.
+Nothing is executed. Keys are text, as written; a date is text, too, and 1e-4 is a number. Refused are surprising
+values: duplicate keys, numbers with a leading zero or with colons (which YAML reads as a different number), numbers out
+of range; and what would take too long: too many values once aliases are expanded, or values nested too deep.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def parse_yaml(text: str, *, where: str) -> Any:
 
 
 class _Composed(Reader, Scanner, Parser, Composer, BaseResolver):
-    """A document as nodes, neither too many nor too deep; what a scalar is, is not decided here."""
+    """A document as nodes, bounded in number and depth; scalars are not resolved here."""
 
     def __init__(self, text: str) -> None:
         Reader.__init__(self, text)
@@ -76,12 +76,12 @@ class _Composed(Reader, Scanner, Parser, Composer, BaseResolver):
         return node
 
     def resolve(self, kind: type[Node], value: Any, implicit: Any) -> str:  # noqa: ARG002 - PyYAML's
-        """Return no tag: only what is written is one."""
+        """Return no tag: only explicit tags count."""
         return ""
 
 
 class _Values:
-    """Turns nodes into values. What aliases stand for is made, and counted, each time."""
+    """Converts nodes to values. Aliases are expanded, and counted, each time."""
 
     def __init__(self) -> None:
         self._count = 0
@@ -103,7 +103,7 @@ class _Values:
         return value
 
     def _mapping(self, node: MappingNode) -> dict[str, Any]:
-        """Return keys and values; those that are merged in give way to the mapping's own."""
+        """Return keys and values; the mapping's own keys override merged ones."""
         merged: dict[str, Any] = {}
         own: dict[str, Any] = {}
         given: set[str] = set()
@@ -127,7 +127,7 @@ def _key(node: Node) -> str:
 
 
 def _mappings(node: Node) -> Iterator[Node]:
-    """Yield what << names: a mapping, or each of a list of mappings."""
+    """Yield the mappings that << names: one, or each of a list."""
     for inner in node.value if isinstance(node, SequenceNode) else [node]:
         if not isinstance(inner, MappingNode):
             raise _wrong("<< of something that is neither a mapping nor a list of mappings", node)
@@ -135,7 +135,7 @@ def _mappings(node: Node) -> Iterator[Node]:
 
 
 def _text(node: ScalarNode) -> str:
-    """Return the text of a word; two halves of a character, as JSON writes them, become that character."""
+    """Return the text of a scalar; a surrogate pair, as JSON writes it, becomes its character."""
     text = str(node.value)
     if text.isprintable():
         return text

@@ -24,7 +24,7 @@ from torch import Tensor
 from torch.distributed.tensor import DTensor
 
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.data.clips.prefetch import fetch_ahead
+from vjepa2_ac.data.clips.prefetch import prefetch_next
 from vjepa2_ac.distributed.device import PRECISIONS
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.training.cost.flops import clip_flops
@@ -62,10 +62,10 @@ class TimedBatches:
         with self._stopwatch.running():
             return next(self._batches)
 
-    def fetch_ahead(self) -> None:
+    def prefetch_next(self) -> None:
         """Fetch the next batch where that can be done ahead."""
         with self._stopwatch.running():
-            fetch_ahead(self._batches)
+            prefetch_next(self._batches)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Which folders of a raw DROID tree are episodes, and what are these called?
+"""Episode folders of a raw DROID tree, and the episodes' names.
 
 The tree is LAB/success|failure/DATE/TIME/{trajectory.h5, metadata_*.json, recordings/MP4/*.mp4}.
 """

@@ -1,4 +1,4 @@
-"""What does the metadata of a raw DROID episode say: which camera is which, did it succeed, what was the task?"""
+"""Metadata of a raw DROID episode: cameras, success and task."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How do DROID's raw recordings become `Episode`s? States from HDF5, pictures from MP4, names from JSON."""
+"""Source of DROID's raw recordings: states from HDF5, frames from MP4, names from JSON."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class _Place:
     folder: str
     metadata: str
     version: str
-    pictures: dict[str, int]  # how many each of the config's cameras has, by serial number
+    pictures: dict[str, int]  # number of frames of each of the config's cameras, by serial number
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class RawDroidSource:
     cameras, once; for data behind a URL it is not looked at again until folders come or go. An episode is known as
     LAB/outcome/DATE/TIME (`folders.identity_of`).
 
-    An MP4 holds one picture per control step, in order, whatever rate its header states, and may lack the last step's.
+    An MP4 holds one frame per control step, in order, whatever rate its header states, and may lack the last step's.
     """
 
     def __init__(self, config: DataConfig) -> None:
@@ -91,7 +91,7 @@ class RawDroidSource:
         return self._table
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - a video is fetched in blocks
-        """Return one episode; of pictures, only those that are asked for are decoded.
+        """Return one episode; of frames, only those that are asked for are decoded.
 
         Raises:
             InputError: A file is missing or damaged, or has changed since it was indexed.
@@ -113,7 +113,7 @@ class RawDroidSource:
         return Episode(
             info=info,
             states=trajectory.states,
-            read_frames=_VideoReader(video, place.version, trajectory.pictures, self._files),
+            read_frames=_VideoReader(video, place.version, trajectory.frame_places, self._files),
             control_rate_hz=self._config.droid_raw.control_rate_hz,
             extrinsics=trajectory.extrinsics[serial],
             joint_velocities=trajectory.joint_velocities,
@@ -196,7 +196,7 @@ class RawDroidSource:
         return _Place(listed.path, listed.metadata, key_of({"files": listed}), {})
 
     def _counted(self, place: _Place, listed: EpisodeFolder, serials: tuple[str, ...]) -> dict[str, int]:
-        """Return how many pictures each camera has."""
+        """Return how many frames each camera has."""
         counts = {}
         for serial in serials:
             path = self._path(place, f"{VIDEOS}/{serial}.mp4")
@@ -214,7 +214,7 @@ class RawDroidSource:
     def _trajectory(self, place: _Place, serials: tuple[str, ...]) -> Trajectory:
         path = self._path(place, TRAJECTORY)
         data = self._files.read(path, version=place.version, where=path)
-        trajectory = parse_trajectory(data, where=path, serials=serials, pictures=place.pictures)
+        trajectory = parse_trajectory(data, where=path, serials=serials, frame_counts=place.pictures)
         if self._config.pose_frame == "camera" and any(trajectory.extrinsics[serial] is None for serial in serials):
             needed = "observation/camera_extrinsics of the camera"
             raise InputError(where=path, found="no poses of the camera", needed=needed, fix="Set data.pose_frame: base")
@@ -231,24 +231,24 @@ class RawDroidSource:
 
 @dataclass(frozen=True)
 class _VideoReader:
-    """Decodes the pictures of one camera that are asked for."""
+    """Decodes the frames of one camera that are asked for."""
 
     path: str
     version: str
-    pictures: Int[np.ndarray, " steps"]
+    frame_places: Int[np.ndarray, " steps"]
     files: EpisodeFiles
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order.
+        """Return the RGB frames at these control steps, in this order.
 
         Raises:
             InputError: The MP4 is missing, damaged, or ends before.
             OSError: A file behind a URL cannot be read.
             ValueError: No steps, or a step outside the episode.
         """
-        if not steps or min(steps) < 0 or max(steps) >= len(self.pictures):
-            raise ValueError(f"{self.path}: steps {list(steps)} of {len(self.pictures)}")
-        places = self.pictures[list(steps)].tolist()
+        if not steps or min(steps) < 0 or max(steps) >= len(self.frame_places):
+            raise ValueError(f"{self.path}: steps {list(steps)} of {len(self.frame_places)}")
+        places = self.frame_places[list(steps)].tolist()
         return read_frames(self.files.open(self.path, version=self.version), places, where=self.path)
 
 

@@ -1,4 +1,4 @@
-"""What does the trajectory.h5 of a raw DROID episode hold, and does it fit the pictures?"""
+"""The trajectory.h5 of a raw DROID episode: its content, and whether it matches the frames."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _FIX = "Copy the episode again"
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The control steps of an episode that have a picture (legend: `vjepa2_ac.episode`)."""
+    """The control steps of an episode that have a frame (legend: `vjepa2_ac.episode`)."""
 
     states: Float[np.ndarray, "steps 7"]
-    pictures: Int[np.ndarray, " steps"]  # place of each step's picture in the MP4
+    frame_places: Int[np.ndarray, " steps"]  # place of each step's frame in the MP4
     skipped: Bool[np.ndarray, " steps"]  # the operator was not in control
     extrinsics: dict[str, np.ndarray | None]  # of each camera, by its serial number: [steps 6]
     joint_velocities: Float[np.ndarray, "steps 7"] | None  # commanded
@@ -36,22 +36,22 @@ class Trajectory:
         """Return some of the steps."""
         return Trajectory(
             self.states[steps],
-            self.pictures[steps],
+            self.frame_places[steps],
             self.skipped[steps],
             {serial: None if poses is None else poses[steps] for serial, poses in self.extrinsics.items()},
             None if self.joint_velocities is None else self.joint_velocities[steps],
         )
 
 
-def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], pictures: Mapping[str, int]) -> Trajectory:
+def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], frame_counts: Mapping[str, int]) -> Trajectory:
     """Read the content of a trajectory.h5.
 
     Args:
         data: The whole file.
         where: The file, as an error names it.
         serials: Cameras whose poses are wanted; one without any has None.
-        pictures: How many each MP4 holds: as many as there are steps, or one more or less. The steps that have a
-            picture in every one are returned.
+        frame_counts: How many each MP4 holds: as many as there are steps, or one more or less. The steps that have a
+            frame in every one are returned.
 
     Raises:
         InputError: Not HDF5, damaged, without what is needed, or of another length than an MP4.
@@ -65,12 +65,12 @@ def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], picture
         found = f"{len(data)} bytes that cannot be read as HDF5 ({str(error)[:200]})"
         raise InputError(where=where, found=found, needed="an undamaged trajectory.h5", fix=_FIX) from None
     steps = len(trajectory.states)
-    for serial, count in pictures.items():
+    for serial, count in frame_counts.items():
         if abs(steps - count) > 1:
-            found = f"{steps} steps, but {count} pictures in {serial}.mp4"
-            needed = "a picture for every step; the last one may be missing"
+            found = f"{steps} steps, but {count} frames in {serial}.mp4"
+            needed = "a frame for every step; the last one may be missing"
             raise InputError(where=where, found=found, needed=needed, fix=_FIX)
-    return trajectory.at(np.arange(min(steps, *pictures.values())))
+    return trajectory.at(np.arange(min(steps, *frame_counts.values())))
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class _Reader:
         skipped = self.optional(_SKIP, 1, steps)
         return Trajectory(
             states=np.concatenate([pose, self.required(_GRIPPER, 1, steps)], axis=1),
-            pictures=np.arange(steps),
+            frame_places=np.arange(steps),
             skipped=np.zeros(steps, bool) if skipped is None else skipped[:, 0] != 0,
             extrinsics={
                 serial: self.optional(f"observation/camera_extrinsics/{serial}_left", 6, steps) for serial in serials

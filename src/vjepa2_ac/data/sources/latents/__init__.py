@@ -1,1 +1,1 @@
-"""How does a latent cache become `Episode`s? One safetensors file for each episode and camera, and an index."""
+"""Latent caches: one safetensors file per episode and camera, and an index."""

@@ -1,4 +1,4 @@
-"""What must agree for cached latents to be used? Everything that decides them, by the names that users know."""
+"""The key of a latent cache: everything that determines its latents, by the names that users know."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ OF_ENCODING = ("encoder", "image_size", "patch_size", "normalisation", "model.dt
 
 @dataclass(frozen=True)
 class Encoding:
-    """What besides a picture decides its latents, and how many numbers they are; made by `encoding.batch.encoding_of`.
+    """What besides a frame decides its latents, and how many numbers they are; made by `encoding.batch.encoding_of`.
 
     How many frames go through the encoder at once is no part of it: with the encoder in use that changes no bit on a
     CPU (measured, tests/encoding/test_latent_cache.py), and elsewhere no more than the order of a sum.
@@ -88,7 +88,7 @@ class CacheKey:
         for name in sorted(self.parts.keys() | wanted) if names is None else names:
             here, there = self.parts.get(name), wanted.get(name)
             if here != there:
-                differing += _in_words(name, here, there)
+                differing += _differences(name, here, there)
         return differing
 
 
@@ -124,17 +124,17 @@ def _reading(config: DataConfig) -> dict[str, Any]:
     return {} if section is None else {section: getattr(config, section).model_dump(mode="json")}
 
 
-def _in_words(name: str, here: Any, there: Any) -> list[str]:
+def _differences(name: str, here: Any, there: Any) -> list[str]:
     if isinstance(here, dict) and isinstance(there, dict):
         return [
-            words
+            difference
             for inner in sorted(here.keys() | there)
             if here.get(inner) != there.get(inner)
-            for words in _in_words(f"{name}.{inner}", here.get(inner), there.get(inner))
+            for difference in _differences(f"{name}.{inner}", here.get(inner), there.get(inner))
         ]
-    return [f"{name}: {_shown(here)}, not {_shown(there)}"]
+    return [f"{name}: {_as_text(here)}, not {_as_text(there)}"]
 
 
-def _shown(value: Any) -> str:
+def _as_text(value: Any) -> str:
     text = value if isinstance(value, str) else json.dumps(value)
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -1,4 +1,4 @@
-"""In which type are latents kept, and what does that cost in exactness? bfloat16, float32, or int8 with scales."""
+"""Storage types of latents and their precision: bfloat16, float32, or int8 with scales."""
 
 from __future__ import annotations
 

@@ -1,12 +1,12 @@
-"""How does an episode of one camera lie in a latent cache? As a safetensors file, read at random by frame.
+"""The file of one episode and camera in a latent cache: safetensors, with random access by frame.
 
-Tensors (control steps as in `episode`; `frames` are the steps whose pictures were encoded):
+Tensors (control steps as in `episode`; `frames` are the steps whose frames were encoded):
     latents            [frames, tokens, dim] bfloat16, float32 or int8
     scales             [frames, tokens] float32, with int8 only: a latent is its value times the scale of its token
     frame_steps        [frames] int32: the control step of each frame, ascending
-    frame_crc          [frames] int64: CRC-32 of the frame's latents and, behind them, its scales
+    frame_crc          [frames] int64: CRC-32 of the frame's latents followed by its scales
     states             [steps, state_dim], and where the source has them commands, extrinsics, joint_velocities
-    pictures           [bytes] uint8: the frames as small JPEGs, one behind the other; for people to look at
+    pictures           [bytes] uint8: the frames as small JPEGs, concatenated; for people to look at
     picture_ends       [frames] int64: where each of them ends; picture_crc likewise: its CRC-32
 The header's metadata (texts): format, id, camera, num_steps, control_rate_hz, metadata (JSON), key (of the cache), and
 crc: CRC-32 of all these texts and of every tensor but latents, scales and pictures.
@@ -69,11 +69,11 @@ def write_episode_file(
     Args:
         path: The file; missing folders are made.
         layout: What all files of the cache have in common.
-        episode: Its states and what else a clip needs; no picture of it is read.
+        episode: Its states and what else a clip needs; no frame of it is read.
         camera: Whose latents they are.
         steps: Control steps of the frames, ascending; there may be none.
         latents: Of these frames, in the type of the layout (`dtypes.pack_latents` makes them so).
-        pictures: Of these frames, square as the encoder sees them and small.
+        pictures: These frames, square as the encoder sees them and small.
 
     Raises:
         InputError: The file cannot be written, or the disk is full.
@@ -86,7 +86,7 @@ def write_episode_file(
         raise ValueError(f"latents of {values.dtype} for a cache of {layout.kind}")
     if any(after <= before for before, after in zip([-1, *steps], [*steps, episode.info.num_steps], strict=True)):
         raise ValueError(f"steps {list(steps)} of {episode.info.num_steps}")
-    jpegs = [encode_jpeg(picture, quality=_JPEG_QUALITY) for picture in pictures]
+    jpegs = [encode_jpeg(frame, quality=_JPEG_QUALITY) for frame in pictures]
     tensors = _small_tensors(episode, steps, jpegs) | {
         "frame_crc": torch.tensor([_crc_of_frame(frame) for frame in _frames_of(values, scales)], dtype=torch.int64)
     }
@@ -150,14 +150,14 @@ class EpisodeFile:
         _require_fitting(self.path, tensors)
         self._arrays = {name: np.array(tensor.numpy()) for name, tensor in tensors.items()}
         self.frame_steps: Int[np.ndarray, " frames"] = self._arrays["frame_steps"]
-        self.id, self.camera, self.metadata = self._told()
+        self.id, self.camera, self.metadata = self._read_identity()
         self._require_shapes(layout)
 
     def __getitem__(self, name: str) -> Any:
         """Return states, or commands, extrinsics or joint_velocities; None where there are none."""
         return self._arrays.get(name)
 
-    def _told(self) -> tuple[str, str, dict[str, str]]:
+    def _read_identity(self) -> tuple[str, str, dict[str, str]]:
         """Return identity and camera, and the language instruction and the like."""
         if absent := [name for name in ("id", "camera", "metadata") if name not in self.about]:
             raise _damaged(self.path, f"no {absent[0]} in its header")
@@ -201,7 +201,7 @@ class EpisodeFile:
         return frames
 
     def pictures(self, places: Sequence[int]) -> UInt8[np.ndarray, "frames height width 3"]:
-        """Return the small pictures of frames.
+        """Return the small frames.
 
         Raises:
             InputError: One is damaged.
@@ -212,7 +212,7 @@ class EpisodeFile:
             jpegs = [bytes(data[ends[place - 1] if place else 0 : ends[place]].numpy()) for place in places]
         for place, step, jpeg in zip(places, steps, jpegs, strict=True):
             if zlib.crc32(jpeg) != self._arrays["picture_crc"][place]:
-                raise _damaged(self.path, f"damaged: the CRC of the picture of control step {step} is wrong")
+                raise _damaged(self.path, f"damaged: the CRC of the image of control step {step} is wrong")
         return decode_jpegs(jpegs, steps, self.path)
 
     def _rows(self, name: str, places: Sequence[int]) -> Any:
@@ -230,14 +230,14 @@ class EpisodeFile:
             found = {name: self._file.get_slice(name) for name in names}
             types = {name: slice_.get_dtype() for name, slice_ in found.items()}
             shapes = {name: list(slice_.get_shape()) for name, slice_ in found.items()}
-            pictures = self._file.get_slice("pictures")
-            bytes_of_pictures, type_of_pictures = pictures.get_shape(), pictures.get_dtype()
+            images = self._file.get_slice("pictures")
+            image_bytes, image_type = images.get_shape(), images.get_dtype()
         if shapes != names or types["latents"] != _SAFETENSORS_NAMES[layout.kind]:
             raise _damaged(self.path, f"{types} {shapes}", f"latents of {_SAFETENSORS_NAMES[layout.kind]}, {names}")
         if "scales" in names and types["scales"] != "F32":
             raise _damaged(self.path, f"scales of {types['scales']}", "F32")
-        if type_of_pictures != "U8" or bytes_of_pictures != [max(self._arrays["picture_ends"], default=0)]:
-            said = f"pictures of {bytes_of_pictures} values of {type_of_pictures}"
+        if image_type != "U8" or image_bytes != [max(self._arrays["picture_ends"], default=0)]:
+            said = f"pictures of {image_bytes} values of {image_type}"
             raise _damaged(self.path, said, "as many bytes as picture_ends says")
 
 
@@ -263,7 +263,7 @@ def _require_fitting(path: str, tensors: Mapping[str, Tensor]) -> None:
     within = torch.cat([torch.tensor([-1]), tensors["frame_steps"], torch.tensor([steps])])
     ends = torch.cat([torch.tensor([0]), tensors["picture_ends"]])
     if (within.diff() <= 0).any() or (ends.diff() < 0).any():
-        raise _damaged(path, f"frames that are not in the order of the {steps} steps, or pictures that overlap")
+        raise _damaged(path, f"frames that are not in the order of the {steps} steps, or images that overlap")
 
 
 _SAFETENSORS_NAMES: dict[CacheType, str] = {"bf16": "BF16", "fp32": "F32", "int8": "I8"}

@@ -1,11 +1,11 @@
-"""What lies in the folder of a latent cache? cache.json, the episodes, the kept ranges, and a file for each episode.
+"""The folder of a latent cache: cache.json, the episodes, the ranges of steps, and a file for each episode.
 
 cache.json     what the cache is: its key in full, the shape of its latents, cameras, counts; written last, so that a
-               cache is whole when it is there
+               cache that has it is complete
 episodes.npz   every episode of the data set that it was made from, in its order, as `EpisodeTable.to_bytes` writes
                them; with, for each camera, the size of an episode's file (0: not encoded)
-kept.npz       the steps that `data.idle` keeps, as `FoundRanges.to_bytes` writes them; none where its rule is none
-episodes/000/000123-CAMERA.safetensors   see `record`
+kept.npz       the steps that `data.idle` leaves, as `FoundRanges.to_bytes` writes them; absent without an idle rule
+episodes/000/000123-CAMERA.safetensors   see `episode_file`
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How does a latent cache become `Episode`s? Their latents are read by frame; the data set itself is not needed."""
+"""Source of cached latents: reads them by frame; the data set itself is not needed."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ class LatentSource:
         return Episode(
             info=info,
             states=record["states"],
-            read_frames=_PictureReader(record),
+            read_frames=_FrameReader(record),
             control_rate_hz=opened.manifest.control_rate_hz,
             extrinsics=record["extrinsics"],
             joint_velocities=record["joint_velocities"],
@@ -216,11 +216,11 @@ class _LatentReader:
 
 
 @dataclass(frozen=True)
-class _PictureReader:
+class _FrameReader:
     record: EpisodeFile
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return small pictures at these control steps, in this order: square, as the encoder saw them.
+        """Return small frames at these control steps, in this order: square, as the encoder saw them.
 
         Raises:
             InputError: There is none of such a step, or it is damaged.

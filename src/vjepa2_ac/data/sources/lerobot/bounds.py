@@ -1,4 +1,4 @@
-"""How much of a Parquet file is ever unpacked? Equal values pack into next to nothing: some KB may claim any memory."""
+"""Limits on decompressed Parquet data: equal values compress so well that a few KB may claim any memory."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from vjepa2_ac.errors import InputError
 MOST_ROWS = 5_000_000  # of one row group, or of one episode
 MOST_NUMBERS = 1 << 27  # of one column in a row group
 MOST_TABLE_BYTES = 1 << 28  # of a table of episodes or tasks
-MOST_PICTURE_BYTES = 1 << 32  # in one row group
+MOST_IMAGE_BYTES = 1 << 32  # in one row group
 FIX = "Copy the file again, or leave its episodes out"
 
-_ROWS_AT_ONCE = 64  # where one value may be as large as a picture
+_ROWS_AT_ONCE = 64  # where one value may be as large as an image
 
 
 def parts_of(
@@ -47,7 +47,7 @@ def parts_of(
 
 
 def _bytes_in(value: Any) -> int:
-    """Return about how many bytes nested lists and dicts of numbers, texts and pictures take."""
+    """Return about how many bytes nested lists and dicts of numbers, texts and images take."""
     if isinstance(value, str | bytes):
         return len(value)
     if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Which episodes does a LeRobot data set have, and where do they lie? v3.0: Parquet tables. v2.1: lines of JSON."""
+"""The episode list of a LeRobot data set, with file locations. v3.0: Parquet tables. v2.1: lines of JSON."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ _STATISTICS = ("min", "max", "mean", "std")
 
 @dataclass(frozen=True)
 class VideoPlace:
-    """Where the pictures of one camera of an episode lie."""
+    """Where the frames of one camera of an episode lie."""
 
     chunk: int
     file: int
-    start_s: float  # of the episode's first picture
+    start_s: float  # of the episode's first frame
     length_s: float | None  # None: the data set does not say
 
 
@@ -57,7 +57,7 @@ class EpisodeRow:
 
 
 @dataclass(frozen=True)
-class Told:
+class StatisticsColumns:
     """Columns of which the tables' statistics tell something."""
 
     states: tuple[str, ...]  # whether two episodes have the same states; none: their rows are read
@@ -80,7 +80,11 @@ def tables_of_episodes(info: DatasetInfo, connections: int) -> dict[str, FileInf
 
 
 def read_episodes(
-    info: DatasetInfo, tables: Sequence[str], keys: Sequence[str], told: Told, open_file: Opener
+    info: DatasetInfo,
+    tables: Sequence[str],
+    keys: Sequence[str],
+    wanted: StatisticsColumns,
+    open_file: Opener,
 ) -> list[EpisodeRow]:
     """Return every episode, sorted by number.
 
@@ -88,7 +92,7 @@ def read_episodes(
         info: Of the data set.
         tables: The files that list the episodes, within the data set.
         keys: Videos whose places are wanted.
-        told: Columns of which statistics are wanted; of v2.1 none are read.
+        wanted: Columns of which statistics are wanted; of v2.1 none are read.
         open_file: Gives what to open for a path.
 
     Raises:
@@ -97,7 +101,7 @@ def read_episodes(
     """
     videos = [key for key in keys if info.features[key].dtype == "video"]
     if info.version == "v3.0":
-        rows = [row for table in tables for row in _rows_of_table(info, table, videos, told, open_file)]
+        rows = [row for table in tables for row in _rows_of_table(info, table, videos, wanted, open_file)]
     else:
         rows = list(_rows_of_lines(info, videos))
     rows.sort(key=lambda row: row.index)
@@ -118,7 +122,7 @@ def data_file(info: DatasetInfo, row: EpisodeRow) -> str:
 
 
 def video_file(info: DatasetInfo, place: VideoPlace, key: str) -> str:
-    """Return the path, within the data set, of the file with an episode's pictures."""
+    """Return the path, within the data set, of the file with an episode's frames."""
     return filled(info.video_path or "", place.chunk, place.file, key)
 
 
@@ -152,11 +156,11 @@ def _of_line(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str]) -
 
 
 def _rows_of_table(
-    info: DatasetInfo, table: str, videos: Sequence[str], told: Told, open_file: Opener
+    info: DatasetInfo, table: str, videos: Sequence[str], wanted: StatisticsColumns, open_file: Opener
 ) -> Iterator[EpisodeRow]:
     path = storage.join(info.root, table)
-    outcome = f"stats/{told.success}/max"
-    statistics = [f"stats/{name}/{kind}" for name in told.states for kind in _STATISTICS]
+    outcome = f"stats/{wanted.success}/max"
+    statistics = [f"stats/{name}/{kind}" for name in wanted.states for kind in _STATISTICS]
     prefixes = tuple(f"videos/{key}/" for key in videos)
     own = {"episode_index", "length", "tasks", "data/chunk_index", "data/file_index", outcome, *statistics}
     columns = read_table(open_file(path), path, lambda name: name in own or name.startswith(prefixes))
@@ -165,10 +169,12 @@ def _rows_of_table(
         raise _damaged(path, f"columns of {sorted(lengths)} rows")
     for number in range(max(lengths, default=0)):
         row = {name: column[number] for name, column in columns.items()}
-        yield _checked(f"{path}: row {number}", _of_row, row, videos, row.get(outcome), statistics)
+        yield _checked(f"{path}: row {number}", _episode_of_row, row, videos, row.get(outcome), statistics)
 
 
-def _of_row(row: Mapping[str, Any], videos: Sequence[str], outcome: object, statistics: Sequence[str]) -> EpisodeRow:
+def _episode_of_row(
+    row: Mapping[str, Any], videos: Sequence[str], outcome: object, statistics: Sequence[str]
+) -> EpisodeRow:
     while isinstance(outcome, list) and outcome:
         outcome = outcome[0]
     return EpisodeRow(

@@ -1,4 +1,4 @@
-"""What do the rows of one LeRobot episode hold, and are they all there? States, commands, outcome."""
+"""The rows of one LeRobot episode, checked for completeness: states, commands, outcome."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _FIX = "Copy the file again, or leave the episode out"
 
 @dataclass(frozen=True)
 class EpisodeContent:
-    """What is read of an episode beside its pictures."""
+    """What is read of an episode beside its frames."""
 
     states: Float[np.ndarray, "steps state_dim"]
     joint_velocities: Float[np.ndarray, "steps joints"] | None

@@ -1,4 +1,4 @@
-"""How do the pictures of a LeRobot episode become pixels? From its part of a video, or from the table itself."""
+"""The frames of a LeRobot episode: decoded from its part of a video, or from images in the table."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from vjepa2_ac.media.image_size import require_bounded
 
 
 @dataclass(frozen=True)
-class VideoPictures:
-    """Reads pictures of an episode from its part of a video: step k is shown at the part's start + k / fps."""
+class VideoFrames:
+    """Reads frames of an episode from its part of a video: step k is shown at the part's start + k / fps."""
 
     open_file: Opener
     path: str
@@ -28,10 +28,10 @@ class VideoPictures:
     where: str
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order.
+        """Return the RGB frames at these control steps, in this order.
 
         Raises:
-            InputError: The video is missing, damaged, or shows no picture within half a step of the time.
+            InputError: The video is missing, damaged, or shows no frame within half a step of the time.
             OSError: It is far away and cannot be read.
             ValueError: No steps, or a step outside the episode.
         """
@@ -46,43 +46,43 @@ class VideoPictures:
 
 
 @dataclass(frozen=True)
-class StoredPictures:
-    """Decodes pictures of an episode that the table holds as PNG or JPEG; they are read when the first is asked for."""
+class StoredImages:
+    """Decodes images of an episode that the table holds as PNG or JPEG; they are read when the first is asked for."""
 
     read: Callable[[], list[bytes]]
     num_steps: int
     where: str
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order.
+        """Return the RGB frames at these control steps, in this order.
 
         Raises:
-            InputError: A picture is neither PNG nor JPEG, is damaged, or differs in size from the first.
+            InputError: An image is neither PNG nor JPEG, is damaged, or differs in size from the first.
             OSError: The table is far away and cannot be read.
             ValueError: No steps, or a step outside the episode.
         """
         _require_within(steps, self.num_steps, self.where)
-        first = decode_image(self._pictures[steps[0]], f"{self.where}: step {steps[0]}")
+        first = decode_image(self._images[steps[0]], f"{self.where}: step {steps[0]}")
         require_bounded(first.shape[0], first.shape[1], f"{self.where}: step {steps[0]}", count=len(steps))
-        others = [decode_image(self._pictures[step], f"{self.where}: step {step}") for step in steps[1:]]
+        others = [decode_image(self._images[step], f"{self.where}: step {step}") for step in steps[1:]]
         frames = [first, *others]
         for step, frame in zip(steps, frames, strict=True):
             if frame.shape != frames[0].shape:
                 raise InputError(
                     where=f"{self.where}: step {step}",
-                    found=f"a picture of {frame.shape[0]}x{frame.shape[1]}",
+                    found=f"an image of {frame.shape[0]}x{frame.shape[1]}",
                     needed=f"{frames[0].shape[0]}x{frames[0].shape[1]} as at step {steps[0]}",
                 )
         return np.stack(frames)
 
     @cached_property
-    def _pictures(self) -> list[bytes]:
-        pictures = self.read()
-        if len(pictures) != self.num_steps:
+    def _images(self) -> list[bytes]:
+        images = self.read()
+        if len(images) != self.num_steps:
             raise InputError(
-                where=self.where, found=f"{len(pictures)} pictures", needed=f"one for each of {self.num_steps} steps"
+                where=self.where, found=f"{len(images)} images", needed=f"one for each of {self.num_steps} steps"
             )
-        return pictures
+        return images
 
 
 def _require_within(steps: Sequence[int], num_steps: int, where: str) -> None:

@@ -1,4 +1,4 @@
-"""Which episodes of a LeRobot data set can be used, and where do they lie? A table for `index_cache` to keep."""
+"""Index of the usable episodes of a LeRobot data set and their locations: a table for `index_cache` to store."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], tex
         locators=locators,
         texts={"tasks": json.dumps(tasks), **texts},
         state_hashes=hashes if any(hashes) else None,
-        labels={"task": labels} if labels.is_said else {},
+        labels={"task": labels} if labels.is_present else {},
     )
 
 
@@ -159,7 +159,7 @@ def _require_usable(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: S
             raise InputError(
                 where=f"{storage.join(info.root, shown_in)}: {row.id}",
                 found=f"no such video, for {row.length} rows in {rows_in}",
-                needed=f"the pictures of {key}",
+                needed=f"the frames of {key}",
                 fix="Copy the data set again, or leave the episode out",
             )
         needed_s = (row.length - 0.5) / info.fps

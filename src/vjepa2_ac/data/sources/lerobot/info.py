@@ -1,4 +1,4 @@
-"""What does a LeRobot data set say of itself? meta/info.json: its version, rate, columns, cameras and file names."""
+"""The meta/info.json of a LeRobot data set: version, rate, columns, cameras and file names."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Feature:
 
     @property
     def is_camera(self) -> bool:
-        """Whether it holds pictures."""
+        """Whether it holds frames."""
         return self.dtype in {"video", "image"}
 
 
@@ -77,7 +77,7 @@ class DatasetInfo:
             self.camera_key(fields, camera)
 
     def camera_key(self, fields: LeRobotFields, camera: str) -> str:
-        """Return the feature with a camera's pictures.
+        """Return the feature with a camera's frames.
 
         Raises:
             InputError: The config or the data set has no such camera.

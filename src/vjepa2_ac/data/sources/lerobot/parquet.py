@@ -1,4 +1,4 @@
-"""How are the rows of one episode read from a Parquet file of many? Its row groups, and the columns that are needed."""
+"""Reading the rows of one episode from a Parquet file of many: only its row groups, and the needed columns."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
 from vjepa2_ac.data.sources.lerobot.bounds import (
     FIX,
-    MOST_PICTURE_BYTES,
+    MOST_IMAGE_BYTES,
     MOST_TABLE_BYTES,
     parts_of,
     require_few,
@@ -34,9 +34,9 @@ Opener = Callable[[str], "str | BlockCachedFile"]  # a path, or a file far away
 
 EPISODE = "episode_index"
 
-_KEPT_BYTES = 64 << 20  # of decoded row groups, in a process
+_CACHED_BYTES = 64 << 20  # of decoded row groups, in a process
 _BUFFER_BYTES = 4096  # of a column from which nothing is read
-_KEPT_FOOTERS = 256
+_CACHED_FOOTERS = 256
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class ParquetRows:
     """
 
     def __init__(self, open_file: Opener, columns: Sequence[str], kept: RowCache | None = None) -> None:
-        self._kept = kept
+        self._row_cache = kept
         self._open, self._columns = open_file, list(dict.fromkeys([EPISODE, *columns]))
         self._lock = threading.Lock()
         self._footers: OrderedDict[str, _Footer] = OrderedDict()
@@ -80,7 +80,7 @@ class ParquetRows:
             InputError: The file is missing or damaged, or a column holds something other than numbers.
             OSError: A file far away cannot be read.
         """
-        if self._kept is not None and (known := self._kept.read(path, episode)) is not None:
+        if self._row_cache is not None and (known := self._row_cache.read(path, episode)) is not None:
             return known
         parts, shared = [], False
         opened = self._open(path)
@@ -94,15 +94,15 @@ class ParquetRows:
                     shared |= len(parts[-1][EPISODE]) < len(group[EPISODE])
                     require_sane([sum(len(part[EPISODE]) for part in parts)], path)
         rows = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
-        if self._kept is not None and shared:
-            self._kept.write(path, episode, rows)
+        if self._row_cache is not None and shared:
+            self._row_cache.write(path, episode, rows)
         return rows
 
-    def pictures(self, path: str, column: str, episode: int) -> list[bytes]:
-        """Return the encoded pictures of one episode from a column of {bytes, path}.
+    def images(self, path: str, column: str, episode: int) -> list[bytes]:
+        """Return the encoded images of one episode from a column of {bytes, path}.
 
         Raises:
-            InputError: The file is missing or damaged, or the column does not hold pictures.
+            InputError: The file is missing or damaged, or the column does not hold images.
             OSError: A file far away cannot be read.
         """
         found: list[bytes] = []
@@ -111,8 +111,8 @@ class ParquetRows:
             footer = self._footer(path, file, opened)
             for number, (first, last) in enumerate(zip(footer.first, footer.last, strict=True)):
                 if (first is None or first <= episode) and (last is None or episode <= last):
-                    for part in parts_of(file, path, [EPISODE, column], MOST_PICTURE_BYTES, row_groups=[number]):
-                        found += _pictures_in(part[column], part[EPISODE], episode, f"{path}: {column}")
+                    for part in parts_of(file, path, [EPISODE, column], MOST_IMAGE_BYTES, row_groups=[number]):
+                        found += _images_in(part[column], part[EPISODE], episode, f"{path}: {column}")
         return found
 
     def _footer(self, path: str, file: parquet.ParquetFile, opened: str | BlockCachedFile) -> _Footer:
@@ -124,7 +124,7 @@ class ParquetRows:
         footer = _footer_of(file, path)
         with self._lock:
             self._footers[path] = footer
-            if len(self._footers) > _KEPT_FOOTERS:
+            if len(self._footers) > _CACHED_FOOTERS:
                 self._footers.popitem(last=False)
         return footer
 
@@ -141,7 +141,7 @@ class ParquetRows:
             raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=FIX)
         with self._lock:
             self._groups[path, number] = group
-            while len(self._groups) > 1 and sum(map(_size_of, self._groups.values())) > _KEPT_BYTES:
+            while len(self._groups) > 1 and sum(map(_size_of, self._groups.values())) > _CACHED_BYTES:
                 self._groups.popitem(last=False)
         return group
 
@@ -260,17 +260,17 @@ def _require_sane_groups(file: parquet.ParquetFile, path: str) -> None:
     require_sane([metadata.row_group(n).num_rows for n in range(metadata.num_row_groups)], path, metadata.num_rows)
 
 
-def _pictures_in(rows: list[Any], episodes: list[Any], episode: int, where: str) -> list[bytes]:
+def _images_in(rows: list[Any], episodes: list[Any], episode: int, where: str) -> list[bytes]:
     stored = [row.get("bytes") if isinstance(row, dict) else row for row in rows]
-    chosen = [picture for picture, its in zip(stored, episodes, strict=True) if its == episode]
-    pictures = [picture for picture in chosen if isinstance(picture, bytes)]
-    if len(pictures) != len(chosen):
+    chosen = [image for image, its in zip(stored, episodes, strict=True) if its == episode]
+    images = [image for image in chosen if isinstance(image, bytes)]
+    if len(images) != len(chosen):
         raise InputError(
             where=where,
-            found="no pictures, or names of files in their place",
+            found="no images, or names of files in their place",
             needed="PNG or JPEG bytes in the column",
         )
-    return pictures
+    return images
 
 
 def _no_numbers(where: str, kind: str, gaps: int) -> InputError:

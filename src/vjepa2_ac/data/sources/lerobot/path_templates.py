@@ -1,4 +1,4 @@
-"""Which files does a LeRobot data set have, and what are they called? Templates such as `chunk-{chunk_index:03d}`."""
+"""File names of a LeRobot data set, from templates such as `chunk-{chunk_index:03d}`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where do the rows of an episode stay, so that a row group of hundreds of episodes is not decoded for each of them?"""
+"""Cache of episode rows, so that a row group of hundreds of episodes is not decoded for each of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How do LeRobot data sets become `Episode`s? v3.0 and v2.1, read with pyarrow and PyAV, without lerobot itself."""
+"""Source of LeRobot data sets v3.0 and v2.1, read with pyarrow and PyAV, without lerobot itself."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import get_or_build, key_of
 from vjepa2_ac.data.sources.lerobot.episode_list import (
     EpisodeRow,
-    Told,
+    StatisticsColumns,
     data_file,
     read_episodes,
     tables_of_episodes,
     video_file,
 )
 from vjepa2_ac.data.sources.lerobot.episode_rows import EpisodeContent, content_of, wanted_columns
-from vjepa2_ac.data.sources.lerobot.images import StoredPictures, VideoPictures
+from vjepa2_ac.data.sources.lerobot.images import StoredImages, VideoFrames
 from vjepa2_ac.data.sources.lerobot.index_build import check_rows, find_problems, row_of, table_of
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
@@ -44,7 +44,7 @@ class LeRobotSource:
 
     Nothing is read before the first call. Of a data set on this machine `infos` checks the states of every episode; of
     one far away it reads what lies in meta, and states are checked when an episode is read (all of them at once where
-    `data.outcome` asks for what only the rows tell). `read` fetches the row groups with the episode's rows; pictures
+    `data.outcome` asks for what only the rows tell). `read` fetches the row groups with the episode's rows; frames
     are fetched and decoded when they are asked for.
     """
 
@@ -73,7 +73,7 @@ class LeRobotSource:
                 self._table = self._found_out(progress)
             return self._table
 
-    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - pictures are fetched one by one
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - frames are fetched one by one
         """Return one episode; see `episode.EpisodeSource`.
 
         Raises:
@@ -89,7 +89,7 @@ class LeRobotSource:
         return Episode(
             info=info,
             states=content.states,
-            read_frames=self._pictures(row, key, where),
+            read_frames=self._frames(row, key, where),
             control_rate_hz=self._control_rate_hz,
             joint_velocities=content.joint_velocities,
             metadata={"language": task} if task else {},
@@ -164,8 +164,8 @@ class LeRobotSource:
     ) -> EpisodeTable:
         info, fields = self._info, self._config.lerobot
         known = info.known_keys(fields)
-        told = Told(tuple(fields.state) if self._is_far else (), fields.success)
-        rows = read_episodes(info, tables, known, told, self._open)
+        statistics = StatisticsColumns(tuple(fields.state) if self._is_far else (), fields.success)
+        rows = read_episodes(info, tables, known, statistics, self._open)
         problems = find_problems(info, rows, files.keys(), keys)
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
         if not self._is_far or (self._config.outcome != "all" and outcome_unknown):
@@ -190,15 +190,15 @@ class LeRobotSource:
         rows = self._parquet.rows(storage.join(self._info.root, data_file(self._info, row)), row.index)
         return content_of(rows, row.length, self._info, self._config, self._where(row))
 
-    def _pictures(self, row: EpisodeRow, key: str, where: str) -> FrameReader:
+    def _frames(self, row: EpisodeRow, key: str, where: str) -> FrameReader:
         info = self._info
         if info.features[key].dtype == "image":
             path = storage.join(info.root, data_file(info, row))
-            return StoredPictures(lambda: self._parquet.pictures(path, key, row.index), row.length, f"{where}: {key}")
+            return StoredImages(lambda: self._parquet.images(path, key, row.index), row.length, f"{where}: {key}")
         place = row.videos[key]
         path = storage.join(info.root, video_file(info, place, key))
         clock = Clock(start_s=place.start_s, rate_hz=info.fps)
-        return VideoPictures(self._open, path, clock, row.length, f"{path}: {row.id}")
+        return VideoFrames(self._open, path, clock, row.length, f"{path}: {row.id}")
 
     def _where(self, row: EpisodeRow) -> str:
         return f"{storage.join(self._info.root, data_file(self._info, row))}: {row.id}"

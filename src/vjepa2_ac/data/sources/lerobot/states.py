@@ -1,4 +1,4 @@
-"""How do a LeRobot data set's own columns become states? Select, turn the rotation, scale the gripper."""
+"""States from the columns of a LeRobot data set: select, convert the rotation, scale the gripper."""
 
 from __future__ import annotations
 

@@ -1,11 +1,11 @@
-"""What does an episode look like as an .npz file, and is this one?
+"""The .npz episode format, and its validation.
 
 An episode NAME.npz, as numpy.savez or numpy.savez_compressed writes it, holds
 
     states             [steps, 7]  measured: x, y, z in metres, roll, pitch, yaw in radians (extrinsic xyz Euler),
                                    gripper closedness, 0 open .. 1 closed; all in the robot's base frame
                                    ([steps, any] with data.states: vector: whatever the robot has)
-    frames             [steps, height, width, 3] uint8, RGB: the picture at each step
+    frames             [steps, height, width, 3] uint8, RGB: the frame at each step
     fps_hz             control steps per second, the same in all episodes
 
 and may hold
@@ -15,11 +15,11 @@ and may hold
     joint_velocities   [steps, joints], *commanded*, radians per second: the idle filter's rule `commands` reads them
     actions            [steps, any], *commanded*: read with data.actions: recorded
     success            true or false
-    language           the task in words
+    language           the task as text
     scene, building, operator, day   texts: what `data.split_by` may keep together
 
-Of a file that numpy.savez wrote, only the pictures that are asked for are read, and their checksum is not checked: it
-covers all of them. Of one that numpy.savez_compressed wrote, the pictures before must be unpacked, too: slow for long
+Of a file that numpy.savez wrote, only the requested frames are read, and their checksum is not checked: it covers all
+frames. Of one that numpy.savez_compressed wrote, the preceding frames must be decompressed, too: slow for long
 episodes.
 """
 
@@ -43,7 +43,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_size import require_bounded
 from vjepa2_ac.storage.npz_reader import NpzFile
 
-_MOST_NUMBERS = 1 << 25  # of an array besides pictures: 88 hours of 7 numbers at 15 Hz; 256 MB as float64
+_MOST_NUMBERS = 1 << 25  # of an array besides frames: 88 hours of 7 numbers at 15 Hz; 256 MB as float64
 _MOST_LETTERS = 1 << 16
 LABELS = ("scene", "building", "operator", "day")
 FORMAT_HELP = "docs/data.md says what an episode holds"
@@ -51,7 +51,7 @@ FORMAT_HELP = "docs/data.md says what an episode holds"
 
 @dataclass(frozen=True)
 class NpzEpisode:
-    """What an episode's file holds, but for the pictures (legend: `vjepa2_ac.episode`)."""
+    """What an episode's file holds, but for the frames (legend: `vjepa2_ac.episode`)."""
 
     states: Float[np.ndarray, "steps state_dim"]
     fps_hz: float
@@ -69,12 +69,12 @@ class NpzEpisode:
 
 
 def read_episode(opened: str | BlockCachedFile, path: str, cameras: Sequence[str], config: DataConfig) -> NpzEpisode:
-    """Read all of a file but the pictures, whose shape is checked.
+    """Read all of a file but the frames, whose shape is checked.
 
     Args:
         opened: What to open to read: the path, or a file far away.
         path: Of the file, for messages.
-        cameras: Whose pictures must be there.
+        cameras: Whose frames must be there.
         config: Whether camera poses and commands must be, too, and what a state is.
 
     Raises:
@@ -88,7 +88,7 @@ def read_episode(opened: str | BlockCachedFile, path: str, cameras: Sequence[str
         (require_plausible if is_pose else require_finite)(states, path, fix=FORMAT_HELP)
         extrinsics = {}
         for camera in cameras:
-            require_pictures(file, camera, steps, path)
+            require_frames(file, camera, steps, path)
             extrinsics[camera] = arrays.extrinsics(camera, steps)
             if config.pose_frame == "camera" and extrinsics[camera] is None:
                 found, needed = "no poses of the camera", f"extrinsics or extrinsics_{camera}"
@@ -127,8 +127,8 @@ def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
         raise storage.unreadable(path, error) from None
 
 
-def require_pictures(file: NpzFile, camera: str, steps: int, path: str, *, count: int = 1) -> None:
-    """Refuse what cannot be the pictures of a camera, without reading them.
+def require_frames(file: NpzFile, camera: str, steps: int, path: str, *, count: int = 1) -> None:
+    """Refuse what cannot be the frames of a camera, without reading them.
 
     Args:
         file: The episode's.
@@ -140,11 +140,11 @@ def require_pictures(file: NpzFile, camera: str, steps: int, path: str, *, count
     Raises:
         InputError: There is no such array, or it is not [steps, height, width, 3] of uint8; they are too large.
     """
-    _require_array(file, camera, (steps, None, None, 3), "u", "pictures (steps, height, width, 3)", path)
+    _require_array(file, camera, (steps, None, None, 3), "u", "frames (steps, height, width, 3)", path)
     header = file.header_of_rows(camera)
     require_bounded(header.shape[1], header.shape[2], f"{path}: {camera}", count=count)
     if header.dtype != np.uint8:
-        found = f"pictures of {header.dtype}"
+        found = f"frames of {header.dtype}"
         raise InputError(where=f"{path}: {camera}", found=found, needed="uint8, 0 to 255", fix=FORMAT_HELP)
 
 

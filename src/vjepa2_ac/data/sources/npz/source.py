@@ -1,4 +1,4 @@
-"""How do plain .npz files become `Episode`s? One file each, in a folder or in folders below it."""
+"""Source of plain .npz files: one file per episode, in a folder or in folders below it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from vjepa2_ac.data.index.index_cache import get_or_build, key_of
 from vjepa2_ac.data.index.labels import labels_of
 from vjepa2_ac.data.index.state_hash import hash_of_states
 from vjepa2_ac.data.sources.listing import in_parallel, walk, within
-from vjepa2_ac.data.sources.npz.npz_episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_pictures
+from vjepa2_ac.data.sources.npz.npz_episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_frames
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.remote import UnreachableError
@@ -35,7 +35,7 @@ _SUFFIX = ".npz"
 class NpzSource:
     """The episodes of a folder of .npz files, in the order of their paths; a path without .npz is the identity.
 
-    Nothing is read before the first call. `infos` reads all of every file but the pictures. What is fetched of files
+    Nothing is read before the first call. `infos` reads all of every file but the frames. What is fetched of files
     behind URLs stays on this machine.
     """
 
@@ -58,7 +58,7 @@ class NpzSource:
         return self._table
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - files are fetched in blocks
-        """Return one episode; of its pictures, only those that are asked for are read.
+        """Return one episode; of its frames, only those that are asked for are read.
 
         Raises:
             InputError: The file is missing or damaged, or has changed since it was indexed.
@@ -78,7 +78,7 @@ class NpzSource:
         return Episode(
             info=info,
             states=found.states,
-            read_frames=_PictureReader(partial(self._opened, path), path, camera, info.num_steps),
+            read_frames=_FrameReader(partial(self._opened, path), path, camera, info.num_steps),
             control_rate_hz=found.fps_hz,
             extrinsics=found.extrinsics[camera],
             joint_velocities=found.joint_velocities,
@@ -171,8 +171,8 @@ class NpzSource:
 
 
 @dataclass(frozen=True)
-class _PictureReader:
-    """Reads the pictures of one camera that are asked for."""
+class _FrameReader:
+    """Reads the frames of one camera that are asked for."""
 
     opened: Callable[[], str | BlockCachedFile]
     path: str
@@ -180,7 +180,7 @@ class _PictureReader:
     steps: int
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order.
+        """Return the RGB frames at these control steps, in this order.
 
         Raises:
             InputError: The file is missing or damaged.
@@ -190,5 +190,5 @@ class _PictureReader:
         if not steps or min(steps) < 0 or max(steps) >= self.steps:
             raise ValueError(f"{self.path}: steps {list(steps)} of {self.steps}")
         with opened_npz(self.opened(), self.path) as file:
-            require_pictures(file, self.camera, self.steps, self.path, count=len(set(steps)))
+            require_frames(file, self.camera, self.steps, self.path, count=len(set(steps)))
             return np.asarray(file.rows(self.camera, steps))

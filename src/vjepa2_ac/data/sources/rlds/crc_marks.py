@@ -1,4 +1,4 @@
-"""Which records of a data set have had their CRC checked on this machine?"""
+"""CRC marks: which records of a data set have had their CRC checked on this machine."""
 
 from __future__ import annotations
 

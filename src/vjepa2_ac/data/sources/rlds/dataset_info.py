@@ -1,4 +1,4 @@
-"""Which TFRecord shards make up an RLDS data set? What its dataset_info.json says."""
+"""The dataset_info.json of an RLDS data set: which TFRecord shards make it up."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vjepa2_ac.storage.structured import read_json_object
 
 _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
-_SHOWN = 5
+_MOST_NAMES = 5
 _MOST_EPISODES = 100_000  # of a shard; DROID's have some 50
 
 
@@ -146,5 +146,5 @@ def _as_listed(folder: str, shards: list[Shard]) -> list[Shard]:
 
 
 def _shorten(names: list[str]) -> str:
-    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    return ", ".join(names[:_SHOWN]) + more
+    more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(names[:_MOST_NAMES]) + more

@@ -1,4 +1,4 @@
-"""What does one record of a data set hold, feature by feature?"""
+"""The content of one record of a data set, feature by feature."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class ExampleRecord:
         return int(np.count_nonzero(np.frombuffer(packed, np.uint8) < 0x80))
 
     def items(self, name: str, count: int | None = None) -> tuple[list[int], list[int]]:
-        """Return offsets and lengths of the texts or pictures of a feature, of the first `count`, reading none of them.
+        """Return offsets and lengths of the texts or images of a feature, of the first `count`, reading none of them.
 
         Raises:
             InputError: There is no such feature, or it holds something else.

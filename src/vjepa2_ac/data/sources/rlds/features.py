@@ -1,4 +1,4 @@
-"""What do the features of a record say of its episode? Identity, steps, states, by the names in `data.fields`."""
+"""An episode's identity, steps and states, from the record features named in `data.fields`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How are the pictures of one camera read out of a record, those that are asked for?"""
+"""Images of one camera in a local record: only the requested ones are read."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from vjepa2_ac.media.jpeg import decode_jpegs
 
 
 @dataclass(frozen=True)
-class LocalPictures:
-    """Hops over the pictures of one camera in a file on this machine, and reads and decodes those asked for."""
+class LocalImages:
+    """Hops over the images of one camera in a file on this machine, and reads and decodes those asked for."""
 
     shard: Shard
     feature: Located
@@ -25,18 +25,18 @@ class LocalPictures:
     where: str  # file, record, identity and feature, for messages
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order.
+        """Return the RGB frames at these control steps, in this order.
 
         Raises:
-            InputError: The file has changed, there are too few pictures, one is not a JPEG, or differs in size.
+            InputError: The file has changed, there are too few images, one is not a JPEG, or differs in size.
             ValueError: No steps, or a step outside the episode.
         """
         with open_shard(self.shard) as read:
-            return PicturesAt(read, self.feature, self.num_steps, self.where)(steps)
+            return ImagesAt(read, self.feature, self.num_steps, self.where)(steps)
 
 
 @dataclass(frozen=True)
-class PicturesAt:
+class ImagesAt:
     """The same, of a file that is open, or of a record that is in memory."""
 
     read: Read
@@ -45,17 +45,17 @@ class PicturesAt:
     where: str
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order.
+        """Return the RGB frames at these control steps, in this order.
 
         Raises:
-            InputError: There are too few pictures, one is not a JPEG, or differs in size.
+            InputError: There are too few images, one is not a JPEG, or differs in size.
             ValueError: No steps, or a step outside the episode.
         """
         require_steps(steps, self.num_steps, self.where)
         try:
             offsets, lengths = locate_items(self.read, self.feature, max(steps) + 1)
         except NotAnExampleError as error:
-            raise InputError(where=self.where, found=str(error), needed="a list of pictures") from None
+            raise InputError(where=self.where, found=str(error), needed="a list of images") from None
         if len(offsets) <= max(steps):
             raise wrong_count(len(offsets), self.num_steps, self.where)
         return decode_jpegs([self.read(offsets[step], lengths[step]) for step in steps], steps, self.where)
@@ -72,5 +72,5 @@ def require_steps(steps: Sequence[int], num_steps: int, where: str) -> None:
 
 
 def wrong_count(found: int, num_steps: int, where: str) -> InputError:
-    """Return the error of a camera that has not one picture for each step."""
-    return InputError(where=where, found=f"{found} pictures", needed=f"one for each of the {num_steps} steps")
+    """Return the error of a camera that has not one image for each step."""
+    return InputError(where=where, found=f"{found} images", needed=f"one for each of the {num_steps} steps")

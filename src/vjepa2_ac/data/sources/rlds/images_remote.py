@@ -1,7 +1,7 @@
-"""How is an episode read whose record lies behind a URL, so that later clips of it cost little?
+"""Reading an episode whose record is behind a URL, so that later clips of it are cheap.
 
-Kept on this machine for ever, a few KB each: where the features of a record lie, and the pictures in them. Kept within
-the limit of `data.disk_cache`: states, and the pictures of the steps that clips may come from, some dozens a file.
+Stored on this machine for ever, a few KB each: the positions of a record's features, and of the images in them. Stored
+within the limit of `data.disk_cache`: states, and the images of steps that clips may come from, some dozens per file.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from vjepa2_ac.storage.structured import json_object
 _HOP_WINDOW = 1 << 16
 _TEXT_BYTES = 512  # of a feature with one text for every step, of which the first is read
 _HOP_BYTES = 32
-_GROUP_STEPS = 64  # pictures of so many steps lie in one entry of the cache
-_GAP_BYTES = 1 << 15  # pictures that lie as near to each other are fetched by one read
+_GROUP_STEPS = 64  # images of so many steps lie in one entry of the cache
+_GAP_BYTES = 1 << 15  # images that lie as near to each other are fetched by one read
 _FOR_EVER = 1 << 62
 
 
@@ -42,7 +42,7 @@ class RemoteCache:
     """What is kept on this machine of one data set."""
 
     key: str  # of the index: another one when the files are others
-    places: DiskCache  # of pictures in their files: small, without limit
+    places: DiskCache  # of images in their files: small, without limit
     contents: DiskCache
 
     @classmethod
@@ -52,7 +52,7 @@ class RemoteCache:
 
 
 class RemoteEpisode:
-    """One record behind a URL: its small features, and the pictures of its cameras.
+    """One record behind a URL: its small features, and the images of its cameras.
 
     Args:
         shard: Its file.
@@ -88,20 +88,20 @@ class RemoteEpisode:
             self._cache.contents.write(self._key, _pack(pieces))
         return ExampleRecord(file, self._span, located)
 
-    def pictures(
+    def images(
         self, feature: str, located: Mapping[str, Located], num_steps: int, needed: StepRanges | None, where: str
-    ) -> RemotePictures:
-        """Return the reader of one camera's pictures.
+    ) -> RemoteImages:
+        """Return the reader of one camera's images.
 
         Args:
             feature: The camera's.
             located: Where the record's features lie.
             num_steps: Of the episode.
-            needed: Steps whose pictures are worth keeping; None: all.
+            needed: Steps whose images are worth keeping; None: all.
             where: File, record, identity and feature, for messages.
         """
         keep = tuple((max(0, start), min(end, num_steps)) for start, end in needed or [(0, num_steps)])
-        return RemotePictures(
+        return RemoteImages(
             self._shard, located[feature], num_steps, keep, where, self._cache, f"{self._key} {feature}"
         )
 
@@ -120,10 +120,10 @@ class RemoteEpisode:
 
 
 @dataclass(frozen=True)
-class RemotePictures:
-    """Reads pictures of one camera of one episode: from this machine, or those that are asked for from afar.
+class RemoteImages:
+    """Reads images of one camera of one episode: from this machine, or those that are asked for from afar.
 
-    The first time all of the camera's pictures are fetched, for nothing less tells where each lies; those of the needed
+    The first time all of the camera's images are fetched, for nothing less tells where each lies; those of the needed
     steps are kept.
     """
 
@@ -136,21 +136,21 @@ class RemotePictures:
     key: str
 
     def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB pictures at these control steps, in this order.
+        """Return the RGB frames at these control steps, in this order.
 
         Raises:
-            InputError: There is not one picture for each step, one is not a JPEG, or differs in size.
+            InputError: There is not one image for each step, one is not a JPEG, or differs in size.
             UnreachableError: The network fails.
             ValueError: No steps, or a step outside the episode.
         """
         require_steps(steps, self.num_steps, self.where)
         try:
-            found = self._kept_or_fetched(sorted(set(steps)))
+            found = self._cached_or_fetched(sorted(set(steps)))
         except OSError as error:
             raise unreadable(self.shard, error) from None
         return decode_jpegs([found[step] for step in steps], steps, self.where)
 
-    def _kept_or_fetched(self, steps: Sequence[int]) -> dict[int, bytes]:
+    def _cached_or_fetched(self, steps: Sequence[int]) -> dict[int, bytes]:
         table = self.cache.places.read(self.key)
         if table is None:
             return self._first_time(steps)
@@ -163,7 +163,7 @@ class RemotePictures:
         return found | self._fetch(missing, places)
 
     def _fetch(self, steps: Sequence[int], places: Int64[np.ndarray, "steps 2"]) -> dict[int, bytes]:
-        """Fetch single pictures, neighbours by one read."""
+        """Fetch single images, neighbours by one read."""
         runs: list[list[int]] = []
         for step in steps:
             if runs and int(places[step, 0]) - int(places[runs[-1][-1]].sum()) <= _GAP_BYTES:
@@ -179,7 +179,7 @@ class RemotePictures:
         return found
 
     def _first_time(self, steps: Sequence[int]) -> dict[int, bytes]:
-        """Fetch all of the camera's pictures, and keep where they lie and those that are needed."""
+        """Fetch all of the camera's images, and keep where they lie and those that are needed."""
         [data] = read_in_parallel(self.shard.path, [self.feature])
         start = self.feature.offset
 
@@ -189,18 +189,18 @@ class RemotePictures:
         try:
             offsets, lengths = locate_items(read, self.feature)
         except NotAnExampleError as error:
-            raise InputError(where=self.where, found=str(error), needed="a list of pictures") from None
+            raise InputError(where=self.where, found=str(error), needed="a list of images") from None
         if len(offsets) != self.num_steps:
             raise wrong_count(len(offsets), self.num_steps, self.where)
-        pictures = [read(offset, length) for offset, length in zip(offsets, lengths, strict=True)]
+        images = [read(offset, length) for offset, length in zip(offsets, lengths, strict=True)]
         self.cache.places.write(self.key, np.array([offsets, lengths], np.int64).T.tobytes())
         groups: dict[int, list[tuple[int, bytes]]] = {}
         for step in (step for first, end in self.needed for step in range(first, end)):
-            if looks_like_jpeg(pictures[step]):  # anything else may be the network's doing
-                groups.setdefault(step // _GROUP_STEPS, []).append((step, pictures[step]))
+            if looks_like_jpeg(images[step]):  # anything else may be the network's doing
+                groups.setdefault(step // _GROUP_STEPS, []).append((step, images[step]))
         for group, members in groups.items():
             self.cache.contents.write(f"{self.key} {group}", _pack(members))
-        return {step: pictures[step] for step in steps}
+        return {step: images[step] for step in steps}
 
 
 def whole_record(shard: Shard, span: RecordSpan) -> Read:

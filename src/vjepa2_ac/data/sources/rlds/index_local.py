@@ -1,4 +1,4 @@
-"""Which episodes does an RLDS data set hold, and where does each lie? Found out by hopping, reading almost nothing."""
+"""Index of a local RLDS data set: its episodes and their positions, found by skipping over almost all of the data."""
 
 from __future__ import annotations
 
@@ -49,12 +49,12 @@ Examine = Callable[[Read, RecordSpan], Found]
 def index_local(
     shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str], *, threads: int, progress: Progress | None
 ) -> EpisodeTable:
-    """Return every episode of shards on this machine; its states are checked, its pictures only found to be there.
+    """Return every episode of shards on this machine; its states are checked, its images only found to be there.
 
     Args:
         shards: All of the data set's.
         config: Names of the features, and what a state is.
-        cameras: Features with pictures that every episode must have.
+        cameras: Features with images that every episode must have.
         threads: Shards that are read at once.
         progress: Told how many of the episodes have been looked at.
 
@@ -167,7 +167,7 @@ def place_of(span: RecordSpan) -> str:
 
 
 def _examine(read: Read, span: RecordSpan, config: DataConfig, cameras: Sequence[str]) -> Found:
-    """Look at identity, steps, states and the presence of the pictures."""
+    """Look at identity, steps, states and the presence of the images."""
     name = place_of(span)
     record = ExampleRecord(read, span)
     try:

@@ -1,11 +1,11 @@
-"""Which episodes does an RLDS data set behind a URL hold? Found out with a few small reads for each.
+"""Index of an RLDS data set behind a URL, built with a few small reads per episode.
 
-A read costs tens of milliseconds, so many shards are read at once, and of a record no more is read than names it and
-tells its steps: its states are checked when it is read, and here only where it may be a copy (`lookalikes`). TFDS
-writes the features of a record in a hash's order, another one in every process: its names lie before, between or behind
-the pictures. Looked at are its head; its end, which comes with the head of the next record; then what lies between the
-pictures. That is one read a record where the names come first, three on the average of all orders. How many bytes one
-read takes is decided by a few records.
+A read costs tens of milliseconds, so many shards are read at once, and only as much of a record is read as gives its
+name and its steps: its states are checked when the episode is read, and here only where it may be a copy
+(`lookalikes`). TFDS writes the features of a record in the order of a hash, which differs between processes: its names
+are before, between or after the images. Read are its head; its end, which comes with the head of the next record; then
+what is between the images. That is one read per record where the names come first, three on average over all orders.
+The size of a read is decided by a few records.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def index_remote(
     Args:
         shards: All of the data set's.
         config: Names of the features, and what a state is.
-        cameras: Features with pictures that episodes must have; looked for in a few of them.
+        cameras: Features with images that episodes must have; looked for in a few of them.
         threads: Shards that are read at once, at least `FEWEST_IN_FLIGHT`.
         progress: Told how many of the episodes have been found.
 

@@ -1,9 +1,9 @@
-"""Which records behind a URL could be copies of one another? Only of those are the states read while indexing.
+"""Records behind a URL that could be copies of one another: only their states are read while indexing.
 
-The index of a record behind a URL reads no states: for DROID that would be several reads more of each of 95,658. A copy
-under another name differs in its name alone: it has as many steps, and a record as long but for its name. Few others
-do: records of some 15 MB, nearly all of it pictures, seldom agree to the byte. A copy whose pictures or texts were
-written anew has another length, and is not found.
+The index of a record behind a URL reads no states: for DROID that would be several more reads for each of 95,658
+records. A copy under another name differs in its name only: it has the same number of steps, and the same record length
+except for the name. Few other records do: records of some 15 MB, nearly all of it images, seldom agree to the byte. A
+copy whose images or texts were encoded again has another length, and is not found.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How are parts of a file behind a URL read, with as few requests as can be?"""
+"""Reading parts of a file behind a URL with as few requests as possible."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How are parts of a shard read, while somebody may change it?"""
+"""Reading parts of a shard that may change meanwhile."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How do RLDS episodes become `Episode`s? One tf.train.Example each, read without TensorFlow, pictures on demand."""
+"""Source of RLDS episodes: one tf.train.Example each, read without TensorFlow, images on demand."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vjepa2_ac.data.sources.rlds.features import (
     num_steps_of,
     states_of,
 )
-from vjepa2_ac.data.sources.rlds.images_local import LocalPictures, PicturesAt, wrong_count
+from vjepa2_ac.data.sources.rlds.images_local import ImagesAt, LocalImages, wrong_count
 from vjepa2_ac.data.sources.rlds.images_remote import RemoteCache, RemoteEpisode, whole_record
 from vjepa2_ac.data.sources.rlds.index_local import index_local
 from vjepa2_ac.data.sources.rlds.index_remote import index_remote
@@ -50,11 +50,11 @@ class RldsSource:
     """The episodes of an RLDS data set, in the order of its shards.
 
     Nothing is read before the first call. `infos` hops through every record once and keeps what it found; `read` reads
-    the states alone, and its pictures are read and decoded when asked for. With `check_crc: once` a record is read
-    whole the first time on this machine: its CRC is checked, and that each camera has one picture for every step.
+    the states alone, and its images are read and decoded when asked for. With `check_crc: once` a record is read
+    whole the first time on this machine: its CRC is checked, and that each camera has one image for every step.
 
     Behind a URL only parts of a record are fetched, and no CRC is of a part: checked are then the CRCs of the lengths,
-    that features and pictures lie within one another as they should, and the pictures' own form; the rest is up to the
+    that features and images lie within one another as they should, and the images' own form; the rest is up to the
     transport. There `always` fetches whole records, every time, and checks their CRC.
     """
 
@@ -107,8 +107,8 @@ class RldsSource:
                 if self._config.check_crc == "once":
                     opened.verified.add(index)
             record.require([feature])
-            pictures = LocalPictures(shard, record.located[feature], info.num_steps, f"{where}: {feature}")
-            return self._episode(record, info, pictures, where)
+            images = LocalImages(shard, record.located[feature], info.num_steps, f"{where}: {feature}")
+            return self._episode(record, info, images, where)
 
     def _read_remote(
         self,
@@ -125,22 +125,22 @@ class RldsSource:
             read = whole_record(shard, span)
             record = ExampleRecord(read, span)
             self._check(record, read, span, info.num_steps, {feature}, where)
-            pictures: FrameReader = PicturesAt(read, record.located[feature], info.num_steps, f"{where}: {feature}")
+            images: FrameReader = ImagesAt(read, record.located[feature], info.num_steps, f"{where}: {feature}")
         else:
             remote = RemoteEpisode(shard, span, opened.cache)
             numbers = [*fields.identity, *features_of_steps(self._config), STEP_FLAG, fields.joint_velocity]
             record = remote.record([name for name in numbers if name], [fields.language] if fields.language else [])
             record.require([feature])
-            pictures = remote.pictures(feature, record.located, info.num_steps, needed, f"{where}: {feature}")
-        return self._episode(record, info, pictures, where)
+            images = remote.images(feature, record.located, info.num_steps, needed, f"{where}: {feature}")
+        return self._episode(record, info, images, where)
 
-    def _episode(self, record: ExampleRecord, info: EpisodeInfo, pictures: FrameReader, where: str) -> Episode:
+    def _episode(self, record: ExampleRecord, info: EpisodeInfo, images: FrameReader, where: str) -> Episode:
         config, fields = self._config, self._config.fields
         _require_as_indexed(record, info, config, where)
         return Episode(
             info=info,
             states=states_of(record, config, info.num_steps, where),
-            read_frames=pictures,
+            read_frames=images,
             control_rate_hz=fields.control_rate_hz,
             joint_velocities=joint_velocities_of(record, fields, info.num_steps, where),
             metadata=language_of(record, fields),
@@ -150,7 +150,7 @@ class RldsSource:
     def _check(
         self, record: ExampleRecord, read: Read, span: RecordSpan, num_steps: int, features: Iterable[str], where: str
     ) -> None:
-        """Look at all of a record: its CRC, unless that is never to be checked, and the number of its pictures."""
+        """Look at all of a record: its CRC, unless that is never to be checked, and the number of its images."""
         if self._config.check_crc != "never":
             require_intact(read, span)
         for feature in features:
@@ -159,7 +159,7 @@ class RldsSource:
                 raise wrong_count(found, num_steps, f"{where}: {feature}")
 
     def _features(self) -> list[str]:
-        """Return the features with the pictures of the config's cameras."""
+        """Return the features with the images of the config's cameras."""
         return [self._config.fields.cameras[camera] for camera in self._config.cameras]
 
     def _open(self, progress: Progress | None) -> _Opened:

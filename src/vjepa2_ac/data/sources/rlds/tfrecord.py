@@ -1,7 +1,7 @@
-"""How is a TFRecord file of tf.train.Examples read and written, without TensorFlow?
+"""TFRecord files of tf.train.Examples, read and written without TensorFlow.
 
-A file is a row of records: u64 little-endian length, masked CRC-32C of the length, data, masked CRC-32C of the data.
-The data of each record is one tf.train.Example: a map from feature names to lists of bytes, floats or integers.
+A file is a sequence of records: u64 little-endian length, masked CRC-32C of the length, data, masked CRC-32C of the
+data. The data of each record is one tf.train.Example: a map from feature names to lists of bytes, floats or integers.
 
 Source: tensorflow/tensorflow, tensorflow/core/lib/io/record_writer.h and core/example/{example,feature}.proto (the
 formats; no code).

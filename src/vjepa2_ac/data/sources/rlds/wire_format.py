@@ -1,8 +1,8 @@
-"""Which features does a serialised tf.train.Example hold, and where, without reading what they hold?
+"""Positions of the features in a serialised tf.train.Example, found without reading their content.
 
-A DROID episode is 18 MB, nearly all of it pictures; its identity and length are a few hundred bytes. Hopping over the
-tags and lengths of the protobuf wire format finds them in a file, and finds single pictures in a feature. The features
-of a record stand in no order: that of TFDS is a hash's, another one in every process that wrote.
+A DROID episode is 18 MB, nearly all of it images; its identity and length are a few hundred bytes. Skipping over the
+tags and lengths of the protobuf wire format finds them in a file, and finds single images in a feature. The features
+of a record have no fixed order: TFDS uses that of a hash, which differs between the processes that wrote.
 
 Source: protobuf.dev/programming-guides/encoding (the format; no code).
 """
@@ -82,7 +82,7 @@ def features_behind(name: str, piece: bytes, offset: int) -> dict[str, Located]:
 
 
 def locate_items(read: Read, feature: Located, count: int | None = None) -> tuple[list[int], list[int]]:
-    """Return offsets and lengths of the texts or pictures of a feature that is a list of bytes; of the first `count`.
+    """Return offsets and lengths of the texts or images of a feature that is a list of bytes; of the first `count`.
 
     Raises:
         NotAnExampleError: It is not a list of bytes, or damaged.

@@ -1,4 +1,4 @@
-"""What do features.json and dataset_info.json say of a data set in DROID's schema?
+"""The features.json and dataset_info.json of a data set in DROID's schema.
 
 Source: measured on files that TFDS wrote (names, types and layout; no code).
 """
@@ -12,7 +12,7 @@ _TFDS = "tensorflow_datasets.core.features"
 
 
 def droid_features(sizes: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """Return features.json of DROID's schema, for pictures of these heights and widths."""
+    """Return features.json of DROID's schema, for images of these heights and widths."""
     position = {
         "cartesian_position": _tensor("float64", 6),
         "gripper_position": _tensor("float64", 1),

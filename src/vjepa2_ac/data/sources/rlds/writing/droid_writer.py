@@ -1,4 +1,4 @@
-"""How is a data set written that is DROID's RLDS field for field, so that TFDS itself reads it?
+"""Writer of data sets in DROID's RLDS schema, field for field, so that TFDS itself reads them.
 
 Source: measured on files that TFDS wrote in DROID's schema (layout, kinds of lists, names; no code).
 """
@@ -43,7 +43,7 @@ class DroidCommands:
 
 @dataclass(frozen=True)
 class DroidMeasurements:
-    """What the robot measured at every control step (DROID's `observation`, without pictures)."""
+    """What the robot measured at every control step (DROID's `observation`, without images)."""
 
     cartesian_position: Float[np.ndarray, "steps 6"]  # metres, extrinsic xyz Euler angles
     gripper_position: Float[np.ndarray, "steps 1"]  # closedness: 0 open .. 1 closed
@@ -85,7 +85,7 @@ def write_droid_rlds(
 
     Raises:
         InputError: The folder exists and is not empty, or cannot be written, or there are fewer episodes than shards.
-        ValueError: An episode's arrays and pictures do not fit together.
+        ValueError: An episode's arrays and images do not fit together.
     """
     folder = Path(folder)
     storage.require_new_folder(folder)
@@ -117,7 +117,7 @@ def _write_shards(
 
 
 def _check(episode: DroidEpisode, sizes: dict[str, tuple[int, int]]) -> None:
-    """Refuse an episode whose parts differ in length or shape; the pictures of a camera share one size."""
+    """Refuse an episode whose parts differ in length or shape; the images of a camera share one size."""
     steps = episode.num_steps
     arrays = {"action": (episode.action, 7)}
     for group in (episode.action_dict, episode.observation):
@@ -129,12 +129,12 @@ def _check(episode: DroidEpisode, sizes: dict[str, tuple[int, int]]) -> None:
             raise ValueError(f"{episode.file_path}: {label} must be {steps} x {width} finite numbers, is {array.shape}")
     if steps == 0 or sorted(episode.images) != sorted(CAMERAS):
         raise ValueError(f"{episode.file_path}: {steps} steps, cameras {sorted(episode.images)}; needed: {CAMERAS}")
-    for camera, pictures in episode.images.items():
-        height, width, _, _ = simplejpeg.decode_jpeg_header(pictures[0])
+    for camera, images in episode.images.items():
+        height, width, _, _ = simplejpeg.decode_jpeg_header(images[0])
         expected = sizes.setdefault(camera, (height, width))
-        if len(pictures) != steps or expected != (height, width):
+        if len(images) != steps or expected != (height, width):
             raise ValueError(
-                f"{episode.file_path}: {camera} has {len(pictures)} pictures of {height}x{width};"
+                f"{episode.file_path}: {camera} has {len(images)} images of {height}x{width};"
                 f" needed: {steps} of {'x'.join(map(str, expected))}"
             )
 
@@ -162,8 +162,8 @@ def _features_of(episode: DroidEpisode) -> dict[str, tuple[Kind, Sequence[Any] |
     for prefix, group in (("action_dict", episode.action_dict), ("observation", episode.observation)):
         for item in fields(group):
             features[f"steps/{prefix}/{item.name}"] = ("float_list", getattr(group, item.name).ravel())
-    for camera, pictures in episode.images.items():
-        features[f"steps/observation/{camera}"] = ("bytes_list", pictures)
+    for camera, images in episode.images.items():
+        features[f"steps/observation/{camera}"] = ("bytes_list", images)
     return features
 
 
