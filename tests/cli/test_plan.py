@@ -166,7 +166,7 @@ WRONG = {
     "limits that are not finite": (["planning.limits.xyz=[.inf,0.05,0.05]"], "planning.limits.xyz.0"),
     "limits that hold everything": (["planning.limits={xyz: [0, 0, 0], gripper: 0}"], "nothing is left to plan"),
     "an unknown knob": (["planning.horizn=2"], "did you mean horizon?"),
-    "a knob of training": (["training.steps=2"], "a setting that planning does not heed"),
+    "a knob of training": (["training.steps=2"], "a setting that planning does not use"),
     "durations for one goal": (["--durations", "2"], "'2' for 1 goal"),
     "durations of nothing": (["--goal", "{here}/goal.png", "--durations", "0"], "whole numbers from 1"),
     "a camera that is not used": (["--extrinsics", "0,0,0,0,0,0"], "a camera pose exactly where the model uses it"),

@@ -12,7 +12,7 @@ from rich.table import Table
 
 import vjepa2_ac
 from vjepa2_ac.cli import main
-from vjepa2_ac.console import data
+from vjepa2_ac.console import data, training
 from vjepa2_ac.console import progress as console_module
 from vjepa2_ac.console.progress import ProgressBar
 from vjepa2_ac.console.training import ConsoleReporter
@@ -29,7 +29,8 @@ def shown_on(monkeypatch: pytest.MonkeyPatch, *, terminal: bool) -> io.StringIO:
     shown = Console(
         file=written, force_terminal=terminal, width=140, highlight=False, soft_wrap=True, color_system=None
     )
-    monkeypatch.setattr(console_module, "console", shown)
+    for module in (console_module, training):
+        monkeypatch.setattr(module, "console", shown)
     return written
 
 

@@ -63,6 +63,8 @@ def test_bfloat16_that_is_only_emulated_is_refused(
         pytest.skip("MuJoCo (extra sim) is not installed")
     monkeypatch.chdir(tmp_path)
     Path("config.yaml").write_text(yaml.safe_dump(values()))
+    for name in ("no such data", "no such model"):  # of which the doors ask only whether it is there, before the device
+        Path(name).mkdir()
     Image.fromarray(np.zeros((16, 16, 3), dtype=np.uint8)).save("seen.png")
     assert main([word.replace("CONFIG", "config.yaml") for word in DOORS[door]]) == 2
     said = " ".join(capsys.readouterr().err.split())

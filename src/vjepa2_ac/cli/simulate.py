@@ -157,8 +157,8 @@ def _steer(options: argparse.Namespace) -> int:
     if options.domain == "random":
         raise InputError(where="--domain random", found="a model that steers", needed="A or B")
     named_domain(options.domain)
-    require_subject(options.subject, options.checkpoint)
     planning_settings(options.subject, config=options.config, overrides=options.overrides)
+    require_subject(options.subject, options.checkpoint)
 
     from vjepa2_ac.console.closed_loop import contest_notes, contest_table
     from vjepa2_ac.console.evaluation import Stages

@@ -27,8 +27,6 @@ from vjepa2_ac.runs.checkpoint_selection import NEWEST
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
 
-# Settings that planning heeds; the others are of training, and changing them here would do nothing.
-
 
 class Fingerprints(NamedTuple):
     """Hashes of a model's weights."""

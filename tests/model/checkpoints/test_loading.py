@@ -7,7 +7,7 @@ from safetensors.torch import load_file, save_file
 
 from vjepa2_ac.config import EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.checkpoints import loading
+from vjepa2_ac.model import base_model
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.pretrained_folder import ENCODER, PREDICTOR
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -16,7 +16,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 @pytest.fixture
 def assets(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Stand in for the folder of models that come with the package; there is none in it."""
-    monkeypatch.setattr(loading, "ASSETS", tmp_path / "assets")
+    monkeypatch.setattr(base_model, "ASSETS", tmp_path / "assets")
     return tmp_path / "assets"
 
 
