@@ -30,8 +30,8 @@ base:  $(INSTALLED)  ## make the demo's base model again (about an hour); replac
 evidence: $(INSTALLED)  ## does LoRA help? every method side by side; goes on where it stopped; replaces table and plot
 	$(BIN)/python benchmarks/evidence --readme README.md
 
-test: $(INSTALLED)  ## the whole test suite
-	$(BIN)/pytest -q
+test: $(INSTALLED)  ## the whole test suite, on all cores (8 at most); a folder in one process: .venv/bin/pytest tests/data
+	$(BIN)/pytest -q -n logical --maxprocesses 8 --dist loadfile --durations 10
 
 # There is no CPU wheel of PyTorch 2.11: this takes the one with CUDA, 5 GB in all, which runs without a GPU, too.
 $(OLDEST)/installed: pyproject.toml constraints.txt

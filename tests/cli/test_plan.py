@@ -149,7 +149,7 @@ def test_a_broken_model_leads_to_no_motion_and_to_status_1(workshop: Path) -> No
 
 WRONG = {
     "goal of another size": (["--goal", "{here}/other.png"], "48 x 60 pixels (width x height)"),
-    "no picture": (["--goal", "{here}/notes.png"], "no picture, starting with b'x,y,'"),
+    "no picture": (["--goal", "{here}/notes.png"], "no image, starting with b'x,y,'"),
     "a picture that is not there": (["--goal", "{here}/nowhere.png"], "nowhere.png: cannot be read: No such file"),
     "a folder": (["--goal", "{here}"], "cannot be read"),
     "too small a picture": (["--goal", "{here}/tiny.png"], "16 pixels or more"),
