@@ -77,6 +77,11 @@ def in_words(error: BaseException) -> str:
     return str(error)
 
 
+def pip_install(extra: str) -> str:
+    """Return the command that installs an extra of this package."""
+    return f'pip install -c constraints.txt -e ".[{extra}]"'
+
+
 def too_few_files(where: str = "") -> InputError:
     """Return the error of a process that has reached its limit of open files."""
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]

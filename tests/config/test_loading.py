@@ -88,7 +88,7 @@ def test_all_errors_are_reported_at_once_with_their_paths() -> None:
         ("training.learning_rate=.nan", "finite"),
         ("steps=3", "did you mean training.steps?"),
         ("seed.x=3", "valid integer"),
-        ("training", "an override such as"),
+        ("training", "key=value, such as training"),
     ],
 )
 def test_a_wrong_override_is_explained(tmp_path: Path, override: str, complaint: str) -> None:

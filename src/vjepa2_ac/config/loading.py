@@ -117,10 +117,8 @@ def _overridden(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, A
     for override in overrides:
         key, separator, text = override.partition("=")
         if not separator or not key:
-            raise InputError(
-                where="command line", found=f"{override!r}", needed="an override such as training.steps=100"
-            )
-        _set(values, key.split("."), parse_yaml(text, where=f"command line: {key}"), override)
+            raise InputError(where="overrides", found=f"{override!r}", needed="key=value, such as training.steps=100")
+        _set(values, key.split("."), parse_yaml(text, where=f"override {key}"), override)
     return values
 
 
@@ -131,7 +129,7 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
             inner = values[key] = {}
         if not isinstance(inner, dict):
             raise InputError(
-                where=f"command line: {override}", found=f"{'.'.join(keys[: depth + 1])} is a value", needed="a section"
+                where=f"override {override}", found=f"{'.'.join(keys[: depth + 1])} is a value", needed="a section"
             )
         values = inner
     values[keys[-1]] = value

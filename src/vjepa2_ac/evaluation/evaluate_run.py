@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
@@ -38,6 +37,7 @@ from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.loading import TrainedRun, load_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
 from vjepa2_ac.storage import try_writing_at, user_can_write
+from vjepa2_ac.storage.structured import utc_now
 
 BASE = "base"
 _NO_BASE = "There is no base to compare with: it takes states or actions of other widths than this robot's."
@@ -246,5 +246,5 @@ def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Datase
         is_pose=data.states == "pose",
         seed=config.seed,
         version=__version__,
-        time=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        time=utc_now(),
     )

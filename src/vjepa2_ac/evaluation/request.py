@@ -71,8 +71,8 @@ def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
         config = asked.data
     if asked.out is None:
         raise InputError(
-            where="command line",
-            found="--data without --out: metrics.json of a run's own folder tells of its own data",
+            where="--data without --out",
+            found="metrics.json of a run's own folder tells of its own data",
             needed="a folder for what is found on these data",
             fix="Add --out FOLDER",
         )

@@ -20,7 +20,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.frame_targets import FrameTargets, QuietFile
 from vjepa2_ac.media.image_size import MOST_PIXELS, require_bounded
 from vjepa2_ac.storage import ByteReader
-from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.storage.libraries import require_library
 
 if TYPE_CHECKING:
     from av.container import InputContainer
@@ -280,13 +280,4 @@ def require_decoder(where: str) -> None:
 
 
 def _library(where: str) -> Any:
-    try:
-        import av
-    except ImportError:
-        # Unreachable: it says nothing of the episode, which is not broken.
-        raise UnreachableError(
-            where=where,
-            found="PyAV, which decodes video, is not installed",
-            fix='pip install -c constraints.txt -e ".[video]"',
-        ) from None
-    return av
+    return require_library("av", where=where, called="PyAV, which decodes video", extra="video")

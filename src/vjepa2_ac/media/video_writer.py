@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.storage import atomic_writer
 
 _QUALITY = "20"  # x264's constant rate factor: text stays sharp
@@ -62,6 +62,6 @@ def video_library() -> Any:
         raise InputError(
             where="video",
             found="PyAV, which writes videos, is not installed",
-            fix='Run `pip install -c constraints.txt -e ".[video]"`, or ask for no video',
+            fix=f"Run `{pip_install('video')}`, or ask for no video",
         ) from None
     return av

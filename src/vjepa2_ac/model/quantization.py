@@ -12,7 +12,7 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.model.adapter.merging import base_dtype, unadapted_copy
 from vjepa2_ac.model.network.world_model import WorldModel
 
@@ -83,7 +83,7 @@ def _torchao(kind: Kind, where: str) -> tuple[Any, Any]:
         raise InputError(
             where=where,
             found=f"{kind}, but torchao is not installed",
-            fix=f'Run pip install -c constraints.txt -e ".[quantize]", or set {where}=off',
+            fix=f"Run {pip_install('quantize')}, or set {where}=off",
         ) from None
     if kind == "int8":
         return quantize_, Int8DynamicActivationInt8WeightConfig()

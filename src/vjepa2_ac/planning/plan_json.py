@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,11 +13,10 @@ from vjepa2_ac.planning.energy_slices import AXES, EnergySlice
 from vjepa2_ac.planning.interfaces import Iteration
 from vjepa2_ac.planning.summary import summarize
 from vjepa2_ac.storage import write_atomically
+from vjepa2_ac.storage.structured import finite_or_none, json_text
 
 PLAN_FILE = "plan.json"
 FORMAT = 1  # goes up when a reader of the file would have to change
-
-_NUMBERS = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null),?\s+)+)\]")  # a list of numbers, over lines
 
 
 def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
@@ -31,8 +27,7 @@ def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path
         about: What answered, and where the pictures came from: plain values.
         path: The file.
     """
-    text = json.dumps(plan_as_dict(answer, about), indent=1, allow_nan=False)
-    write_atomically(path, _NUMBERS.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n")
+    write_atomically(path, json_text(plan_as_dict(answer, about)))
     return path
 
 
@@ -53,9 +48,9 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
         "states": _plain(answer.states),
         "goal_of_each_step": list(decision.goals),
         "energy": {
-            "now": _number(decision.energy_now),
-            "doing_nothing": _number(answer.doing_nothing),
-            "plan": None if plan is None else _number(plan.energy),
+            "now": finite_or_none(decision.energy_now),
+            "doing_nothing": finite_or_none(answer.doing_nothing),
+            "plan": None if plan is None else finite_or_none(plan.energy),
         },
         "evaluations": 0 if plan is None else plan.evaluations,
         "iterations": [] if plan is None else [_iteration(one) for one in plan.iterations],
@@ -73,8 +68,8 @@ def _iteration(one: Iteration) -> dict[str, Any]:
     return {
         "samples": one.samples,
         "finite": one.finite,
-        "lowest": _number(one.lowest),
-        "elites_mean": _number(one.elite_energy),
+        "lowest": finite_or_none(one.lowest),
+        "elites_mean": finite_or_none(one.elite_energy),
         "mean": _plain(one.mean.double().numpy()),
         "std": _plain(one.std.double().numpy()),
         "seconds": one.seconds,
@@ -87,8 +82,4 @@ def _slice(one: EnergySlice) -> dict[str, Any]:
 
 
 def _plain(values: np.ndarray) -> Any:
-    return [_plain(row) if row.ndim else _number(float(row)) for row in np.asarray(values, dtype=np.float64)]
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    return [_plain(row) if row.ndim else finite_or_none(float(row)) for row in np.asarray(values, dtype=np.float64)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ from vjepa2_ac.planning.settings import planning_settings
 from vjepa2_ac.runs.checkpoint_selection import NEWEST
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.storage.structured import utc_now
 
 
 class Fingerprints(NamedTuple):
@@ -86,7 +86,7 @@ class PlanningSession:
         dtype = next(model.parameters()).dtype
         return {
             "version": __version__,
-            "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "time": utc_now(),
             "model": {
                 "subject": self.subject,
                 "checkpoint": self.checkpoint or None,

@@ -54,7 +54,7 @@ def _of_run(subject: str, config: str | Path | None, overrides: Sequence[str]) -
 def _of_model(subject: str, config: str | Path | None, overrides: Sequence[str], dtype: str) -> Config:
     if config is None:
         plain = {"run_dir": "none", "data": {"path": "none"}, "model": {"base": subject, "dtype": dtype}}
-        return config_from(plain, overrides, where="command line")
+        return config_from(plain, overrides, where="overrides")
     its = load_config(config, [*overrides, _ANY_TYPE])
     return its.model_copy(update={"model": its.model.model_copy(update={"base": subject, "random": None})})
 
@@ -65,7 +65,7 @@ def _require_relevant(overrides: Sequence[str]) -> None:
         is_relevant = any(key == known or (known.endswith(".") and key.startswith(known)) for known in RELEVANT_KEYS)
         if key.split(".")[0] in Config.model_fields and not is_relevant:  # of others the config says what is wrong
             raise InputError(
-                where=f"command line: {override}",
+                where=f"override {override}",
                 found="a setting that planning does not use",
                 needed=f"one of {', '.join(known + '…' * known.endswith('.') for known in RELEVANT_KEYS)}",
             )

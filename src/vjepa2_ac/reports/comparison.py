@@ -40,7 +40,7 @@ def compare(folders: Sequence[Path]) -> Comparison:
         InputError: Fewer than two, one is named twice or was not evaluated, or they were measured on different clips.
     """
     if len(folders) < 2:
-        raise InputError(where="command line", found=f"{len(folders)} run", needed="two or more to compare")
+        raise InputError(where="runs to compare", found=f"{len(folders)}", needed="two or more to compare")
     for number, folder in enumerate(folders):
         if folder.resolve() in [other.resolve() for other in folders[:number]]:
             raise InputError(where=str(folder), found="a run that is named twice", needed="each run once")

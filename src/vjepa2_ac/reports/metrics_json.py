@@ -8,8 +8,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -45,19 +43,16 @@ from vjepa2_ac.evaluation.result import (
 from vjepa2_ac.evaluation.verdict import uses_actions, verdict
 from vjepa2_ac.reports.action_score_json import plans_as_dict, study_as_dict
 from vjepa2_ac.storage import write_atomically
-from vjepa2_ac.storage.structured import read_json_object, shown
+from vjepa2_ac.storage.structured import finite_or_none, json_text, read_json_object, shown
 
 METRICS_FILE = "metrics.json"
 _MOST_BYTES = 1 << 28  # landscapes are long
 FORMAT = 1  # goes up when a reader of the file would have to change
 
-_NUMBERS = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null|true|false),?\s+)+)\]")  # a list of plain values, over lines
-
 
 def write_metrics(evaluation: Evaluation, path: Path) -> Path:
     """Write every figure of an evaluation; the file appears whole or not at all."""
-    text = json.dumps(metrics_as_dict(evaluation), indent=1, allow_nan=False)
-    write_atomically(path, _NUMBERS.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n")
+    write_atomically(path, json_text(metrics_as_dict(evaluation)))
     return path
 
 
@@ -170,8 +165,8 @@ def _episode(score: EpisodeScore) -> dict[str, Any]:
     return {
         "episode": score.episode_id,
         "clips": score.clips,
-        "over_persistence": _number(score.over_persistence),
-        "gain_over_base": None if gain is None else _number(gain),
+        "over_persistence": finite_or_none(score.over_persistence),
+        "gain_over_base": None if gain is None else finite_or_none(gain),
     }
 
 
@@ -206,7 +201,7 @@ def _landscapes(landscapes: Landscapes) -> dict[str, Any]:
         "chance_distance": landscapes.chance_distance,
         "sign_least": landscapes.sign_least,
         "sign_agreement": {
-            name: {**agreement.as_dict(), "chance": _number(chance), "clips": clips}
+            name: {**agreement.as_dict(), "chance": finite_or_none(chance), "clips": clips}
             for name, (agreement, chance, clips) in zip(landscapes.axis_names, signs, strict=True)
         },
         "maps": [
@@ -240,8 +235,4 @@ def _rounded(values: np.ndarray) -> Any:
 
 
 def _each(value: Any) -> Any:
-    return [_each(one) for one in value] if isinstance(value, list) else _number(float(f"{value:.7g}"))
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    return [_each(one) for one in value] if isinstance(value, list) else finite_or_none(float(f"{value:.7g}"))

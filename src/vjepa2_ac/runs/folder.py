@@ -23,7 +23,6 @@ import re
 import secrets
 import shutil
 import sys
-import time
 from pathlib import Path
 
 from vjepa2_ac.config import Config
@@ -34,7 +33,7 @@ from vjepa2_ac.runs.checkpoint import remove_leavings
 from vjepa2_ac.runs.lock import LOCK
 from vjepa2_ac.runs.own_files import refuse_links_out
 from vjepa2_ac.storage import read_bounded, try_writing_at, write_atomically
-from vjepa2_ac.storage.structured import read_json_list, shown
+from vjepa2_ac.storage.structured import read_json_list, shown, utc_now
 
 CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
@@ -195,7 +194,7 @@ def environment() -> dict[str, object]:
     """Return what a figure should be read with: versions, machine, command, time."""
     packages = ("vjepa2-ac", "torch", "transformers", "peft", "accelerate", "numpy", "scipy", "simplejpeg", "protobuf")
     return {
-        "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "time": utc_now(),
         "command": sys.argv,
         "python": platform.python_version(),
         "machine": platform.platform(),

@@ -12,7 +12,6 @@ import json
 import logging
 import os
 import platform
-import time
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
@@ -20,7 +19,7 @@ from typing import TextIO
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.own_files import refused_link
 from vjepa2_ac.storage import user_can_write
-from vjepa2_ac.storage.structured import json_object
+from vjepa2_ac.storage.structured import json_object, utc_now
 
 logger = logging.getLogger(__name__)
 
@@ -94,7 +93,7 @@ class RunLock:
         if self._file is None:
             raise ValueError("the lock is not held")
         self._file.truncate(0)
-        now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+        now = utc_now()
         self._file.write(json.dumps({"process": os.getpid(), "host": platform.node(), "since": now}))
         self._file.flush()
 

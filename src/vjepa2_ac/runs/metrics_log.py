@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from vjepa2_ac.runs.folder import METRICS
 from vjepa2_ac.runs.slow_disk import warn_if_stalled
 from vjepa2_ac.runs.trackers import Trackers
 from vjepa2_ac.storage import read_bounded, user_can_write, write_atomically
-from vjepa2_ac.storage.structured import json_object
+from vjepa2_ac.storage.structured import finite_or_none, json_object
 
 WARNING = "warning"  # kind of a row in metrics.jsonl, which has a `text`
 logger = logging.getLogger(__name__)
@@ -147,9 +146,7 @@ def _unwritable(path: Path, error: OSError, checkpoint: str) -> InputError:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None  # JSON has no NaN
-    return value
+    return finite_or_none(value) if isinstance(value, float) else value
 
 
 def warnings_of(path: Path) -> list[str]:

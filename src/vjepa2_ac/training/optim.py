@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from vjepa2_ac.config import TrainingConfig
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.model.finite import first_not_finite
 
 _MOST_STEPS = 2**53  # a float64 counts no further
@@ -65,7 +65,7 @@ def _adamw_8bit() -> Any:
         raise InputError(
             where="training.optimizer",
             found="adamw_8bit, but bitsandbytes is not installed",
-            fix='Run pip install -c constraints.txt -e ".[8bit]", or set training.optimizer=adamw',
+            fix=f"Run {pip_install('8bit')}, or set training.optimizer=adamw",
         ) from None
     return AdamW8bit
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+
+from vjepa2_ac.reports.figures.page import new_figure
 
 _DOTS = 100  # per inch, of text
 _LINE = 30  # pixels
@@ -42,8 +43,8 @@ def side_by_side(
 
 @lru_cache(maxsize=64)
 def _words(text: str, width: int, points: float) -> UInt8[np.ndarray, "_ width 3"]:
-    figure = Figure(figsize=(width / _DOTS, _LINE / _DOTS), dpi=_DOTS, facecolor="white")
-    canvas = FigureCanvasAgg(figure)
+    figure = new_figure(width / _DOTS, _LINE / _DOTS, dpi=_DOTS, facecolor="white")
+    canvas: Any = figure.canvas
     figure.text(8 / width, 0.5, text, fontsize=points, va="center", ha="left", parse_math=False)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

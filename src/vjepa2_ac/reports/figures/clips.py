@@ -10,10 +10,8 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from vjepa2_ac.reports.figures.page import Page
+from vjepa2_ac.reports.figures.page import Page, new_figure
 from vjepa2_ac.storage import atomic_writer
 
 _WIDTH, _SIDE, _TITLE = 16.0, 0.3, 0.6  # inches, as all below
@@ -42,8 +40,7 @@ def plot_clips(title: str, clips: Sequence[ClipFigure], path: Path) -> Path:
     row = _NAME + _FILM + _LABEL + _PLOT + _BETWEEN
     height = _TITLE + row * len(clips)
     with mpl.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(_WIDTH, height), facecolor="white")
-        FigureCanvasAgg(figure)
+        figure = new_figure(_WIDTH, height, facecolor="white")
         page = Page(figure, _WIDTH, height)
         page.text(_SIDE, 0.2, title, size=12.0)
         for number, clip in enumerate(clips):

@@ -11,12 +11,10 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, Int, UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.clips.transforms import CropBox
-from vjepa2_ac.reports.figures.page import Page
+from vjepa2_ac.reports.figures.page import Page, new_figure
 from vjepa2_ac.storage import atomic_writer
 
 _INK, _FAINT, _SPEED, _GRIPPER, _IDLE = "#222222", "#8a8a8a", "#1f6fb4", "#d1762a", "#c9c9c9"
@@ -85,8 +83,7 @@ def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
             "axes.linewidth": 0.6,
         }
     ):
-        figure = Figure(figsize=(_WIDTH, height), facecolor="white")
-        FigureCanvasAgg(figure)
+        figure = new_figure(_WIDTH, height, facecolor="white")
         page = Page(figure, _WIDTH, height)
         page.text(_SIDE, 0.16, sheet.title, size=13, weight="bold")
         for number, line in enumerate(facts):

@@ -9,14 +9,13 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import UInt8
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Example
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.reports.comparison import Comparison
+from vjepa2_ac.reports.figures.page import new_figure
 from vjepa2_ac.storage import atomic_writer
 
 _COLOURS = {"persistence": "#8a8a8a", "base": "#d1762a", "adapter": "#1f6fb4", "model": "#1f6fb4"}
@@ -30,8 +29,7 @@ _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
     """Write the picture of an evaluation as PNG; it appears whole or not at all."""
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(13, 6.2), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = new_figure(13.0, 6.2, layout="constrained")
         figure.suptitle("\n".join(textwrap.wrap(verdict(evaluation), 150)), fontsize=10.5, x=0.01, ha="left")
         halves: Any = figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
         upper, lower = halves[0].subplots(2, 1, height_ratios=[3, 2])
@@ -47,8 +45,7 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
 def plot_comparison(comparison: Comparison, path: Path) -> Path:
     """Write the curves of several runs as PNG; it appears whole or not at all."""
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(9.5, 4.5), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = new_figure(9.5, 4.5, layout="constrained")
         axes = figure.subplots()
         drawn = [axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--")]
         for number, curve in enumerate(comparison.curves.values()):

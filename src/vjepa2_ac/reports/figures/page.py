@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
 
 @dataclass(frozen=True, eq=False)
 class Page:
@@ -24,3 +27,10 @@ class Page:
         """Write words whose top left corner stands there."""
         style = {"va": "top", "ha": "left", **style}
         self.figure.text(left / self.width, 1 - top / self.height, words, **style)
+
+
+def new_figure(width: float, height: float, **options: Any) -> Figure:
+    """Return a figure of so many inches with a canvas of its own: pyplot keeps figures, and may open windows."""
+    figure = Figure(figsize=(width, height), **options)
+    FigureCanvasAgg(figure)
+    return figure

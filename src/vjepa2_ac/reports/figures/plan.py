@@ -8,8 +8,6 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.clips.transforms import crop_box
@@ -17,6 +15,7 @@ from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.planning.energy_slices import AXES, EnergySlice
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.summary import summarize
+from vjepa2_ac.reports.figures.page import new_figure
 from vjepa2_ac.storage import atomic_writer
 
 PLAN_IMAGE = "plan.png"
@@ -33,8 +32,7 @@ def plot_plan(answer: PlanResult, path: Path) -> Path:
     with mpl.rc_context(_STYLE):
         plan = answer.decision.plan
         rows = 1 if plan is None else 3 if answer.slices else 2
-        figure = Figure(figsize=(13, 0.9 + 3.4 * rows), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = new_figure(13.0, 0.9 + 3.4 * rows, layout="constrained")
         figure.suptitle("\n".join(textwrap.wrap(summarize(answer), 165)), fontsize=10.5, x=0.01, ha="left")
         parts: Any = figure.subfigures(rows, 1, squeeze=False)[:, 0]
         _pictures(parts[0], answer)

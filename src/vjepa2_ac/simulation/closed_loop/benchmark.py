@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +25,7 @@ from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
 from vjepa2_ac.simulation.world.domains import named_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
 from vjepa2_ac.storage import user_can_write, write_atomically
+from vjepa2_ac.storage.structured import utc_now
 
 FILE, FILM = "closed_loop.json", "closed_loop.mp4"
 FORMAT = 1  # goes up when a reader of the file would have to change
@@ -135,7 +135,7 @@ def benchmark_as_dict(contest: ClosedLoopBenchmark) -> dict[str, Any]:
             "planning": contest.planning,
             "planning_seed": contest.planning_seed,
             "version": __version__,
-            "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "time": utc_now(),
         },
         "policies": {result.policy: _figures(result) for result in contest.results},
     }

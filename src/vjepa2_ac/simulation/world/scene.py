@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.simulation.world.domains import Domain, Look
 from vjepa2_ac.simulation.world.kinematics import FLANGE_OFFSET_M, JOINTS
 
@@ -101,7 +101,7 @@ def load_mujoco() -> ModuleType:
             where="simulation",
             found="MuJoCo is not installed",
             needed="the extra `sim`",
-            fix='Run `pip install -c constraints.txt -e ".[sim]"`',
+            fix=f"Run `{pip_install('sim')}`",
         ) from None
     return mujoco  # type: ignore[no-any-return]
 

@@ -7,6 +7,7 @@ from vjepa2_ac.storage.structured.json_text import (
     read_json_list,
     read_json_object,
 )
+from vjepa2_ac.storage.structured.json_writing import finite_or_none, json_text, utc_now
 from vjepa2_ac.storage.structured.messages import message_of, shown
 from vjepa2_ac.storage.structured.nesting import MOST_DEPTH, require_shallow
 from vjepa2_ac.storage.structured.patterns import require_quick
@@ -17,8 +18,10 @@ __all__ = [
     "MOST_BYTES",
     "MOST_DEPTH",
     "MOST_VALUES",
+    "finite_or_none",
     "json_list",
     "json_object",
+    "json_text",
     "message_of",
     "parse_yaml",
     "read_json_list",
@@ -27,4 +30,5 @@ __all__ = [
     "require_quick",
     "require_shallow",
     "shown",
+    "utc_now",
 ]

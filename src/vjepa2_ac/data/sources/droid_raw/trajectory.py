@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float64, Int
 
 from vjepa2_ac.data.sources.validation import zero_steps
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.storage.libraries import require_library
 
 _POSE = "observation/robot_state/cartesian_position"
 _GRIPPER = "observation/robot_state/gripper_position"
@@ -141,13 +141,4 @@ class _Reader:
 
 
 def _library(where: str) -> Any:
-    try:
-        import h5py
-    except ImportError:
-        # Unreachable: it says nothing of the episode, which is not broken.
-        raise UnreachableError(
-            where=where,
-            found="h5py, which reads trajectory.h5, is not installed",
-            fix='pip install -c constraints.txt -e ".[raw]"',
-        ) from None
-    return h5py
+    return require_library("h5py", where=where, called="h5py, which reads trajectory.h5", extra="raw")

@@ -24,7 +24,7 @@ from vjepa2_ac.data.sources.lerobot.bounds import (
 )
 from vjepa2_ac.data.sources.lerobot.row_cache import Columns, RowCache
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.storage.libraries import require_library
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -283,14 +283,6 @@ def _size_of(columns: Columns) -> int:
 
 
 def _library(where: str) -> tuple[Any, Any]:
-    try:
-        import pyarrow as pa
-        from pyarrow import parquet
-    except ImportError:
-        # Unreachable: it says nothing of the episode, which is not broken.
-        raise UnreachableError(
-            where=where,
-            found="pyarrow, which reads LeRobot data sets, is not installed",
-            fix='pip install -c constraints.txt -e ".[lerobot]"',
-        ) from None
-    return pa, parquet
+    called = "pyarrow, which reads LeRobot data sets"
+    pa = require_library("pyarrow", where=where, called=called, extra="lerobot")
+    return pa, require_library("pyarrow.parquet", where=where, called=called, extra="lerobot")
