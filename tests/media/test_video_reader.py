@@ -15,7 +15,7 @@ from synthetic import draw_frame, synthetic_states
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media import video_reader
 from vjepa2_ac.media.frame_targets import FrameTargets
-from vjepa2_ac.media.video_reader import Clock, count_frames, frame_size, read_frames
+from vjepa2_ac.media.video_reader import Clock, count_frames, read_frames
 
 STEPS = 40
 FRAMES = [draw_frame(state, size=(36, 64)) for state in synthetic_states(STEPS)]
@@ -96,10 +96,6 @@ def test_only_what_the_asked_pictures_need_is_decoded(tmp_path: Path, monkeypatc
     monkeypatch.setattr(video_reader._Video, "_keep", counted)
     read_frames(path, [14, 38], where="a")
     assert [time // 1024 for time in decoded] == [12, 13, 14, 36, 37, 38]
-
-
-def test_sizes_come_from_the_header(tmp_path: Path) -> None:
-    assert frame_size(write_mp4(tmp_path / "a.mp4", FRAMES[:2]), where="a") == (36, 64)
 
 
 def test_a_file_that_is_open_is_read_and_stays_open(tmp_path: Path) -> None:

@@ -86,17 +86,6 @@ def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
         return len(video.stored_times() if video.is_indexed else video.shown_times())
 
 
-def frame_size(file: str | Path | ByteReader, *, where: str) -> tuple[int, int]:
-    """Return height and width in pixels, as the header states them.
-
-    Raises:
-        InputError: Not a video, or damaged.
-        OSError: A file behind a URL cannot be read.
-    """
-    with _opened(file, where) as video:
-        return int(video.stream.height), int(video.stream.width)
-
-
 @contextmanager
 def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
     """Open a video for decoding in one thread: the loader's workers are the parallelism."""

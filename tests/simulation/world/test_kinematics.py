@@ -9,7 +9,8 @@ from vjepa2_ac.simulation.world.kinematics import (
     HOME,
     LOW,
     OutOfReachError,
-    flange_jacobian,
+    _frames,
+    _jacobian,
     forward_kinematics,
     inverse_kinematics,
 )
@@ -66,7 +67,7 @@ def test_the_jacobian_predicts_a_small_motion() -> None:
     before, after = forward_kinematics(joints), forward_kinematics(joints + step)
     turn = matrices_from_euler(after[3:]) @ matrices_from_euler(before[3:]).T
     moved = np.concatenate([after[:3] - before[:3], [turn[2, 1], turn[0, 2], turn[1, 0]]])
-    np.testing.assert_allclose(flange_jacobian(joints) @ step, moved, atol=1e-9)
+    np.testing.assert_allclose(_jacobian(_frames(joints)) @ step, moved, atol=1e-9)
 
 
 def test_inverse_kinematics_returns_to_every_pose_within_the_limits() -> None:

@@ -55,11 +55,6 @@ def forward_kinematics(joints: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarra
     return np.concatenate([frame[..., :3, 3], euler_from_matrices(frame[..., :3, :3])], axis=-1)
 
 
-def flange_jacobian(joints: Float[np.ndarray, " 7"]) -> Float[np.ndarray, "6 7"]:
-    """Return how the flange moves (m, then rad, in the base frame) per radian of each joint."""
-    return _jacobian(_frames(joints))
-
-
 def inverse_kinematics(
     pose: Float[np.ndarray, " 6"],
     start: Float[np.ndarray, " 7"] = HOME,

@@ -78,11 +78,6 @@ def linear_layers(sizes: ModelSizes) -> dict[str, Layer]:
     return layers
 
 
-def adapted_layers(config: Config, sizes: ModelSizes) -> frozenset[str]:
-    """Return the layers that get an adapter, by the last part of their name."""
-    return frozenset(_last(name) for name in adapter_ranks(config, sizes))
-
-
 def adapter_ranks(config: Config, sizes: ModelSizes) -> dict[str, int]:
     """Return the layers that get an adapter, by name, with the rank of each; none where all is trained."""
     adapter = config.adapter

@@ -63,16 +63,6 @@ class ParquetRows:
         self._footers: OrderedDict[str, _Footer] = OrderedDict()
         self._groups: OrderedDict[tuple[str, int], Columns] = OrderedDict()
 
-    def columns_of(self, path: str) -> list[str]:
-        """Return the columns that a file has.
-
-        Raises:
-            InputError: It is missing or damaged.
-        """
-        opened = self._open(path)
-        with _opened(opened, path) as file:
-            return list(self._footer(path, file, opened).schema.names)
-
     def rows(self, path: str, episode: int) -> Columns:
         """Return the rows of one episode, as columns of shape [rows, numbers].
 
