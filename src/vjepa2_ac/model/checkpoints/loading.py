@@ -23,7 +23,7 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     """Return the world model to start from, on the CPU: `model.base`, or a fresh one of the sizes `model.random`.
 
     Raises:
-        InputError: There is no such model, it cannot be read, or `model.sizes` says otherwise.
+        InputError: There is no such model, it cannot be read, or contradicts `model.sizes`.
     """
     dtype = torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
     if config.random is not None:
@@ -46,9 +46,9 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
 
 
 def base_sizes(config: ModelConfig) -> ModelSizes:
-    """Return the sizes of the model that `load_base` would give, without reading a weight.
+    """Return the sizes of the model that `load_base` would return, without reading a weight.
 
-    Of an official `.pt`, or where nothing is there yet, they are those of `model.sizes`.
+    Of an official `.pt`, or a file that does not exist yet, they are those of `model.sizes`.
 
     Raises:
         InputError: There is a folder, but it is not a world model.

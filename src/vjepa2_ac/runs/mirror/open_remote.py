@@ -118,7 +118,7 @@ def _look(checkpoints: RemoteCheckpoints, run_id: str | None) -> tuple[Listing, 
 
 
 def _refuse_foreign(checkpoints: RemoteCheckpoints, listing: Listing, run_id: str | None) -> str | None:
-    """Refuse checkpoints, also incomplete ones, of several runs or of another run than this machine's; return the run."""
+    """Refuse checkpoints, also incomplete ones, of several runs or of another run than ours; return the run."""
     for name in sorted(listing, reverse=True):
         owner = checkpoints.run_id(name)
         run_id = owner if run_id is None else run_id
