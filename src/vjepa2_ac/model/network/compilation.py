@@ -82,9 +82,8 @@ def _compiled(function: Callable[..., Any], backend: str, way_out: str, dynamic:
     from torch._dynamo.exc import FailOnRecompileLimitHit
 
     config.recompile_limit = max(config.recompile_limit, VARIANTS)
-    whole = torch.compile(
-        function, backend=backend, fullgraph=True, dynamic=dynamic
-    )  # otherwise the limit is only a warning
+    # fullgraph: otherwise the limit is only a warning
+    whole = torch.compile(function, backend=backend, fullgraph=True, dynamic=dynamic)
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:
