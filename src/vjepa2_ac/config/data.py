@@ -19,7 +19,7 @@ _STRIDES_AT_15_HZ = (4, 8, 15)
 
 
 def _split_by(text: str) -> str:
-    """Take the name of a field, or a pattern with one group; which fields there are only the data set knows."""
+    """Accept the name of a field, or a pattern with one group; the fields depend on the data set."""
     if re.fullmatch(r"[A-Za-z_]+", text):
         return text
     try:
@@ -35,7 +35,7 @@ def _split_by(text: str) -> str:
 
 
 class IdleConfig(Section):
-    """Which control steps are left out because the robot stands still."""
+    """Which control steps are excluded because the robot stands still."""
 
     rule: Literal["none", "published", "commands", "motion"] = "none"
     """none: keep all. published: ranges from a file. commands: openpi's rule on commanded joint velocities. motion: the
@@ -44,11 +44,11 @@ class IdleConfig(Section):
     """For published: a JSON file, local or a URL, of {"recording_folderpath--file_path": [[start, end), ...]}. Episodes
     that it does not name count as idle."""
     keep_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """Share of the idle windows that stay all the same: a world model should see stillness too."""
+    """Share of the idle windows that are kept: a world model should see stillness too."""
     velocity_change_rad_s: Annotated[float, Field(gt=0.0)] = 1e-3
-    """For commands: a step is idle if no commanded joint velocity changes by as much."""
+    """For commands: a step is idle if no commanded joint velocity changes by this much."""
     translation_m: Annotated[float, Field(gt=0.0)] = 1e-3
-    """For motion: a step is idle if it moves less, turns less and closes less than these three."""
+    """For motion: a step is idle if translation, rotation and gripper change less than these three."""
     rotation_rad: Annotated[float, Field(gt=0.0)] = 5e-3
     """See translation_m."""
     gripper: Annotated[float, Field(gt=0.0)] = 1e-2
@@ -56,9 +56,9 @@ class IdleConfig(Section):
     shortest_idle_steps: PositiveInt = 7
     """Shorter idle runs stay."""
     shortest_kept_steps: PositiveInt = 16
-    """What is left between idle runs goes, too, if it is shorter."""
+    """Ranges between idle runs are removed, too, if they are shorter."""
     cut_last_steps: Annotated[int, Field(ge=0)] = 10
-    """Steps cut from the end of each range that is left."""
+    """Steps cut from the end of each remaining range."""
 
     @model_validator(mode="after")
     def _published_ranges_are_named(self) -> IdleConfig:
@@ -95,16 +95,16 @@ class AugmentConfig(Section):
 
 
 class DiskCacheConfig(Section):
-    """What is kept on this machine of data that lies elsewhere, and of what was found out about it."""
+    """The cache on this machine: remote data, and indexes of data sets."""
 
     dir: Local | None = None
     """Folder; null: $VJEPA2_AC_CACHE, or vjepa2-ac in the user's cache folder."""
     limit_gb: Annotated[float, Field(ge=0.0)] = 50.0
-    """Frames beyond this size go, least recently used first; 0: none are kept. Indexes do not count."""
+    """Frames beyond this size are removed, least recently used first; 0: none are cached. Indexes do not count."""
 
 
 class DataConfig(Section):
-    """Which clips, from where."""
+    """The data set, and the clips made of it."""
 
     source: Literal["rlds", "droid_raw", "lerobot", "npz", "latents"] = "rlds"
     """Form of the data set. rlds: TFRecord shards with a dataset_info.json, as TFDS writes them. droid_raw: DROID's
@@ -115,7 +115,7 @@ class DataConfig(Section):
     fields: RldsFields = RldsFields()
     """For rlds: names of the features."""
     droid_raw: RawDroidOptions = RawDroidOptions()
-    """For droid_raw: what is kept."""
+    """For droid_raw: which steps are used."""
     lerobot: LeRobotFields = LeRobotFields()
     """For lerobot: names and conventions of the columns."""
     camera: _CameraName | tuple[_CameraName, ...] | None = None
@@ -123,11 +123,11 @@ class DataConfig(Section):
     exterior camera, which the released weights saw. rlds, lerobot: a name in `cameras`. droid_raw: left, right, wrist,
     ext1, ext2 or a serial number. npz: the name of an array of frames."""
     states: Literal["pose", "vector"] = "pose"
-    """What a state is. pose: 7 numbers, position, rotation and gripper, which the released weights know. vector: the
-    source's own numbers as they are, of any width, for other robots: two arms, joints, a mobile base."""
+    """Kind of state. pose: 7 numbers, position, rotation and gripper, which the released weights know. vector: the
+    source's own numbers, unchanged, of any width, for other robots: two arms, joints, a mobile base."""
     actions: Literal["difference", "recorded"] = "difference"
-    """difference: what carries a state to the next one; of vectors, the plain difference. recorded: the commands in the
-    source, of any width; for vectors only."""
+    """difference: the change from a state to the next one; of vectors, the plain difference. recorded: the commands in
+    the source, of any width; for vectors only."""
     join_actions: Literal["sum", "mean", "last"] | None = None
     """How the recorded commands of a model step's control steps become one action. sum: deltas. mean: velocities. last:
     absolute targets. Must be given unless `stride` is 1."""
@@ -140,21 +140,22 @@ class DataConfig(Section):
     """Clips start at multiples of this many control steps, counted from the first step of their episode that
     `data.idle` keeps. With the stride's own number, only every stride-th frame is ever needed: a small latent cache."""
     stride_candidates: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] | None = None
-    """Strides that `auto` and `data calibrate` try; null: 4, 8, 15 at 15 control steps per second, scaled to others."""
+    """Strides that `auto` and `data calibrate` evaluate; null: 4, 8, 15 at 15 control steps per second, scaled to
+    others."""
     validation_share: Share = 0.05
     """Share of the episodes held out for validation, chosen by a hash of the episode's identity."""
     test_share: Share = 0.05
     """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
     split_by: Annotated[str, Field(max_length=500), AfterValidator(_split_by)] | None = None
-    """What keeps episodes that belong together in one split, since neighbours tell of one another: a field (lab, day or
-    folder, as the identity says; task, scene, building, operator or day where the data set does), or a regular
-    expression with one group, which is searched in the identity. null: each episode is drawn for itself."""
+    """What keeps related episodes in one split, so that training reveals nothing about held-out ones: a field (lab, day
+    or folder, as the identity says; task, scene, building, operator or day where the data set does), or a regular
+    expression with one group, which is searched in the identity. null: each episode is drawn independently."""
     outcome: Literal["all", "success", "failure"] = "all"
-    """Which demonstrations take part, where the data set tells success from failure."""
+    """Which demonstrations are used, if the data set records success and failure."""
     idle: IdleConfig = IdleConfig()
-    """Which steps are left out because the robot stands still."""
+    """Which steps are excluded because the robot stands still."""
     short_episodes: Literal["skip", "error"] = "skip"
-    """What to do with episodes shorter than a clip: leave them out and say how many, or stop."""
+    """What to do with episodes shorter than a clip: skip them and report how many, or stop."""
     broken_episodes: Literal["error", "skip"] = "error"
     """What to do with an episode that cannot be read: stop and name it, or leave its clips out, name and count it, and
     stop when more than 1 % of the episodes are broken."""
@@ -163,15 +164,15 @@ class DataConfig(Section):
     pose_frame: Literal["base", "camera"] = "base"
     """Frame of the poses: the robot's base (the released recipe), or the camera, where its extrinsics are known."""
     crop: Literal["released", "square", "letterbox"] = "released"
-    """What becomes of a frame that is not square. released: its centre, 1.35 times as wide as high at most, squashed.
+    """How a frame that is not square is cropped. released: its centre, 1.35 times as wide as high at most, squashed.
     square: its central square (upstream's evaluation). letterbox: all of it, with black bars."""
     augment: AugmentConfig = AugmentConfig()
     """Random changes of training clips."""
     cache: Annotated[Literal["off", "auto", "require"], OFF] = "off"
-    """Whether the frozen encoder's latents are kept on disk, so that each frame is encoded once. off: no. auto: those
+    """Whether the frozen encoder's latents are cached on disk, so that each frame is encoded once. off: no. auto: those
     that are not there yet are encoded before the first step. require: refuse to start where they are not there."""
     cache_dtype: Literal["bf16", "fp32", "int8"] = "bf16"
-    """Type that latents are kept in: bf16; fp32, which takes twice as much room; int8 with a scale per token, half."""
+    """Storage type of latents: bf16; fp32, which takes twice as much room; int8 with a scale per token, half."""
     cache_dir: Local | None = None
     """Folder for latent caches, one folder in it for each; null: `latents` in the folder of `disk_cache`."""
     check_crc: Literal["once", "always", "never"] = "once"
@@ -179,13 +180,13 @@ class DataConfig(Section):
     time, or never. The CRC of a record's length is always checked. Likewise the CRC-32 of cached latents, frame by
     frame; once is then once for each process."""
     disk_cache: DiskCacheConfig = DiskCacheConfig()
-    """What is kept on this machine."""
+    """The cache on this machine."""
     workers: Annotated[int, Field(ge=0, le=256)] = 4
     """Loader processes; 0 loads in the training process. The data does not depend on it."""
     prefetch: PositiveInt = 2
-    """Batches that each loader process prepares ahead."""
+    """Batches that each loader process prefetches."""
     connections: Annotated[int, Field(ge=1, le=256)] = 16
-    """Reads in flight at once per process, for data that lies elsewhere."""
+    """Concurrent reads per process, for remote data."""
 
     @model_validator(mode="after")
     def _parts_fit(self) -> DataConfig:
@@ -236,7 +237,7 @@ class DataConfig(Section):
 
     @property
     def known_cameras(self) -> tuple[str, ...] | None:
-        """The cameras that the config can know of, or None where only the data set does."""
+        """The cameras known from the config, or None if only the data set knows them."""
         return {"rlds": tuple(self.fields.cameras), "lerobot": tuple(self.lerobot.cameras)}.get(self.source)
 
     @property
@@ -257,7 +258,7 @@ class DataConfig(Section):
         """Control steps that a clip spans, first and last frame included.
 
         Raises:
-            ValueError: The stride is still to be found out.
+            ValueError: The stride is not yet calibrated.
         """
         return (self.frames - 1) * self.model_stride + 1
 
@@ -266,18 +267,18 @@ class DataConfig(Section):
         """The stride as a number.
 
         Raises:
-            ValueError: It is still to be found out.
+            ValueError: It is not yet calibrated.
         """
         if self.stride == "auto":
             raise ValueError("data.stride is auto: calibrate first")
         return self.stride
 
     def strides_to_try(self, control_rate_hz: float) -> tuple[int, ...]:
-        """Return the strides among which a model may choose, at a control rate."""
+        """Return the candidate strides at a control rate."""
         if self.stride_candidates is not None:
             return self.stride_candidates
         return tuple(sorted({max(1, round(stride * control_rate_hz / 15)) for stride in _STRIDES_AT_15_HZ}))
 
     def with_stride(self, stride: int) -> DataConfig:
-        """Return the same with a stride that was found out."""
+        """Return the config with a calibrated stride."""
         return self.model_copy(update={"stride": stride})

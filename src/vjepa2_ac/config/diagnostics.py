@@ -14,11 +14,11 @@ from pydantic import BaseModel, ValidationError
 from vjepa2_ac.config import Config
 from vjepa2_ac.storage.structured import message_of
 
-_ROUNDS = 20  # more than there are rules about several values
+_ROUNDS = 20  # more than the number of rules about several values
 _MOST_LINES = 30
 _LONGEST_KEY = 80
 
-# What people bring along from other programs, by the key that it has here.
+# Names of knobs in other programs, by their key here.
 _ALSO_CALLED = {
     "run_dir": ("output_dir", "out_dir", "save_dir"),
     "data.path": ("dataset", "data_path", "data_dir", "root"),
@@ -52,10 +52,10 @@ _ALSO_CALLED = {
 
 
 def wrong_values(values: Mapping[str, Any], error: ValidationError) -> list[str]:
-    """Return a line for everything that is wrong with plain values, by the error that they gave.
+    """Return a line for every error in plain values, given their validation error.
 
-    Rules about several values are only looked at when each value by itself is right. What is wrong is therefore taken
-    out, and the rest is looked at again; what a rule then says about something that was taken out does not count.
+    Rules about several values are only checked when each single value is valid. Invalid values are therefore removed,
+    and the rest is checked again; messages about removed values are then ignored.
     """
     left, found, taken = json.loads(json.dumps(values)), error.errors(include_url=False)[:_MOST_LINES], set[str]()
     lines: list[str] = []
@@ -89,13 +89,13 @@ def all_keys(section: type[BaseModel] = Config, prefix: str = "") -> list[str]:
 
 
 def _messages_of(details: Sequence[Any]) -> list[str]:
-    """Return a line for each value that is wrong: what may be of several kinds is messages once, not for each kind."""
+    """Return a line for each invalid value: a value that may be of several types gets one line, not one per type."""
     kinds: dict[tuple[Any, ...], list[Any]] = {}
     for detail in details:
         kinds.setdefault(_union_of(detail["loc"]) or (*detail["loc"], detail["msg"]), []).append(detail)
     lines = []
     for together in kinds.values():
-        deepest = max(len(detail["loc"]) for detail in together)  # of a kind that fits at least from outside
+        deepest = max(len(detail["loc"]) for detail in together)  # of the type that fits best
         line, *others = [_explain(detail) for detail in together if len(detail["loc"]) == deepest]
         also = [other.split("Input should be ", 1)[-1].split(" (found ", 1)[0] for other in others]
         message, found, rest = line.partition(" (found ")
@@ -117,14 +117,14 @@ def _explain(detail: Any) -> str:
 
 
 def _places(location: Sequence[Any]) -> list[str]:
-    """Return the keys and numbers of items that lead to a value; pydantic's names for kinds of values are no keys."""
+    """Return the keys and item numbers that lead to a value, without pydantic's names of union members."""
     union = _union_of(location)
     kept = location if union is None else (*union, *location[len(union) + 1 :])
     return [part if len(part := str(one)) <= _LONGEST_KEY else f"{part[:_LONGEST_KEY]}…" for one in kept]
 
 
 def _union_of(location: Sequence[Any]) -> tuple[Any, ...] | None:
-    """Return the place of the knob that a location lies in, if that may be of several kinds."""
+    """Return the location of the knob that contains a location, if it may be of several types."""
     for depth in range(1, len(location)):
         section = _section_at(location[: depth - 1])
         knob = None if section is None else section.model_fields.get(str(location[depth - 1]))
@@ -134,7 +134,7 @@ def _union_of(location: Sequence[Any]) -> tuple[Any, ...] | None:
 
 
 def _probably_meant(location: Sequence[Any]) -> str | None:
-    """Return the key that was probably meant by an unknown one; with its section where that is another."""
+    """Return the key that an unknown one probably stands for; with its section if that differs."""
     name, here = str(location[-1]), "".join(f"{part}." for part in location[:-1])
     known = [key.removeprefix(here) for key, names in _ALSO_CALLED.items() if name in names]
     close = difflib.get_close_matches(name, _keys_at(location[:-1]), n=1)
@@ -143,12 +143,12 @@ def _probably_meant(location: Sequence[Any]) -> str | None:
 
 
 def _is_about(detail: Any, names: Iterable[str]) -> bool:
-    """Return whether a message speaks of one of these keys, or of a place that is one."""
+    """Return whether a message is about one of these keys."""
     return any(re.search(rf"(?<!\w){re.escape(name)}(?!\w)", _explain(detail)) for name in names)
 
 
 def _take_out(values: dict[str, Any], detail: Any) -> set[str]:
-    """Take what is wrong out of the values; return the names of what is no longer as it was meant."""
+    """Remove an invalid value; return the names of the values that are changed by that."""
     location, names = [str(part) for part in detail["loc"]], set[str]()
     if detail["type"] == "missing" and isinstance(detail["loc"][-1], int):
         return _delete(values, location[:-1], whole=False)
@@ -166,7 +166,7 @@ def _take_out(values: dict[str, Any], detail: Any) -> set[str]:
 
 
 def _delete(values: dict[str, Any], path: Sequence[str], *, whole: bool) -> set[str]:
-    """Delete what is at a path, or what is nearest above it; `whole`: only if all of the path is there."""
+    """Delete the value at a path, or the nearest one above it; `whole`: only if the complete path exists."""
     inside: Any = values
     for depth, key in enumerate(path):
         if key not in inside:
@@ -175,7 +175,7 @@ def _delete(values: dict[str, Any], path: Sequence[str], *, whole: bool) -> set[
             if whole and (depth < len(path) - 1 or (not depth and _section_at(path) is not None)):
                 return set()
             del inside[key]
-            if not inside and depth and _section_at(path[:depth]) is None:  # an empty list of cameras is no camera
+            if not inside and depth and _section_at(path[:depth]) is None:  # an empty list of cameras is invalid
                 return {key, *_delete(values, path[:depth], whole=False)}
             return {key}
         inside = inside[key]
@@ -183,7 +183,7 @@ def _delete(values: dict[str, Any], path: Sequence[str], *, whole: bool) -> set[
 
 
 def _stand_in(values: dict[str, Any], taken: set[str]) -> None:
-    """Fill in what has no default, so that the rest can be looked at."""
+    """Fill in values that have no default, so that the rest can be checked."""
     data, model = (values.setdefault(section, {}) for section in ("data", "model"))
     for inside, key, others in ((values, "run_dir", ()), (data, "path", ()), (model, "base", ("random",))):
         if not any(inside.get(one) is not None for one in (key, *others)):

@@ -87,7 +87,7 @@ def changed_keys(old: Config, new: Config) -> list[str]:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Puts text in quotes that would be read as another thing."""
+    """Quotes text that would be read as another type."""
 
 
 _Dumper.add_implicit_resolver("!number", re.compile(r"^[-+]?[\d_]*\.?[\d_]*[eE][-+]?\d+$"), list("-+.0123456789"))

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 from vjepa2_ac import places
 from vjepa2_ac.config.section import PositiveInt, Section, Share
 
-# Far beyond every model of the kind (released: width 1408, depth 40, 1.3 billion weights): a file may claim anything.
+# Far beyond every such model (released: width 1408, depth 40, 1.3 billion weights): a file may claim any size.
 Width = Annotated[int, Field(ge=1, le=16_384)]
 Depth = Annotated[int, Field(ge=1, le=512)]
 Heads = Annotated[int, Field(ge=1, le=1_024)]
@@ -17,7 +17,7 @@ Ratio = Annotated[float, Field(gt=0.0, le=64.0)]
 VectorWidth = Annotated[int, Field(ge=1, le=4_096)]
 _MOST_TOKENS = 65_536  # of a frame
 _MOST_WEIGHTS = 10**10  # 40 GB in float32
-_MOST_PATTERNS = 64  # that decide about layers by their names
+_MOST_PATTERNS = 64  # that select layers by name
 
 
 class EncoderSizes(Section):
@@ -107,11 +107,11 @@ class ModelConfig(Section):
     random: ModelSizes | None = None
     """Instead of `base`: a fresh model of these sizes; with `adapter.kind: none` that is training from scratch."""
     random_start: Literal["persistence", "released"] = "persistence"
-    """How a `random` model begins: close to copying the last frame, or as the released recipe drew its weights."""
+    """Initialisation of a `random` model: close to copying the last frame, or as in the released recipe."""
     sizes: ModelSizes = ModelSizes()
-    """What an official `.pt` cannot say of itself: image size and heads. Everything else is read from its tensors."""
+    """What an official `.pt` does not contain: image size and heads. Everything else is read from its tensors."""
     dtype: Literal["float32", "bfloat16"] = "bfloat16"
-    """Type of the frozen weights; what is trained is always float32. Plans compute in it."""
+    """Type of the frozen weights; trained weights are always float32. Planning computes in it."""
     encode_chunk: PositiveInt = 16
     """Frames that go through the encoder at once: bounds its memory."""
 
@@ -134,19 +134,19 @@ class AdapterConfig(Section):
     rslora: bool = True
     """Rank-stabilised scale (arXiv 2312.03732)."""
     dropout: Share = 0.0
-    """Dropout before the adapter's first matrix, in training only. The released recipe has none, nor what was measured
-    here; it costs an eighth of a step on a GPU (predicted) and keeps a mask and a copy of each layer's input."""
+    """Dropout before the adapter's first matrix, in training only. The released recipe and our measurements use none;
+    it costs an eighth of a step on a GPU (predicted) and keeps a mask and a copy of each layer's input."""
     targets: Annotated[tuple[str, ...], Field(max_length=_MOST_PATTERNS)] = ("q", "k", "v", "o", "fc1", "fc2")
     """Linear layers of the predictor that get an adapter, by the last part of their name; besides the defaults:
     predictor_embed, predictor_proj, action_encoder, state_encoder. Or sets: attention (q, k, v, o), mlp (fc1, fc2),
     all (every linear layer)."""
     modules_to_save: tuple[Literal["predictor_embed", "predictor_proj", "action_encoder", "state_encoder"], ...] = ()
-    """Layers before and after the blocks that are trained whole, beside the adapter, instead of by one."""
+    """Layers before and after the blocks that are trained directly, without an adapter."""
     dora: bool = False
-    """Train the length of each row of a weight apart from its direction (DoRA, arXiv 2402.09353)."""
+    """Train the norm of each row of a weight separately from its direction (DoRA, arXiv 2402.09353)."""
     init: Literal["default", "gaussian", "pissa"] = "default"
-    """Where an adapter starts. default, gaussian: first matrix random, second zero. pissa: at the largest singular
-    values of the weights (arXiv 2404.02948). PEFT's other ways need data, or change what the base predicts."""
+    """Initialisation of an adapter. default, gaussian: first matrix random, second zero. pissa: at the largest singular
+    values of the weights (arXiv 2404.02948). PEFT's other methods need data, or change the base's predictions."""
     rank_pattern: Annotated[dict[str, Annotated[int, Field(ge=1, le=1024)]], Field(max_length=_MOST_PATTERNS)] = {}
     """Other ranks for some targets: {fc1: 32, blocks.0.attn.q: 4}, by the end of a layer's name or a regular
     expression for it; the first that matches counts."""

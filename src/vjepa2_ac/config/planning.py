@@ -10,16 +10,16 @@ from pydantic import Field, model_validator
 from vjepa2_ac.config.section import OFF, PositiveInt, Section, Share
 
 Positive = Annotated[float, Field(gt=0.0)]
-Metre = Annotated[float, Field(ge=0.0, le=1.0)]  # no arm moves farther in a model step: these would be millimetres
+Metre = Annotated[float, Field(ge=0.0, le=1.0)]  # no arm moves farther in a model step: more would be millimetres
 
 
 class LimitsConfig(Section):
-    """What no action goes beyond, whatever the model says. All of one model step; `action_repeat` repeats it."""
+    """Limits of every action, independent of the model. All per model step; `action_repeat` repeats it."""
 
     xyz: tuple[Metre, Metre, Metre] = (0.05, 0.05, 0.05)
     """Largest dx, dy, dz in metres, 1 at most; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075."""
     ball: Literal["none", "l1", "l2"] = "none"
-    """Whether (dx, dy, dz) stays, besides, in a ball: sum of sizes (l1) or length (l2)."""
+    """Whether (dx, dy, dz) is also limited to a ball: sum of absolute values (l1) or length (l2)."""
     radius: Positive = 0.05
     """Of the ball, in metres."""
     rotation: Annotated[float, Field(ge=0.0, le=math.pi)] = 0.0
@@ -27,10 +27,10 @@ class LimitsConfig(Section):
     gripper: Annotated[float, Field(ge=0.0, le=1.0)] = 0.75
     """Largest change of the gripper's closedness."""
     gripper_mode: Literal["rounded", "free", "held", "open", "close"] = "rounded"
-    """rounded: small changes of a finished plan become none, as upstream. free: left as they are. held: no change.
+    """rounded: small changes of a finished plan become zero, as upstream. free: left as they are. held: no change.
     open, close: a change of -1 or 1, whatever `gripper` says, from model step `gripper_from` on; rounded before."""
     gripper_rounding: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
-    """Changes below this become none."""
+    """Changes below this become zero."""
     gripper_from: Annotated[int, Field(ge=0)] = 0
     """Model step of the plan at which open or close begins; a multiple of action_repeat."""
 
@@ -43,12 +43,12 @@ class LimitsConfig(Section):
 
 
 class EnergyConfig(Section):
-    """How far a prediction is from the goal."""
+    """Distance of a prediction from the goal."""
 
     distance: Literal["l1", "l2", "cosine"] = "l1"
-    """Of predicted and wanted latents: mean absolute difference (upstream), mean square, or 1 - cosine of a token."""
+    """Of predicted and goal latents: mean absolute difference (upstream), mean square, or 1 - cosine of a token."""
     steps: Literal["last", "sum"] = "last"
-    """last: of the plan's last step (upstream). sum: of all its steps, added."""
+    """last: of the plan's last step (upstream). sum: over all its steps."""
     samples_at_once: PositiveInt = 64
     """Action sequences that go through the predictor at once: bounds its memory."""
 
@@ -67,7 +67,7 @@ class CemConfig(Section):
     momentum_std_gripper: Share = 0.15
     """The same, of the gripper."""
     try_mean: bool = False
-    """Whether the mean itself takes the place of an iteration's first sample (facebookresearch/jepa-wms)."""
+    """Whether the mean itself replaces an iteration's first sample (facebookresearch/jepa-wms)."""
     answer: Literal["mean", "best"] = "mean"
     """The mean of the last distribution (upstream), or the best sample of all."""
 
@@ -84,41 +84,43 @@ class IcemConfig(Section):
     shrink: Annotated[float, Field(ge=1.0)] = 1.25
     """Each iteration has as many samples as the last divided by this, and at least twice the elites."""
     kept: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
-    """Share of the elites that take part again, in the next iteration and, with warm_start, in the next decision."""
+    """Share of the elites that are reused, in the next iteration and, with warm_start, in the next decision."""
 
 
 class MppiConfig(Section):
     """Model predictive path integral control."""
 
     temperature: Positive = 0.1
-    """Of the weights exp(-energy / temperature), in standard deviations of the samples' energies: no unit to know."""
+    """Of the weights exp(-energy / temperature), in standard deviations of the samples' energies, hence without a
+    unit."""
     std_decay: Annotated[float, Field(gt=0.0, le=1.0)] = 0.8
-    """What the standard deviation is multiplied by after each iteration; 1: it stays."""
+    """Factor of the standard deviation after each iteration; 1: constant."""
 
 
 class GradientConfig(Section):
     """Gradient descent through the model."""
 
     starts: PositiveInt = 8
-    """Sequences that descend at once: the first from the previous plan (or no motion), the others from random ones."""
+    """Sequences that are optimised at once: the first from the previous plan (or no motion), the others from random
+    ones."""
     learning_rate: Positive = 0.1
-    """Of Adam at the first iteration, as a share of the limits; it falls in a line to nothing."""
+    """Of Adam at the first iteration, as a share of the limits; it decays linearly to zero."""
 
 
 class PlanningConfig(Section):
-    """One decision, from what is seen now to an action."""
+    """One decision: from the current frame to an action."""
 
     planner: Literal["cem", "icem", "mppi", "gradient"] = "cem"
     """How actions are searched."""
     horizon: PositiveInt = 1
     """Model steps that a plan spans."""
     action_repeat: PositiveInt = 1
-    """Model steps for which one action is repeated; the horizon is a multiple of it. A controller decides anew at each
-    of them all the same."""
+    """Model steps for which one action is repeated; the horizon is a multiple of it. A controller still decides anew at
+    each of them."""
     samples: Annotated[int, Field(ge=2)] = 800
     """Action sequences an iteration; gradient has `gradient.starts`."""
     iterations: PositiveInt = 10
-    """Rounds of trying and learning."""
+    """Iterations of sampling and fitting."""
     start_std: Positive = 1.0
     """Standard deviation of the first samples, as a share of the limits of position and rotation."""
     gripper_start_std: Positive = 1.0
@@ -127,10 +129,10 @@ class PlanningConfig(Section):
     """Seconds of search after which the best plan so far is taken: no iteration begins that would not end by then. The
     first always runs. Encoding the frame is not counted. null: all iterations run."""
     warm_start: bool = False
-    """Whether a decision begins from the last one's plan, shifted by what was done of it. Not at horizon 1, where the
-    last action is all there is of it: the arm overshoots (docs/log.md)."""
+    """Whether a decision starts from the last one's plan, shifted by the steps executed. Not at horizon 1, where the
+    plan is the last action only: the arm overshoots (docs/log.md)."""
     context: PositiveInt = 1
-    """Frames that the model sees, the present one included (upstream: 1); fewer at the start."""
+    """Frames that the model sees, the current one included (upstream: 1); fewer at the start."""
     compile: Annotated[Literal["off", "blocks"], OFF] = "off"
     """blocks: torch.compile for the predictor's blocks; needs a C compiler, and a minute within the first decision. The
     same energies to rounding. Not of `evaluate --planning`, which computes plainly."""
@@ -139,9 +141,9 @@ class PlanningConfig(Section):
     rest in bfloat16, which model.dtype must be. fp8 needs compute capability 8.9. Not of planner gradient, nor of
     `evaluate --planning`."""
     limits: LimitsConfig = LimitsConfig()
-    """What no action goes beyond."""
+    """Limits of every action."""
     energy: EnergyConfig = EnergyConfig()
-    """How far a prediction is from the goal."""
+    """Distance of a prediction from the goal."""
     cem: CemConfig = CemConfig()
     """Of planner cem only."""
     icem: IcemConfig = IcemConfig()

@@ -31,7 +31,7 @@ class Config(Section):
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     """Decides the order of clips, fresh weights and dropout."""
     data: DataConfig
-    """Which clips, from where."""
+    """The data set, and the clips made of it."""
     model: ModelConfig
     """Which world model to start from."""
     adapter: AdapterConfig = AdapterConfig()
@@ -39,13 +39,13 @@ class Config(Section):
     training: TrainingConfig = TrainingConfig()
     """How the weights change."""
     validation: ValidationConfig = ValidationConfig()
-    """The measurement before the first step and on the way."""
+    """Validation before the first step and during training."""
     checkpoint: CheckpointConfig = CheckpointConfig()
-    """What is kept of a run."""
+    """Checkpoints, here and elsewhere."""
     tracking: TrackingConfig = TrackingConfig()
     """Where metrics go."""
     planning: PlanningConfig = PlanningConfig()
-    """How a robot is steered afterwards; training does not heed it."""
+    """How a robot is controlled afterwards; training does not use it."""
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Config:

@@ -8,9 +8,9 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from vjepa2_ac import places
 
-PositiveInt = Annotated[int, Field(ge=1, le=1_000_000_000)]  # more of anything no machine has room for
+PositiveInt = Annotated[int, Field(ge=1, le=1_000_000_000)]  # no machine has memory for more of anything
 Share = Annotated[float, Field(ge=0.0, lt=1.0)]
-OFF = BeforeValidator(lambda value: "off" if value is False else value)  # YAML takes off for a truth value
+OFF = BeforeValidator(lambda value: "off" if value is False else value)  # YAML reads off as a boolean
 Place = Annotated[str, AfterValidator(places.anywhere)]  # on this machine, where ~ is the user's home, or a URL
 Local = Annotated[str, AfterValidator(places.on_this_machine)]  # likewise, but no URL
 

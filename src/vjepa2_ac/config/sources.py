@@ -14,18 +14,18 @@ _Names = Annotated[tuple[str, ...], Field(min_length=1)]
 
 
 class RldsFields(Section):
-    """Where an RLDS data set keeps what the model needs; the defaults are DROID's."""
+    """Where an RLDS data set stores what the model needs; the defaults are DROID's."""
 
     state: _Names = (
         "steps/observation/cartesian_position",
         "steps/observation/gripper_position",
     )
-    """Features that give, joined, the 7 numbers of the *measured* state (legend: episode.py); for `states: vector` any
-    numbers."""
+    """Features that form, concatenated, the 7 numbers of the *measured* state (legend: episode.py); for `states:
+    vector` any numbers."""
     action: _Names = ("steps/action",)
-    """For `actions: recorded`: features that give, joined, the *commanded* action of each control step."""
+    """For `actions: recorded`: features that form, concatenated, the *commanded* action of each control step."""
     gripper: Literal["closedness", "openness"] = "closedness"
-    """What the last number of the state is: 0 open .. 1 closed (DROID), or 0 closed .. 1 open (BridgeData)."""
+    """Meaning of the state's last number: 0 open .. 1 closed (DROID), or 0 closed .. 1 open (BridgeData)."""
     identity: _Names = ("episode_metadata/recording_folderpath", "episode_metadata/file_path")
     """Features that name an episode; the split into train, validation and test is a hash of them."""
     cameras: Annotated[dict[str, str], Field(min_length=1)] = {
@@ -35,7 +35,7 @@ class RldsFields(Section):
     }
     """Camera name -> feature with its frames."""
     language: str | None = "steps/language_instruction"
-    """Feature kept in the episode's metadata; the model does not use it."""
+    """Feature stored in the episode's metadata; the model does not use it."""
     joint_velocity: str | None = "steps/action_dict/joint_velocity"
     """Feature with the *commanded* joint velocities, read by the idle filter; null: there is none."""
     control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)] = 15.0
@@ -52,22 +52,22 @@ class RawDroidOptions(Section):
 
 
 class LeRobotFields(Section):
-    """Where a LeRobot data set keeps what the model needs; the defaults are those of DROID's ports."""
+    """Where a LeRobot data set stores what the model needs; the defaults are those of DROID's ports."""
 
     state: _Names = ("observation.state.cartesian_position", "observation.state.gripper_position")
-    """Columns whose values, joined, hold position, rotation and gripper of the *measured* state; for `states: vector`
-    any numbers."""
+    """Columns whose values, concatenated, hold position, rotation and gripper of the *measured* state; for `states:
+    vector` any numbers."""
     action: _Names = ("action",)
-    """For `actions: recorded`: columns that give, joined, the *commanded* action of each control step."""
+    """For `actions: recorded`: columns that form, concatenated, the *commanded* action of each control step."""
     select: tuple[Annotated[int, Field(ge=0)], ...] | None = None
-    """Which of the joined numbers, in this order, are x, y, z, the rotation's 3 or 4, the gripper; for `states: vector`
-    which are the state; null: all."""
+    """Which of the concatenated numbers, in this order, are x, y, z, the rotation's 3 or 4, the gripper; for `states:
+    vector` which are the state; null: all."""
     rotation: Literal["euler_xyz", "quaternion_wxyz", "quaternion_xyzw"] = "euler_xyz"
     """How the rotation is written: extrinsic xyz Euler angles in radians, or a unit quaternion, w first or last."""
     gripper_open: float = 0.0
-    """What the gripper's number is when it is open."""
+    """The gripper's value when it is open."""
     gripper_closed: float = 1.0
-    """What the gripper's number is when it is closed; smaller than gripper_open where the sign is turned."""
+    """The gripper's value when it is closed; smaller than gripper_open if the sign is inverted."""
     cameras: Annotated[dict[str, str], Field(min_length=1)] = {
         "exterior_1_left": "observation.images.exterior_1_left",
         "exterior_2_left": "observation.images.exterior_2_left",
@@ -75,9 +75,9 @@ class LeRobotFields(Section):
     }
     """Camera name -> video feature."""
     joint_velocity: str | None = "action.joint_velocity"
-    """Column with the *commanded* joint velocities, read by the idle filter where there is one."""
+    """Column with the *commanded* joint velocities, read by the idle filter if there is one."""
     success: str | None = "is_episode_successful"
-    """Column that says whether the episode succeeded, used where there is one."""
+    """Column with the episode's success, used if there is one."""
     fps: Annotated[float, Field(gt=0.0, le=1000.0)] | None = None
     """Control steps per second; null: what meta/info.json says."""
 

@@ -17,39 +17,39 @@ class TrainingConfig(Section):
     batch_size: PositiveInt = 2
     """Clips per process and micro-batch."""
     accumulation: PositiveInt = 16
-    """Micro-batches of each process per optimizer step. A run that goes on with another number of processes keeps the
+    """Micro-batches of each process per optimizer step. A run resumed with another number of processes keeps the
     clips of a step: accumulation then follows from that."""
     rollout_steps: Annotated[int, Field(ge=1, le=64)] = 2
-    """Predictions of the rollout loss; the first is the teacher-forced one, each further one is fed back."""
+    """Predictions of the rollout loss; the first is teacher-forced, each further one uses the previous prediction."""
     loss: Literal["l1", "l2", "smooth_l1"] = "l1"
-    """Distance of predicted and true latents: absolute (released), squared, or squared below smooth_l1_beta only."""
+    """Distance of predicted and true latents: absolute (released), squared, or squared only below smooth_l1_beta."""
     smooth_l1_beta: Annotated[float, Field(gt=0.0)] = 1.0
     """Below this difference smooth_l1 is squared, above it is absolute; smooth_l1 only."""
     teacher_forcing_weight: Annotated[float, Field(ge=0.0)] = 1.0
-    """What the teacher-forced loss is multiplied by, in the sum and in metrics.jsonl."""
+    """Factor of the teacher-forced loss, in the sum and in metrics.jsonl."""
     rollout_weight: Annotated[float, Field(ge=0.0)] = 1.0
-    """What the rollout loss is multiplied by, in the sum and in metrics.jsonl; 0 saves its computation."""
+    """Factor of the rollout loss, in the sum and in metrics.jsonl; 0 saves its computation."""
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-4
     """Peak learning rate."""
     schedule: Literal["cosine", "warmup_stable_decay", "linear", "constant"] = "cosine"
     """All begin with a linear warm-up. Then cosine: half a cosine to the end. linear: a straight line to the end.
-    warmup_stable_decay: constant, and a linear decay at the end. constant: the peak for good."""
+    warmup_stable_decay: constant, and a linear decay at the end. constant: the peak throughout."""
     warmup_steps: Annotated[int, Field(ge=0)] = 1_000
     """Optimizer steps of the linear warm-up."""
     decay_steps: Annotated[int, Field(ge=0)] = 0
     """Optimizer steps of the final decay; warmup_stable_decay only."""
     start_learning_rate: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """Where the warm-up starts."""
+    """Learning rate at the start of the warm-up."""
     final_learning_rate: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """Where the schedule ends; constant has no such place."""
+    """Learning rate at the end of the schedule; not used by constant."""
     optimizer: Literal["adamw", "adamw_8bit"] = "adamw"
-    """adamw_8bit keeps the moments of matrices of 4,096 elements and more in 8 bits: bitsandbytes, extra 8bit."""
+    """adamw_8bit stores the moments of matrices of 4,096 elements and more in 8 bits: bitsandbytes, extra 8bit."""
     weight_decay: Annotated[float, Field(ge=0.0, le=1.0)] = 0.04
     """AdamW's decay; biases and norms are exempt."""
     betas: tuple[Annotated[float, Field(ge=0.0, lt=1.0)], Annotated[float, Field(ge=0.0, lt=1.0)]] = (0.9, 0.999)
     """AdamW's decay rates of the running moments."""
     max_grad_norm: Annotated[float, Field(gt=0.0)] | None = 1.0
-    """Gradients are scaled down to this norm; null: never (the released recipe)."""
+    """Gradients are clipped to this norm; null: never (the released recipe)."""
     precision: Literal["bf16", "fp16", "fp32"] = "bf16"
     """Arithmetic of the networks (autocast). bf16 needs compute capability 8.0 on CUDA (Ampere). fp16 scales the loss,
     and needs CUDA."""
@@ -93,7 +93,7 @@ class TrainingConfig(Section):
 
 
 class ValidationConfig(Section):
-    """The measurement before the first step and on the way."""
+    """Validation before the first step and during training."""
 
     every: PositiveInt = 1_000
     """Optimizer steps between validations."""
@@ -104,23 +104,24 @@ class ValidationConfig(Section):
 
 
 class CheckpointConfig(Section):
-    """What is kept of a run."""
+    """Checkpoints, here and elsewhere."""
 
     every: PositiveInt = 1_000
     """Optimizer steps between checkpoints."""
     every_minutes: Annotated[float, Field(gt=0.0)] | None = 15.0
-    """Minutes after which a checkpoint is written in any case; null: by steps alone."""
+    """Minutes after which a checkpoint is written in any case; null: by steps only."""
     keep: PositiveInt = 5
-    """How many of the newest checkpoints stay."""
+    """Number of newest checkpoints that are kept."""
     keep_best: bool = True
-    """Write one after the validation that went best (rollout error over persistence at the last horizon); it stays."""
+    """Write one after the best validation (rollout error over persistence at the last horizon), and keep it."""
     remote: Place | None = None
-    """Where the run is copied to as it goes: gs://bucket/folder, another URL of fsspec that can be written, or a folder
-    (a mounted disk). A start with an empty run_dir goes on from there; null: nowhere. Same keep and best as here."""
+    """Where the run is copied to during training: gs://bucket/folder, another URL of fsspec that can be written, or a
+    folder (a mounted disk). A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as
+    here."""
     remote_every_minutes: Annotated[float, Field(ge=0.0)] = 30.0
-    """Minutes between two times that remote is brought up to date; at the end and on preemption it is, too."""
+    """Minutes between uploads to remote; there is also one at the end and on preemption."""
     remote_wait_seconds: Annotated[float, Field(ge=0.0)] = 120.0
-    """How long a run that was asked to stop waits for that; shorter than the notice that the machine gives."""
+    """How long a preempted run waits for that; shorter than the notice period of the machine."""
 
 
 class TrackingConfig(Section):
@@ -131,6 +132,6 @@ class TrackingConfig(Section):
     wandb: Literal["disabled", "online", "offline"] = "disabled"
     """Weights & Biases, extra wandb. offline: files in RUN/wandb, which `wandb sync` sends later."""
     trackio: bool = False
-    """trackio, extra trackio: kept where trackio keeps its runs (TRACKIO_DIR), shown by `trackio show`."""
+    """trackio, extra trackio: stored where trackio stores its runs (TRACKIO_DIR), shown by `trackio show`."""
     project: Annotated[str, Field(min_length=1)] = "vjepa2-ac"
-    """Name of the project there; the run in it has the same id wherever it goes on."""
+    """Name of the project there; the run in it has the same id wherever it is resumed."""

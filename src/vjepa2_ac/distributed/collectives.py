@@ -22,7 +22,7 @@ _T = TypeVar("_T")
 
 
 def all_reduce_sum(accelerator: Accelerator, values: Sequence[float | int]) -> list[float]:
-    """Return the sums over all processes, the same bits in each."""
+    """Return the sums over all processes, bit-identical in each."""
     if accelerator.num_processes == 1:
         return [float(value) for value in values]
     added = torch.tensor(values, dtype=torch.float64, device=accelerator.device)
@@ -42,7 +42,7 @@ def all_reduce_max(accelerator: Accelerator, values: Sequence[int | bool]) -> li
 def all_reduce_gradients(accelerator: Accelerator, parameters: Iterable[nn.Parameter]) -> None:
     """Replace the gradient of each parameter by its sum over all processes; no gradient counts as zero.
 
-    The gradient of a shared weight (`training.fsdp`) is such a sum already.
+    The gradient of a sharded weight (`training.fsdp`) is such a sum already.
     """
     if accelerator.num_processes == 1:
         return
@@ -58,7 +58,7 @@ def all_reduce_gradients(accelerator: Accelerator, parameters: Iterable[nn.Param
 
 
 def broadcast_object(accelerator: Accelerator, value: _T) -> _T:
-    """Return what the first process has; the others' own does not count."""
+    """Return the value of the first process; the others' values are ignored."""
     if accelerator.num_processes == 1:
         return value
     holder: list[Any] = [value if accelerator.is_main_process else None]
@@ -66,7 +66,7 @@ def broadcast_object(accelerator: Accelerator, value: _T) -> _T:
 
 
 def all_gather_object(accelerator: Accelerator, value: _T) -> list[_T]:
-    """Return the values of all processes, in their order, in each."""
+    """Return the values of all processes, in their order, in each process."""
     return [value] if accelerator.num_processes == 1 else list(gather_object([value]))
 
 
@@ -79,10 +79,10 @@ def broadcast_tensors(accelerator: Accelerator, tensors: Iterable[Tensor]) -> No
 
 
 def require_same(accelerator: Accelerator, value: object, *, what: str, fix: str) -> None:
-    """See that all processes were given the same.
+    """Check that all processes have the same values.
 
     Raises:
-        InputError: In all of them, where one differs; names the processes.
+        InputError: In all processes, if one differs; names the processes.
     """
     values = all_gather_object(accelerator, value)
     differing = [str(rank) for rank, other in enumerate(values) if other != values[0]]

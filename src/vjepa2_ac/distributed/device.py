@@ -11,14 +11,14 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.compilation import require_compiler
 
 PRECISIONS = {"bf16": torch.bfloat16, "fp16": torch.float16, "fp32": torch.float32}
-_BF16_FROM = (8, 0)  # compute capability; PyTorch's own is_bf16_supported counts emulation, which is slower than fp32
+_BF16_FROM = (8, 0)  # compute capability; PyTorch's is_bf16_supported includes emulation, which is slower than fp32
 
 
 def is_on_cpu(training: TrainingConfig) -> bool:
     """Return whether a config computes on a CPU; else on CUDA.
 
     Raises:
-        InputError: CUDA was asked for and there is none.
+        InputError: CUDA was requested and there is none.
     """
     has_cuda = torch.cuda.is_available()
     if training.device == "cuda" and not has_cuda:
@@ -31,10 +31,10 @@ def is_on_cpu(training: TrainingConfig) -> bool:
 
 
 def computing_device(training: TrainingConfig) -> torch.device:
-    """Return the device of this process, once it is certain that it computes so.
+    """Return the device of this process, after checking that it supports the config.
 
     Raises:
-        InputError: CUDA was asked for and there is none, fp16 without CUDA, bfloat16 on a GPU that has none, or nothing
+        InputError: CUDA was requested and there is none, fp16 without CUDA, bfloat16 on a GPU that has none, or nothing
             to compile with.
     """
     on_cpu = is_on_cpu(training)
@@ -50,7 +50,7 @@ def computing_device(training: TrainingConfig) -> torch.device:
             where="training.cuda_graph", found="true, on a CPU", needed="a CUDA device", fix="Set it to false"
         )
     device = torch.device("cpu") if on_cpu else torch.device("cuda", cuda_index())
-    if training.precision == "bf16":  # fp32 is for float32 weights only, and fp16 casts them, whatever they are
+    if training.precision == "bf16":  # fp32 is for float32 weights only, and fp16 casts any weights
         _require_bf16(device, where="training.precision", found="bf16", fix="Set training.precision=fp16")
     if training.compile == "blocks":
         require_compiler(device.type, where="training.compile")
@@ -58,10 +58,10 @@ def computing_device(training: TrainingConfig) -> torch.device:
 
 
 def require_type_of_weights(model: ModelConfig, device: torch.device) -> None:
-    """Refuse to compute in the type of the weights where the device has it not: what planning does, without autocast.
+    """Refuse a weight type that the device does not support: planning computes in it, without autocast.
 
     Raises:
-        InputError: They are bfloat16 on a GPU that has none.
+        InputError: They are bfloat16 on a GPU without it.
     """
     if model.dtype == "bfloat16":
         _require_bf16(device, where="model.dtype", found="bfloat16", fix="Set model.dtype=float32")
@@ -73,12 +73,12 @@ def has_bf16() -> bool:
 
 
 def cuda_index() -> int:
-    """Return which of the CUDA devices of its machine is that of this process."""
+    """Return the index of this process's CUDA device on its machine."""
     return int(os.environ.get("LOCAL_RANK", "0")) % torch.cuda.device_count()
 
 
 def autocast(training: TrainingConfig, device: torch.device) -> torch.autocast:
-    """Return the arithmetic that `training.precision` asks for, as Accelerate gives it to a run."""
+    """Return the arithmetic of `training.precision`, as Accelerate provides it."""
     kind = None if training.precision == "fp32" else PRECISIONS[training.precision]
     return torch.autocast(device.type, dtype=kind, enabled=kind is not None)
 

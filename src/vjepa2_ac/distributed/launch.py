@@ -14,13 +14,13 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.distributed.device import computing_device
 from vjepa2_ac.errors import InputError
 
-LONGEST_WAIT = timedelta(hours=2)  # of a process for the others: one may look through a data set for the first time
+LONGEST_WAIT = timedelta(hours=2)  # of a process for the others: one may be indexing a data set
 _OTHER_WAYS = {
     "ACCELERATE_USE_DEEPSPEED": "DeepSpeed",
     "ACCELERATE_USE_MEGATRON_LM": "Megatron-LM",
     "ACCELERATE_USE_PARALLELISM_CONFIG": "a parallelism config",
 }
-_OPTIONS = {  # that would do nothing, and are not known by their default
+_OPTIONS = {  # that would have no effect, and have no recognisable default
     "FSDP_OFFLOAD_PARAMS": ("--fsdp_offload_params true", "start without it"),
     "FSDP_ACTIVATION_CHECKPOINTING": (
         "--fsdp_activation_checkpointing true",
@@ -32,11 +32,11 @@ _OPTIONS = {  # that would do nothing, and are not known by their default
 def make_accelerator(config: Config) -> Accelerator:
     """Return the device and precision of a run.
 
-    Where there are several processes it joins them.
+    With several processes it joins them.
 
     Raises:
-        InputError: CUDA was asked for and there is none, the device does not compute so (fp16 on a CPU, bf16 on an old
-            GPU), or a launch that cannot be followed.
+        InputError: CUDA was requested and there is none, the device does not compute so (fp16 on a CPU, bf16 on an old
+            GPU), or an unsupported launch.
     """
     check_launch(config)
     training, on_cpu = config.training, computing_device(config.training).type == "cpu"
@@ -47,10 +47,10 @@ def make_accelerator(config: Config) -> Accelerator:
 
 
 def check_launch(config: Config, environment: Mapping[str, str] = os.environ) -> None:
-    """Refuse ways to share a model that this program does not know, and runs that FSDP2 cannot share.
+    """Refuse unsupported ways to shard a model, and runs that FSDP2 cannot shard.
 
     Raises:
-        InputError: Any of these, with the way out.
+        InputError: Any of these, with a fix.
     """
     for name, way in _OTHER_WAYS.items():
         if _is_set(environment, name):
@@ -67,12 +67,12 @@ def check_launch(config: Config, environment: Mapping[str, str] = os.environ) ->
 
 
 def shares_weights(environment: Mapping[str, str] = os.environ) -> bool:
-    """Return whether the launch asks for FSDP."""
+    """Return whether the launch requests FSDP."""
     return _is_set(environment, "ACCELERATE_USE_FSDP")
 
 
 def _check_run(config: Config) -> None:
-    """Refuse runs whose weights FSDP2 cannot share."""
+    """Refuse runs whose weights FSDP2 cannot shard."""
     if config.adapter.kind == "lora":
         raise _refusal(
             "FSDP with adapter.kind lora",

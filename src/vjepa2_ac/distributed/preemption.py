@@ -21,11 +21,11 @@ from types import FrameType
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 HANG_UP = signal.SIGHUP
-EXIT_STATUS = 75  # sysexits.h, EX_TEMPFAIL: the same command goes on
+EXIT_STATUS = 75  # sysexits.h, EX_TEMPFAIL: the same command resumes
 
 
 class StoppedError(Exception):
-    """A run stopped because it was asked to; its checkpoint is written, and the same command goes on from there.
+    """A run stopped on request; its checkpoint is written, and the same command resumes from it.
 
     Args:
         folder: The run's folder.
@@ -39,7 +39,7 @@ class StoppedError(Exception):
 
 
 class StopRequest:
-    """Says whether a signal has asked to stop, and which.
+    """Records whether a signal has requested a stop, and which.
 
     Args:
         same_within_s: Another signal within this time is the same request: `timeout` and some launchers signal both the
@@ -53,11 +53,11 @@ class StopRequest:
 
     @property
     def number(self) -> int:
-        """The signal's number; 0: none came."""
+        """The signal's number; 0: none."""
         return 0 if self.reason is None else signal.Signals[self.reason].value
 
     def take(self, number: int, _frame: FrameType | None) -> None:
-        """Note a first signal; let a second one do what it does by default."""
+        """Record a first signal; give a second one its default effect."""
         if self.reason is None:
             self.reason, self._came_at = signal.Signals(number).name, time.monotonic()
         elif number != HANG_UP and time.monotonic() - self._came_at >= self._same_within_s:
@@ -67,10 +67,10 @@ class StopRequest:
 
 @contextlib.contextmanager
 def stop_on_signals(*, same_within_s: float = 0.5) -> Iterator[StopRequest]:
-    """Note signals instead of dying of them, as long as the context lasts; afterwards they do what they did before.
+    """Record signals instead of being killed by them, within the context; afterwards the old handlers are restored.
 
-    Outside the main thread, where Python takes no signals, and for signals that the process was started to ignore
-    (`nohup`, a shell's `&`), nothing is changed.
+    Nothing changes outside the main thread, where Python handles no signals, and for signals that the process was
+    started to ignore (`nohup`, a shell's `&`).
     """
     request = StopRequest(same_within_s)
     if threading.current_thread() is not threading.main_thread():

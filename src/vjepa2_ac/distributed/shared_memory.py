@@ -16,13 +16,13 @@ from vjepa2_ac.distributed.collectives import all_gather_object
 from vjepa2_ac.episode import Batch
 
 SHARED_MEMORY = "/dev/shm"  # noqa: S108  # where PyTorch puts them on Linux
-_MOST_CLIPS_READ = 8  # one is read; the others are for where data.broken_episodes passes over it
+_MOST_CLIPS_READ = 8  # one is needed; the others replace clips that data.broken_episodes skips
 _GIGABYTE, _MEGABYTE = 10**9, 10**6
 
 
 @runtime_checkable
 class FileSystem(Protocol):
-    """What is asked of `os.statvfs_result`."""
+    """The used part of `os.statvfs_result`."""
 
     @property
     def f_bavail(self) -> int:
@@ -38,14 +38,14 @@ class FileSystem(Protocol):
 def warn_if_shared_memory_is_small(
     config: Config, dataset: Dataset, batch_of_frames: Batch, accelerator: Accelerator, note: Callable[[str], None]
 ) -> None:
-    """Note before the first step where batches of this run may not fit. All processes have to call.
+    """Warn before the first step if batches of this run may not fit. All processes have to call.
 
     Args:
         config: The run.
         dataset: Its clips.
-        batch_of_frames: A batch of them with frames, from before they came from a cache of latents.
-        accelerator: Tells how many processes are on this machine.
-        note: Told.
+        batch_of_frames: A batch of them as frames, also where they come from a latent cache now.
+        accelerator: Used to count the processes on this machine.
+        note: Called with the warning.
     """
     here = platform.node()
     processes = all_gather_object(accelerator, here).count(here)
@@ -62,22 +62,22 @@ def warn_if_shared_memory_is_small(
 def small_shared_memory(
     config: Config, clip_bytes: int, processes: int = 1, *, statvfs: Callable[[str], FileSystem] | None = None
 ) -> str | None:
-    """Return what to tell where shared memory may not hold the batches that are prepared ahead; None where it does.
+    """Return a warning if shared memory may not hold the prefetched batches; None if it does.
 
-    A validation that is read by workers, too, comes while those of training wait.
+    Validation batches are loaded by workers, too, while those of training wait.
 
     Args:
         config: The run.
-        clip_bytes: Of one clip as it leaves the loader.
+        clip_bytes: Of one clip from the loader.
         processes: Of the run, on this machine.
-        statvfs: Tells what a file system has free; None: the system's.
+        statvfs: Returns the free space of a file system; None: the system's.
     """
     data, validation = config.data, config.validation
     clips = config.training.batch_size + validation.batch_size * (validation.clips >= CLIPS_WORTH_WORKERS)
     needed = processes * data.workers * (data.prefetch + 1) * clips * clip_bytes
     try:
         found = (statvfs or os.statvfs)(SHARED_MEMORY)
-    except OSError:  # another system has none
+    except OSError:  # other systems have none
         return None
     free = found.f_bavail * found.f_frsize
     if needed <= free:

@@ -25,7 +25,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
     """Return the RGB pixels of a PNG or JPEG file.
 
     Raises:
-        InputError: There is no such file, it cannot be read, or it is no such image.
+        InputError: There is no such file, it cannot be read, or it is neither PNG nor JPEG.
     """
     try:
         data = read_bytes(path)
@@ -35,7 +35,7 @@ def read_image(path: str | Path) -> UInt8[np.ndarray, "height width 3"]:
 
 
 def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Return the RGB pixels of PNG or JPEG bytes; transparency is left out.
+    """Return the RGB pixels of PNG or JPEG bytes; transparency is dropped.
 
     Raises:
         InputError: They are neither, damaged, too large, or of more than 8 bits a channel.
@@ -43,7 +43,7 @@ def decode_image(data: bytes, where: str) -> UInt8[np.ndarray, "height width 3"]
     try:
         if data.startswith(_JPEG):
             return _jpeg(data, where)
-        with PngImageFile(io.BytesIO(data)) as image:  # which reads the header only
+        with PngImageFile(io.BytesIO(data)) as image:  # reads the header only
             require_bounded(image.height, image.width, where)
             return _as_rgb(image)
     except (OSError, ValueError, SyntaxError, struct.error, zlib.error, EOFError, IndexError) as error:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from vjepa2_ac.errors import InputError
 
-MOST_PIXELS = 100_000_000  # a robot's camera has a tenth of that; a file of 600 bytes may claim forty times as many
+MOST_PIXELS = 100_000_000  # a robot's camera has a tenth; a file of 600 bytes may claim forty times as many
 _MOST_BYTES = 1 << 32  # of images that are decoded together
-_MOST_WORK = 2_000_000_000  # pixels of a JPEG, times the scans that each goes through
-_SCAN = b"\xff\xda"  # in a JPEG's data these bytes never stand
+_MOST_WORK = 2_000_000_000  # pixels of a JPEG times its scans
+_SCAN = b"\xff\xda"  # these bytes never occur in a JPEG's data
 
 
 def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> None:
@@ -39,10 +39,10 @@ def require_bounded(height: int, width: int, where: str, *, count: int = 1) -> N
 
 
 def require_few_scans(image: bytes, height: int, width: int, where: str) -> None:
-    """Refuse a JPEG that goes over its pixels again and again: a short file may ask for days of work.
+    """Refuse a JPEG with too many scans of its pixels: a short file may require days of work.
 
     Raises:
-        InputError: It does.
+        InputError: It has.
     """
     scans = bytes(image).count(_SCAN)
     if scans * height * width > _MOST_WORK:

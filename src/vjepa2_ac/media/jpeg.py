@@ -13,7 +13,7 @@ from vjepa2_ac.media.image_size import require_bounded, require_few_scans
 
 
 def decode_jpegs(images: Sequence[bytes], steps: Sequence[int], where: str) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return images as RGB, equal to TensorFlow's decoder bit for bit.
+    """Return images as RGB, bit for bit as TensorFlow's decoder.
 
     Args:
         images: One JPEG or more, all of one size.
@@ -59,7 +59,7 @@ def _no_jpeg(image: bytes, step: int, where: str, error: ValueError) -> InputErr
 
 
 def looks_like_jpeg(image: bytes) -> bool:
-    """Return whether bytes begin and end as a JPEG does."""
+    """Return whether bytes begin and end like a JPEG."""
     return image.startswith(b"\xff\xd8\xff") and image.endswith(b"\xff\xd9")
 
 

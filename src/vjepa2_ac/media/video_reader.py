@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from av.video.reformatter import VideoReformatter
     from av.video.stream import VideoStream
 
-_DEMUXER = "mp4"  # by name: libav would otherwise follow play lists to other files
+_DEMUXER = "mp4"  # by name: otherwise libav follows playlists to other files
 _STRICT = {
     "err_detect": "crccheck+bitstream+buffer+explode",  # an error rather than a guessed frame
     "max_pixels": str(MOST_PIXELS),
@@ -40,7 +40,7 @@ _FIX = "Copy the file again, or leave the episode out"
 
 @dataclass(frozen=True)
 class Clock:
-    """Where an episode's frames lie in a file that holds many: step k is shown at start_s + k / rate_hz."""
+    """Where an episode's frames are in a file of many episodes: step k is shown at start_s + k / rate_hz."""
 
     start_s: float
     rate_hz: float
@@ -49,15 +49,15 @@ class Clock:
 def read_frames(
     file: str | Path | ByteReader, steps: Sequence[int], *, where: str, clock: Clock | None = None
 ) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return the RGB frames at these places of a video, in this order; places may repeat.
+    """Return the RGB frames at these positions of a video, in this order; positions may repeat.
 
     Decoding starts at the key frame before a requested frame; only requested frames become RGB.
 
     Args:
-        file: Local path, URL, or a file that is open to read; an open one stays open.
-        steps: Places in the order in which frames are shown, the first being 0; with a clock, its steps.
-        where: The file and its episode, as an error names them.
-        clock: The times of the steps, where places do not tell the frames.
+        file: Local path, URL, or a file open for reading, which stays open.
+        steps: Positions in display order, from 0; with a clock, its steps.
+        where: The file and its episode, for messages.
+        clock: The times of the steps, where positions do not identify the frames.
 
     Raises:
         InputError: Not a video, damaged, without such frames, or of a codec that cannot be decoded.
@@ -76,7 +76,7 @@ def read_frames(
 
 
 def count_frames(file: str | Path | ByteReader, *, where: str) -> int:
-    """Return how many frames a video shows: what its index says, counted packet by packet where it has none.
+    """Return how many frames a video shows: from its index, or by counting packets if it has none.
 
     Raises:
         InputError: Not a video, or damaged.
@@ -112,7 +112,7 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
 
 
 def _require_readable(path: str | Path, where: str) -> None:
-    """Let the system say what it has against a local file, before libav says it in words for damage."""
+    """Raise the system's error for a local file, before libav reports it as damage."""
     try:
         storage.open_to_read(path).close()
     except OSError as error:
@@ -137,11 +137,11 @@ def _video_of(container: InputContainer, converter: VideoReformatter, where: str
 
 @dataclass(frozen=True)
 class _Video:
-    """A video that is open. Times are in units of the stream; its index knows times of decoding, not of showing."""
+    """An open video. Times are in units of the stream; its index has decoding times, not presentation times."""
 
     container: InputContainer
     stream: VideoStream
-    converter: VideoReformatter  # one for all frames: making one takes as long as using it
+    converter: VideoReformatter  # one for all frames: creating one takes as long as using it
     where: str
 
     @property
@@ -150,25 +150,25 @@ class _Video:
         return 0 < self.stream.frames == len(self.stream.index_entries)
 
     def stored_times(self) -> list[int]:
-        """Return when each frame is decoded, from the header: when it is shown, too, if no frame is moved."""
+        """Return the decoding time of each frame, from the header; it is the presentation time if none is reordered."""
         return [entry.timestamp for entry in self.stream.index_entries if not entry.is_discard]
 
     def shown_times(self) -> list[int]:
-        """Return when each frame is shown, in order; goes through the whole file, decoding nothing."""
+        """Return the presentation time of each frame, in order; reads the whole file without decoding."""
         return sorted(int(packet.pts) for packet in self.packets() if packet.pts is not None and not packet.is_discard)
 
     def packets(self, seek_to: int = _START) -> Iterator[Packet[VideoStream]]:
-        """Yield what is stored, from the start or from a key frame."""
+        """Yield packets, from the start or from a key frame."""
         self.container.seek(seek_to, stream=self.stream, backward=True)
         yield from (packet for packet in self.container.demux(self.stream) if packet.dts is not None)
 
     def is_reordered(self) -> bool:
-        """Return whether frames are shown in another order than they are stored, as far as the start tells."""
+        """Return whether frames are shown in another order than stored, judged by the start of the file."""
         first = next(self.packets(), None)
         return bool(self.stream.codec_context.has_b_frames) or first is None or first.pts != first.dts
 
     def targets_at(self, steps: Sequence[int]) -> list[int]:
-        """Return the times at which the frames at these places are shown."""
+        """Return the presentation times of the frames at these positions."""
         in_header = self.is_indexed and not self.is_reordered()
         times = self.stored_times() if in_header else self.shown_times()
         if max(steps) >= len(times):
@@ -207,15 +207,13 @@ class _Video:
         return wanted.frames
 
     def _decode_run(self, target: int, wanted: FrameTargets) -> None:
-        """Decode from the key frame before a target as long as going on costs less than the next seek."""
+        """Decode from the key frame before a target for as long as that costs less than the next seek."""
         decoder = self.stream.codec_context
         delay: int | None = None
         for packet in self._packets_before(target):
             decoded = int(packet.dts or 0)
             shown = decoded if packet.pts is None else int(packet.pts)
-            delay = (
-                shown - decoded if delay is None else delay
-            )  # of the key frame; the others of the file have the same
+            delay = shown - decoded if delay is None else delay  # of the key frame; all of the file have the same
             wanted.feed(shown)
             self._keep(decoder.decode(packet), wanted)
             if wanted.is_fed(target):
@@ -238,7 +236,7 @@ class _Video:
         yield from self.packets()
 
     def _key_frame_before(self, time: int) -> int:
-        """Return when the last key frame that is decoded no later than a time is decoded."""
+        """Return the decoding time of the last key frame that is decoded no later than a time."""
         place = self.stream.index_entries.search_timestamp(time, backward=True, any_frame=False)
         return int(self.stream.index_entries[place].timestamp) if place >= 0 else _START
 
@@ -260,7 +258,7 @@ class _Video:
 
 
 def require_decoder(where: str) -> None:
-    """See that videos can be decoded, before anything is done with a set that has some.
+    """Check that videos can be decoded, before a data set with videos is used.
 
     Raises:
         UnreachableError: PyAV is not installed.

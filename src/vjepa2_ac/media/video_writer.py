@@ -17,12 +17,12 @@ _QUALITY = "20"  # x264's constant rate factor: text stays sharp
 
 
 def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height width 3"]], *, rate_hz: float) -> Path:
-    """Write RGB frames as a video and return its path; an odd last row or column of pixels is left out.
+    """Write RGB frames as a video and return its path; an odd last row or column of pixels is dropped.
 
     Args:
-        path: A local file; missing folders are made.
+        path: A local file; missing folders are created.
         frames: Of one size, at least one.
-        rate_hz: How many are shown in a second.
+        rate_hz: Frames per second.
 
     Raises:
         InputError: PyAV is not installed.
@@ -34,7 +34,7 @@ def write_video(path: str | Path, frames: Iterable[UInt8[np.ndarray, "height wid
         stream = container.add_stream(
             "libx264", rate=Fraction(rate_hz).limit_denominator(1000), options={"crf": _QUALITY, "preset": "medium"}
         )
-        stream.pix_fmt = "yuv420p"  # what browsers can show
+        stream.pix_fmt = "yuv420p"  # supported by browsers
         for frame in frames:
             even = frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2]
             if size is None:

@@ -11,9 +11,9 @@ from vjepa2_ac.errors import InputError
 
 
 def first_not_finite(tensors: Mapping[str, Tensor]) -> str | None:
-    """Return the name of the first tensor that holds NaN or infinity; None where there is none.
+    """Return the name of the first tensor that holds NaN or infinity; None if there is none.
 
-    Least and largest tell it in one pass, without memory of their own: a second for a thousand million numbers.
+    Minimum and maximum show it in one pass, without extra memory: a second for a thousand million numbers.
     """
     for name, value in tensors.items():
         if value.is_floating_point() and value.numel() and not torch.stack(torch.aminmax(value)).isfinite().all():
@@ -26,8 +26,8 @@ def require_finite(tensors: Mapping[str, Tensor], *, where: str, fix: str) -> No
 
     Args:
         tensors: By name.
-        where: Whose they are.
-        fix: The way out, as a sentence.
+        where: Their owner, for messages.
+        fix: How to fix it, as a sentence.
 
     Raises:
         InputError: Names the first such tensor.

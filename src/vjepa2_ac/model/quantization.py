@@ -22,16 +22,16 @@ _FP8_FROM = (8, 9)  # compute capability
 
 
 def quantized_copy(world_model: WorldModel, kind: Kind, *, where: str) -> WorldModel:
-    """Return a model for inference that shares the encoder; an adapter is merged into it. The given one stays as it is.
+    """Return a model for inference that shares the encoder; with the adapter merged. The given one is not changed.
 
     Args:
-        world_model: On the device that it is to compute on.
+        world_model: On the device on which it will compute.
         kind: int8, or fp8 (e4m3).
-        where: The setting that asks for it.
+        where: The setting that requests it.
 
     Raises:
-        InputError: torchao is not installed, the device does not compute so, the weights are not bfloat16, or a layer
-            cannot be in 8 bits.
+        InputError: torchao is not installed, the device does not support it, the weights are not bfloat16, or a layer
+            cannot be quantized.
     """
     require_8_bits(kind, base_dtype(world_model), world_model.device, where=where)
     quantize, config = _torchao(kind, where)
@@ -42,16 +42,16 @@ def quantized_copy(world_model: WorldModel, kind: Kind, *, where: str) -> WorldM
 
 
 def require_8_bits(kind: Kind, dtype: torch.dtype, device: torch.device, *, where: str) -> None:
-    """Refuse to compute in 8 bits where that cannot be: known before there are weights.
+    """Refuse to compute in 8 bits where that is impossible; needs no weights.
 
     Args:
         kind: int8 or fp8.
         dtype: Of the weights that would be quantized.
-        device: What would compute.
-        where: The setting that asks for it.
+        device: The device.
+        where: The setting that requests it.
 
     Raises:
-        InputError: Says which of all this does not do, and what to set.
+        InputError: Names the unsupported part, and what to set.
     """
     if dtype != torch.bfloat16:
         raise InputError(
@@ -71,7 +71,7 @@ def require_8_bits(kind: Kind, dtype: torch.dtype, device: torch.device, *, wher
 
 
 def _torchao(kind: Kind, where: str) -> tuple[Any, Any]:
-    """Return what quantizes, and the way asked for."""
+    """Return torchao's quantizer, and its configuration."""
     try:
         from torchao.quantization import (
             Float8DynamicActivationFloat8WeightConfig,
@@ -91,7 +91,7 @@ def _torchao(kind: Kind, where: str) -> tuple[Any, Any]:
 
 
 def _require_everywhere(blocks: nn.Module, kind: Kind, where: str) -> None:
-    """Refuse layers that torchao passes over without a word: fp8 has products of multiples of 16 only."""
+    """Refuse layers that torchao skips silently: fp8 supports multiples of 16 only."""
     for name, layer in blocks.named_modules():
         if isinstance(layer, nn.Linear) and type(layer.weight.data) is torch.Tensor:
             raise InputError(

@@ -32,7 +32,7 @@ logger = logging.getLogger(__name__)
 STATE = "state.json"
 ADAPTER = "adapter"  # a folder: what `model.adapter.lora.save_trained` writes
 OPTIMIZER = "optimizer.pt"
-FETCHING = ".fetching-"  # a checkpoint that comes from elsewhere, see `runs.mirror.fetch`
+FETCHING = ".fetching-"  # a checkpoint being fetched, see `runs.mirror.fetch`
 
 _WRITING = ".writing-"
 _NAME = re.compile(r"step-([0-9]{8,})")
@@ -44,34 +44,34 @@ Count = Annotated[int, Field(ge=0, lt=2**63)]
 
 @dataclass(frozen=True)
 class RunState:
-    """Where a run stands. Data order, learning rate and random numbers are functions of the step."""
+    """Progress of a run. Data order, learning rate and random numbers are functions of the step."""
 
     step: Count  # optimizer steps done
-    run_id: str = ""  # a random name that stays with the run for good, wherever it goes on
-    clips_done: Count = 0  # place in the row of clips of the whole run
-    clips_per_step: PositiveInt | None = None  # of all processes together
+    run_id: str = ""  # a random name that stays with the run wherever it is resumed
+    clips_done: Count = 0  # position in the sequence of clips of the whole run
+    clips_per_step: PositiveInt | None = None  # of all processes
     clips_asked: PositiveInt | None = None  # of one process, by the config: batch_size * accumulation
     processes: PositiveInt = 1
-    broken: Mapping[str, str] = field(default_factory=dict)  # episodes that clips could not be read from, and why
-    windows: Count | None = None  # clips of an epoch: with another number, their order is another
-    best_step: Count | None = None  # the validation that went best, where checkpoint.keep_best is set
+    broken: Mapping[str, str] = field(default_factory=dict)  # episodes whose clips could not be read, and why
+    windows: Count | None = None  # clips of an epoch: their order depends on the number
+    best_step: Count | None = None  # the best validation, if checkpoint.keep_best is set
     best_error: Annotated[float, Field(allow_inf_nan=False)] | None = None
-    measured_on: Mapping[str, str] | None = None  # what validation errors are of, see `training.best_checkpoint`
+    measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.best_checkpoint`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
 
     def measured(self, error: float) -> RunState:
-        """Return the state after a validation at its step: another one only where that went better than any before."""
+        """Return the state after a validation at its step: changed only if it was better than all before."""
         if not math.isfinite(error) or (self.best_error is not None and error >= self.best_error):
             return self
         return replace(self, best_step=self.step, best_error=error)
 
 
 class CheckpointClock:
-    """Says when the next checkpoint is due: by optimizer steps, and by minutes since the last one.
+    """Schedule of checkpoints: by optimizer steps, and by minutes since the last one.
 
     Args:
         config: How often.
-        now_s: Tells the time, in seconds since whenever.
+        now_s: Returns the time in seconds, from any origin.
     """
 
     def __init__(self, config: CheckpointConfig, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -84,7 +84,7 @@ class CheckpointClock:
         return by_time or step % self._config.every == 0
 
     def restart(self) -> None:
-        """A checkpoint was written now."""
+        """Record that a checkpoint was written now."""
         self._last_s = self._now_s()
 
 
@@ -94,20 +94,20 @@ def checkpoint_name(step: int) -> str:
 
 
 def step_of(name: str) -> int | None:
-    """Return the step of a checkpoint by the name of its folder; None where checkpoints are called otherwise."""
+    """Return the step of a checkpoint by the name of its folder; None if the name is no checkpoint's."""
     found = _NAME.fullmatch(name)
     return int(found[1]) if found and name == checkpoint_name(int(found[1])) else None
 
 
 def listed(folder: Path) -> list[Path]:
-    """Return the checkpoints in a folder by their steps, the newest last, whole or damaged; of no folder, none."""
+    """Return the checkpoints in a folder, sorted by step, complete or damaged; none if there is no folder."""
     there = folder.iterdir() if folder.is_dir() else ()
     found = [path for path in there if step_of(path.name) is not None and path.is_dir()]
     return sorted(found, key=lambda path: step_of(path.name) or 0)
 
 
 def remove_leavings(folder: Path) -> None:
-    """Remove what starts of this run that were killed left by halves. Nobody else may be at work there."""
+    """Remove the incomplete files of killed starts of this run. No other process may write there."""
     for beginning in (_WRITING, FETCHING):
         for path in folder.glob(f"{beginning}*"):
             if step_of(path.name.removeprefix(beginning)) is not None:
@@ -115,27 +115,27 @@ def remove_leavings(folder: Path) -> None:
 
 
 def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path], None], *, keep: int) -> Path:
-    """Write a checkpoint whole or not at all, then remove all but the newest `keep` and the best.
+    """Write a checkpoint atomically, then remove all but the newest `keep` and the best.
 
     Args:
         folder: The run's checkpoint folder.
-        state: Where the run stands.
-        write_files: Writes weights and optimizer state into the folder it is given.
-        keep: How many of the newest checkpoints stay; that of `state.best_step` stays besides.
+        state: Progress of the run.
+        write_files: Called with a folder, into which it writes weights and optimizer state.
+        keep: How many of the newest checkpoints stay; that of `state.best_step` stays, too.
 
     Raises:
-        InputError: The folder cannot be written (full disk, no permission). Older checkpoints stay as they are.
+        InputError: The folder cannot be written (full disk, no permission). Older checkpoints are not changed.
     """
     final = folder / checkpoint_name(state.step)
     temporary = folder / f"{_WRITING}{final.name}"
     try:
-        remove_leavings(folder)  # they need the room
+        remove_leavings(folder)  # they occupy space
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir(parents=True)
         write_files(temporary)
         (temporary / STATE).write_text(json.dumps(asdict(state)))
         write_manifest(temporary)
-        for stale in listed(folder):  # damaged ones that were passed over; those steps are being done again
+        for stale in listed(folder):  # damaged ones that were skipped; their steps are being repeated
             if (step_of(stale.name) or 0) >= state.step:
                 _remove(stale)
         temporary.rename(final)
@@ -152,10 +152,10 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
 
 
 def newest_checkpoint(folder: Path) -> Path | None:
-    """Return the newest checkpoint that is whole, None where there are none; damaged ones are named in a warning.
+    """Return the newest complete checkpoint, None if there are none; damaged ones are named in a warning.
 
     Raises:
-        InputError: There are checkpoints, and every one is damaged.
+        InputError: There are checkpoints, and all are damaged.
     """
     found = listed(folder)
     for path in reversed(found):
@@ -173,17 +173,17 @@ def newest_checkpoint(folder: Path) -> Path | None:
 
 
 def find_damage(checkpoint: Path, name: str | None = None) -> str | None:
-    """Return what is wrong with a checkpoint, or None when every file is what the manifest says.
+    """Return what is wrong with a checkpoint, or None if every file matches the manifest.
 
     Args:
         checkpoint: Its folder.
-        name: What it is called, where its folder is called otherwise.
+        name: Its name, if its folder has another.
     """
     return verify_manifest(checkpoint, needed={STATE}) or _another_step(checkpoint, name or checkpoint.name)
 
 
 def read_state(checkpoint: Path) -> RunState:
-    """Return where the run stood when the checkpoint was written; a best one that is gone or damaged is no best."""
+    """Return the progress of the run at a checkpoint, without a best checkpoint that is missing or damaged."""
     state = written_state(checkpoint)
     if (
         state.best_step in {None, state.step}
@@ -194,7 +194,7 @@ def read_state(checkpoint: Path) -> RunState:
 
 
 def written_state(checkpoint: Path) -> RunState:
-    """Return where the run stood, as it was written, whatever became of the best checkpoint since.
+    """Return the progress of the run as it was written, without checking the best checkpoint.
 
     Raises:
         InputError: The file is missing or damaged, or of an older version of this program.
@@ -211,7 +211,7 @@ def written_state(checkpoint: Path) -> RunState:
 
 
 def _another_step(checkpoint: Path, name: str) -> str | None:
-    """Return that a checkpoint is the copy of another one, whose name says another step than its state does."""
+    """Return the error of a checkpoint that is a copy of another one: its name and its state differ in the step."""
     try:
         step = read_json_object(checkpoint / STATE, allow_nan=True).get("step")
     except (OSError, InputError) as error:
@@ -229,6 +229,6 @@ def _prune(folder: Path, keep: int, best_step: int | None) -> None:
 
 def _remove(checkpoint: Path) -> None:
     if checkpoint.is_symlink():
-        checkpoint.unlink()  # what it leads to is not this run's
+        checkpoint.unlink()  # its target is not this run's
     else:
         shutil.rmtree(checkpoint)

@@ -15,7 +15,7 @@ _MOST_DIGITS = 18  # of a number of steps
 
 @dataclass(frozen=True)
 class SelectedCheckpoint:
-    """A whole checkpoint, and what it was chosen by."""
+    """A complete checkpoint, and how it was selected."""
 
     path: Path
     by: str  # newest, best, or a step
@@ -26,14 +26,14 @@ class SelectedCheckpoint:
 
 
 def select_checkpoint(run: Path, by: str = NEWEST) -> SelectedCheckpoint:
-    """Return a whole checkpoint of a run.
+    """Return a complete checkpoint of a run.
 
     Args:
         run: The run's folder.
         by: newest; best (by validation, see `checkpoint.keep_best`); or a number of optimizer steps.
 
     Raises:
-        InputError: There is no such checkpoint, or it is damaged; those that there are are named.
+        InputError: There is no such checkpoint, or it is damaged; names the existing ones.
     """
     folder = run / CHECKPOINTS
     newest = newest_checkpoint(folder)

@@ -74,7 +74,7 @@ _FREE_TO_CHANGE = (
 
 
 def check_run_folder(config: Config, *, allow_config_change: bool = False) -> None:
-    """See that the run's folder is free, or belongs to this very config, and can be written. Changes nothing.
+    """Check that the run's folder is free, or belongs to this config, and can be written. Changes nothing.
 
     Args:
         config: The run.
@@ -102,7 +102,7 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
 
 
 def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool = False) -> Path:
-    """Create the run's folder, or go on in it, and note this start's versions.
+    """Create the run's folder, or resume in it, and record this start's versions.
 
     Args:
         config: The run.

@@ -22,16 +22,16 @@ class TrainedRun:
     config: Config
     world_model: WorldModel
     checkpoint: Path
-    chosen: str  # which checkpoint it is, in words
+    chosen: str  # which checkpoint it is, as text
 
 
 def load_run(folder: Path, checkpoint: str = NEWEST, config: Config | None = None) -> TrainedRun:
-    """Load the model of a run: its base with the trained weights of a whole checkpoint.
+    """Load the model of a run: its base with the trained weights of a complete checkpoint.
 
     Args:
         folder: The run.
         checkpoint: newest, best, or a number of optimizer steps; see `runs.checkpoint_selection`.
-        config: Its own with other settings of how it is loaded; None: its own.
+        config: The run's config, with changed settings for loading; None: unchanged.
 
     Raises:
         InputError: Not the folder of a run, no such checkpoint, or its base cannot be loaded.

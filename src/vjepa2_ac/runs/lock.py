@@ -30,10 +30,10 @@ _TAKEN = frozenset({errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES})
 
 
 class RunLock:
-    """The right to write into a run's folder, held from `take` to the end of the `with` block.
+    """A lock for writing into a run's folder, held from `take` to the end of the `with` block.
 
     Args:
-        folder: The run's folder; `take` makes it where it is not there.
+        folder: The run's folder; `take` creates it if needed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -41,12 +41,12 @@ class RunLock:
         self._file: TextIO | None = None
 
     def take(self) -> None:
-        """Take the lock; nothing happens where it is held already.
+        """Take the lock; does nothing if it is held already.
 
-        On a file system that has no such locks the run goes on without one, with a warning.
+        On a file system without such locks the run continues without one, with a warning.
 
         Raises:
-            InputError: Another process holds it, which is named; or the folder cannot be written.
+            InputError: Another process, which is named, holds it; or the folder cannot be written.
         """
         if self._file is not None:
             return
@@ -74,7 +74,7 @@ class RunLock:
         return os.fdopen(handle, "a+", encoding="utf-8")
 
     def release(self) -> None:
-        """Let others have it."""
+        """Release the lock."""
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -86,7 +86,7 @@ class RunLock:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Let others have it."""
+        """Release the lock."""
         self.release()
 
     def _sign(self) -> None:
@@ -99,12 +99,12 @@ class RunLock:
 
 
 def _holder(file: TextIO) -> str:
-    """Return who signed the lock, in words."""
+    """Return the holder of the lock, as text."""
     try:
         file.seek(0)
         who = json_object(file.read(_MOST_CHARACTERS), where=LOCK)
         return f"process {who['process']} on {who['host']}, since {who['since']}"
-    except (OSError, ValueError, KeyError, InputError):  # it is signing just now
+    except (OSError, ValueError, KeyError, InputError):  # it is just writing its name
         return "another process"
 
 

@@ -34,10 +34,10 @@ def write_manifest(folder: Path) -> None:
 
 
 def verify_manifest(folder: Path, needed: Set[str]) -> str | None:
-    """Return what is wrong with a sealed folder, or None when every file is what the manifest says.
+    """Return what is wrong with a sealed folder, or None if every file matches the manifest.
 
     Args:
-        folder: The folder. Files that the manifest does not name are nobody's matter.
+        folder: The folder. Files that the manifest does not name are ignored.
         needed: Files that the manifest must name.
     """
     try:
@@ -59,10 +59,10 @@ def verify_manifest(folder: Path, needed: Set[str]) -> str | None:
 
 
 def named_files(manifest: bytes) -> dict[str, str]:
-    """Return the files that a manifest names, in the folder that it lies in, with the SHA-256 of each.
+    """Return the files that a manifest names, in its own folder, with the SHA-256 of each.
 
     Raises:
-        InputError: It is not one, or names a file elsewhere.
+        InputError: It is no manifest, or names a file elsewhere.
     """
     files = json_object(manifest, where=MANIFEST).get("files")
     if not isinstance(files, dict) or not all(isinstance(digest, str) for digest in files.values()):

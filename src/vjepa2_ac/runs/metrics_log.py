@@ -30,11 +30,11 @@ _MOST_BYTES = 1 << 28
 
 
 class MetricsLog:
-    """Appends rows to `metrics.jsonl`, a JSON object per line, and hands them on to trackers.
+    """Appends rows to `metrics.jsonl`, a JSON object per line, and sends them to trackers.
 
     Args:
         run_dir: The run's folder.
-        first_step: Rows after this step are from a part of the run that is now done again; they are dropped.
+        first_step: Rows after this step belong to a part of the run that is being repeated; they are dropped.
         trackers: Closed with the metrics log; None: there are none.
 
     Raises:
@@ -47,7 +47,7 @@ class MetricsLog:
         with user_can_write(self.path):
             write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in kept).encode())
             self._handle = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW)
-        self._waiting = b""  # rows that could not be written yet; the first may be there by halves
+        self._waiting = b""  # rows that could not be written yet; the first may be partly written
         self._trackers = trackers or Trackers({})
 
     def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
@@ -59,15 +59,15 @@ class MetricsLog:
 
     @property
     def is_behind(self) -> bool:
-        """Whether rows wait that could not be written."""
+        """Whether there are rows that could not be written yet."""
         return bool(self._waiting)
 
     @contextmanager
     def before_a_checkpoint(self) -> Iterator[None]:
-        """Make the rows survive a power cut before the block does a checkpoint, which would go on without them.
+        """Sync the rows to the disk before the block writes a checkpoint, from which the run would resume without them.
 
-        The block runs in any case: the work of hours is worth more than a row. An older checkpoint that it removes may
-        make the room that a row needs.
+        The block runs in any case: hours of work matter more than a row. An older checkpoint that it removes may free
+        the space that a row needs.
 
         Raises:
             InputError: Rows can be written neither before nor after the block, or its own error.
@@ -81,7 +81,7 @@ class MetricsLog:
             raise _unwritable(self.path, error, f"{other.where}: {other.found}") from other
         if error and self._waiting:
             error = self._sync()
-        if error:  # also of a flush, after which the system may have forgotten what it was to write
+        if error:  # also of a flush, after which the system may have discarded the data
             raise _unwritable(self.path, error, "The checkpoint of this step is written")
 
     def _write(self) -> OSError | None:
@@ -119,7 +119,7 @@ class MetricsLog:
 
 
 def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a metrics.jsonl; a last line that a killed process left by halves is passed over.
+    """Yield the rows of a metrics.jsonl; an incomplete last line of a killed process is skipped.
 
     Raises:
         InputError: The file is too large to be one.
@@ -150,6 +150,6 @@ def _plain(value: Any) -> Any:
 
 
 def warnings_of(path: Path) -> list[str]:
-    """Return what was said of a run, by its metrics.jsonl."""
+    """Return the warnings of a run, from its metrics.jsonl."""
     rows = (row for row in read_metrics_log(path) if row.get("kind") == WARNING)
     return [row["text"] for row in rows if isinstance(row.get("text"), str)]

@@ -12,14 +12,14 @@ from vjepa2_ac.errors import InputError
 
 
 def refuse_links_out(run: Path, names: Iterable[str]) -> None:
-    """See that nothing that is to be written leads out of a run's folder.
+    """Check that no file to be written leads out of a run's folder.
 
     Args:
         run: The run's folder.
-        names: Of files and folders in it; parts of a path may be links as well.
+        names: Of files and folders in it; parts of a path may be links, too.
 
     Raises:
-        InputError: One is a link, or is behind one, that does.
+        InputError: One is, or is behind, a link that leads out.
     """
     home = run.resolve()
     for link in (link for name in names for link in _links(run, name)):
@@ -29,7 +29,7 @@ def refuse_links_out(run: Path, names: Iterable[str]) -> None:
 
 
 def refused_link(link: Path) -> InputError:
-    """Return what to tell of a link in a run's folder that is not followed."""
+    """Return the error of a link in a run's folder that is not followed."""
     target = _target(link)
     return InputError(
         where=str(link),
@@ -41,7 +41,7 @@ def refused_link(link: Path) -> InputError:
 
 
 def _links(run: Path, name: str) -> Iterator[Path]:
-    """Yield what is a link of `a/b/c`: `a`, `a/b`, `a/b/c`."""
+    """Yield the links among the parts of `a/b/c`: `a`, `a/b`, `a/b/c`."""
     path = run
     for part in Path(name).parts:
         path /= part
@@ -52,5 +52,5 @@ def _links(run: Path, name: str) -> Iterator[Path]:
 def _target(link: Path) -> Path | None:
     try:
         return link.resolve()
-    except (OSError, RuntimeError):  # a circle of links
+    except (OSError, RuntimeError):  # a cycle of links
         return None

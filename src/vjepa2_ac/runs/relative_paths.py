@@ -17,17 +17,17 @@ _PATHS = (DATA, RANGES, "data.cache_dir", "data.disk_cache.dir", BASE)
 
 
 def with_paths_from_start(config: Config, run: Path, *, needed: Sequence[str]) -> Config:
-    """Return a run's config in which paths that lead nowhere from here are seen from where the run was started.
+    """Return a run's config with relative paths that do not exist here resolved from the folder of the run's start.
 
-    The config in the run's folder stays as it is: to go on with a run is another matter, see `require_start_folder`.
+    The config in the run's folder is not changed. For resuming a run see `require_start_folder`.
 
     Args:
-        config: What `read_run_config` gave.
+        config: As `read_run_config` returns it.
         run: The run's folder.
-        needed: Paths that have to lead somewhere.
+        needed: Keys of paths that must exist.
 
     Raises:
-        InputError: One of these leads nowhere from there either.
+        InputError: One of these does not exist there either.
     """
     flat, elsewhere = config_as_flat_dict(config), _seen_from_start(config, run)
     for key in needed:
@@ -44,7 +44,7 @@ def with_paths_from_start(config: Config, run: Path, *, needed: Sequence[str]) -
 
 
 def require_start_folder(config: Config, run: Path) -> None:
-    """Refuse to go on with a run from another folder than its own, where its relative paths lead nowhere.
+    """Refuse to resume a run from another folder, where its relative paths do not exist.
 
     Raises:
         InputError: Names the folder.
@@ -60,11 +60,11 @@ def require_start_folder(config: Config, run: Path) -> None:
 
 
 def _seen_from_start(config: Config, run: Path) -> dict[str, str]:
-    """Return the paths, by their keys, that are there when seen from a folder in which the run was started."""
+    """Return the paths, by their keys, that exist relative to a folder in which the run was started."""
     found: dict[str, str] = {}
     flat = config_as_flat_dict(config)
     for key in _PATHS:
-        unread = key == RANGES and config.data.source == "latents"  # there it is but a name, part of the cache's key
+        unread = key == RANGES and config.data.source == "latents"  # there it is only a name, part of the cache's key
         if unread or not _leads_nowhere(flat[key]):
             continue
         there = next((start / flat[key] for start in start_folders(run) if (start / flat[key]).exists()), None)
@@ -74,7 +74,7 @@ def _seen_from_start(config: Config, run: Path) -> dict[str, str]:
 
 
 def _leads_nowhere(path: str | None) -> bool:
-    """Return whether this is a relative path, and there is nothing at it."""
+    """Return whether this is a relative path that does not exist."""
     if path is None or is_url(path) or path.startswith(BUILTIN):
         return False
     here = Path(path)

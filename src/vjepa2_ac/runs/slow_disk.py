@@ -20,10 +20,10 @@ STALLED_S = 60.0
 
 @contextmanager
 def warn_if_stalled(path: Path, *, after_s: float | None = None) -> Iterator[None]:
-    """Warn where the block, which writes a file, lasts longer than that; and, when it ends, how long it took.
+    """Warn if the block, which writes a file, lasts longer than `after_s`; and when it ends, how long it took.
 
     Args:
-        path: What is written.
+        path: The file.
         after_s: Seconds; None: a minute.
     """
     patience_s, begun_s, is_over = STALLED_S if after_s is None else after_s, time.monotonic(), threading.Lock()

@@ -22,7 +22,7 @@ def write_torch(value: object, file: BinaryIO) -> None:
     """Write tensors and plain values.
 
     Raises:
-        OSError: The disk is full, or another reason of the system's, which torch alone would hide.
+        OSError: The disk is full, or another system error, which torch itself would hide.
     """
     try:
         torch.save(value, file)
@@ -36,7 +36,7 @@ def read_torch(path: Path) -> Any:
     """Return the tensors and plain values of a file, on the CPU. Nothing in it is executed.
 
     Raises:
-        InputError: The file cannot be read, or holds more than tensors and plain values.
+        InputError: The file cannot be read, or contains more than tensors and plain values.
     """
     needed = "a file that this program wrote"
     try:
@@ -51,11 +51,11 @@ def read_torch(path: Path) -> Any:
 
 
 def _require_as_written(path: Path) -> None:
-    """Refuse other forms that torch reads, too: of those, a small file may take any memory.
+    """Refuse other formats that torch reads, too: a small file of these may take any memory.
 
     Raises:
         OSError: The file cannot be read.
-        ValueError: It is no archive, or its parts are compressed.
+        ValueError: It is no zip archive, or its parts are compressed.
     """
     with zipfile.ZipFile(path) as archive:
         if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):

@@ -11,19 +11,19 @@ from typing import Protocol, runtime_checkable
 
 logger = logging.getLogger(__name__)
 
-MOST_ROWS = 10_000  # that wait: some 15 MB
+MOST_ROWS = 10_000  # in the queue: some 15 MB
 
 
 @runtime_checkable
 class Tracker(Protocol):
-    """Takes metrics; may raise anything, and take any time."""
+    """A tracker; its methods may raise anything, and take any time."""
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
-        """Take the metrics of a row, named kind/metric, and its optimizer step."""
+        """Log the metrics of a row, named kind/metric, and its optimizer step."""
         ...
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write pending rows."""
         ...
 
 
@@ -31,24 +31,24 @@ Opening = Callable[[], Tracker]
 
 
 class TrackerThread:
-    """A tracker in its thread, which opens it, hands it row after row and closes it; it is warned of once.
+    """A tracker in its own thread, which opens it, sends it rows and closes it; problems are warned of once.
 
     Args:
-        name: What a person knows it by.
+        name: Its display name.
         opening: Opens it.
-        patience_s: After which it is said that it does not answer.
+        patience_s: After which a warning says that it does not answer.
     """
 
     def __init__(self, name: str, opening: Opening, *, patience_s: float) -> None:
         self._name, self._opening, self._patience_s = name, opening, patience_s
         self._rows: queue.SimpleQueue[tuple[Mapping[str, float], int] | None] = queue.SimpleQueue()
-        self._problem, self._since_s = "cannot be opened", time.monotonic()  # of the call that is under way
+        self._problem, self._since_s = "cannot be opened", time.monotonic()  # of the current call
         self._warned, self._dropped = False, 0
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
-        """Let a row wait for its turn."""
+        """Queue a row."""
         if not self._thread.is_alive():
             return
         if self._rows.qsize() < MOST_ROWS:
@@ -59,15 +59,15 @@ class TrackerThread:
             self._warn(f"no answer within {self._patience_s:g} s", "its metrics wait")
 
     def end(self) -> None:
-        """Let it close when it has all rows; does not wait."""
+        """Close it after the last row; does not wait."""
         self._rows.put(None)
 
     def wait(self, within_s: float, limit_s: float) -> None:
-        """Wait until it is closed, but no longer than that.
+        """Wait until it is closed, at most `within_s`.
 
         Args:
-            within_s: What is left of the limit.
-            limit_s: What to call it.
+            within_s: The rest of the limit.
+            limit_s: The limit, for the warning.
         """
         self._thread.join(within_s)
         if self._thread.is_alive():
@@ -87,7 +87,7 @@ class TrackerThread:
             after = "its last metrics may be missing there"
             self._call("did not close")
             tracker.close()
-        except BaseException as error:  # also what would end the program: a tracker never stops training
+        except BaseException as error:  # also SystemExit and the like: a tracker never stops training
             self._warn(_summary(error), after)
 
     def _call(self, problem: str) -> None:

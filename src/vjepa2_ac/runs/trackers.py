@@ -22,8 +22,8 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.folder import TENSORBOARD
 from vjepa2_ac.runs.tracker_thread import Opening, TrackerThread
 
-PATIENCE_S = 60.0  # after which it is said that a tracker does not answer
-CLOSING_S = 30.0  # how long the end of a run waits for all of them
+PATIENCE_S = 60.0  # after which a warning says that a tracker does not answer
+CLOSING_S = 30.0  # that the end of a run waits for all of them
 
 _INSTALL = {
     "tensorboard": "Run pip install -c constraints.txt -e .",
@@ -33,12 +33,12 @@ _INSTALL = {
 
 
 class Trackers:
-    """Those trackers of a run that work.
+    """The working trackers of a run.
 
     Args:
-        openings: By the name that a person knows it by, what opens a tracker.
-        opening_s: After which it is said that one does not answer; training does not wait for it.
-        closing_s: Longer than this none is waited for in the end, all together.
+        openings: Functions that open a tracker, by its display name.
+        opening_s: After which a warning says that one does not answer; training does not wait for it.
+        closing_s: Longest wait at the end, for all of them.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Trackers:
         self._guests = [TrackerThread(name, opening, patience_s=opening_s) for name, opening in openings.items()]
 
     def log(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
-        """Hand on a row: its numbers; lists, such as errors by horizon, number by number from 1."""
+        """Log the numbers of a row; lists, such as errors by horizon, number by number from 1."""
         numbers = {f"{kind}/{key}": value for key, value in _numbers(metrics).items()}
         for guest in self._guests:
             guest.log(numbers, step)
@@ -64,10 +64,10 @@ class Trackers:
 
 
 def require_installed(tracking: TrackingConfig) -> None:
-    """See that the libraries of the trackers are there.
+    """Check that the libraries of the trackers are installed.
 
     Raises:
-        InputError: One that was asked for is not installed.
+        InputError: A requested one is not installed.
     """
     asked = {
         "tensorboard": tracking.tensorboard,
@@ -85,13 +85,13 @@ def require_installed(tracking: TrackingConfig) -> None:
 
 
 def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int) -> Trackers:
-    """Open the trackers that a config asks for; where one cannot be opened, say so and do without it.
+    """Open the trackers of a config; one that cannot be opened is disabled with a warning.
 
     Args:
         config: The run.
         folder: Its folder, where TensorBoard and W&B write.
-        run_id: What the run is called for good, there too.
-        first_step: Steps that are done; TensorBoard forgets those after it, which are done again.
+        run_id: The run's permanent name, there, too.
+        first_step: Completed steps; TensorBoard drops rows after it, whose steps are repeated.
     """
     tracking = config.tracking
     openings: dict[str, Opening] = {}
@@ -119,12 +119,12 @@ class _TensorBoard:
 
 
 class _WeightsAndBiases:
-    """W&B drops rows of steps that it has already: what a resumed run does again are the same metrics."""
+    """W&B ignores rows of steps that it has already: a resumed run repeats the same metrics."""
 
     def __init__(self, config: Config, folder: Path, run_id: str) -> None:
         import wandb
 
-        # Output is not taken over: the console's bar would end up in there. Times are bounded where W&B can.
+        # Output is not captured: it would contain the console's progress bar. Times are bounded where W&B can.
         bounds: dict[str, Any] = {"init_timeout": 20.0, "login_timeout": 30.0, "finish_timeout": 20.0, "console": "off"}
         known = getattr(wandb.Settings, "model_fields", {})
         self._run: Any = wandb.init(
@@ -147,7 +147,7 @@ class _WeightsAndBiases:
 
 
 class _Trackio:
-    """trackio finds a run again by its name, which is therefore the run's id."""
+    """trackio identifies a run by its name, which is therefore the run's id."""
 
     def __init__(self, config: Config, run_id: str) -> None:
         import trackio

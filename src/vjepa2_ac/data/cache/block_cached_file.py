@@ -12,20 +12,20 @@ _BLOCK_BYTES = 128 << 10
 
 
 class BlockCachedFile(RangedFile):
-    """A file behind a URL to read and seek in; each block is fetched once on this machine.
+    """A seekable file behind a URL; each block is fetched once per machine.
 
-    The error of a fetch stays in `failure`: libraries that read through this object may wrap it in one of theirs.
+    The error of a fetch stays in `failure`: libraries that read through this object may wrap it in their own.
 
     Args:
         path: The URL.
-        version: Differs when the content does; blocks of another version are not used.
+        version: Changes with the content; blocks of another version are not used.
         size: The file's size.
-        kept: Where blocks stay on this machine.
+        cache: The local cache of blocks.
     """
 
-    def __init__(self, path: str, *, version: str, size: int, kept: DiskCache) -> None:
+    def __init__(self, path: str, *, version: str, size: int, cache: DiskCache) -> None:
         super().__init__(self._fetched, size)
-        self._path, self._cache = path, kept
+        self._path, self._cache = path, cache
         self._bytes, self._key = size, f"{path} {version} {size}"
         self.failure: Exception | None = None
 
@@ -39,7 +39,7 @@ class BlockCachedFile(RangedFile):
         return data[start - first * _BLOCK_BYTES :][:length]
 
     def _blocks_of(self, first: int, last: int) -> list[bytes]:
-        """Return blocks from the disk; those that lack are fetched, neighbours together."""
+        """Return blocks from the disk; missing ones are fetched, adjacent ones together."""
         found = {number: self._cached(number) for number in range(first, last + 1)}
         lacking = [number for number, block in found.items() if block is None]
         runs = [

@@ -10,20 +10,20 @@ from vjepa2_ac.errors import InputError
 
 
 class EpisodeFiles:
-    """Reads files; what is read of those behind URLs stays on this machine, within `data.disk_cache.limit_gb`."""
+    """Reads files; data from URLs is cached on this machine, within `data.disk_cache.limit_gb`."""
 
     def __init__(self, config: DataConfig) -> None:
         self._cache = fetched_data(config.disk_cache)
 
     def open(self, path: str, *, version: str) -> str | BlockCachedFile:
-        """Return what to open to read parts of a file: the path itself on this machine, a file of kept blocks else.
+        """Return what to open for partial reads: a local path itself, or a file of cached blocks.
 
         Args:
             path: Local path or URL.
-            version: What tells apart the contents that the file has had; its size is asked for once for each.
+            version: Changes with the file's content; the size is requested once for each version.
 
         Raises:
-            OSError: A file behind a URL is not there or cannot be reached.
+            OSError: A file behind a URL does not exist or cannot be reached.
         """
         if not storage.is_url(path):
             return path
@@ -32,18 +32,18 @@ class EpisodeFiles:
         if size is None:
             size = str(storage.file_size(path)).encode()
             self._cache.write(key, size)
-        return BlockCachedFile(path, version=version, size=int(size), kept=self._cache)
+        return BlockCachedFile(path, version=version, size=int(size), cache=self._cache)
 
     def read(self, path: str, *, version: str, where: str) -> bytes:
-        """Return a whole file.
+        """Return the content of a file.
 
         Args:
             path: Local path or URL.
-            version: What tells apart the contents that the file has had; for what is kept of a URL.
-            where: The file and its episode, as an error names them.
+            version: Changes with the file's content; for the cache of a URL.
+            where: The file and its episode, for messages.
 
         Raises:
-            InputError: There is no such file; an UnreachableError where a local one cannot be read.
+            InputError: There is no such file; an UnreachableError if a local one cannot be read.
             OSError: A file behind a URL cannot be read.
         """
         if not storage.is_url(path):

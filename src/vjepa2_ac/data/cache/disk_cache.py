@@ -23,21 +23,21 @@ _HEADER = struct.Struct("<4sIQ")  # magic, CRC-32 of the data, its length
 _MAGIC = b"VJC1"
 _LEDGER = "ledger"
 _PARTIAL = ".partial"
-_ROOM_LEFT = 0.1  # share of the limit that is freed when it is reached, so that entries are looked through seldom
+_ROOM_LEFT = 0.1  # share of the limit that is freed when it is reached, so that entries are scanned seldom
 _ABANDONED_S = 3600.0
 
 
 class DiskCache:
-    """Entries of bytes under keys in a local folder; those used longest ago go when the limit is reached.
+    """Entries of bytes under keys in a local folder; the least recently used are evicted at the limit.
 
-    Any number of threads and processes may use one folder, with one limit. Together the entries never take more than
-    the limit. The sum of their sizes stands in a locked ledger: only when it reaches the limit are the entries looked
-    through. A damaged entry counts as absent, and so does everything where the folder cannot be used: that costs a
-    warning, never the run.
+    Any number of threads and processes may use one folder, with one limit. The total size of the entries never exceeds
+    the limit. The sum of their sizes is stored in a locked ledger: entries are scanned only when it reaches the limit.
+    A damaged entry counts as absent, and so do all entries if the folder cannot be used: that causes a warning, never
+    an error.
 
     Args:
-        folder: Made when the first entry is written.
-        limit_bytes: Size of all entries together; an entry that is larger is not kept, so with 0 none is.
+        folder: Created with the first entry.
+        limit_bytes: Total size of all entries; a larger entry is not stored, so with 0 none is.
     """
 
     def __init__(self, folder: str | Path, limit_bytes: int) -> None:
@@ -47,13 +47,13 @@ class DiskCache:
         self._warned = False
 
     def read(self, key: str) -> bytes | None:
-        """Return what was written under a key, or None; it counts as used now."""
+        """Return the entry of a key, or None; it counts as used now."""
         path = self._path(key)
         try:
             content = path.read_bytes()
-        except OSError:  # most often: not there
+        except OSError:  # usually: absent
             return None
-        with suppress(OSError):  # evicted by now, or in a folder that may only be read
+        with suppress(OSError):  # evicted meanwhile, or in a read-only folder
             os.utime(path)
         data = _checked(content)
         if data is None:
@@ -63,7 +63,7 @@ class DiskCache:
         return data
 
     def write(self, key: str, data: bytes) -> None:
-        """Keep bytes under a key, in place of what was there; a warning is logged where that is not possible."""
+        """Store bytes under a key, replacing an old entry; a warning is logged if that is not possible."""
         path = self._path(key)
         size = _HEADER.size + len(data)
         if size > self._limit:
@@ -92,7 +92,7 @@ class DiskCache:
 
     @contextmanager
     def _ledger(self) -> Iterator[int]:
-        """Hold the ledger, a file with the sum of all sizes, for one process and thread alone."""
+        """Lock the ledger, a file with the sum of all sizes, for one process and thread."""
         handle = os.open(self._folder / _LEDGER, os.O_RDWR | os.O_CREAT, 0o666)
         try:
             fcntl.flock(handle, fcntl.LOCK_EX)
@@ -101,7 +101,7 @@ class DiskCache:
             os.close(handle)  # and with it the lock
 
     def _make_room(self, ledger: int, path: Path, size: int) -> int:
-        """Delete the entry that is to be replaced, and others where the limit would be passed; return what is left."""
+        """Delete the entry to be replaced, and others if the limit would be exceeded; return the remaining size."""
         replaced = _size_of(path)
         if replaced:
             path.unlink(missing_ok=True)
@@ -112,7 +112,7 @@ class DiskCache:
         return total if total + size <= self._limit else self._evict(self._limit - size)
 
     def _evict(self, allowed: int) -> int:
-        """Delete the entries used longest ago until the rest leaves some room; return the size of the rest."""
+        """Delete the least recently used entries until there is some room; return the remaining size."""
         entries = sorted(_entries(self._folder))
         total = sum(size for _, size, _ in entries)
         if total <= allowed:
@@ -128,12 +128,12 @@ class DiskCache:
 
 
 def fetched_data(config: DiskCacheConfig) -> DiskCache:
-    """Return the cache of what was fetched, one for all sources and runs: so the limit is one, too."""
+    """Return the cache of fetched data: one for all sources and runs, with one limit."""
     return DiskCache(cache_folder(config) / "fetched", int(config.limit_gb * 1e9))
 
 
 def _checked(content: bytes) -> bytes | None:
-    """Return the data of an entry, or None where it is not what was written."""
+    """Return the data of an entry, or None if it is damaged."""
     if len(content) < _HEADER.size:
         return None
     magic, crc, length = _HEADER.unpack_from(content)
@@ -149,7 +149,7 @@ def _size_of(path: Path) -> int:
 
 
 def _entries(folder: Path) -> Iterator[tuple[int, int, str]]:
-    """Yield last use, size and path of every entry; what an interrupted writer left behind goes."""
+    """Yield last use, size and path of every entry; partial files of killed writers are removed."""
     for inner in [entry.path for entry in os.scandir(folder) if entry.is_dir()]:
         for entry in os.scandir(inner):
             with suppress(FileNotFoundError):  # damaged, deleted by a reader

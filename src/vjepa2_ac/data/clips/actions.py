@@ -19,16 +19,16 @@ def actions_of(
     steps: Sequence[int],
     config: DataConfig,
 ) -> Float[np.ndarray, "time-1 action_dim"]:
-    """Return the action between each two model steps of a clip.
+    """Return the actions between consecutive model steps of a clip.
 
     Args:
-        states: At these steps, in the frame that the config asks for.
-        commands: Recorded ones of all control steps of the episode; read for `data.actions: recorded` only.
-        steps: Control steps of the clip, evenly apart.
-        config: What an action is.
+        states: At these steps, in the config's coordinate frame.
+        commands: The recorded ones of all control steps of the episode; used for `data.actions: recorded` only.
+        steps: Control steps of the clip, equally spaced.
+        config: The definition of an action.
 
     Raises:
-        ValueError: Commands are asked for and there are none.
+        ValueError: Commands are required and there are none.
     """
     if config.states == "pose":
         return actions_from_states(states)
@@ -44,8 +44,8 @@ def joined(
 ) -> Float[np.ndarray, "model_steps action_dim"]:
     """Return one action for each `stride` commands: their sum, their mean, or the last of them.
 
-    The command of a control step is what was sent after that step was measured: those of the model step from control
-    step t to t + stride are the ones of t .. t + stride - 1.
+    The command of a control step is sent after that step is measured: the model step from control step t to t + stride
+    has the commands of t .. t + stride - 1.
     """
     groups = commands.reshape(-1, stride, commands.shape[1])
     if how == "sum":
@@ -56,13 +56,13 @@ def joined(
 
 
 def widths_of(episode: Episode) -> Widths:
-    """Return how many numbers states and actions of an episode have."""
+    """Return the widths of an episode's states and actions."""
     state = int(episode.states.shape[1])
     return Widths(state, state if episode.commands is None else int(episode.commands.shape[1]))
 
 
 def require_widths(episode: Episode, widths: Widths) -> None:
-    """Refuse an episode whose numbers are more or fewer than those of the others.
+    """Refuse an episode whose widths differ from those of the others.
 
     Raises:
         InputError: Names both.

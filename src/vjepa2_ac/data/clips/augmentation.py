@@ -13,20 +13,20 @@ from torch import Tensor
 from vjepa2_ac.config import AugmentConfig
 from vjepa2_ac.episode import Augmentation
 
-_STREAM = 0xA6  # keeps these random numbers apart from others of the same seed and position
+_STREAM = 0xA6  # separates these random numbers from others of the same seed and position
 
 _RED, _GREEN, _BLUE = 0.299, 0.587, 0.114  # weights of a colour's brightness, ITU-R BT.601
 
 
 def draw(config: AugmentConfig, height: int, width: int, *, seed: int, position: int) -> Augmentation | None:
-    """Return what is changed in the clip at a position of the run, or None where nothing is to change.
+    """Return the augmentation of the clip at a position of the run, or None if there is none.
 
     A pure function of its arguments: neither workers nor resuming change it. The crop's share of the area is uniform,
     the logarithm of its aspect likewise, among the aspects with which that area fits into the frame; where none of
-    `crop_aspect` fits, it takes the nearest that does. So no draw falls back to the whole frame.
+    `crop_aspect` fits, the nearest one that fits is used. So no draw falls back to the whole frame.
 
     Args:
-        config: What may be changed, and how much.
+        config: The ranges of the changes.
         height: Of the clip's frames, in pixels, after `transforms.view`.
         width: Likewise.
         seed: Of the run.
@@ -66,9 +66,9 @@ def _box(
 def jittered(
     pixels: Float[Tensor, "time 3 height width"], augmentation: Augmentation
 ) -> Float[Tensor, "time 3 height width"]:
-    """Return a clip, 0..255, with other brightness, contrast and saturation; a factor of 1 changes nothing.
+    """Return a clip, 0..255, with changed brightness, contrast and saturation; a factor of 1 changes nothing.
 
-    Each blends the frame with a plainer one and clamps: brightness with black, contrast with the mean grey,
+    Each blends the frame with another one and clamps: brightness with black, contrast with the mean grey,
     saturation with the frame in grey. The mean grey is the whole clip's, so that every frame changes alike.
 
     Source: the formulas of torchvision's adjust_brightness, adjust_contrast and adjust_saturation, in this order.

@@ -23,7 +23,7 @@ Augment = Callable[[int, int], Augmentation | None]  # from the height and width
 
 @dataclass(frozen=True)
 class ClipRequest:
-    """A clip that is to be read."""
+    """A request for a clip."""
 
     episode: int
     start: int
@@ -37,11 +37,11 @@ def clip_at(
     """Return the clip that starts at a control step of an episode; decodes its frames only.
 
     Args:
-        dataset: Where it comes from.
+        dataset: Its data set.
         episode: Index into the data set's table.
         start: First control step.
         camera: Whose frames; None: the config's (first) camera.
-        augmentation: Draws what is to be changed, once the size of the frames is known.
+        augmentation: Draws the augmentation, given the size of the frames.
 
     Raises:
         InputError: The episode or one of the frames cannot be read; says how to leave the episode out.
@@ -81,11 +81,11 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
 
 
 def frames_of(dataset: Dataset, batch: Batch, row: int) -> UInt8[np.ndarray, "time height width 3"]:
-    """Return the frames of a clip of a batch, cropped, for people to look at; of cached latents, small frames.
+    """Return the frames of a clip of a batch, cropped, for people to look at; small frames for cached latents.
 
     Raises:
         InputError: The frames of a cache cannot be read.
-        ValueError: The clip is of another data set.
+        ValueError: The clip belongs to another data set.
     """
     if batch.frames is not None:
         return batch.frames[row].numpy()
@@ -116,7 +116,7 @@ def _stacked(latents: Sequence[StoredLatents]) -> StoredLatents:
 
 
 def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
-    """Return a clip; its errors do not say how to leave the episode out, as those of `clip_at` do."""
+    """Return a clip; unlike those of `clip_at`, its errors do not say how to exclude the episode."""
     config = dataset.config
     steps = range(request.start, request.start + config.clip_steps, config.model_stride)
     recording = dataset.source.read(request.episode, request.camera, dataset.needed_steps(request.episode))
@@ -162,7 +162,7 @@ def _states(
 
 
 def no_clips(frames: int, widths: Widths, bytes_fetched: int) -> Batch:
-    """Return a micro-batch of which no clip could be read."""
+    """Return an empty micro-batch, of which no clip could be read."""
     return Batch(
         frames=torch.zeros(0, frames, 1, 1, 3, dtype=torch.uint8),
         states=torch.zeros(0, frames, widths.state),

@@ -28,18 +28,18 @@ from vjepa2_ac.storage.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
-_MOST_EPISODES_READ = 8  # episodes that are read for their widths, where some are broken
+_MOST_EPISODES_READ = 8  # to find the widths, if some are broken
 
 
 @dataclass(frozen=True)
 class Removed:
-    """What a filter took away, after those before it."""
+    """What a filter removed, after the previous filters."""
 
     name: str  # excluded, broken, outcome, idle
-    episodes: int  # of which no step is left
+    episodes: int  # without remaining steps
     steps: int  # of episodes that could be read
     windows: int | None  # clips; None while data.stride is auto
-    stays: float = 0.0  # share of the clips from these steps that stay all the same (data.idle.keep_share)
+    stays: float = 0.0  # share of the clips from these steps that are still used (data.idle.keep_share)
 
     def __str__(self) -> str:
         clips = "" if self.windows is None else f", {self.windows:,} clips"
@@ -49,18 +49,20 @@ class Removed:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A data set that is open: its episodes, and what the config leaves of them. Can be pickled to a loader worker."""
+    """An open data set: its episodes, and the steps that the config selects. Can be pickled to a loader worker."""
 
     config: DataConfig
     source: EpisodeSource
     table: EpisodeTable
     kept: StepSelection
     broken: BrokenEpisodes  # grows in the process that opened the set
-    groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each one's group; None: `data.split_by` names none
+    groups: UInt64[np.ndarray, " episodes"] | None = (
+        None  # hash of each episode's group; None: `data.split_by` names none
+    )
 
     @property
     def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
-        """What decides the split of each episode."""
+        """The hashes that determine the split of each episode."""
         return self.table.id_hash if self.groups is None else self.groups
 
     def windows(self, split: Split) -> Windows:
@@ -72,10 +74,10 @@ class Dataset:
         return windows_of(self.table, self.kept.taking_part, self.starts, self.config, split, self.split_hash)
 
     def with_stride(self, stride: int) -> Dataset:
-        """Return the same data at another stride.
+        """Return the data set with another stride.
 
         Raises:
-            InputError: The data is a latent cache, which has frames of one stride only.
+            InputError: The data is a latent cache, which has the frames of one stride only.
         """
         if self.config.source == "latents" and stride != self.config.stride:
             raise InputError(
@@ -88,7 +90,7 @@ class Dataset:
 
     @cached_property
     def removed(self) -> tuple[Removed, ...]:
-        """What each filter took away, in the order in which they are applied."""
+        """What each filter removed, in their order."""
         included_ones = included(self.table, self.config)
         of_outcome = included_ones & _of_outcome(self.table, self.config)
         excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
@@ -112,7 +114,7 @@ class Dataset:
         )
 
     def _count(self, kept: StepSelection) -> tuple[int, int, int]:
-        """Return episodes, steps and, where the stride is known, windows."""
+        """Return the numbers of episodes, steps and, if the stride is known, windows."""
         windows = 0
         if self.config.stride != "auto":
             starts = self.starts if kept is self.kept else clip_starts(self.table, kept, self.config)
@@ -132,22 +134,22 @@ class Dataset:
         """The first steps of the clips of all splits.
 
         Raises:
-            ValueError: The stride is still to be found out.
+            ValueError: The stride is not yet calibrated.
         """
         return clip_starts(self.table, self.kept, self.config)
 
     @cached_property
     def control_rate_hz(self) -> float:
-        """Control steps per second: what the source says of the whole set, or else of its first episode."""
+        """Control steps per second: of the whole data set if the source knows it, else of its first episode."""
         said = self.table.texts.get("control_rate_hz")
         return float(said) if said is not None else self.source.read(int(self.episodes[0])).control_rate_hz
 
     @cached_property
     def widths(self) -> Widths:
-        """How many numbers states and actions have: 7 of poses, else those of the first episode that can be read.
+        """The widths of states and actions: 7 for poses, else those of the first readable episode.
 
         Raises:
-            InputError: None of the first ones can be.
+            InputError: None of the first episodes can be read.
         """
         if self.config.states == "pose":
             return POSE_WIDTHS
@@ -164,10 +166,10 @@ class Dataset:
         raise first_error or ValueError("a data set without episodes")
 
     def leave_out(self, episode: int, error: InputError) -> None:
-        """Do what `data.broken_episodes` says with an episode that cannot be read: take note of it, or stop.
+        """Apply `data.broken_episodes` to an episode that cannot be read: record it, or stop.
 
         Raises:
-            InputError: The error with the way out; or, too many are broken by now.
+            InputError: The error with a fix; or, too many are broken by now.
         """
         if isinstance(error, UnreachableError):
             raise error  # the network's fault, not the episode's
@@ -184,15 +186,15 @@ class Dataset:
 
 
 def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dataset:
-    """Open a data set and decide what of it takes part.
+    """Open a data set and select its episodes and steps.
 
     Args:
-        config: Where it is, and what is left out.
-        progress: Told (done, total) where the set is looked through for the first time.
+        config: Where it is, and what is excluded.
+        progress: Called with (done, total) while the data set is indexed for the first time.
 
     Raises:
-        InputError: There is no such set; an episode is broken and `data.broken_episodes` does not skip it, or too many
-            are; two episodes have one identity; a filter or `data.split_by` cannot be applied; or nothing is left.
+        InputError: There is no such data set; an episode is broken and `data.broken_episodes` does not skip it, or too
+            many are; two episodes have one identity; a filter or `data.split_by` cannot be applied; or nothing remains.
     """
     source = open_source(config)
     table = EpisodeTable.of(source.infos(progress))
@@ -221,7 +223,7 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
 
 
 def through_latents(dataset: Dataset, folder: Path) -> Dataset:
-    """Return the same data set, with the same clips in the same order, read from a latent cache that was made of it.
+    """Return the same data set, with the same clips in the same order, read from its latent cache.
 
     Raises:
         InputError: The cache lacks episodes or is damaged.
@@ -232,7 +234,7 @@ def through_latents(dataset: Dataset, folder: Path) -> Dataset:
 
 
 def _of_latents(dataset: Dataset, source: LatentSource) -> Dataset:
-    """Check that a cache has what the clips need, and name its cameras in the config."""
+    """Check that a cache has what the clips need, and set its cameras in the config."""
     source.require_encoded(dataset.starts.episode)
     excluded = frozenset(dataset.config.exclude)
     dataset.broken.found([problem for problem in source.wrong_files() if problem.name not in excluded])
@@ -284,7 +286,7 @@ def _log_listed_episodes(found: FoundRanges, table: EpisodeTable, config: DataCo
 
 
 def _require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig) -> None:
-    """Refuse two episodes of one identity: they would fall into one split, and an error could not name one of them."""
+    """Refuse two episodes with one identity: they would share a split, and an error could not name one of them."""
     order = np.argsort(table.id_hash, kind="stable")
     order = order[taking_part[order]]
     hashes = table.id_hash[order]

@@ -36,7 +36,7 @@ from vjepa2_ac.episode import Augmentation, Batch, Clip, Skipped
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.remote import UnreachableError
 
-CLIPS_WORTH_WORKERS = 256  # fewer validation clips are read before the workers have started
+CLIPS_WORTH_WORKERS = 256  # starting workers takes longer than reading fewer validation clips
 
 
 def training_loader(
@@ -49,17 +49,17 @@ def training_loader(
     world_size: int = 1,
     copies: Copies = NO_COPIES,
 ) -> Batches:
-    """Yield the micro-batches of one rank, without end, from any position of the run at once.
+    """Yield the micro-batches of one rank, endlessly, from any position of the run.
 
-    The run is one row of clips. Micro-batch m of rank r holds the `batch_size` clips from position
+    The run is one sequence of clips. Micro-batch m of rank r holds the `batch_size` clips from position
     start_position + (m * world_size + r) * batch_size, so after m micro-batches of every rank the position to resume
-    from is start_position + m * world_size * batch_size. Where `data.broken_episodes` is skip, clips that cannot be
-    read are missing from their micro-batch, which may even be empty; no other clip takes their place.
+    from is start_position + m * world_size * batch_size. If `data.broken_episodes` is skip, clips that cannot be
+    read are missing from their micro-batch, which may even be empty; no other clip replaces them.
 
-    Where batches are copied to a device ahead (`copies`), they are in pinned memory.
+    If batches are prefetched to a device (`copies`), they are in pinned memory.
 
     Raises:
-        InputError: There is nothing to train on, or a clip cannot be read, also where a worker met it.
+        InputError: There is nothing to train on, or a clip cannot be read, also in a worker.
     """
     clips = _Clips(dataset, _TrainingClips(dataset.config, ClipOrder(dataset.windows("train"), seed)))
     rows = _rows(start_position + rank * batch_size, batch_size, batch_size * world_size)
@@ -71,8 +71,8 @@ def validation_batches(
 ) -> Iterator[Batch]:
     """Yield a fixed set of at most `clips` clips of a split, evenly spread over its windows, in batches.
 
-    The set follows from the data alone: neither the seed nor the number of shards changes it. Neighbours in it are
-    from far apart, so that the actions of one are no stand-in for those of the next. A large set is read by workers.
+    The set depends on the data only: neither the seed nor the number of shards changes it. Neighbours in it are from
+    distant parts of the data, so that their actions are unrelated. A large set is read by workers.
 
     Raises:
         InputError: The split is empty, or a clip cannot be read.
@@ -81,7 +81,7 @@ def validation_batches(
 
 
 def validation_windows(dataset: Dataset, split: Split, *, clips: int) -> list[tuple[int, int]]:
-    """Return where those clips start: (episode, first control step), in their order.
+    """Return the starts of those clips: (episode, first control step), in their order.
 
     Raises:
         InputError: The split is empty.
@@ -95,7 +95,7 @@ def batches_of(
 ) -> Iterator[Batch]:
     """Yield the clips that start at these (episode, first control step), in this order, in batches.
 
-    Where `data.broken_episodes` is skip, a batch may be smaller; none is empty. Many clips are read by workers.
+    If `data.broken_episodes` is skip, a batch may be smaller; none is empty. Many clips are read by workers.
 
     Raises:
         InputError: A clip cannot be read; or, by policy, none of them.
@@ -129,14 +129,14 @@ def _some_of(batches: Iterator[Batch], dataset: Dataset) -> Iterator[Batch]:
 
 @runtime_checkable
 class _Requests(Protocol):
-    """Says which clip stands at a position; a pure function, the same in every worker."""
+    """The clip at each position; a pure function, the same in every worker."""
 
     def at(self, position: int) -> ClipRequest: ...
 
 
 @dataclass(frozen=True)
 class _TrainingClips:
-    """The endless row of a run: a permutation of all windows each epoch; camera and changes are drawn per clip."""
+    """The endless sequence of a run: a permutation of all windows per epoch; camera and augmentation drawn per clip."""
 
     config: DataConfig
     order: ClipOrder
@@ -161,7 +161,7 @@ class _ChosenClips:
 
     def at(self, position: int) -> ClipRequest:
         episode, start = self.windows[position]
-        # Not the number by which idle windows were drawn: those that stay have a small one, and would share a camera.
+        # Not the number by which idle windows were drawn: kept ones have a small number, and would share a camera.
         number = drawn(~self.table.id_hash[[episode]], np.array([start], np.int32))[0]
         return ClipRequest(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
 
@@ -174,7 +174,7 @@ class _Clips(TorchDataset[MicroBatch]):
     requests: _Requests
 
     def __getitems__(self, positions: list[int]) -> MicroBatch | InputError:
-        """Return a micro-batch, or the error that prevents it: DataLoader could not carry that one home unharmed."""
+        """Return a micro-batch, or its error: DataLoader would change an error that is raised."""
         before = storage.bytes_fetched()
         try:
             read = self._read(positions)
@@ -229,7 +229,7 @@ def _read(
         clips,
         batch_sampler=positions,
         collate_fn=_identity,
-        generator=torch.Generator(),  # else the loader draws from the generator that dropout draws from
+        generator=torch.Generator(),  # otherwise the loader uses dropout's generator
         num_workers=workers,
         multiprocessing_context=context,
         worker_init_fn=end_with_the_run if workers else None,
@@ -240,11 +240,11 @@ def _read(
     rows = iter(loader)
     ours = set(multiprocessing.active_children()) - others
     at_exit = partial(end_workers, ours)
-    atexit.register(at_exit)  # multiprocessing's own way is SIGTERM, and to wait for those that are deaf to it
+    atexit.register(at_exit)  # multiprocessing sends SIGTERM, and waits for workers that ignore it
     try:
         yield from rows
     finally:
-        del rows  # asks the workers to end, and waits a while
+        del rows  # requests the workers to end, and waits for a while
         end_workers(ours)
         atexit.unregister(at_exit)
 

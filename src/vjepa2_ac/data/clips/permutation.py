@@ -6,14 +6,14 @@ import hashlib
 from functools import lru_cache
 
 _ROUNDS = 8
-_HALF_BITS = 3  # at least: narrower halves favour some orders of a handful of windows
+_HALF_BITS = 3  # minimum: narrower halves favour some orders of few windows
 _MASK64 = (1 << 64) - 1
 
 
 def permuted(index: int, *, size: int, seed: int, epoch: int) -> int:
-    """Return where a keyed permutation of `range(size)` sends an index; nothing of that size is ever in memory.
+    """Return the image of an index under a keyed permutation of `range(size)`, which is never in memory.
 
-    A Feistel network permutes a power of four that is as large; what falls outside is sent on until it falls inside.
+    A Feistel network permutes the next power of four; results outside the range are permuted again until inside.
     """
     if not 0 <= index < size:
         raise ValueError(f"index {index} of {size}")

@@ -14,41 +14,41 @@ from vjepa2_ac.errors import InputError
 
 @dataclass(frozen=True)
 class MicroBatch:
-    """What a worker sends home for one micro-batch."""
+    """A worker's result for one micro-batch."""
 
     batch: Batch
     skipped: tuple[Skipped, ...] = ()
 
     def pin_memory(self) -> MicroBatch:
-        """Return it in pinned memory; DataLoader calls a method of this name, where it pins."""
+        """Return it in pinned memory; DataLoader calls a method of this name to pin."""
         return replace(self, batch=self.batch.pin_memory())
 
 
 @runtime_checkable
 class SupportsPrefetch(Protocol):
-    """Batches of which the next one can be fetched before it is asked for."""
+    """Batches whose next one can be prefetched."""
 
     def prefetch_next(self) -> None:
-        """Fetch it now."""
+        """Prefetch it now."""
         ...
 
 
 def prefetch_next(batches: Iterator[Batch]) -> None:
-    """Fetch the next batch where these batches can do so ahead: to be called before the host waits for the device."""
+    """Prefetch the next batch if these batches support it: to be called before the host waits for the device."""
     if isinstance(batches, SupportsPrefetch):
         batches.prefetch_next()
 
 
 class Batches(Iterator[Batch]):
-    """The batches of a loader, in order, each on its way to the device since it was fetched.
+    """The batches of a loader, in order, each being copied to the device since it was fetched.
 
-    They stay on the host; a copy on the device is in `on_device`. What is wrong with a batch, and which clips it lacks,
-    is told when it is asked for and not when it is fetched ahead: a checkpoint in between must not know of it.
+    They stay on the host; a copy on the device is in `on_device`. A batch's error and its skipped clips are reported
+    when it is requested, not when it is prefetched: a checkpoint in between must not contain them.
 
     Args:
-        rows: What the workers send home: micro-batches, and errors in the place of such.
-        broken: Takes note of clips that could not be read.
-        copies: How batches get to the device; where nothing overlaps they do not, and nothing is fetched ahead.
+        rows: The workers' results: micro-batches, or errors instead.
+        broken: Records clips that could not be read.
+        copies: How batches are copied to the device; without overlap there are no copies and no prefetching.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class Batches(Iterator[Batch]):
         """Return the next batch.
 
         Raises:
-            InputError: A clip cannot be read, also where a worker met it; or too many cannot.
+            InputError: A clip cannot be read, also in a worker; or too many cannot.
         """
         fetched, self._prefetched = self._prefetched or self._fetched(), None
         if isinstance(fetched, Exception):
@@ -72,12 +72,12 @@ class Batches(Iterator[Batch]):
         return replace(fetched.row.batch, on_device=fetched.on_device)
 
     def prefetch_next(self) -> None:
-        """Fetch the next batch and start its way to the device."""
+        """Fetch the next batch and start its copy to the device."""
         if self._copies.overlap and self._prefetched is None:
             self._prefetched = self._fetched()
 
     def close(self) -> None:
-        """End the workers; what was fetched ahead is nobody's."""
+        """End the workers and drop the prefetched batch."""
         self._prefetched = None
         self._rows.close()
 
@@ -99,6 +99,6 @@ class _Fetched:
 
 
 def _take_once(taken: Callable[[], Batch]) -> Callable[[], Batch | None]:
-    """Return what gives a copy and forgets it, so that it lives no longer than it is used."""
+    """Return a function that returns a copy once and drops it, so that its memory is freed after use."""
     held = [taken]
     return lambda: held.pop()() if held else None

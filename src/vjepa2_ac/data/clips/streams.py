@@ -16,43 +16,43 @@ Change = Callable[[Tensor], Tensor]
 
 
 class Cuda:
-    """What is asked of a CUDA device beside computing; a test puts a recording fake in its place.
+    """The functions of a CUDA device besides computing; tests replace it by a recording fake.
 
     Streams and events are PyTorch's.
 
     Args:
-        device: Which one.
+        device: The device.
     """
 
     def __init__(self, device: torch.device) -> None:
         self._device = device
 
     def new_stream(self) -> Any:
-        """Return another stream than the one that computes."""
+        """Return a new stream, separate from the computing one."""
         return torch.cuda.Stream(self._device)  # type: ignore[no-untyped-call]  # torch
 
     def computing(self) -> Any:
-        """Return the stream that computes."""
+        """Return the computing stream."""
         return torch.cuda.current_stream(self._device)
 
     def on(self, stream: Any) -> contextlib.AbstractContextManager[object]:
-        """Let what is enqueued in the context go to a stream."""
+        """Enqueue work on a stream within the context."""
         return torch.cuda.stream(stream)
 
     def to_device(self, pinned: Tensor) -> Tensor:
-        """Enqueue the copy of a pinned tensor, and return where it will be."""
+        """Enqueue the copy of a pinned tensor to the device, and return the copy."""
         return pinned.to(self._device, non_blocking=True)
 
     def pinned_copy(self, tensor: Tensor) -> Tensor:
-        """Return a copy in pinned memory; of a tensor of the device it is enqueued only."""
+        """Return a copy in pinned memory; from the device it is only enqueued."""
         return torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor, non_blocking=True)
 
     def used_by(self, tensor: Tensor, stream: Any) -> None:
-        """Let the memory of a tensor not be given away before a stream, not the one it was made on, is done with it."""
+        """Reserve the memory of a tensor until a stream other than its own has finished with it."""
         tensor.record_stream(stream)
 
     def timestamp(self) -> Any:
-        """Enqueue an event that notes the time where the device computes, and return it."""
+        """Enqueue an event with time on the computing stream, and return it."""
         event = torch.cuda.Event(enable_timing=True)  # type: ignore[no-untyped-call]  # torch
         event.record(self.computing())
         return event
@@ -63,18 +63,18 @@ class Copying(Protocol):
     """Copies in one direction."""
 
     def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
-        """Start to copy tensors, and return what gives the copies.
+        """Start to copy tensors, and return a function that returns the copies.
 
         Args:
-            mapped: Replaces each of them, such as `Batch.mapped`; it is called once, at once.
+            mapped: Replaces each of them, such as `Batch.mapped`; called once, immediately.
         """
         ...
 
 
 class ToDevice:
-    """Copies tensors to the device, on a stream of its own. Nothing waits but the computing that takes the copies.
+    """Copies tensors to the device, on its own stream. Only the computation that uses the copies waits.
 
-    What is not pinned is pinned first: a copy from other memory would be waited for.
+    Unpinned tensors are pinned first: a copy from other memory would block the host.
 
     Args:
         cuda: The device.
@@ -84,7 +84,7 @@ class ToDevice:
         self._cuda, self._stream = cuda, cuda.new_stream()
 
     def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
-        """Start to copy; what is returned lets computing wait for the copies, not the host, and gives them."""
+        """Start to copy; the returned function lets the computing stream, not the host, wait for the copies."""
         cuda, copies = self._cuda, list[Tensor]()
 
         def copy(tensor: Tensor) -> Tensor:
@@ -106,7 +106,7 @@ class ToDevice:
 
 
 class ToHost:
-    """Copies tensors from the device into pinned memory, on a stream of its own, once they are computed.
+    """Copies tensors from the device into pinned memory, on its own stream, once they are computed.
 
     Args:
         cuda: The device.
@@ -116,7 +116,7 @@ class ToHost:
         self._cuda, self._stream = cuda, cuda.new_stream()
 
     def start(self, mapped: Callable[[Change], _T]) -> Callable[[], _T]:
-        """Start to copy; what is returned waits for these copies and for nothing enqueued since, and gives them."""
+        """Start to copy; the returned function waits for these copies only, not for work enqueued since."""
         cuda, stream = self._cuda, self._stream
 
         def copy(tensor: Tensor) -> Tensor:
@@ -136,10 +136,10 @@ class ToHost:
 
 
 class AtOnce:
-    """Copies where nothing could overlap; on a CPU nothing is copied at all.
+    """Copies without overlap; on a CPU nothing is copied.
 
     Args:
-        device: Where to.
+        device: The target.
     """
 
     def __init__(self, device: torch.device) -> None:
@@ -157,7 +157,7 @@ class Copies:
 
     to_device: Copying
     to_host: Copying
-    overlap: bool  # whether the device computes meanwhile
+    overlap: bool  # whether copies overlap with computation
 
 
 _HOST = torch.device("cpu")
@@ -166,7 +166,7 @@ NO_COPIES = Copies(AtOnce(_HOST), AtOnce(_HOST), overlap=False)
 
 @lru_cache(maxsize=8)
 def copies_for(device: torch.device) -> Copies:
-    """Return how tensors get to a device and back; the same streams whenever it is asked for."""
+    """Return the copies to a device and back; always the same streams."""
     if device.type != "cuda":
         return Copies(AtOnce(device), AtOnce(_HOST), overlap=False)
     cuda = Cuda(device)

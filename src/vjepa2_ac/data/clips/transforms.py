@@ -23,7 +23,7 @@ from vjepa2_ac.episode import Augmentation
 
 Crop = Literal["released", "square", "letterbox"]
 
-NARROWEST, WIDEST = 0.75, 1.35  # width over height that the recipe lets through uncropped
+NARROWEST, WIDEST = 0.75, 1.35  # width over height that the recipe leaves uncropped
 
 _MEAN = (0.485 * 255, 0.456 * 255, 0.406 * 255)  # of ImageNet, as the encoder was trained
 _STD = (0.229 * 255, 0.224 * 255, 0.225 * 255)
@@ -60,9 +60,9 @@ def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
 def view(
     frames: UInt8[np.ndarray, "time height width 3"], kind: Crop = "released"
 ) -> UInt8[np.ndarray, "time seen_height seen_width 3"]:
-    """Return what the model sees of the frames, in their own pixels; see `DataConfig.crop`.
+    """Return the part of the frames that the model sees, at their own resolution; see `DataConfig.crop`.
 
-    A slice of the same memory, but for letterbox where bars must be added.
+    A view of the same memory, except for letterbox, if bars must be added.
     """
     if kind == "letterbox":
         return _with_bars(frames)
@@ -86,12 +86,12 @@ def pixels_to_input(
     image_size: int,
     augmentations: Sequence[Augmentation] = (),
 ) -> Float[Tensor, "batch time 3 size size"]:
-    """Return cropped frames as the encoder wants them: squashed to a square (bilinear), ImageNet mean 0 and std 1.
+    """Return cropped frames as encoder input: squashed to a square (bilinear), ImageNet mean 0 and std 1.
 
     Args:
-        frames: What `view` returned, stacked, on any device.
+        frames: Results of `view`, stacked, on any device.
         image_size: Height and width of a result, in pixels.
-        augmentations: What is changed on the way, one for each clip; none: nothing.
+        augmentations: One for each clip, applied before; or none.
 
     Raises:
         ValueError: There are some augmentations, but not one for each clip.
@@ -111,7 +111,7 @@ def pixels_to_input(
 
 @lru_cache(maxsize=8)
 def _mean_and_std(device: torch.device) -> tuple[Float[Tensor, "3 1 1"], Float[Tensor, "3 1 1"]]:
-    # Once for each device, since the way there is one that the host waits for; not as a tensor of inference mode.
+    # Once per device, since the copy blocks the host; not as a tensor of inference mode.
     with torch.inference_mode(False):
         return (
             torch.tensor(_MEAN, device=device).view(3, 1, 1),

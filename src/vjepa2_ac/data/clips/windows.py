@@ -28,11 +28,11 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Every clip of a split, in the order of the episodes' identities, then of the starts; runs of neighbours."""
+    """Every clip of a split, in the order of the episodes' identities, then of the starts; as runs of neighbours."""
 
     starts: ClipStarts
     ends: Int64[np.ndarray, " runs"]  # windows up to and including each run
-    short: Int32[np.ndarray, " short"]  # episodes left out because they are shorter than a clip
+    short: Int32[np.ndarray, " short"]  # episodes skipped because they are shorter than a clip
     id_hash: UInt64[np.ndarray, " episodes"]
     keep_share: float  # of the idle windows
 
@@ -58,7 +58,7 @@ class Windows:
 
 @dataclass(frozen=True)
 class ClipOrder:
-    """The endless order of training: every window once per epoch, each epoch in an order of its own."""
+    """The endless order of training: every window once per epoch, each epoch in its own order."""
 
     windows: Windows
     seed: int
@@ -69,13 +69,13 @@ class ClipOrder:
         return self.windows[permuted(index, size=len(self.windows), seed=self.seed, epoch=epoch)]
 
     def choice(self, position: int, count: int) -> int:
-        """Return one of `range(count)` for the clip at a position of the run, each as likely."""
+        """Return one of `range(count)`, uniformly drawn, for the clip at a position of the run."""
         digest = hashlib.blake2b(f"{self.seed} {position}".encode(), digest_size=8).digest()
         return int.from_bytes(digest, "big") % count
 
 
 def split_of(name: str, config: DataConfig) -> Split:
-    """Return where an episode belongs: a hash of its identity, as a number in [0, 1), against the shares.
+    """Return the split of an episode: a hash of its identity, as a number in [0, 1), compared with the shares.
 
     Args:
         name: Its identity; with `data.split_by`, the name of its group.
@@ -111,11 +111,11 @@ def windows_of(
 
     Args:
         table: The episodes.
-        taking_part: Which of them take part.
-        starts: What `clip_starts` returned for all of these.
+        taking_part: Which of them are used.
+        starts: The result of `clip_starts` for all of these.
         config: Shares of the splits, and what to do with short episodes.
         split: Which split.
-        split_hash: What decides the split of each episode.
+        split_hash: The hash that determines the split of each episode.
 
     Raises:
         InputError: The split has no episodes, or only short ones, or none with a clip's length of kept steps, or
@@ -145,13 +145,13 @@ def spread(size: int, count: int) -> list[int]:
 
 
 def far_neighbours(items: list[int]) -> list[int]:
-    """Return sorted items in an order in which neighbours lie about half the list apart."""
+    """Return sorted items in an order in which neighbours are about half the list apart."""
     half = (len(items) + 1) // 2
     pairs = itertools.zip_longest(items[:half], items[half:])
     return [item for pair in pairs for item in pair if item is not None]
 
 
-@lru_cache(maxsize=64)  # said once: every validation asks for the same windows
+@lru_cache(maxsize=64)  # logged once: every validation uses the same windows
 def _warn_of_short(path: str, split: Split, clip_steps: int, members: int, short: int, names: tuple[str, ...]) -> None:
     logger.warning(
         "%s: %d of %d %s episodes are shorter than a clip of %d control steps and left out: %s",

@@ -13,16 +13,16 @@ from vjepa2_ac import output
 
 
 def end_workers(workers: Iterable[multiprocessing.process.BaseProcess]) -> None:
-    """End workers that did not when they were asked: busy with a clip that does not come, and deaf to SIGTERM."""
+    """Kill workers that did not end on request: blocked by a clip, and ignoring SIGTERM."""
     for worker in workers:
         if worker.is_alive():
             worker.kill()
 
 
 def start_servers_deaf() -> None:
-    """Start the processes that workers come from with the signals blocked that ask a run to stop, also in workers.
+    """Start the fork server with a run's stop signals blocked, which its workers inherit.
 
-    Who signals the whole process group, as a terminal, `timeout` and Slurm do, means the run: it needs its workers to
+    A signal to the whole process group, as from a terminal, `timeout` or Slurm, is for the run: it needs its workers to
     finish the step, and ends them.
     """
     for start in (resource_tracker.ensure_running, forkserver.ensure_running):  # the first one clears the mask
@@ -36,15 +36,15 @@ def start_servers_deaf() -> None:
 
 
 def end_with_the_run(_worker: int) -> None:
-    """End this worker when the process that reads from it is gone, however it went.
+    """End this worker when its reading process has ended for any reason.
 
-    PyTorch's own watch looks at the fork server, which lives as long as its workers: both would stay for ever.
+    PyTorch's own watchdog checks the fork server, which lives as long as its workers: both would stay for ever.
     """
     run = multiprocessing.parent_process()
     if run is None:
         raise ValueError("not in a worker")
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the run, which ends its workers
-    output.never_wait()  # a warning that nobody reads must not hold up the batch
+    output.never_wait()  # a warning that nobody reads must not block the batch
 
     def watch() -> None:
         run.join()

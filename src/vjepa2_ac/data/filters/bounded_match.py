@@ -12,7 +12,7 @@ from vjepa2_ac.errors import InputError
 LONGEST_S = 20.0  # for all texts together; 100,000 take a tenth of a second
 LONGEST_TEXT = 4096  # letters
 
-# Python's own engine goes back and forth, for `(a+)+b` longer than anyone lives, and cannot be interrupted in a thread.
+# Python's engine backtracks, for `(a+)+b` practically for ever, and cannot be interrupted in a thread.
 _MATCH = """
 import json, re, sys
 pattern, texts = json.load(sys.stdin)
@@ -22,12 +22,12 @@ json.dump([found.group(1) if (found := search(text)) else None for text in texts
 
 
 def first_groups(pattern: str, texts: Sequence[str], *, where: str) -> list[str | None]:
-    """Return what the one group of a pattern takes from each text; None where it does not match.
+    """Return the match of a pattern's one group in each text; None if there is none.
 
     Args:
         pattern: A regular expression that compiles and has one group.
         texts: To search in.
-        where: What named the pattern.
+        where: The origin of the pattern, for messages.
 
     Raises:
         InputError: It takes too long, or fails in another way.

@@ -16,9 +16,9 @@ MOST_BROKEN = 0.01  # share of the episodes
 
 
 class BrokenEpisodes:
-    """The broken episodes of an opened data set: those found when it was opened, and those that clips met since.
+    """The broken episodes of an opened data set: those found while opening it, and those found by clips since.
 
-    It lives in the process that opened the set; a loader worker reports to it what it met.
+    It is in the process that opened the data set; loader workers report to it.
     """
 
     def __init__(self, config: DataConfig, episodes: int) -> None:
@@ -30,16 +30,16 @@ class BrokenEpisodes:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """The broken episodes and what is wrong with each, in the order in which they were met."""
+        """The broken episodes and their errors, in the order in which they were found."""
         return dict(self._reasons)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The broken episodes, in the order in which they were met."""
+        """The broken episodes, in the order in which they were found."""
         return tuple(self._reasons)
 
     def found(self, problems: Sequence[EpisodeProblem]) -> None:
-        """Take note of what was found when the data set was opened or looked through.
+        """Record the problems found while the data set was opened or indexed.
 
         Raises:
             InputError: `data.broken_episodes` is error: the first of them; or too many are broken.
@@ -57,12 +57,12 @@ class BrokenEpisodes:
         self._refuse_too_many()
 
     def recall(self, reasons: Mapping[str, str]) -> None:
-        """Count what a run met before it was resumed: the share that may be broken is that of the whole run."""
+        """Count the broken episodes from before a resume: the allowed share is that of the whole run."""
         excluded = frozenset(self._config.exclude)
         self._reasons = {name: why for name, why in reasons.items() if name not in excluded} | self._reasons
 
     def met(self, name: str, reason: str) -> None:
-        """Take note of an episode that a clip could not be read from.
+        """Record an episode of which a clip could not be read.
 
         Raises:
             InputError: Now too many are broken.
@@ -87,10 +87,10 @@ class BrokenEpisodes:
 
 
 def as_error(problem: EpisodeProblem) -> InputError:
-    """Return what the user reads of an episode that cannot be used."""
+    """Return the error of an unusable episode."""
     return InputError(where=problem.where, found=problem.found, needed=problem.needed, fix=problem.fix)
 
 
 def as_problem(error: InputError, name: str) -> EpisodeProblem:
-    """Return what is noted of an episode that cannot be used."""
+    """Return the record of an unusable episode."""
     return EpisodeProblem(name=name, where=error.where, found=error.found, needed=error.needed, fix=error.fix)

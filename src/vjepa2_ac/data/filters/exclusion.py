@@ -16,10 +16,10 @@ NAMED = 10  # episodes in one message, at most
 
 
 def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " episodes"]:
-    """Return which episodes take part: all but those that `data.exclude` names.
+    """Return which episodes are used: all except those in `data.exclude`.
 
     Raises:
-        InputError: `data.exclude` names what no episode is called.
+        InputError: `data.exclude` contains an unknown identity.
     """
     excluded = frozenset(config.exclude)
     hashes = np.array([identity_hash(name) for name in excluded], np.uint64)
@@ -38,12 +38,12 @@ def included(table: EpisodeTable, config: DataConfig) -> Bool[np.ndarray, " epis
 
 
 def with_way_out(error: InputError, names: Sequence[str], *, skippable: bool = True) -> InputError:
-    """Return an error of one or more episodes that says, too, how to leave them out: ten of them, and how many more.
+    """Return an error of one or more episodes with the way to exclude them: ten of them, and the number of the rest.
 
     Args:
         error: What is wrong with the first of them.
         names: Their identities.
-        skippable: Whether `data.broken_episodes: skip` would leave them out.
+        skippable: Whether `data.broken_episodes: skip` would skip them.
     """
     others = f"{len(names) - 1} more cannot be used either. " if len(names) > 1 else ""
     fix = f"{error.fix.rstrip('.')}. " if error.fix else ""
@@ -59,6 +59,6 @@ def with_way_out(error: InputError, names: Sequence[str], *, skippable: bool = T
 
 
 def named(ids: Sequence[str], count: int | None = None) -> str:
-    """Return identities as a message shows them: the first ten, and how many more there are (of `count` in all)."""
+    """Return identities for a message: the first ten, and the number of the rest (of `count` in total)."""
     more = (len(ids) if count is None else count) - NAMED
     return ", ".join(ids[:NAMED]) + (f" and {more} more" if more > 0 else "")

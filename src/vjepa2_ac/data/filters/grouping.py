@@ -13,7 +13,7 @@ from vjepa2_ac.data.filters.exclusion import named
 from vjepa2_ac.data.index.episode_table import EpisodeTable, identity_hash
 from vjepa2_ac.errors import InputError
 
-# Of DROID, whose identities hold .../LAB/success|failure/DATE/..., and of whatever lies in folders.
+# For DROID, whose identities contain .../LAB/success|failure/DATE/..., and for any data in folders.
 IN_IDENTITY = {
     "lab": re.compile(r"([^/]+)/(?:success|failure)/"),
     "day": re.compile(r"/(?:success|failure)/([0-9]{4}-[0-9]{2}-[0-9]{2})(?:/|$)"),
@@ -24,11 +24,11 @@ IN_IDENTITY = {
 def split_hash(
     table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"], config: DataConfig
 ) -> UInt64[np.ndarray, " episodes"] | None:
-    """Return the hash that decides each episode's split: that of its group; None: that of its identity.
+    """Return the hash that determines each episode's split: of its group; None: of its identity.
 
     Args:
         table: The episodes.
-        taking_part: Which of them take part; the others need not belong to a group.
+        taking_part: Which of them are used; the others need not belong to a group.
         config: `data.split_by`.
 
     Raises:

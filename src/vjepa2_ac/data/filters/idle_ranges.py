@@ -28,14 +28,14 @@ from vjepa2_ac.storage.structured import json_object, record_of, shown
 logger = logging.getLogger(__name__)
 
 _MOST_BYTES = 1 << 28  # of a published list
-_ALL_BROKEN = 10  # as many broken episodes at the start, and no other, are no accident
+_ALL_BROKEN = 10  # so many broken episodes at the start, and no others, have one cause
 
 Found = list[tuple[int, int]] | EpisodeProblem
 
 
 @dataclass(frozen=True, eq=False)
 class FoundRanges:
-    """The kept ranges [start, end) of all episodes of a table, and the episodes that broke on the way."""
+    """The remaining ranges [start, end) of all episodes of a table, and the episodes that could not be read."""
 
     episode: Int32[np.ndarray, " ranges"]  # ascending
     start: Int32[np.ndarray, " ranges"]
@@ -45,7 +45,7 @@ class FoundRanges:
 
     @classmethod
     def of(cls, found: Sequence[Found], *, listed: int = 0) -> FoundRanges:
-        """Join what was found in each episode."""
+        """Join the results of all episodes."""
         problems = tuple((place, one) for place, one in enumerate(found) if isinstance(one, EpisodeProblem))
         ranges = [(place, *pair) for place, one in enumerate(found) if isinstance(one, list) for pair in one]
         columns = np.array(ranges, np.int32).reshape(-1, 3)
@@ -62,10 +62,10 @@ class FoundRanges:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> FoundRanges:
-        """Read what `to_bytes` returned.
+        """Read the result of `to_bytes`.
 
         Raises:
-            NotATableError: It is something else, or damaged.
+            NotATableError: It is another kind of file, or damaged.
         """
         try:
             arrays = read_arrays(data)
@@ -78,10 +78,10 @@ class FoundRanges:
         return cls(*columns, text.problems, text.listed)
 
     def require_of(self, table: EpisodeTable) -> None:
-        """Refuse ranges that are not of the episodes of a table.
+        """Refuse ranges that do not belong to the episodes of a table.
 
         Raises:
-            NotATableError: They are not.
+            NotATableError: They do not.
         """
         places = [place for place, _ in self.problems]
         known = len(table) > self.episode.max(initial=-1) and len(table) > max(places, default=-1)
@@ -94,7 +94,7 @@ class FoundRanges:
 
 @dataclass(frozen=True)
 class _Text:
-    """What of the ranges is no numbers."""
+    """The parts of the ranges that are not numbers."""
 
     problems: tuple[tuple[int, EpisodeProblem], ...]
     listed: int
@@ -103,10 +103,10 @@ class _Text:
 def find_ranges(
     source: EpisodeSource, table: EpisodeTable, config: DataConfig, progress: Progress | None
 ) -> FoundRanges:
-    """Return the ranges that `data.idle.rule` keeps, of all episodes, whether they take part or not.
+    """Return the ranges that `data.idle.rule` keeps, of all episodes, used or not.
 
     Raises:
-        InputError: The list of ranges cannot be read or is of another data set; or the rule fits no episode.
+        InputError: The list of ranges cannot be read or belongs to another data set; or the rule fits no episode.
     """
     parts: dict[str, object] = {
         "found": "idle ranges",
@@ -146,7 +146,7 @@ def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, pr
 
 
 def _in_order(look: Callable[[int], Found], count: int, threads: int) -> Iterator[Found]:
-    """Look at every episode, several at once; an error is raised in its turn."""
+    """Read every episode, several at once; errors are raised in the episodes' order."""
     with ThreadPoolExecutor(threads) as pool:
         for first in range(0, count, 4 * threads):
             yield from pool.map(look, range(first, min(first + 4 * threads, count)))
@@ -210,7 +210,7 @@ def _checked(ranges: object, name: str, steps: int, path: str) -> list[tuple[int
 
 
 def fingerprint_of(table: EpisodeTable) -> str:
-    """Name everything that the episodes depend on: the key of their index, or where none is kept, what is known."""
+    """Return everything that the episodes depend on: the key of their index, or without an index, the known facts."""
     if "index" in table.texts:
         return table.texts["index"]
     digest = hashlib.sha256(json.dumps(dict(table.texts)).encode())
@@ -229,7 +229,7 @@ def _knobs_that_matter(config: DataConfig) -> dict[str, object]:
 
 
 def _version(path: str) -> list[object]:
-    """Tell one content of the list from another without reading it, as far as that goes."""
+    """Return the version of the list, without reading it if possible."""
     try:
         return [storage.absolute(path), storage.file_size(path), storage.file_version(path)]
     except OSError:

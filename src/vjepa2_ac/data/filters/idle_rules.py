@@ -36,7 +36,7 @@ def kept_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
 
 
 def idle_by_commands(velocities: Float[np.ndarray, "steps joints"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
-    """Return at which steps no commanded joint velocity differs from the step before; never at the first.
+    """Return the steps at which no commanded joint velocity differs from the step before; never the first.
 
     Source: Physical-Intelligence/openpi @ 15a9616, examples/droid/compute_droid_nonidle_ranges.py.
     """
@@ -45,7 +45,7 @@ def idle_by_commands(velocities: Float[np.ndarray, "steps joints"], config: Idle
 
 
 def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> Bool[np.ndarray, " steps"]:
-    """Return at which steps the measured pose hardly differs from the step before; never at the first."""
+    """Return the steps at which the measured pose hardly differs from the step before; never the first."""
     if len(states) < 2:
         return np.zeros(len(states), bool)
     motion = actions_from_states(states.astype(np.float64))
@@ -58,7 +58,7 @@ def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> 
 
 
 def moving_ranges(idle: Bool[np.ndarray, " steps"], config: IdleConfig) -> list[tuple[int, int]]:
-    """Return what is left when long idle runs, then short rests between them, then the last steps of each, are cut.
+    """Return the ranges that remain without long idle runs, short ranges between them, and the last steps of each.
 
     Source: Physical-Intelligence/openpi @ 15a9616, examples/droid/compute_droid_nonidle_ranges.py.
     """

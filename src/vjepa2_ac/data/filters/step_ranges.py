@@ -11,26 +11,26 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.episode import StepRanges
 
-_WINDOWS_AT_ONCE = 1 << 17  # idle windows that are drawn in one go
+_WINDOWS_AT_ONCE = 1 << 17  # idle windows that are drawn at once
 
 
 @dataclass(frozen=True, eq=False)
 class StepSelection:
-    """Ranges [start, end) of control steps that a clip must lie in, whole; by episode, then ascending and apart."""
+    """Ranges [start, end) of control steps that a clip must fit into; by episode, then ascending and disjoint."""
 
     episode: Int32[np.ndarray, " ranges"]  # index into the table
     start: Int32[np.ndarray, " ranges"]
     end: Int32[np.ndarray, " ranges"]
-    taking_part: Bool[np.ndarray, " episodes"]  # an episode may take part though none of its steps is kept
+    taking_part: Bool[np.ndarray, " episodes"]  # an episode may be used although none of its steps is kept
 
     @classmethod
     def whole(cls, table: EpisodeTable, taking_part: Bool[np.ndarray, " episodes"]) -> StepSelection:
-        """Keep every step of the episodes that take part."""
+        """Keep every step of the used episodes."""
         episode = np.flatnonzero(taking_part).astype(np.int32)
         return cls(episode, np.zeros(len(episode), np.int32), table.num_steps[episode], taking_part)
 
     def only(self, episodes: Bool[np.ndarray, " episodes"]) -> StepSelection:
-        """Return the same with these episodes only."""
+        """Return the selection with these episodes only."""
         stays = episodes[self.episode]
         ranges = replace(self, episode=self.episode[stays], start=self.start[stays], end=self.end[stays])
         return replace(ranges, taking_part=self.taking_part & episodes)
@@ -42,13 +42,13 @@ class StepSelection:
 
     @property
     def steps(self) -> int:
-        """How many steps are kept in all."""
+        """The total number of kept steps."""
         return int((self.end.astype(np.int64) - self.start).sum())
 
 
 @dataclass(frozen=True, eq=False)
 class ClipStarts:
-    """First steps of clips as runs of neighbours: all of a run where count is span, else those that `drawn` chose.
+    """First steps of clips as runs of neighbours: the whole run if count is span, else those that `drawn` selected.
 
     Neighbours are `every` control steps apart: first, first + every, ..., span of them.
     """
@@ -60,21 +60,21 @@ class ClipStarts:
     every: int = 1
 
     def __getitem__(self, chosen: np.ndarray) -> ClipStarts:
-        """Return some of the runs, by a mask or by places."""
+        """Return some of the runs, by a mask or by index."""
         episode, first, span, count = (column[chosen] for column in self.columns)
         return ClipStarts(episode, first, span, count, self.every)
 
     def thinned(self, phase: Int32[np.ndarray, " episodes"], every: int) -> ClipStarts:
-        """Return every n-th start of runs of neighbours: those that lie a multiple of n from their episode's phase."""
+        """Return every n-th start of runs of neighbours: those a multiple of n from their episode's phase."""
         first = self.first + (phase[self.episode] - self.first) % every
-        span = -((first - self.first - self.span) // every)  # rounded up; 0 or less where none is left
+        span = -((first - self.first - self.span) // every)  # rounded up; 0 or less if none remains
         return ClipStarts(self.episode, first, span, span, every)[span > 0]
 
     def steps_of(self, run: int, id_hash: UInt64[np.ndarray, " episodes"], keep_share: float) -> Int[np.ndarray, " n"]:
         """Return the starts of a run.
 
         Args:
-            run: Which.
+            run: Its index.
             id_hash: Of all episodes.
             keep_share: Of the idle windows.
         """
@@ -96,17 +96,17 @@ class ClipStarts:
 
     @property
     def windows(self) -> int:
-        """How many clips there are."""
+        """The number of clips."""
         return int(self.count.sum(dtype=np.int64))
 
 
 def clip_starts(table: EpisodeTable, kept: StepSelection, config: DataConfig) -> ClipStarts:
-    """Return every start of a clip, by the episodes' identities: those of kept steps, and a share of the idle ones."""
+    """Return all clip starts, sorted by the episodes' identities: in kept steps, and in a share of the idle ones."""
     counts = kept.end - kept.start - (config.clip_steps - 1)
     fits = counts > 0
     runs = ClipStarts(kept.episode[fits], kept.start[fits], counts[fits], counts[fits])
     every, phase = config.start_every, np.zeros(len(table), np.int32)
-    phase[kept.episode[::-1]] = kept.start[::-1]  # the last one that is written counts: an episode's first range
+    phase[kept.episode[::-1]] = kept.start[::-1]  # the last write counts: an episode's first range
     if config.idle.rule != "none" and config.idle.keep_share > 0:
         gaps = _gaps(table, kept.taking_part, runs, config).thinned(phase, every)
         still = _still(table, gaps, config.idle.keep_share)
@@ -119,11 +119,11 @@ def clip_starts(table: EpisodeTable, kept: StepSelection, config: DataConfig) ->
 
 
 def _still(table: EpisodeTable, gaps: ClipStarts, keep_share: float) -> ClipStarts:
-    """Return the idle windows that stay: each is drawn by a hash of its episode's identity and its start."""
+    """Return the idle windows that are kept: each is drawn by a hash of its episode's identity and its start."""
     ends = np.cumsum(gaps.span, dtype=np.int64)
     counts = np.zeros_like(gaps.span)
     cut = 0
-    while cut < len(ends):  # some at a time: bounds the memory
+    while cut < len(ends):  # in parts: bounds the memory
         before = int(ends[cut - 1]) if cut else 0
         upto = max(cut + 1, int(np.searchsorted(ends, before + _WINDOWS_AT_ONCE, side="right")))
         some = gaps[np.arange(cut, upto)]

@@ -22,21 +22,21 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.arrays import read_arrays
 from vjepa2_ac.storage.structured import json_object, record_of
 
-FORMAT = 2  # of `to_bytes`: with another number an index is built again
+FORMAT = 2  # of `to_bytes`: an index with another number is rebuilt
 
 _UNKNOWN = -1
 _LOCATOR, _LABEL = "locator.", "label."
 
 
 class NotATableError(ValueError):
-    """The bytes are not a table that `to_bytes` wrote."""
+    """The bytes are not a table by `to_bytes`."""
 
 
 @dataclass(frozen=True)
 class EpisodeProblem:
-    """An episode that cannot be used, and why."""
+    """An unusable episode, and the reason."""
 
-    name: str  # its identity; where even that cannot be read, its place
+    name: str  # its identity; if that cannot be read, its position
     where: str
     found: str
     needed: str = ""
@@ -47,20 +47,20 @@ class EpisodeProblem:
 class EpisodeTable(Sequence[EpisodeInfo]):
     """The usable episodes of a data set, in the source's order, as columns.
 
-    `locators` are columns of the source's own (where an episode lies); `labels` say what an episode belongs to, such as
-    its scene; `texts` are small values of the whole set.
+    `locators` are columns of the source (the position of an episode); `labels` are an episode's groups, such as its
+    scene; `texts` are small values of the whole data set.
     """
 
     num_steps: Int32[np.ndarray, " episodes"]
-    success: Int8[np.ndarray, " episodes"]  # 1, 0, or -1: the data set does not say
+    success: Int8[np.ndarray, " episodes"]  # 1, 0, or -1: unknown
     id_ends: Int64[np.ndarray, " episodes"]
     id_bytes: UInt8[np.ndarray, " bytes"]
     id_hash: UInt64[np.ndarray, " episodes"]  # the first 8 bytes of the identity's SHA-256
-    id_rank: Int32[np.ndarray, " episodes"]  # place of the identity in alphabetical order
+    id_rank: Int32[np.ndarray, " episodes"]  # rank of the identity in alphabetical order
     problems: tuple[EpisodeProblem, ...] = ()
     locators: Mapping[str, np.ndarray] = field(default_factory=dict)
     texts: Mapping[str, str] = field(default_factory=dict)
-    state_hash: UInt64[np.ndarray, " episodes"] | None = None  # `state_hash.hash_of_states`; None: not known of any
+    state_hash: UInt64[np.ndarray, " episodes"] | None = None  # `state_hash.hash_of_states`; None: unknown for all
     labels: Mapping[str, Labels] = field(default_factory=dict)
 
     @classmethod
@@ -74,7 +74,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         state_hashes: Sequence[int] | None = None,
         labels: Mapping[str, Labels] | None = None,
     ) -> EpisodeTable:
-        """Make a table; one that is given is returned as it is."""
+        """Make a table; a given table is returned unchanged."""
         if isinstance(infos, EpisodeTable):
             return infos
         ids = [info.id for info in infos]
@@ -103,7 +103,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
     def __getitem__(self, index: slice) -> Sequence[EpisodeInfo]: ...
 
     def __getitem__(self, index: int | slice) -> EpisodeInfo | Sequence[EpisodeInfo]:
-        """Return what is known of one episode, or of several."""
+        """Return the facts about one episode, or several."""
         if isinstance(index, slice):
             return [self[number] for number in range(*index.indices(len(self)))]
         if not -len(self) <= index < len(self):
@@ -124,7 +124,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
         return text_of("id", {"id_ends": self.id_ends, "id_bytes": self.id_bytes}, index)
 
     def find(self, identity: str) -> int | None:
-        """Return the place of an episode, or None where no episode is called so."""
+        """Return the index of an episode, or None if the identity is unknown."""
         for index in np.flatnonzero(self.id_hash == np.uint64(identity_hash(identity))):
             if self.identity(int(index)) == identity:
                 return int(index)
@@ -147,10 +147,10 @@ class EpisodeTable(Sequence[EpisodeInfo]):
 
     @classmethod
     def from_bytes(cls, data: bytes) -> EpisodeTable:
-        """Read what `to_bytes` returned; of before there were hashes and labels (latent caches), it has none.
+        """Read the result of `to_bytes`; older ones (of latent caches) have no hashes and labels.
 
         Raises:
-            NotATableError: It is something else, or damaged.
+            NotATableError: It is another kind of file, or damaged.
         """
         try:
             arrays = read_arrays(data)
@@ -172,7 +172,7 @@ class EpisodeTable(Sequence[EpisodeInfo]):
 
 @dataclass(frozen=True)
 class _Text:
-    """What of a table is no numbers."""
+    """The parts of a table that are not numbers."""
 
     problems: tuple[EpisodeProblem, ...]
     texts: Mapping[str, str]
@@ -191,10 +191,10 @@ _COLUMNS = {
 
 
 def _require_columns(arrays: Mapping[str, np.ndarray], locators: Mapping[str, np.ndarray]) -> None:
-    """Refuse columns that contradict each other: places of episodes would lead anywhere.
+    """Refuse inconsistent columns: positions of episodes would be wrong.
 
     Raises:
-        NotATableError: They do.
+        NotATableError: They are.
     """
     for name, kind in _COLUMNS.items():
         if name not in arrays or arrays[name].dtype != kind or arrays[name].ndim != 1:
@@ -214,7 +214,7 @@ def _require_columns(arrays: Mapping[str, np.ndarray], locators: Mapping[str, np
 
 
 def _column(arrays: Mapping[str, np.ndarray], name: str, kind: type[np.generic]) -> np.ndarray:
-    """Return a column that not every table has: one value for each episode.
+    """Return an optional column: one value for each episode.
 
     Raises:
         NotATableError: It is missing, or of another type or length.
@@ -237,5 +237,5 @@ def _is_packed(name: str) -> bool:
 
 
 def identity_hash(identity: str) -> int:
-    """Return 64 bits of the identity's SHA-256: as a share of 2**64 it decides the episode's split."""
+    """Return 64 bits of the identity's SHA-256: as a share of 2**64 it determines the episode's split."""
     return int.from_bytes(hashlib.sha256(identity.encode()).digest()[:8], "big")

@@ -24,13 +24,13 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 _CACHE = "VJEPA2_AC_CACHE"
-_VERSION = 3  # of what is kept: another number makes all of it be found out again
+_VERSION = 3  # of the cache: another number makes all of it be rebuilt
 _CRC_BYTES = 4
 
 
 @dataclass
 class Usage:
-    """What of the index was used while somebody watched."""
+    """The index files used while they were recorded."""
 
     rebuild: bool
     files: list[Path] = field(default_factory=list)
@@ -41,7 +41,7 @@ _watch: ContextVar[Usage | None] = ContextVar("watch", default=None)
 
 @contextlib.contextmanager
 def record_usage(*, rebuild: bool = False) -> Iterator[Usage]:
-    """Note which files of the index are used meanwhile; with `rebuild`, none is read: what they hold is made again."""
+    """Record which files of the index are used within the block; with `rebuild`, none is read, and all are rebuilt."""
     watch = Usage(rebuild)
     token = _watch.set(watch)
     try:
@@ -51,7 +51,7 @@ def record_usage(*, rebuild: bool = False) -> Iterator[Usage]:
 
 
 def cache_folder(config: DiskCacheConfig) -> Path:
-    """Return the folder for what is kept on this machine: the config's, $VJEPA2_AC_CACHE, or the user's.
+    """Return the cache folder on this machine: the config's, $VJEPA2_AC_CACHE, or the user's.
 
     Raises:
         InputError: The environment names none.
@@ -67,17 +67,17 @@ def cache_folder(config: DiskCacheConfig) -> Path:
 
 
 def key_of(parts: Mapping[str, object]) -> str:
-    """Return a short name for everything that something found out depends on."""
+    """Return a short key of everything that a cached result depends on."""
     text = json.dumps({"version": _VERSION, **parts}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
 def get_or_build(config: DiskCacheConfig, key: str, build: Callable[[], EpisodeTable]) -> EpisodeTable:
-    """Return the table kept under a key; build and keep it where there is none, or a damaged one.
+    """Return the table cached under a key; build and cache it if it is missing or damaged.
 
-    The key is among the table's `texts`, as `index`: what else is found out of these episodes depends on it. The form
-    of the table is no part of the key, but of the file's name: an index of another form is built again, while latent
-    caches and what was fetched of the same files stay good.
+    The key is among the table's `texts`, as `index`: other cached results of these episodes depend on it. The format of
+    the table is part of the file's name, not of the key: an index in another format is rebuilt, while latent caches
+    and fetched data of the same files stay valid.
     """
 
     def build_marked() -> EpisodeTable:
@@ -96,9 +96,9 @@ def get_or_make(
     to_bytes: Callable[[T], bytes],
     from_bytes: Callable[[bytes], T],
 ) -> T:
-    """Return what is kept under a key; make and keep it where there is none, or it is damaged.
+    """Return the object cached under a key; make and cache it if it is missing or damaged.
 
-    It is damaged where it is not what was written, by a CRC, or `from_bytes` raises NotATableError.
+    It is damaged if its CRC is wrong, or `from_bytes` raises NotATableError.
     """
     path = cache_folder(config) / "index" / f"{key}.index"
     watch = _watch.get()

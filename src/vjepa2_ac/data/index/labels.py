@@ -13,13 +13,13 @@ _MISSING = -1
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """One name for each episode, as the place of the name in a list of all that there are."""
+    """One name for each episode, as an index into a list of all names."""
 
     names: tuple[str, ...]
-    number: Int32[np.ndarray, " episodes"]  # into the names; -1: the data set does not say
+    number: Int32[np.ndarray, " episodes"]  # into the names; -1: unknown
 
     def __post_init__(self) -> None:
-        """Refuse numbers of no name, which a damaged file may hold."""
+        """Refuse numbers without a name, which a damaged file may contain."""
         if not all(isinstance(name, str) for name in self.names):
             raise ValueError("labels that are no text")
         if len(self.number) and not _MISSING <= self.number.min() <= self.number.max() < len(self.names):
@@ -27,7 +27,7 @@ class Labels:
 
     @classmethod
     def of(cls, values: Sequence[str | None]) -> Labels:
-        """Make labels; None or an empty name: the data set does not say."""
+        """Make labels; None or an empty name: unknown."""
         names = sorted({value for value in values if value})
         place = {name: number for number, name in enumerate(names)}
         return cls(tuple(names), np.array([place.get(value or "", _MISSING) for value in values], np.int32))
@@ -38,13 +38,13 @@ class Labels:
         return bool(self.names)
 
     def of_episode(self, index: int) -> str | None:
-        """Return the name of one episode, or None where the data set does not say."""
+        """Return the name of one episode, or None if unknown."""
         number = int(self.number[index])
         return None if number == _MISSING else self.names[number]
 
 
 def labels_of(values: Sequence[Mapping[str, str | None]]) -> dict[str, Labels]:
-    """Return the labels of episodes, each given as {label: name}; labels that no episode has are left out."""
+    """Return the labels of episodes, each given as {label: name}; unused labels are dropped."""
     every = {label for of_one in values for label in of_one}
     found = {label: Labels.of([of_one.get(label) for of_one in values]) for label in sorted(every)}
     return {label: labels for label, labels in found.items() if labels.is_present}

@@ -8,11 +8,11 @@ import numpy as np
 
 
 class NotPackedTextError(ValueError):
-    """Columns are not what `pack_texts` returned."""
+    """Columns are not a result of `pack_texts`."""
 
 
 def pack_texts(name: str, lines: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return columns that hold these texts under a name."""
+    """Return columns with these texts under a name."""
     encoded = [line.encode() for line in lines]
     ends = np.cumsum([len(line) for line in encoded], dtype=np.int64)
     return {f"{name}_ends": ends, f"{name}_bytes": np.frombuffer(b"".join(encoded), np.uint8)}
@@ -22,7 +22,7 @@ def require_texts(ends: np.ndarray, data: np.ndarray | None) -> None:
     """Refuse columns that `pack_texts` cannot have made.
 
     Raises:
-        NotPackedTextError: The ends do not lie within the bytes, in their order.
+        NotPackedTextError: The ends are not within the bytes, or not in order.
     """
     fits = data is not None and data.dtype == np.uint8 and ends.dtype == np.int64
     edges = np.concatenate([[0], ends, [0 if data is None else len(data)]])

@@ -21,27 +21,27 @@ from vjepa2_ac.data.inspection.excerpts import Excerpt
 MOST_LAG = 10  # control steps
 _LAG_SHARE = 4  # an excerpt is shifted by a quarter of its length at most
 _FEWEST_CHANGES = 8  # of an excerpt
-_SHIFTS = 20  # pairings with other episodes, each of all episodes
-FEWEST_EPISODES = 8  # of fewer, chance is not known well enough
+_SHIFTS = 20  # pairings with other episodes, each covering all episodes
+FEWEST_EPISODES = 8  # with fewer, chance level is not known well enough
 _SURE = 3.0  # standard errors, or deviations of chance
-_GAIN = 0.25  # of what is above chance, that another shift must add
-_ABOVE = 0.15  # chance, at least, of a robot with its own frames: 0.3 and more was seen
+_GAIN = 0.25  # of the value above chance, that another shift must add
+_ABOVE = 0.15  # minimum above chance for matching frames: 0.3 and more was measured
 
 Verdict = Literal["together", "late", "reversed", "foreign", "unknown"]
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well frames and states fit."""
+    """Agreement of frames and states."""
 
     verdict: Verdict
     episodes: int
-    lag: int = 0  # control steps by which frames lag behind states where they fit best; below 0: are ahead
+    lag: int = 0  # control steps by which frames lag behind states where they fit best; below 0: lead
     best: float = 0.0  # mean rank correlation there
     unshifted: float = 0.0
     backwards: float = 0.0  # with the frames in reverse, at the best shift
     chance: float = 0.0  # with frames of other episodes, at the best shift
-    is_farthest: bool = False  # no wider shift was tried
+    is_farthest: bool = False  # no wider shift was evaluated
 
 
 def agreement_of(
@@ -52,12 +52,12 @@ def agreement_of(
     Args:
         excerpts: Some episodes.
         moved: How far each has moved at each step, in any unit.
-        least_lag: Control steps that are called late; a camera is soon one step behind.
+        least_lag: Control steps that count as late; a camera easily lags by one step.
     """
     pairs = [(one, other.frame_change) for one, other in zip(moved, excerpts, strict=True)]
     pairs = [pair for pair in pairs if all(len(values) and np.ptp(values) > 0 for values in pair)]
     usual = float(np.median([len(one) for one, _ in pairs])) if pairs else 0.0
-    pairs = [pair for pair in pairs if len(pair[0]) >= usual / 2]  # shorter ones would tell of few shifts only
+    pairs = [pair for pair in pairs if len(pair[0]) >= usual / 2]  # shorter ones would allow few shifts only
     most = min(MOST_LAG, int(usual) // _LAG_SHARE)
     if len(pairs) < FEWEST_EPISODES or usual < _FEWEST_CHANGES:
         return Agreement("unknown", len(pairs))
@@ -105,7 +105,7 @@ def _judged(
 
 
 def _ranks(rows: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, "rows longest"]:
-    """Return the ranks of each row's values, from 0 to 1; NaN behind the shorter ones."""
+    """Return the ranks of each row's values, from 0 to 1; NaN after the end of shorter ones."""
     ranks = np.full((len(rows), max(map(len, rows))), np.nan)
     for place, row in enumerate(rows):
         ranks[place, : len(row)] = rankdata(row) / len(row)
@@ -115,7 +115,7 @@ def _ranks(rows: Sequence[Float[np.ndarray, " _"]]) -> Float[np.ndarray, "rows l
 def _profiles(
     moved: Float[np.ndarray, "episodes longest"], seen: Float[np.ndarray, "episodes longest"], lags: range
 ) -> Float[np.ndarray, "episodes lags"]:
-    """Return each row's correlation where what is seen is taken so many steps later than what has moved."""
+    """Return each row's correlation with frame changes taken so many steps later than motion."""
     length = moved.shape[1]
     columns = []
     for lag in lags:

@@ -23,16 +23,16 @@ from vjepa2_ac.data.inspection.finding import Finding, Level
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
 
-_MOVED_M = 0.01  # of the flange: it should be seen
+_MOVED_M = 0.01  # of the flange: it should be visible
 _DARK = 8  # of 255: mean of frames that show next to nothing
-_STILL_CM, _FAR_CM = 0.2, 30.0  # medians of |dxyz| per model step that are worth a word
+_STILL_CM, _FAR_CM = 0.2, 30.0  # medians of |dxyz| per model step that are reported
 _REACH_M = 1.6  # beyond the reach of common arms
-_LONGEST = 300  # letters of a reason
+_LONGEST = 300  # characters of a reason
 _NARROW = 0.2  # a gripper that never closes further may be given in metres
 
 
 def at_some_stride(dataset: Dataset) -> Dataset:
-    """Return a data set at its stride; where that is auto, at the smallest that would be tried."""
+    """Return a data set at its stride; if that is auto, at the smallest candidate."""
     if dataset.config.stride != "auto":
         return dataset
     return dataset.with_stride(min(dataset.config.strides_to_try(dataset.control_rate_hz)))
@@ -47,17 +47,17 @@ def check_data(
     progress: Progress | None = None,
     clock: Callable[[], float] = time.perf_counter,
 ) -> Iterator[Finding]:
-    """Yield what was found, line after line, as training would meet it.
+    """Yield the findings, line by line, in the order in which training would meet them.
 
-    An `error` line says that training would learn nothing or not begin; a `warning` is worth a look.
+    An `error` means that training would learn nothing or not start; a `warning` should be looked at.
 
     Args:
         config: The data.
         seed: Of the order of clips.
         batch_size: Clips in a batch.
         clips: About as many are read.
-        progress: Told where the index is built.
-        clock: Seconds.
+        progress: Called while the index is built.
+        clock: Returns seconds.
 
     Raises:
         InputError: The data cannot be opened, or a clip cannot be read.
@@ -93,7 +93,9 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
         except InputError as error:
             if split == "train":
                 raise
-            level: Level = "error" if split == "validation" or share else "ok"  # training opens every split it is given
+            level: Level = (
+                "error" if split == "validation" or share else "ok"
+            )  # training opens every split that has a share
             yield Finding(level, split, f"{_shortened(error.found)}. {error.fix}")
             continue
         episodes = len(np.unique(windows.episodes))
@@ -134,7 +136,7 @@ def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int, clock: Ca
 
 
 def findings_in(batches: Sequence[Batch], *, is_pose: bool = True) -> Iterator[Finding]:
-    """Yield what the numbers of some batches say, whose states are poses or not; a pure look, nothing is read."""
+    """Yield the findings of some batches, with or without poses; a pure function, reads nothing."""
     clips = sum(len(batch.starts) for batch in batches)
     first = batches[0]
     name, seen = ("latents", first.latents.values) if first.latents else ("frames", _frames(first))
@@ -240,5 +242,5 @@ def _motion(actions: np.ndarray) -> Finding:
 
 
 def _percentiles(values: np.ndarray, form: str) -> str:
-    """Return the percentiles 10, 50, 90 and 99 in words."""
+    """Return the percentiles 10, 50, 90 and 99 as text."""
     return " / ".join(f"{value:{form}}" for value in np.percentile(values, [10, 50, 90, 99])) + " (10/50/90/99 %)"

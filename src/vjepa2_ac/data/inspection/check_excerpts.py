@@ -15,10 +15,10 @@ _EPISODES_FAR = 12  # of some 5 MB each, for DROID
 
 
 def excerpt_findings(dataset: Dataset) -> Iterator[Finding]:
-    """Read some episodes and yield what is odd in them.
+    """Read some episodes and yield what is unusual in them.
 
     Raises:
-        InputError: An episode cannot be read, and `data.broken_episodes` does not leave it out.
+        InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
     """
     if dataset.config.source == "latents":
         yield Finding("ok", "agreement", "not looked at in a latent cache: check the data set that it was made from")
@@ -34,7 +34,7 @@ def excerpt_findings(dataset: Dataset) -> Iterator[Finding]:
 
 
 def signs_in(excerpts: Sequence[Excerpt], *, is_pose: bool, stride: int, control_rate_hz: float) -> Iterator[Finding]:
-    """Yield what is odd in stretches of episodes, and whether frames and states belong together; nothing is read."""
+    """Yield what is unusual in excerpts, and whether frames and states belong together; reads nothing."""
     excerpts = [one for one in excerpts if len(one.states) > 1]
     if not excerpts:
         return
@@ -66,7 +66,7 @@ def _agreement(found: Agreement, stride: int, control_rate_hz: float, *, is_soun
         steps = abs(found.lag)
         text = f"{said} {found.best:.2f} so, {found.unshifted:.2f} as they are"
         fix = f"Give each frame the state of {_steps(steps)} {'before' if found.lag > 0 else 'after'}"
-        level: Level = "error" if steps >= stride else "warning"  # then each action stands beside another one's frames
+        level: Level = "error" if steps >= stride else "warning"  # then each action is paired with another one's frames
         by = f"frames are {'at least ' * found.is_farthest}{_shift(found.lag)} ({steps / control_rate_hz:.2f} s)"
         return Finding(level, "agreement", f"{by}: {text}. {fix}")
     if found.verdict == "foreign" and is_sound:

@@ -10,14 +10,14 @@ from torch import Tensor
 
 from vjepa2_ac.data.inspection.finding import Finding
 
-_LARGE = 100.0  # beyond what radians, metres and shares come to
+_LARGE = 100.0  # beyond plausible radians, metres and shares
 _FAR = 0.05  # of the range of a number
 
 
 def vector_findings(
     states: Float[np.ndarray, "steps state_dim"], actions: Float[np.ndarray, "pairs action_dim"]
 ) -> Iterator[Finding]:
-    """Yield what can be said of states and actions of some clips."""
+    """Yield the findings about states and actions of some clips."""
     yield _about("states", states, "Check which fields the state is made of")
     yield _about("actions", actions, "There is nothing to learn from")
 
@@ -30,7 +30,7 @@ def has_moved(
 
 
 def numbered(places: Sequence[int], *, most: int = 8) -> str:
-    """Return which numbers of a vector are meant, counted from 0."""
+    """Return the indices of numbers of a vector as text, counted from 0."""
     return ", ".join(map(str, places[:most])) + (", ..." if len(places) > most else "")
 
 

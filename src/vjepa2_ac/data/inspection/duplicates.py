@@ -19,14 +19,14 @@ WAY_OUT = "Leave copies out with data.exclude, or keep in one split what belongs
 
 @dataclass(frozen=True)
 class Duplicates:
-    """Episodes that have the same states as another one, of those that take part."""
+    """Used episodes that have the same states as another one."""
 
-    is_known: bool  # whether the states were looked at
+    is_known: bool  # whether the states were compared
     episodes: int = 0
-    different: int = 0  # that would be left of these without copies
+    different: int = 0  # of these, without copies
     across: int = 0  # of these: with a copy in another split
-    example: tuple[tuple[str, Split], ...] = ()  # two of them with their splits: of different ones, where there are
-    copies: tuple[str, ...] = ()  # identities of all but the first of each: what to leave out
+    example: tuple[tuple[str, Split], ...] = ()  # two of them with their splits: of different splits, if there are
+    copies: tuple[str, ...] = ()  # identities of all but the first of each: what to exclude
 
     def __str__(self) -> str:
         if not self.is_known:
@@ -46,7 +46,7 @@ class Duplicates:
 
 
 def find_duplicates(dataset: Dataset) -> Duplicates:
-    """Compare the states of all episodes that take part, by their hashes: at once, nothing is read."""
+    """Compare the states of all used episodes by their hashes: fast, reads nothing."""
     table = dataset.table
     if table.state_hash is None:
         return Duplicates(is_known=False)
@@ -76,7 +76,7 @@ def find_duplicates(dataset: Dataset) -> Duplicates:
 
 
 def _splits(dataset: Dataset, members: Int[np.ndarray, " members"]) -> Int[np.ndarray, " members"]:
-    """Return the split of each, as a place in `_SPLITS`."""
+    """Return the split of each, as an index into `_SPLITS`."""
     hashes = dataset.split_hash[members]
     return np.asarray(np.argmax([in_split(hashes, dataset.config, split) for split in _SPLITS], axis=0))
 

@@ -27,18 +27,18 @@ class Excerpt:
     name: str  # the episode's identity
     states: Float[np.ndarray, "steps state_dim"]
     grey: Float32[np.ndarray, "steps rows columns"]  # 0 to 255
-    warmth: float  # of what is strongly coloured: 1 all of it more red than blue, -1 more blue; 0 where nothing is
+    warmth: float  # of strongly coloured pixels: 1 all more red than blue, -1 more blue; 0 if there are none
 
     @property
     def frame_change(self) -> Float[np.ndarray, " changes"]:
-        """How much each frame differs from the one before: the mean over its pixels."""
+        """The difference of each frame from the one before: the mean over its pixels."""
         return np.asarray(np.abs(np.diff(self.grey, axis=0)).mean(axis=(1, 2)), np.float64)
 
 
 def excerpts_of(dataset: Dataset, *, episodes: int = EPISODES, steps: int = STEPS) -> Iterator[Excerpt]:
-    """Yield the middle of some episodes that take part: always the same draw.
+    """Yield the middle of some used episodes: always the same draw.
 
-    Episodes that cannot be read are left out, or stop this, as `data.broken_episodes` says.
+    Episodes that cannot be read are skipped, or raise an error, as `data.broken_episodes` says.
 
     Raises:
         InputError: As `Dataset.leave_out`.
@@ -75,14 +75,14 @@ def _read(dataset: Dataset, index: int, steps: int) -> Excerpt:
 
 
 def warmth_of(frames: UInt8[np.ndarray, "steps height width 3"]) -> float:
-    """Return how much more red than blue the strongly coloured pixels are, -1 to 1; 0 where there are few."""
+    """Return how much more red than blue the strongly coloured pixels are, -1 to 1; 0 if there are few."""
     warmer = frames[..., 0].astype(np.int16) - frames[..., 2]
     strong = warmer[np.abs(warmer) > _STRONG]
     return float(strong.sum() / np.abs(strong).sum()) if len(strong) > _STRONG_SHARE * warmer.size else 0.0
 
 
 def small_grey(frames: UInt8[np.ndarray, "steps height width 3"]) -> Float32[np.ndarray, "steps rows columns"]:
-    """Return frames in grey, each pixel the mean of a part; those that are smaller than that stay as they are."""
+    """Return frames in grey, each pixel the mean of a part; smaller frames are not reduced."""
     grey = frames.mean(axis=3, dtype=np.float32)
     for axis, wanted in ((1, _ROWS), (2, _COLUMNS)):
         size = grey.shape[axis]

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac.data.inspection.excerpts import Excerpt
 from vjepa2_ac.data.inspection.finding import Finding
 
-_STILL_FRAME = 0.1  # of an episode's median change: what a codec leaves of a frame that is shown twice
+_STILL_FRAME = 0.1  # of an episode's median change: the codec noise of a repeated frame
 _STALE, _MOSTLY_STALE = 0.05, 0.5
 _COPIED = 0.2
 _FAR_LIKE_NEAR, _FEWEST_STEPS = 0.9, 8
@@ -36,10 +36,10 @@ _COLD, _COLD_SHARE, _COLD_EPISODES = -0.4, 0.9, 8
 
 
 def motion_in(excerpts: Sequence[Excerpt], *, is_pose: bool) -> list[Float[np.ndarray, " _"]]:
-    """Return how far each episode moves at each step: the sum over its numbers, each in units of what it moves by."""
+    """Return the motion of each episode at each step: the sum over its numbers, each in units of its typical change."""
     changes = [_change_of_pose(one.states) if is_pose else np.diff(one.states, axis=0) for one in excerpts]
     scale = np.sqrt((np.concatenate(changes) ** 2).mean(axis=0))
-    scale = np.where(scale > 0, scale, np.inf)  # what never moves does not count
+    scale = np.where(scale > 0, scale, np.inf)  # constant numbers do not count
     return [np.abs(change / scale).sum(axis=1) for change in changes]
 
 
@@ -52,7 +52,7 @@ def _change_of_pose(states: Float[np.ndarray, "steps 7"]) -> Float[np.ndarray, "
 
 
 def noise_as_frames(excerpts: Sequence[Excerpt]) -> Finding | None:
-    """Say so where neighbouring frames differ as much as those half an excerpt apart."""
+    """Report neighbouring frames that differ as much as those half an excerpt apart."""
     excerpts = [one for one in excerpts if len(one.grey) >= _FEWEST_STEPS]
     near = sum(float(one.frame_change.sum()) for one in excerpts)
     far = sum(_far_change(one) * (len(one.grey) - 1) for one in excerpts)
@@ -68,7 +68,7 @@ def _far_change(excerpt: Excerpt) -> float:
 
 
 def repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, " _"]]) -> Iterator[Finding]:
-    """Yield what only repeats: poses while frames change, frames while poses do, or single steps of both.
+    """Yield repetitions: of poses while frames change, of frames while poses change, or of single steps of both.
 
     Args:
         excerpts: Some episodes.
@@ -104,16 +104,16 @@ def _by_episode(mask: Bool[np.ndarray, " changes"], excerpts: Sequence[Excerpt])
 
 
 def _alone(mask: Bool[np.ndarray, " changes"]) -> Bool[np.ndarray, " changes"]:
-    """Return which are true while both neighbours are not."""
+    """Return which values are true while both neighbours are not."""
     padded = np.pad(mask, 1)
     return np.asarray(mask & ~padded[:-2] & ~padded[2:])
 
 
 def shaking(excerpts: Sequence[Excerpt]) -> Finding | None:
-    """Say so where positions go back and forth from step to step, as noise does and no arm can.
+    """Report positions that go back and forth from step to step, like noise and unlike an arm.
 
-    The autocorrelation of the motion is near 1 for an arm and -0.5 for noise alone; it is below the limit where the
-    noise, on each axis, is about as large as what the arm moves in a step.
+    The autocorrelation of the motion is near 1 for an arm and -0.5 for noise alone; it is below the limit if the
+    noise, on each axis, is about as large as the arm's motion in a step.
     """
     ways = [np.diff(one.states[:, :3], axis=0) for one in excerpts]
     size = sum(float((way**2).sum()) for way in ways)
@@ -129,7 +129,7 @@ def shaking(excerpts: Sequence[Excerpt]) -> Finding | None:
 
 
 def deltas_for_poses(excerpts: Sequence[Excerpt]) -> Finding | None:
-    """Say so where positions lie where no flange can be: at the base, as differences of positions do."""
+    """Report positions that are impossible for a flange: at the base, as differences of positions are."""
     positions = [one.states[:, :3] for one in excerpts]
     median_m = float(np.median(np.linalg.norm(np.concatenate(positions), axis=1)))
     if not 0 < median_m < _INSIDE_M:
@@ -144,7 +144,7 @@ def deltas_for_poses(excerpts: Sequence[Excerpt]) -> Finding | None:
 
 
 def too_fast(excerpts: Sequence[Excerpt], control_rate_hz: float) -> Finding | None:
-    """Say so where the flange is faster than arms are: the control rate, or the unit, may be wrong."""
+    """Report a flange that is faster than arms: the control rate, or the unit, may be wrong."""
     steps = np.concatenate([np.diff(one.states[:, :3], axis=0) for one in excerpts])
     fast = float(np.percentile(np.linalg.norm(steps, axis=1), 99)) * control_rate_hz if len(steps) else 0.0
     if fast < _FASTEST_M_S:
@@ -154,7 +154,7 @@ def too_fast(excerpts: Sequence[Excerpt], control_rate_hz: float) -> Finding | N
 
 
 def blue_hint(excerpts: Sequence[Excerpt]) -> Finding | None:
-    """Hint where in nearly all episodes colours are cold, which is rare among rooms, wood and skin, but no fault."""
+    """Hint if colours are cold in nearly all episodes, which is rare for rooms, wood and skin, but no error."""
     warmth = np.array([one.warmth for one in excerpts])
     if len(warmth) < _COLD_EPISODES or (warmth < _COLD).mean() < _COLD_SHARE:
         return None

@@ -26,7 +26,7 @@ from vjepa2_ac.errors import InputError
 PERCENTILES = (10, 50, 90, 99)
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 
-RELEASED_STEP_CM = 12.9  # what the flange moves between the two frames of upstream's example (franka_example_traj.npz)
+RELEASED_STEP_CM = 12.9  # motion of the flange between the two frames of upstream's example (franka_example_traj.npz)
 RELEASED = (
     "the released weights saw DROID at a step of 4, 8 or 15 control steps (0.27, 0.53 or 1 s): which one is unsettled."
     f" The one known pair of frames, upstream's own example, is {RELEASED_STEP_CM} cm apart."
@@ -38,14 +38,14 @@ RELEASED = (
 class ReadEpisode:
     """An episode of the sample, without frames."""
 
-    index: int  # place in the data set's table
+    index: int  # index into the data set's table
     states: Float[np.ndarray, "steps state_dim"]
     kept: tuple[tuple[int, int], ...]  # ranges that clips come from
 
 
 @dataclass(frozen=True, eq=False)
 class MotionPerStep:
-    """How far the flange moves and turns from one model step to the next, at one stride."""
+    """Translation and rotation of the flange per model step, at one stride."""
 
     stride: int
     seconds: float
@@ -60,12 +60,12 @@ class MotionPerStep:
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """What was found; values of motion are those of a sample of the episodes that take part."""
+    """The statistics of a data set; motion is measured on a sample of the used episodes."""
 
     config: DataConfig
     control_rate_hz: float
     lengths: np.ndarray  # control steps of every readable episode
-    success: np.ndarray  # of every readable episode: 1, 0, or -1 where the data set does not say
+    success: np.ndarray  # of every readable episode: 1, 0, or -1 if unknown
     broken: int
     removed: tuple[Removed, ...]
     episodes_of: dict[Split, int]
@@ -79,12 +79,12 @@ class Inspection:
 
     @property
     def hours(self) -> float:
-        """How long all readable episodes last."""
+        """The total duration of all readable episodes."""
         return float(self.lengths.sum() / self.control_rate_hz / 3600)
 
     @property
     def success_share(self) -> float | None:
-        """The share of successes among the episodes of which that is known; None: of none."""
+        """The share of successes among the episodes with known outcome; None: there are none."""
         known = self.success >= 0
         return float(self.success[known].mean()) if known.any() else None
 
@@ -95,7 +95,7 @@ class Inspection:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """The cameras that can be asked for, as far as the config knows."""
+        """The available cameras, as far as the config knows them."""
         known = self.config.known_cameras
         return known if known is not None else RAW_CAMERAS if self.config.source == "droid_raw" else self.config.cameras
 
@@ -115,7 +115,7 @@ class Inspection:
         return float(values.min()), float(values.max())
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every figure as plain values, for `inspect.json`."""
+        """Return all statistics as plain values, for `inspect.json`."""
         return {
             "path": self.config.path,
             "source": self.config.source,
@@ -171,15 +171,15 @@ class Inspection:
 
 
 def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress | None = None) -> Inspection:
-    """Look at a data set: at the table for what concerns all episodes, at the states of a sample for the motion.
+    """Compute the statistics of a data set: from the table for all episodes, from the states of a sample for motion.
 
     Args:
         dataset: Its stride is a number.
-        episodes: At most as many are read, without frames, spread over those that take part.
-        progress: Told (episodes read, episodes in all).
+        episodes: At most as many are read, without frames, spread over the used ones.
+        progress: Called with (episodes read, total number).
 
     Raises:
-        InputError: Episodes of the sample cannot be read, and `data.broken_episodes` does not leave them out.
+        InputError: Episodes of the sample cannot be read, and `data.broken_episodes` does not skip them.
     """
     sample = tuple(_read(dataset, sample_of(dataset, episodes), progress))
     rate, strides = dataset.control_rate_hz, dataset.config.strides_to_try(dataset.control_rate_hz)
@@ -208,15 +208,15 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
 
 
 def sample_of(dataset: Dataset, count: int) -> list[int]:
-    """Return at most `count` episodes of those that take part: a random draw that is always the same."""
-    # A latent cache has only the episodes of which clips are made.
+    """Return at most `count` of the used episodes: a random draw that is always the same."""
+    # A latent cache has only the episodes that clips come from.
     members = dataset.starts.episodes if dataset.config.source == "latents" else dataset.episodes
     members = members[np.argsort(dataset.table.id_hash[members], kind="stable")]
     return [int(members[place]) for place in spread(len(members), count)]
 
 
 def motion_per_step(sample: Sequence[ReadEpisode], stride: int, control_rate_hz: float) -> MotionPerStep:
-    """Return what the flange does from each step to the one `stride` later, where both are in one kept range."""
+    """Return the motion of the flange from each step to the one `stride` later, within one kept range."""
     pieces = [one.states[start:end] for one in sample for start, end in one.kept if end - start > stride]
     if not pieces:
         return MotionPerStep(stride, stride / control_rate_hz, np.zeros(0), np.zeros(0))
@@ -231,7 +231,7 @@ def motion_per_step(sample: Sequence[ReadEpisode], stride: int, control_rate_hz:
 
 
 def idle_runs(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[np.ndarray, " steps"]:
-    """Return which steps are in a run of idle ones, by the measured motion, that is long enough for the idle filter."""
+    """Return the steps in runs of idle ones, by measured motion, that are long enough for the idle filter."""
     idle = idle_by_motion(states, config.idle)
     edges = np.flatnonzero(np.diff(idle.astype(np.int8), prepend=0, append=0))
     for start, end in zip(edges[::2], edges[1::2], strict=True):
@@ -264,5 +264,5 @@ def _episodes(dataset: Dataset, split: Split) -> int:
 def _windows(dataset: Dataset, split: Split) -> int:
     try:
         return len(dataset.windows(split))
-    except InputError:  # an empty split is a figure here, not a mistake
+    except InputError:  # an empty split is a statistic here, not an error
         return 0

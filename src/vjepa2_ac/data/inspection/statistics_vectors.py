@@ -11,11 +11,11 @@ from jaxtyping import Float
 
 @dataclass(frozen=True, eq=False)
 class ChangePerStep:
-    """How far vectors get from one model step to the next, at one stride."""
+    """Change of vectors per model step, at one stride."""
 
     stride: int
     seconds: float
-    percent: Float[np.ndarray, " pairs"]  # of its range, the number that changes most
+    percent: Float[np.ndarray, " pairs"]  # of its range, for the number that changes most
 
     def percentiles(self, which: Sequence[int]) -> list[float]:
         """Return percentiles of the change; empty if no pair of steps fits."""
@@ -31,7 +31,7 @@ def change_per_step(
     """Return the change from each step to the one `stride` later.
 
     Args:
-        pieces: States of ranges of steps that clips come from.
+        pieces: States in the ranges that clips come from.
         ranges: The least and greatest value of each number.
         stride: Control steps per model step.
         control_rate_hz: Control steps per second.

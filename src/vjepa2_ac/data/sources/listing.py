@@ -17,9 +17,9 @@ Result = TypeVar("Result")
 
 
 def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
-    """Yield all files, with their folder relative to `root`; names that begin with a dot are left out.
+    """Yield all files, with their folder relative to `root`; names that begin with a dot are skipped.
 
-    A folder to which several links lead is gone through once: its files would be episodes of several names.
+    A folder with several links to it is visited once: its files would be episodes under several names.
 
     Raises:
         OSError: A folder cannot be listed.
@@ -39,7 +39,7 @@ def walk(root: str, connections: int) -> Iterator[tuple[str, FileInfo]]:
 
 
 def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
-    """Return the files of a folder, and the names of the folders in it but for hidden ones.
+    """Return the files of a folder, and the names of its folders except hidden ones.
 
     Raises:
         OSError: It cannot be listed.
@@ -54,12 +54,12 @@ def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
 
 
 def within(folder: str, name: str) -> str:
-    """Return the path of what lies in a folder, relative to what the folder's path is relative to."""
+    """Return the path of an entry of a folder, with the same base as the folder's path."""
     return f"{folder}/{name}" if folder else name
 
 
 def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> list[Result]:
-    """Return the function of every item, in order, computed in several threads; the first error is raised."""
+    """Apply a function to every item in several threads; return the results in order, or raise the first error."""
     if connections == 1 or len(items) < 2:
         return [function(item) for item in items]
     with ThreadPoolExecutor(max_workers=connections) as pool:
@@ -67,6 +67,6 @@ def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], conne
 
 
 def _require_text(name: str, place: str) -> None:
-    """Refuse what cannot be written down, as the identity of an episode must be."""
+    """Refuse a name that cannot be encoded, as the identity of an episode must be."""
     if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
         raise InputError(where=place, found=f"the name {name!r}", needed="names in UTF-8", fix="Rename it")

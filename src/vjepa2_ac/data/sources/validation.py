@@ -13,15 +13,15 @@ _GRIPPER_TOLERANCE = 0.05
 
 
 def require_plausible(states: Float[np.ndarray, "steps 7"], where: str, *, fix: str) -> None:
-    """Refuse what cannot be metres, radians and closedness (legend: `vjepa2_ac.episode`), and an episode of no steps.
+    """Refuse implausible metres, radians and closedness (legend: `vjepa2_ac.episode`), and an episode without steps.
 
     Args:
         states: Measured states of every control step.
-        where: File and episode, for the message.
-        fix: The way out: which settings to check.
+        where: File and episode, for messages.
+        fix: Which settings to check.
 
     Raises:
-        InputError: Names the first step that cannot be one, and its numbers.
+        InputError: Names the first implausible step, and its numbers.
     """
     if len(states) == 0:
         raise zero_steps(where)
@@ -47,7 +47,7 @@ def require_plausible(states: Float[np.ndarray, "steps 7"], where: str, *, fix: 
 
 
 def require_finite(states: Float[np.ndarray, "steps state_dim"], where: str, *, fix: str) -> None:
-    """Refuse vectors that cannot be a robot's state or command, and an episode of no steps. What they mean is unknown.
+    """Refuse impossible state or command vectors, and an episode without steps. Their meaning is unknown.
 
     Raises:
         InputError: Names the first step with a number that is not finite.
@@ -65,5 +65,5 @@ def require_finite(states: Float[np.ndarray, "steps state_dim"], where: str, *, 
 
 
 def zero_steps(where: str) -> InputError:
-    """Return the error of an episode without a single step."""
+    """Return the error of an episode without steps."""
     return InputError(where=where, found="no steps", needed="one or more")

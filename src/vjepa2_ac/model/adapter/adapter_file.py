@@ -35,21 +35,21 @@ _KNOBS = {  # PEFT's names, and ours
     "alpha_pattern": "alpha_pattern",
 }
 _FIXED = {"peft_type": "LORA", "bias": "none"}
-_INFORMATIONAL = frozenset({  # where it comes from, and for what
+_INFORMATIONAL = frozenset({  # origin and purpose
     "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_version", "revision",
     "task_type",
 })  # fmt: skip
 
 
 def read_adapter_file(folder: Path, defaults: Mapping[str, Any]) -> AdapterConfig:
-    """Return the knobs that an adapter was made with.
+    """Return the knobs of a saved adapter.
 
     Args:
-        folder: Where it lies.
-        defaults: What PEFT writes of settings that nobody chose.
+        folder: Its folder.
+        defaults: PEFT's values of settings that were not chosen.
 
     Raises:
-        InputError: The file is missing or damaged, or of an adapter that this program does not make.
+        InputError: The file is missing or damaged, or of an unsupported adapter.
     """
     path = folder / ADAPTER_FILE
     try:
@@ -69,7 +69,7 @@ def read_adapter_file(folder: Path, defaults: Mapping[str, Any]) -> AdapterConfi
 
 
 def _require_plain_lora(values: Mapping[str, Any], defaults: Mapping[str, Any], path: Path) -> None:
-    """Refuse settings that change what an adapter does, and that this program has no knob for."""
+    """Refuse settings that change an adapter's effect, and for which this program has no knob."""
     for name, needed in _FIXED.items():
         if values.get(name) != needed:
             found = f"an adapter with {name} {shown(values.get(name))}"

@@ -24,12 +24,12 @@ from vjepa2_ac.storage.structured import read_json_object, record_of
 CARD = "vjepa2_ac.json"
 LORA_WEIGHTS = "adapter_model.safetensors"  # PEFT's name
 FULL_WEIGHTS = "predictor.safetensors"
-PRINCIPAL_PARTS = "pissa_start.safetensors"  # what an adapter of init pissa started from, and the base then lacks
+PRINCIPAL_PARTS = "pissa_start.safetensors"  # the initial values of an adapter of init pissa, which the base then lacks
 
 
 @dataclass(frozen=True)
 class _Heads:
-    """Fresh heads: the widths of states and actions, and what they were drawn from."""
+    """Fresh heads: the widths of states and actions, and their seed."""
 
     state_dim: VectorWidth
     action_dim: VectorWidth
@@ -38,7 +38,7 @@ class _Heads:
 
 @dataclass(frozen=True)
 class _Card:
-    """What was trained, and on which base."""
+    """The trained weights' kind and base."""
 
     kind: Literal["lora", "none"]
     base_predictor: str
@@ -49,10 +49,10 @@ class _Card:
 def write_trained(
     folder: Path, adaptation: Adaptation, weights: dict[str, Tensor], fresh_heads: dict[str, int] | None = None
 ) -> None:
-    """Write weights and the card that says what they are, what they were trained on, and with which fresh heads.
+    """Write weights and their card: kind, base, and fresh heads.
 
     Raises:
-        OSError: The disk is full, or another reason of the system's.
+        OSError: The disk is full, or another system error.
     """
     folder.mkdir(parents=True, exist_ok=True)
     whole = {key: value.detach().to("cpu").contiguous() for key, value in weights.items()}
@@ -71,10 +71,10 @@ def write_trained(
 
 
 def read_kind(folder: Path, model: WorldModel) -> str:
-    """Return what was trained, lora or none, once it is certain that it belongs to this model.
+    """Return the kind of the trained weights, lora or none, after checking that they belong to this model.
 
     Raises:
-        InputError: The folder is of another kind, or belongs to another base.
+        InputError: The folder is of another kind, or its weights belong to another base.
     """
     card = _read_card(folder)
     _check_base(model, card, where=str(folder / CARD))
@@ -89,7 +89,7 @@ def read_kind(folder: Path, model: WorldModel) -> str:
 
 
 def read_fresh_heads(folder: Path) -> tuple[Widths, int] | None:
-    """Return the widths of states and actions and the seed of fresh heads; None where the base's own were kept.
+    """Return the widths of states and actions and the seed of fresh heads; None if the base's own heads are used.
 
     Raises:
         InputError: The folder is of another kind, or damaged.
@@ -99,7 +99,7 @@ def read_fresh_heads(folder: Path) -> tuple[Widths, int] | None:
 
 
 def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Read weights that have the names and shapes of others.
+    """Read weights that must have the names and shapes of given ones.
 
     Raises:
         InputError: The file is missing or damaged, or holds other tensors, or NaN or infinity.
@@ -115,7 +115,7 @@ def read_weights(path: Path, like: dict[str, Tensor]) -> dict[str, Tensor]:
 def _save(weights: dict[str, Tensor], path: Path) -> None:
     try:
         save_file(weights, path, metadata={"format": "pt"})
-    except SafetensorError as error:  # the system's reason stands in its text alone
+    except SafetensorError as error:  # the system's reason is in its text only
         raise OSError(errno.EIO, str(error), str(path)) from None
 
 

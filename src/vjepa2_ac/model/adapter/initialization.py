@@ -9,11 +9,11 @@ from typing import Any
 import torch
 from torch import Generator, Tensor, nn
 
-# Layers are PEFT's LoraLayer, which has no types, by their name in the predictor.
+# Layers are PEFT's LoraLayer, which is untyped, by their name in the predictor.
 
 
 def draw_first_matrices(layers: Mapping[str, Any], init: object, generator: Generator) -> None:
-    """Draw the first matrix of each layer; the second one is zero, so that nothing changes yet.
+    """Draw the first matrix of each layer; the second one is zero, so the output does not change.
 
     Source: the two distributions are those of PEFT's `init_lora_weights` True and "gaussian".
     """
@@ -33,13 +33,13 @@ def original_weights(layers: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def set_original_weights(layers: Mapping[str, Any], weights: Mapping[str, Tensor]) -> None:
-    """Give the layers these weights of their own."""
+    """Set the layers' own weights."""
     for name, layer in layers.items():
         layer.get_base_layer().weight.data.copy_(weights[name])
 
 
 def principal_parts(layers: Mapping[str, Any]) -> dict[str, Tensor]:
-    """Return, for each layer, the two matrices of its largest singular values: what PiSSA starts from.
+    """Return, for each layer, the two matrices of its largest singular values: PiSSA's initial values.
 
     Source: arXiv 2404.02948, equations 2 and 3.
     """
@@ -55,10 +55,10 @@ def principal_parts(layers: Mapping[str, Any]) -> dict[str, Tensor]:
 
 
 def start_from(layers: Mapping[str, Any], original: Mapping[str, Tensor], parts: Mapping[str, Tensor]) -> None:
-    """Give each adapter its principal part, and take it off the layer's own weight: together they are the original.
+    """Give each adapter its principal part, and subtract it from the layer's own weight: their sum is the original.
 
-    It is computed on the CPU in float32, whatever the device: the same bits wherever a run goes on. What is left of a
-    bfloat16 weight is rounded to bfloat16.
+    It is computed on the CPU in float32 on any device: bit-identical wherever a run is resumed. The rest of a bfloat16
+    weight is rounded to bfloat16.
     """
     for name, layer in layers.items():
         first, second = parts[f"{name}.lora_A"], parts[f"{name}.lora_B"]
@@ -69,7 +69,7 @@ def start_from(layers: Mapping[str, Any], original: Mapping[str, Tensor], parts:
 
 
 def measure_magnitudes(layers: Mapping[str, Any]) -> None:
-    """Give DoRA's magnitudes the lengths of the rows as they are, in float32: as PEFT computes them in each step."""
+    """Set DoRA's magnitudes to the current norms of the rows, in float32, as PEFT computes them in each step."""
     for layer in layers.values():
         if "default" in layer.lora_magnitude_vector:
             update = layer.lora_B["default"].weight @ layer.lora_A["default"].weight

@@ -57,7 +57,7 @@ _COMPARED = (
 
 
 class TrainableReport(NamedTuple):
-    """How many parameters there are; those of an adapter count as trained only."""
+    """Parameter counts; those of an adapter count as trained only."""
 
     trained: int
     predictor: int
@@ -76,22 +76,22 @@ class TrainableReport(NamedTuple):
 
 
 def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Path | None = None) -> None:
-    """Make a model trainable: its predictor gets an adapter, or all of it is trained. What is trained is float32.
+    """Make a model trainable: its predictor gets an adapter, or is trained completely. Trained weights are float32.
 
-    A fresh adapter changes nothing: its second matrix is zero; the first is decided by the seed. With `init: pissa` it
-    is a part of the weights, taken off them, which comes to the same up to rounding.
+    A fresh adapter does not change the output: its second matrix is zero; the seed determines the first. With `init:
+    pissa` it is a part of the weights, subtracted from them: the same output up to rounding.
 
     Args:
         model: The base.
         config: What is trained.
-        seed: Decides the first matrices.
-        started: What `save_trained` wrote of an adapter that began in the same way. With `init: pissa` the part is read
-            there and not computed, which takes minutes; all else is for `load_trained`.
+        seed: Determines the first matrices.
+        started: A folder of `save_trained` with an adapter of the same start. With `init: pissa` the part is read from
+            there instead of computed, which takes minutes; everything else is left to `load_trained`.
 
     Raises:
         InputError: A target matches no layer, another knob does not fit the predictor, a fresh head (`input_heads`)
             would not be trained, or `started` is of another adapter.
-        ValueError: The model has been adapted already.
+        ValueError: The model is already adapted.
     """
     if model.adaptation is not None:
         raise ValueError("this model has been adapted already: merge_adapter first, or load_trained into it")
@@ -110,27 +110,27 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Pa
 
 
 def trainable_report(model: WorldModel) -> TrainableReport:
-    """Return how many parameters are trained, the predictor's own, and the model's without an adapter."""
+    """Return the number of trained parameters, of the predictor's own, and of the model's without an adapter."""
     own = sum(value.numel() for value in base_weights(model.base_predictor).values())
     encoder = sum(value.numel() for value in model.encoder.parameters())
     return TrainableReport(sum(p.numel() for p in model.parameters() if p.requires_grad), own, own + encoder)
 
 
 def has_adapter(model: WorldModel) -> bool:
-    """Return whether the model differs from the base it started from: `base_only` brings that back for a while."""
+    """Return whether the model differs from its base: `base_only` restores the base temporarily."""
     return model.adaptation is not None
 
 
 def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tensor] | None = None) -> None:
-    """Write what was trained: an adapter in PEFT's own format, or all of the predictor; and which base it belongs to.
+    """Write the trained weights: an adapter in PEFT's format, or the whole predictor; and the base's identity.
 
     Args:
         model: The adapted model.
         folder: Where to.
-        weights: All of the predictor, where the model itself has but a part of each weight.
+        weights: The whole predictor, if the model itself has only a shard of each weight.
 
     Raises:
-        ValueError: The model has not been adapted.
+        ValueError: The model is not adapted.
     """
     adaptation, folder = adaptation_of(model), Path(folder)
     if adaptation.kind == "lora":
@@ -141,16 +141,16 @@ def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tenso
 
 
 def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
-    """Put what `save_trained` wrote on the base it was trained on, or into the adapter that is on already.
+    """Load what `save_trained` wrote onto its base, or into an existing adapter.
 
     Args:
-        model: The base, or a model adapted in the same way; it is never wrapped twice.
+        model: The base, or a model adapted in the same way; it is not wrapped again.
         folder: The folder.
-        trainable: Whether to train on; None leaves an adapter that is on as it is, and freezes a new one.
+        trainable: Whether it can be trained; None leaves an existing adapter unchanged, and freezes a new one.
 
     Raises:
-        InputError: The folder is not an adapter, is damaged, belongs to another base, or differs from the one that
-            is on.
+        InputError: The folder is not an adapter, is damaged, belongs to another base, or differs from the existing
+            one.
     """
     folder = Path(folder)
     fresh = model.adaptation is None
@@ -175,7 +175,7 @@ def adaptation_of(model: WorldModel) -> Adaptation:
     """Return how a model was adapted.
 
     Raises:
-        ValueError: It was not.
+        ValueError: It is not adapted.
     """
     if model.adaptation is None:
         raise ValueError("this model has not been adapted: add_adapter or load_trained first")
@@ -208,7 +208,7 @@ def _wrap(model: WorldModel, config: LoraConfig) -> None:
     model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
     init, config.init_lora_weights = config.init_lora_weights, True  # or PEFT cuts PiSSA out of the base, in its type
     training = model.predictor.training
-    model.predictor = get_peft_model(model.predictor, config).train(training)  # PEFT's dropout begins switched on
+    model.predictor = get_peft_model(model.predictor, config).train(training)  # PEFT's dropout is enabled at first
     config.init_lora_weights = init
     model.set_gradient_checkpointing(checkpointing)
     model.adaptation = Adaptation("lora", base, model.encoder_fingerprint())
@@ -273,7 +273,7 @@ def _load_lora(model: WorldModel, folder: Path) -> None:
 
 
 def _read_lora_config(folder: Path, model: WorldModel) -> Any:
-    """Return what an adapter was made with, as PEFT takes it; on a base it is seen to fit."""
+    """Return an adapter's settings in PEFT's form; on a base they are checked to fit."""
     knobs = read_adapter_file(folder, LoraConfig().to_dict())
     if model.adaptation is not None:
         return LoraConfig(**peft_arguments(knobs, knobs.targets))

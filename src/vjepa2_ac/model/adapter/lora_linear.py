@@ -20,17 +20,17 @@ with quiet_imports():
 class LoraLinear(Linear):  # type: ignore[misc]  # PEFT has no types
     """PEFT's linear layer with a low-rank adapter; plain LoRA takes fewer passes over the tokens.
 
-    PEFT casts tokens to the adapter's float32 and autocast casts them back; dropout, scaling and adding are passes of
-    their own, and so are their gradients. Here nothing is cast but the two small matrices, and the matrix products
-    scale and add. In float32 the same to rounding; in bfloat16 it rounds less often. Whatever is not plain LoRA on a
-    frozen layer (DoRA, an adapter that is switched off or merged, types that nothing brings together) is left to PEFT.
-    Hooks on the layer and the matrices inside are not called, and there are no second derivatives.
+    PEFT casts tokens to the adapter's float32 and autocast casts them back; dropout, scaling and adding are separate
+    passes, and so are their gradients. Here only the two small matrices are cast, and the matrix products scale and
+    add. In float32 the result is the same to rounding; in bfloat16 it is rounded less often. Everything except plain
+    LoRA on a frozen layer (DoRA, a disabled or merged adapter, types that do not match) is left to PEFT. Hooks on the
+    layer and the matrices inside are not called, and there are no second derivatives.
     """
 
     cast: tuple[Tensor, Tensor] | None = None  # its matrices in the arithmetic's type, while `CastMatrices` holds them
 
     def forward(self, tokens: Float[Tensor, "*batch inputs"], *args: Any, **kwargs: Any) -> Tensor:
-        """Return what the layer and its adapter make of each token."""
+        """Return the output of the layer and its adapter for each token."""
         dtype = self._dtype_of_plain_lora(tokens)
         if dtype is None or args or kwargs:
             return super().forward(tokens, *args, **kwargs)  # type: ignore[no-any-return]
@@ -49,7 +49,7 @@ class LoraLinear(Linear):  # type: ignore[misc]  # PEFT has no types
         return apply(tokens, masked, weight, bias, *matrices, *cast, self.scaling[name])
 
     def _dtype_of_plain_lora(self, tokens: Tensor) -> torch.dtype | None:
-        """Return the type to compute in; None where PEFT shall compute."""
+        """Return the type to compute in; None if PEFT computes."""
         adapters, layer = self.active_adapters, self.base_layer
         if self.disable_adapters or self.merged or len(adapters) != 1 or adapters[0] not in self.lora_A:
             return None
@@ -64,10 +64,10 @@ class LoraLinear(Linear):  # type: ignore[misc]  # PEFT has no types
 
 
 class CastMatrices:
-    """The matrices of adapters in the arithmetic's type, cast together once a step, and not at each of their uses.
+    """The matrices of adapters in the arithmetic's type, cast together once per step instead of at each use.
 
     Args:
-        module: In which the adapters are.
+        module: The module with the adapters.
         dtype: Of the arithmetic.
     """
 
@@ -82,7 +82,7 @@ class CastMatrices:
 
     @contextmanager
     def current(self) -> Iterator[None]:
-        """Cast now, and let all layers use that meanwhile: the matrices must not change."""
+        """Cast now, and let all layers use the result within the block: the matrices must not change."""
         if self._own:
             with torch.no_grad():
                 torch._foreach_copy_(self._cast, self._own)
@@ -96,7 +96,7 @@ class CastMatrices:
 
 
 def _matrices(layer: LoraLinear) -> list[nn.Linear]:
-    """Return the two of the one adapter that is computed here; none where there are several."""
+    """Return the two matrices of the adapter that is computed here; none if there are several adapters."""
     names = layer.active_adapters
     return [layer.lora_A[names[0]], layer.lora_B[names[0]]] if len(names) == 1 and names[0] in layer.lora_A else []
 
@@ -104,9 +104,9 @@ def _matrices(layer: LoraLinear) -> list[nn.Linear]:
 class _LowRankLinear(torch.autograd.Function):
     """`tokens @ weight.T + bias + scale * masked @ first.T @ second.T`, the weight frozen; all of one type.
 
-    Where the matrices have another type, they are given once more in this one, which is what is computed with; their
-    gradients have their own. What is kept for the gradient is the adapter's input (masked, else the tokens) and what
-    is between its matrices; of a frozen adapter neither.
+    If the matrices have another type, they are also given in this one, which is used to compute; their gradients have
+    their own type. Saved for the gradient are the adapter's input (masked, else the tokens) and the values between its
+    matrices; for a frozen adapter neither.
     """
 
     @staticmethod
@@ -153,7 +153,7 @@ class _LowRankLinear(torch.autograd.Function):
 
 
 def _plus_product(total: Tensor, left: Tensor, right: Tensor, scale: float) -> Tensor:
-    """Return `total + scale * left @ right` in the memory of the total; a compiler decides that by itself."""
+    """Return `total + scale * left @ right` in the memory of the total; a compiler chooses the memory itself."""
     if torch.compiler.is_compiling():  # torch 2.11 would lose the gradient of the result (PyTorch issue 180642)
         return torch.addmm(total, left, right, alpha=scale)
-    return torch.addmm(total, left, right, alpha=scale, out=total)  # which PyTorch's counter of FLOPs knows
+    return torch.addmm(total, left, right, alpha=scale, out=total)  # PyTorch's FLOP counter knows this operation

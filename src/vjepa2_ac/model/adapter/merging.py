@@ -16,9 +16,9 @@ from vjepa2_ac.model.network.world_model import Adaptation, WorldModel
 
 @contextmanager
 def base_only(model: WorldModel) -> Iterator[None]:
-    """Let the model predict as the base it was adapted from, for a while; a model that was not adapted is the base.
+    """Let the model predict as its base within the block; a model without adapter is the base.
 
-    A model with fresh heads goes back to these as they were drawn: not a base that could be compared with.
+    A model with fresh heads returns to their initial values: not a base for comparison.
     """
     if model.adaptation is None:
         yield
@@ -33,12 +33,12 @@ def base_only(model: WorldModel) -> Iterator[None]:
         with switch:
             yield
     finally:
-        for value, requires_grad in trained:  # PEFT turns gradients on when it turns an adapter on
+        for value, requires_grad in trained:  # PEFT enables gradients when it enables an adapter
             value.requires_grad_(requires_grad)
 
 
 def base_dtype(model: WorldModel) -> torch.dtype:
-    """Return the type of the predictor's weights before anything of it was trained, in float32: `model.dtype`."""
+    """Return the type of the predictor's weights before training, which is in float32: `model.dtype`."""
     if model.adaptation is not None and model.adaptation.kind == "none" and model.adaptation.start:
         return next(iter(model.adaptation.start.values())).dtype
     weight: torch.Tensor = model.base_predictor.predictor_norm.weight  # never trained beside an adapter
@@ -46,12 +46,12 @@ def base_dtype(model: WorldModel) -> torch.dtype:
 
 
 def merge_adapter(model: WorldModel) -> None:
-    """Make what was trained part of the predictor: added in float32, then cast to the base's type, frozen.
+    """Merge the trained weights into the predictor: added in float32, then cast to the base's type, frozen.
 
-    Autocast around it changes nothing.
+    A surrounding autocast has no effect.
 
     Raises:
-        ValueError: The model has not been adapted.
+        ValueError: The model is not adapted.
     """
     dtype = base_dtype(model)
     if adaptation_of(model).kind == "lora":
@@ -62,9 +62,9 @@ def merge_adapter(model: WorldModel) -> None:
 
 
 def unadapted_copy(model: WorldModel) -> WorldModel:
-    """Return a model for inference that shares the encoder and has a predictor of its own, what was trained merged.
+    """Return a model for inference with a shared encoder and its own predictor, into which the adapter is merged.
 
-    The given one stays as it is.
+    The given model is not changed.
     """
     own = WorldModel.empty(model.sizes)
     own.encoder, own.predictor = model.encoder, copy.deepcopy(model.predictor)
@@ -75,7 +75,7 @@ def unadapted_copy(model: WorldModel) -> WorldModel:
 
 
 def _without_autocast(device: str) -> AbstractContextManager[object]:
-    """Switch autocast off on a kind of device; some, as meta, have none."""
+    """Disable autocast on a kind of device; some, such as meta, have none."""
     return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()
 
 

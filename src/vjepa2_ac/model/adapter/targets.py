@@ -22,10 +22,10 @@ def lora_arguments(predictor: nn.Module, config: AdapterConfig, unused: tuple[st
     Args:
         predictor: The predictor, not adapted.
         config: The knobs.
-        unused: Layers through which nothing flows, by the last part of their name: they can have no adapter.
+        unused: Layers without input, by the last part of their name: they cannot have an adapter.
 
     Raises:
-        InputError: A target or pattern matches no layer, a layer is named twice, or a rank is beyond a layer.
+        InputError: A target or pattern matches no layer, a layer is named twice, or a rank is too large for a layer.
     """
     layers = {
         name: layer
@@ -42,7 +42,7 @@ def lora_arguments(predictor: nn.Module, config: AdapterConfig, unused: tuple[st
 
 
 def peft_arguments(config: AdapterConfig, targets: Iterable[str]) -> dict[str, Any]:
-    """Return the arguments of PEFT's LoraConfig for layers of these names; whether they fit is not looked at."""
+    """Return the arguments of PEFT's LoraConfig for layers of these names; not checked against a predictor."""
     return {
         "r": config.rank,
         "lora_alpha": config.alpha,
@@ -59,10 +59,10 @@ def peft_arguments(config: AdapterConfig, targets: Iterable[str]) -> dict[str, A
 
 
 def chosen_targets(config: AdapterConfig, linear: set[str]) -> tuple[str, ...]:
-    """Return the targets with sets replaced by their layers; `all` leaves out what is trained whole.
+    """Return the targets with sets replaced by their layers; `all` excludes layers that are trained directly.
 
     Raises:
-        InputError: A target is no layer, there is none, or one is also in modules_to_save.
+        InputError: A target is no layer, there are none, or one is also in modules_to_save.
     """
     everything = tuple(sorted(linear - set(config.modules_to_save)))
     sets = {"attention": ATTENTION, "mlp": MLP, "all": everything}
@@ -109,7 +109,7 @@ def _check_ranks(config: AdapterConfig, adapted: Mapping[str, nn.Linear]) -> Non
 
 
 def _matches(pattern: str, name: str) -> bool:
-    """Say whether PEFT lets this pattern decide about this layer."""
+    """Return whether PEFT applies this pattern to this layer."""
     return re.match(rf"(.*\.)?({pattern})$", name) is not None
 
 

@@ -19,11 +19,11 @@ _HEADS = (
 
 
 def foreign_kind(path: Path, error: Exception) -> str | None:
-    """Return what a file is that torch could not read, in a few words; None where it may be a damaged checkpoint.
+    """Return the kind of a file that torch could not read; None if it may be a damaged checkpoint.
 
     Args:
         path: The file.
-        error: What torch said of it.
+        error: torch's error.
     """
     with path.open("rb") as file:
         head = file.read(_HEAD_BYTES)
@@ -41,13 +41,13 @@ def foreign_kind(path: Path, error: Exception) -> str | None:
 
 
 def _kind_of_pickle(head: bytes) -> str:
-    """Look at what a pickle names before it is loaded, without loading it."""
+    """Inspect the names in a pickle without loading it."""
     names = [name for name in _names_in(head) if name.split(".")[0] not in _KNOWN]
     return _refused(names[0]) if names else "a pickle, or a file of an old version of torch.save"
 
 
 def _names_in(pickles: bytes) -> list[str]:
-    """Return what pickles, one behind the other, would import; those before the place where they cannot be read."""
+    """Return the imports of consecutive pickles, up to the first that cannot be read."""
     names, texts, file = [], [""], io.BytesIO(pickles)
     try:
         while file.tell() < len(pickles):

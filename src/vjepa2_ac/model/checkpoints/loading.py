@@ -15,7 +15,7 @@ def load_base(config: ModelConfig, *, seed: int) -> WorldModel:
     """Return the world model to start from, on the CPU: `model.base`, or a fresh one of the sizes `model.random`.
 
     Raises:
-        InputError: There is no such model, it cannot be read, or `model.sizes` says otherwise.
+        InputError: There is no such model, it cannot be read, or contradicts `model.sizes`.
     """
     dtype = torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
     if config.random is not None:

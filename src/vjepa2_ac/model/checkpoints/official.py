@@ -26,30 +26,30 @@ from vjepa2_ac.model.sizes import check_sizes
 
 logger = logging.getLogger(__name__)
 
-GROUP_BYTES = 2**29  # of the file that are in memory at once, besides the weights themselves
+GROUP_BYTES = 2**29  # of the file in memory at once, in addition to the weights
 IGNORED = {
     "encoder": ("pos_embed",),
     "predictor": (),
-}  # may be there: a network with rotary positions has no use for it
+}  # may exist: a network with rotary positions does not use it
 
 _NEEDED = "a checkpoint of V-JEPA 2-AC as Meta publishes it (vjepa2-ac-vitg.pt)"
 _FIX = "`vjepa2-ac download` fetches it, and goes on with a part of it"
 _SPLIT = ("q", "k", "v")
-_DAMAGE = (  # what a pickle that is damaged ends in, beside what torch says of it
+_DAMAGE = (  # errors of a damaged pickle, in addition to torch's own
     pickle.UnpicklingError, OSError, EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError,
     AssertionError, ArithmeticError, MemoryError,
 )  # fmt: skip
 
 
 def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torch.dtype = torch.float32) -> WorldModel:
-    """Read Meta's checkpoint. Every tensor is matched; only those in `IGNORED` may be left over.
+    """Read Meta's checkpoint. Every tensor is matched; only those in `IGNORED` may remain.
 
     The file is mapped and read in groups: the peak is the weights in `dtype` plus about 1 GB.
 
     Args:
         path: The `.pt` file.
-        sizes: What the tensors cannot say: image size, heads, extrinsics. Another size that is neither the default
-            nor what the tensors say is a contradiction.
+        sizes: Sizes that tensors do not show: image size, heads, extrinsics. Any other size that differs from both the
+            default and the tensors is a contradiction.
         dtype: Type of the weights in memory.
 
     Raises:
@@ -65,10 +65,10 @@ def load_official(path: str | Path, sizes: ModelSizes | None = None, dtype: torc
 
 
 def to_official(model: WorldModel) -> dict[str, Any]:
-    """Return the weights by Meta's names, q, k and v fused: what `torch.save` makes an official checkpoint of.
+    """Return the weights by Meta's names, q, k and v fused: `torch.save` of it is an official checkpoint.
 
     Raises:
-        ValueError: An adapter is on: merge it first. Or states and actions are not of the widths that Meta's code has.
+        ValueError: There is an adapter: merge it first. Or states and actions differ in width from Meta's code.
     """
     if model.predictor is not model.base_predictor:
         raise ValueError("an adapter is on: merge_adapter first")
@@ -108,7 +108,7 @@ def official_name(name: str, part: str) -> tuple[str, int | None]:
 
 
 def _open(path: Path) -> dict[str, dict[str, Tensor]]:
-    """Map a checkpoint and return encoder and predictor by Meta's names without prefixes; nothing is read yet."""
+    """Map a checkpoint and return encoder and predictor by Meta's names without prefixes; reads no values."""
     if not path.is_file():
         raise InputError(where=str(path), found="no such file", needed=_NEEDED, fix=_FIX)
     try:
@@ -142,7 +142,7 @@ def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
 
 
 def _sizes(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes, *, where: str) -> ModelSizes:
-    """Return the sizes that the tensors have; heads, image size and extrinsics are those given."""
+    """Return the sizes of the tensors; heads, image size and extrinsics are those given."""
     try:
         found = _sizes_of_tensors(parts, given)
     except KeyError as missing:
@@ -190,7 +190,7 @@ def _depth(names: Mapping[str, object], blocks: str) -> int:
 
 
 def _fill(network: nn.Module, path: Path, part: str, dtype: torch.dtype) -> None:
-    """Give a network on the meta device its weights, a group of tensors at a time, dropping the mapped file between."""
+    """Load the weights of a network on the meta device in groups of tensors, releasing the mapped file in between."""
     needed = network.state_dict()
     _check(_shapes(_open(path)[part]), _shapes(needed), part, where=str(path))
     for names in _groups(needed):

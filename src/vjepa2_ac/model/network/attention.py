@@ -24,8 +24,8 @@ from vjepa2_ac.model.network.compilation import compiled, has_triton
 AttentionKind = Literal["auto", "dense", "per_step", "flex"]
 ATTENTION_KINDS: tuple[str, ...] = get_args(AttentionKind)
 
-_FLEX_HEAD_DIM = 16  # at least: what its kernels take
-_FLEX_STEPS = 4  # at least: what is worth a compilation
+_FLEX_HEAD_DIM = 16  # minimum of its kernels
+_FLEX_STEPS = 4  # minimum that is worth a compilation
 
 
 def block_causal_attention(
@@ -37,12 +37,13 @@ def block_causal_attention(
 ) -> Float[Tensor, "batch heads sequence head_dim"]:
     """Return the attention in which a token of step t sees all tokens of steps <= t.
 
-    `auto` takes `flex` on CUDA where Triton is installed, with gradients on and at least four steps; `per_step`
+    `auto` uses `flex` on CUDA if Triton is installed, with gradients on and at least four steps; `per_step`
     everywhere else. Each length and each number of clips is compiled anew: lengths vary in evaluation and planning, and
     the short ones at the start of a rollout are not worth it.
 
     Raises:
-        ValueError: A sequence is not a whole number of steps, fewer keys than queries are given, or an unknown kind.
+        ValueError: A sequence is not a whole number of steps, there are fewer keys than queries, or the kind is
+            unknown.
         InputError: FlexAttention was compiled for too many sizes; uncompiled it would hold all scores in memory.
     """
     for length in (query.shape[2], key.shape[2]):
@@ -59,7 +60,7 @@ def block_causal_attention(
 
 
 def best_kind(device: torch.device, head_dim: int, steps: int, *, gradients: bool) -> AttentionKind:
-    """Return what `auto` takes: see `block_causal_attention`."""
+    """Return the choice of `auto`: see `block_causal_attention`."""
     fits_flex = device.type == "cuda" and head_dim >= _FLEX_HEAD_DIM and steps >= _FLEX_STEPS and gradients
     return "flex" if fits_flex and has_triton() else "per_step"
 
@@ -82,8 +83,8 @@ def _per_step(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -
 class _Beginnings(torch.autograd.Function):
     """The first tokens of keys or values up to each end, as views: nothing is copied.
 
-    As slices, the gradient of each would be padded with zeros to the full length before it is added to the others;
-    here it is added where it belongs.
+    With plain slices, the gradient of each would be padded with zeros to the full length before it is added to the
+    others; here it is added in place.
     """
 
     @staticmethod

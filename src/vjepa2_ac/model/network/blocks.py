@@ -15,11 +15,11 @@ from vjepa2_ac.model.network.rotary import RotaryTables, rotate
 
 NORM_EPSILON = 1e-6
 INIT_STD = 0.02
-_PLAIN = "training.compile=off (planning.compile=off)"  # leaves blocks uncompiled
+_PLAIN = "training.compile=off (planning.compile=off)"  # blocks are not compiled
 
 
 class OutputLinear(nn.Linear):
-    """A linear layer whose output is added to the residual stream: starts smaller by sqrt(2 * layer), layer from 1."""
+    """A linear layer into the residual stream: initialised smaller by sqrt(2 * layer), layer from 1."""
 
     def __init__(self, inputs: int, outputs: int, layer: int) -> None:
         super().__init__(inputs, outputs)
@@ -27,7 +27,7 @@ class OutputLinear(nn.Linear):
 
 
 class Attention(nn.Module):
-    """Layers around block-causal attention; queries, keys and values keep one type (SDPA refuses a mixture)."""
+    """Layers around block-causal attention; queries, keys and values have one type (SDPA refuses mixed types)."""
 
     def __init__(self, width: int, heads: int, layer: int) -> None:
         super().__init__()
@@ -60,18 +60,18 @@ class Mlp(nn.Module):
         self.fc2 = OutputLinear(hidden, width, layer)
 
     def forward(self, tokens: Float[Tensor, "*batch width"]) -> Float[Tensor, "*batch width"]:
-        """Return each token changed on its own."""
+        """Return each token, transformed independently."""
         return self.fc2(self.activation(self.fc1(tokens)))  # type: ignore[no-any-return]  # nn.Module is untyped
 
 
 class Block(nn.Module):
-    """Attention and MLP, each on normalised tokens, each added to what came in.
+    """Attention and MLP, each on normalised tokens, each added to its input.
 
-    A block keeps nothing itself, for gradient checkpointing computes it twice: what it knows of earlier steps is given
-    to it, and what later steps shall know is returned.
+    A block has no state, because gradient checkpointing computes it twice: keys and values of earlier steps are
+    arguments, and those for later steps are returned.
 
     Args:
-        layer: Which block this is, from 1.
+        layer: Number of the block, from 1.
     """
 
     def __init__(self, width: int, heads: int, hidden: int, layer: int) -> None:
@@ -99,8 +99,8 @@ class Block(nn.Module):
             tokens_per_step: How many make a step.
             kind: How to compute attention.
             keep: How many tokens' keys and values to return; keys are rotated already.
-            past: What earlier calls returned, in their order: the tokens come after these, and see them. One argument
-                each, for checkpointing knows of tensors among its arguments only.
+            past: Results of earlier calls, in their order: the tokens come after these, and see them. Separate
+                arguments, because checkpointing handles only tensors among its arguments.
         """
         before, after = _before_attention, _after_attention
         if self.compiled == "always" or (self.compiled == "with gradients" and torch.is_grad_enabled()):
@@ -114,7 +114,7 @@ class Block(nn.Module):
 
 
 def initialise(module: nn.Module, generator: Generator | None = None) -> None:
-    """Give one module (not its children) fresh weights: truncated normal, std 0.02; biases 0; norms 1.
+    """Initialise one module (not its children): truncated normal, std 0.02; biases 0; norms 1.
 
     Source: facebookresearch/vjepa2 @ c2963a4, src/models/ac_predictor.py, _init_weights and _rescale_blocks.
     """
@@ -129,7 +129,7 @@ def initialise(module: nn.Module, generator: Generator | None = None) -> None:
 
 
 def output_std(layer: int) -> float:
-    """Return the standard deviation of a fresh output layer of a block, counted from 1."""
+    """Return the initial standard deviation of a block's output layer, with blocks counted from 1."""
     return INIT_STD / math.sqrt(2 * layer)
 
 
@@ -143,7 +143,7 @@ def _after_attention(block: Block, tokens: Tensor, gathered: Tensor) -> Tensor:
 
 
 def normalised(norm: nn.LayerNorm, tokens: Tensor) -> Tensor:
-    """Return normalised tokens, cast once to the type that all layers after them compute in."""
+    """Return normalised tokens, cast once to the type of all following layers."""
     kind = tokens.device.type
     if not torch.is_autocast_enabled(kind):
         return norm(tokens)  # type: ignore[no-any-return]  # nn.Module is untyped
@@ -152,10 +152,10 @@ def normalised(norm: nn.LayerNorm, tokens: Tensor) -> Tensor:
 
 
 def without_needless_autocast(tokens: Tensor, weights: Tensor) -> AbstractContextManager[object]:
-    """Switch autocast off where tokens and weights have the type that it computes in.
+    """Disable autocast where tokens and weights have its type already.
 
-    There it only has norms computed from a float32 copy, and their result cast back by each layer after them. Their
-    kernels compute in float32 as it is: the same numbers, in a fifth of the bytes.
+    There its only effect is that norms are computed from a float32 copy, and each following layer casts the result
+    back. Norm kernels compute in float32 anyway: the same numbers, with a fifth of the bytes.
     """
     kind = tokens.device.type
     if torch.is_autocast_enabled(kind) and tokens.dtype == weights.dtype == torch.get_autocast_dtype(kind):
@@ -169,7 +169,7 @@ def hidden_width(width: int, mlp_ratio: float) -> int:
 
 
 def mlp_ratio_of(width: int, hidden: int, expected: float) -> float:
-    """Return a ratio from which `hidden_width` gives `hidden`: the expected one where it does."""
+    """Return a ratio for which `hidden_width` is `hidden`: the expected one if it fits."""
     if hidden_width(width, expected) == hidden:
         return expected
     exact = hidden / width

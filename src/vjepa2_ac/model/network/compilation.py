@@ -24,21 +24,21 @@ import torch
 from vjepa2_ac.errors import InputError
 
 BACKEND = "inductor"
-VARIANTS = 64  # that PyTorch may compile of one function: it gives up at 8 if nothing is said
+VARIANTS = 64  # that PyTorch may compile of one function: its default is 8
 
 When = Literal["never", "with gradients", "always"]  # blocks are compiled
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function, *, way_out: str, dynamic: bool | None = None) -> Function:
-    """Return a function compiled, the same for all who ask; it is compiled when it is called.
+    """Return the compiled function, the same object for all callers; it is compiled when called.
 
-    What it returns raises `InputError` where it was compiled for `VARIANTS` kinds of input already.
+    The compiled function raises `InputError` if it was compiled for `VARIANTS` kinds of input already.
 
     Args:
-        function: What is compiled, as one graph.
-        way_out: The setting with which nothing is compiled.
-        dynamic: False: for each size by itself; None: PyTorch decides.
+        function: Compiled as one graph.
+        way_out: The setting that disables compilation.
+        dynamic: False: for each size separately; None: PyTorch decides.
     """
     return cast("Function", _compiled(function, BACKEND, way_out, dynamic))
 
@@ -50,7 +50,7 @@ def has_triton() -> bool:
 
 
 def missing_for_compilation(device: str) -> str | None:
-    """Return what this machine lacks to compile for a kind of device: cpu or cuda; None where it lacks nothing."""
+    """Return what this machine lacks to compile for a kind of device, cpu or cuda; None if nothing."""
     if device == "cuda" and not has_triton():
         return "Triton is not installed"
     given = os.environ.get("CC" if device == "cuda" else "CXX")
@@ -61,14 +61,14 @@ def missing_for_compilation(device: str) -> str | None:
 
 
 def require_compiler(device: str, *, where: str) -> None:
-    """Refuse to compile blocks for a kind of device, cpu or cuda, where nothing can.
+    """Refuse to compile blocks for a kind of device, cpu or cuda, without a compiler.
 
     Args:
-        device: What for.
-        where: The setting that asks for it.
+        device: The kind of device.
+        where: The setting that requests it.
 
     Raises:
-        InputError: Nothing can; says what is missing.
+        InputError: There is none; says what is missing.
     """
     missing = missing_for_compilation(device)
     if missing:
@@ -82,7 +82,8 @@ def _compiled(function: Callable[..., Any], backend: str, way_out: str, dynamic:
     from torch._dynamo.exc import FailOnRecompileLimitHit
 
     config.recompile_limit = max(config.recompile_limit, VARIANTS)
-    whole = torch.compile(function, backend=backend, fullgraph=True, dynamic=dynamic)  # else the limit is a warning
+    # fullgraph: otherwise the limit is only a warning
+    whole = torch.compile(function, backend=backend, fullgraph=True, dynamic=dynamic)
 
     @wraps(function)
     def call(*args: Any, **kwargs: Any) -> Any:

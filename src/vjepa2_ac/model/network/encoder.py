@@ -19,15 +19,15 @@ with quiet_imports():
     from transformers import VJEPA2Config
     from transformers.models.vjepa2.modeling_vjepa2 import VJEPA2Encoder, VJEPA2RopeAttention
 
-TUBELET = 2  # frames that the encoder sees at once: here the same one twice
+TUBELET = 2  # frames per tubelet: here the same one twice
 
 
 class Encoder(nn.Module):
-    """Turns frames into features, each frame by itself; frozen, and always in eval mode.
+    """Encodes frames to features, each frame independently; frozen, and always in eval mode.
 
     The network is the encoder of transformers' `VJEPA2Model` (its masked predictor is never built), with rotary
-    tables computed once and in float32 (transformers makes angles in the type of the weights), and with patches
-    embedded by one product of matrices.
+    tables computed once and in float32 (transformers computes angles in the type of the weights), and with patches
+    embedded by one matrix product.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
@@ -51,7 +51,7 @@ class Encoder(nn.Module):
             chunk: Frames that go through the network at once: bounds the memory.
 
         Raises:
-            ValueError: The frames have another size than the model's: the positions would be wrong.
+            ValueError: The frames differ in size from the model's: the positions would be wrong.
         """
         if frames.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(
@@ -61,11 +61,11 @@ class Encoder(nn.Module):
         return torch.cat([self._encode(part) for part in torch.split(frames, chunk)])
 
     def train(self, mode: bool = True) -> Encoder:  # noqa: ARG002  # a frozen encoder has one mode
-        """Stay in eval mode, whatever the model around it does."""
+        """Stay in eval mode, independent of the surrounding model."""
         return super().train(False)
 
     def initialise(self, generator: Generator) -> None:
-        """Give every weight a fresh value, decided by the generator alone.
+        """Initialise every weight; the generator determines the values.
 
         Source: facebookresearch/vjepa2 @ c2963a4, src/models/vision_transformer.py, _init_weights and _rescale_blocks.
         """
@@ -84,10 +84,10 @@ class Encoder(nn.Module):
 
 
 class _FramePatches(nn.Conv3d):
-    """The patch embedding of a tubelet that is one frame over and over: the kernel is summed over time, once.
+    """The patch embedding of a tubelet of identical frames: the kernel is summed over time, once.
 
-    Half the arithmetic of the convolution, and a product of matrices, which every version of cuDNN leaves alone: some
-    have no fast convolution in three dimensions in bfloat16.
+    Half the arithmetic of the convolution, and a matrix product, which does not depend on cuDNN: some versions have no
+    fast 3D convolution in bfloat16.
     """
 
     def __init__(self, width: int, patch_size: int) -> None:
@@ -97,7 +97,7 @@ class _FramePatches(nn.Conv3d):
     def forward(
         self, tubelets: Float[Tensor, "frames 3 time height width"]
     ) -> Float[Tensor, "frames dim 1 rows columns"]:
-        """Return what the convolution would, of tubelets whose frames are all alike."""
+        """Return the result of the convolution for tubelets of identical frames."""
         side = self.kernel_size[-1]
         frames = tubelets[:, :, 0]
         patches = rearrange(frames, "n c (rows p) (columns q) -> n (rows columns) (c p q)", p=side, q=side)
@@ -107,27 +107,27 @@ class _FramePatches(nn.Conv3d):
 
 
 class _ExactAttention(VJEPA2RopeAttention):  # type: ignore[misc]  # transformers has no types
-    """transformers' attention, turned by tables that are computed once, in float32."""
+    """transformers' attention, rotated by tables that are computed once, in float32."""
 
     def __init__(self, config: Any, layout: TokenLayout) -> None:
         super().__init__(config, config.hidden_size, config.num_attention_heads)
         self.layout = layout
 
     def apply_rotary_embeddings(self, qk: Tensor, pos_ids: Any) -> Tensor:  # noqa: ARG002  # positions are the layout's
-        """Return queries or keys [batch heads sequence head_dim] turned by their position."""
+        """Return queries or keys [batch heads sequence head_dim], rotated by their position."""
         tables = rotary_tables(self.layout, qk.shape[-1], qk.device)
         return rotate(qk.transpose(1, 2), tables).transpose(1, 2)
 
 
 class _PreciseNorm(nn.LayerNorm):
-    """The last norm, in float32: its result is normalised once more, and rounding it before would be for nothing."""
+    """The last norm, in float32: its result is normalised again, so rounding it before would only lose precision."""
 
     def forward(self, tokens: Tensor) -> Tensor:
         return layer_norm(tokens.float(), self.normalized_shape, self.weight.float(), self.bias.float(), self.eps)
 
 
 def _share_exact_tables(vit: Any, layout: TokenLayout) -> None:
-    """Give every layer an attention that uses our tables; the names of the weights stay."""
+    """Replace every layer's attention by one that uses our tables; the names of the weights stay."""
     if not hasattr(VJEPA2RopeAttention, "apply_rotary_embeddings"):
         raise RuntimeError("this version of transformers turns queries and keys elsewhere; 5.17 to 5.23 are tested")
     for block in vit.layer:

@@ -15,7 +15,7 @@ from vjepa2_ac.model.network.world_model import FreshHeads, WorldModel
 
 
 def heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
-    """Return which input heads of a model of these sizes do not take states and actions of these widths."""
+    """Return the input heads of a model of these sizes that do not fit states and actions of these widths."""
     fits = {
         "action_encoder": sizes.predictor.action_dim == widths.action,
         "state_encoder": sizes.predictor.state_dim == widths.state,
@@ -24,7 +24,7 @@ def heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
 
 
 def require_trained(heads: tuple[str, ...], config: AdapterConfig) -> None:
-    """Refuse to leave a fresh head as it was drawn.
+    """Refuse to leave a fresh head untrained.
 
     Raises:
         InputError: An adapter is trained and a head is not among its modules_to_save; says what to set.
@@ -42,16 +42,16 @@ def require_trained(heads: tuple[str, ...], config: AdapterConfig) -> None:
 
 
 def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
-    """Replace the input heads that do not take states and actions of these widths by fresh ones.
+    """Replace the input heads that do not fit states and actions of these widths by fresh ones.
 
-    They are drawn as the released recipe draws its weights, each from the seed and its own name. What the base is does
-    not change (`WorldModel.predictor_fingerprint`), but without training the model predicts noise.
+    They are initialised as in the released recipe, each from the seed and its own name. The base's identity does not
+    change (`WorldModel.predictor_fingerprint`), but without training the model predicts noise.
 
     Returns:
-        A line for each that was replaced; none where all fit.
+        A line for each replaced head; none if all fit.
 
     Raises:
-        ValueError: The model has been adapted, or has fresh heads already.
+        ValueError: The model is adapted, or has fresh heads already.
     """
     heads = heads_to_replace(model.sizes, widths)
     if not heads:
@@ -75,7 +75,7 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
 
 
 def widths_of_model(sizes: ModelSizes) -> Widths:
-    """Return how many numbers a model's states and actions have."""
+    """Return the widths of a model's states and actions."""
     return Widths(state=sizes.predictor.state_dim, action=sizes.predictor.action_dim)
 
 

@@ -9,10 +9,10 @@ from torch import Tensor
 
 
 class KeyValueCache:
-    """The keys (rotated) and values of steps that a predictor has seen, in every layer; empty at first.
+    """The keys (rotated) and values of earlier steps, in every layer of a predictor; empty at first.
 
-    Gradients flow through it into the passes that filled it. It stays in the pieces that it was filled in: a block puts
-    them together while it computes, so that with gradient checkpointing no step is kept twice.
+    Gradients flow through it into the passes that filled it. It stores the pieces as they were added: a block
+    concatenates them while it computes, so that with gradient checkpointing no step is stored twice.
     """
 
     def __init__(self) -> None:
@@ -20,7 +20,7 @@ class KeyValueCache:
 
     @property
     def tokens(self) -> int:
-        """How many tokens have gone by."""
+        """Number of tokens in the cache."""
         return sum(piece.shape[3] for piece in self._pieces[0]) if self._pieces else 0
 
     def layer(self, index: int) -> tuple[Float[Tensor, "2 batch heads _ head_dim"], ...]:
@@ -33,13 +33,13 @@ class KeyValueCache:
         self._pieces = tuple((*pieces, piece) for pieces, piece in zip(before, added, strict=True))
 
     def copy(self) -> KeyValueCache:
-        """Return a cache that grows by itself; no tensor is copied."""
+        """Return a cache that can grow independently; no tensor is copied."""
         other = KeyValueCache()
         other._pieces = self._pieces
         return other
 
     def expanded(self, samples: int) -> KeyValueCache:
-        """Return a cache of one start for many samples that go on from it; no tensor is copied.
+        """Return the cache of one start expanded to many samples; no tensor is copied.
 
         Raises:
             RuntimeError: It holds more than one start.

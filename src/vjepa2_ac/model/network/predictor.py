@@ -89,7 +89,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         self.predictor_embed = nn.Linear(config.latent_dim, width)
         self.action_encoder = nn.Linear(config.action_dim, width)
         self.state_encoder = nn.Linear(config.state_dim, width)
-        self.extrinsics_encoder = nn.Linear(EXTRINSICS_DIM, width)  # always there, as in the official checkpoint
+        self.extrinsics_encoder = nn.Linear(EXTRINSICS_DIM, width)  # always exists, as in the official checkpoint
         self.blocks = nn.ModuleList(
             Block(width, config.num_attention_heads, hidden, layer=index + 1)
             for index in range(config.num_hidden_layers)
@@ -98,7 +98,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         self.predictor_proj = nn.Linear(width, config.latent_dim)
         self.attention: AttentionKind = "auto"
         self.gradient_checkpointing = False  # the name transformers switches
-        self.has_dropout = False  # in its blocks: then a block computed again draws the same masks again
+        self.has_dropout = False  # in its blocks: then recomputed blocks draw the same masks
         self.post_init()
 
     @property
@@ -124,11 +124,11 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             actions: The action of each.
             states: The state of each.
             extrinsics: The camera of each, where the model uses it.
-            cache: The given steps come after those in the cache, and see them; then they are added to it.
-            keep: How many of the given steps are added, from the first; None: all of them.
+            cache: The steps come after those in the cache, and see them; then they are added to it.
+            keep: How many of the steps are added, from the first; None: all.
 
         Raises:
-            ValueError: The tokens do not belong to the image size, or extrinsics are missing or unasked for.
+            ValueError: The tokens do not match the image size, or extrinsics are missing or unexpected.
         """
         tokens, layout = self._assemble(latents, actions, states, extrinsics, cache)
         tokens = self._through_blocks(tokens, layout, cache, keep)
@@ -138,19 +138,19 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         return _in_own_type(self.predictor_proj, normalised(self.predictor_norm, patches), self._dtype)
 
     def initialise(self, generator: Generator) -> None:
-        """Give every weight a fresh value, decided by the generator alone."""
+        """Initialise every weight; the generator determines the values."""
         for module in self.modules():
             initialise(module, generator)
 
     def start_at_persistence(self, generator: Generator) -> None:
-        """Make a fresh predictor begin close to copying: read latents through a rotation, write through its inverse.
+        """Initialise a predictor close to copying: it reads latents through a rotation, and writes through its inverse.
 
-        The network has no path from its input to its output but these two layers; a tiny one that starts at random
+        These two layers are the network's only path from input to output; a tiny one that starts at random
         spends most of its training on learning to copy. Exact where the predictor is as wide as a latent.
         """
         shape = self.predictor_embed.weight.shape
         drawn = torch.randn(max(shape), min(shape), generator=generator, device=generator.device)
-        drawn = drawn.double()  # or threads would change last bits
+        drawn = drawn.double()  # threads would change the last bits
         rotation, triangle = torch.linalg.qr(drawn)
         rotation = rotation * triangle.diagonal().sign()
         with torch.no_grad():
@@ -165,7 +165,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         extrinsics: Tensor | None,
         cache: KeyValueCache | None = None,
     ) -> tuple[Tensor, TokenLayout]:
-        """Return the sequence of tokens, step by step, and how it is laid out."""
+        """Return the sequence of tokens, step by step, and its layout."""
         if latents.shape[2] != self.grid**2:
             raise ValueError(
                 f"{latents.shape[2]} tokens a step do not make a frame of {self.config.image_size} px with patches of"
@@ -186,7 +186,7 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
     def _through_blocks(
         self, tokens: Tensor, layout: TokenLayout, cache: KeyValueCache | None, keep: int | None
     ) -> Tensor:
-        """Return the tokens after all blocks, which see the cache; what they leave for later steps goes into it."""
+        """Return the tokens after all blocks, which see the cache; new keys and values are added to it."""
         tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
         how = (tables, layout.tokens_per_step, self.attention)
         steps = layout.steps if keep is None else min(keep, layout.steps)
@@ -206,22 +206,22 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
         return tokens
 
     def _init_weights(self, module: nn.Module) -> None:
-        """Initialise one module: what transformers calls for weights that a checkpoint lacks."""
+        """Initialise one module: called by transformers for weights that a checkpoint lacks."""
         initialise(module)
 
     @property
     def _dtype(self) -> torch.dtype:
-        """The base's type; a head that is trained whole may have another."""
+        """The base's type; a directly trained head may have another."""
         return self.predictor_norm.weight.dtype
 
     @property
     def is_gradient_checkpointing(self) -> bool:
-        """Whether blocks are computed again in the backward pass; PEFT asks, and transformers' own answer warns."""
+        """Whether blocks are recomputed in the backward pass; PEFT reads this, and transformers' own property warns."""
         return self.gradient_checkpointing
 
 
 def _in_own_type(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Apply a layer that may be trained, and so be float32, in a predictor of another type; autocast knows its own."""
+    """Apply a layer that may be trained, hence float32, in a predictor of another type; autocast casts by itself."""
     if torch.is_autocast_enabled(values.device.type):
         return layer(values)  # type: ignore[no-any-return]  # PEFT may be around it, untyped
     return layer(values.to(layer.weight.dtype)).to(dtype)  # type: ignore[no-any-return]  # the same

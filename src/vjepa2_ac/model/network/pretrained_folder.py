@@ -23,23 +23,23 @@ ENCODER, PREDICTOR = "encoder.safetensors", "predictor/model.safetensors"
 
 
 def write_folder(folder: Path, sizes: ModelSizes, encoder: nn.Module, predictor: Any) -> None:
-    """Write a model aside, then put it in place, config.json last: what has one is a whole model.
+    """Write a model to a temporary folder, then move it, config.json last: a folder that has one is complete.
 
     Args:
-        folder: Where the model goes; one that is there is replaced.
+        folder: Where the model goes; an existing one is replaced.
         sizes: Sizes of the model.
         encoder: The encoder.
         predictor: The predictor: a transformers model.
 
     Raises:
-        InputError: The folder cannot be made or written, or the disk is full.
+        InputError: The folder cannot be created or written, or the disk is full.
     """
     with storage.folder_writer(folder, CONFIG) as fresh:
         (fresh / PREDICTOR).parent.mkdir()
         try:
             save_file(_whole(encoder), fresh / ENCODER, metadata={"format": "pt"})
             save_file(_whole(predictor), fresh / PREDICTOR, metadata={"format": "pt"})
-        except SafetensorError as error:  # which is no OSError, also where the disk is full
+        except SafetensorError as error:  # which is no OSError, even if the disk is full
             raise InputError(where=str(folder), found=f"cannot be written: {error}") from None
         predictor.config.architectures = [type(predictor).__name__]
         predictor.config.save_pretrained(fresh / "predictor")
@@ -69,7 +69,7 @@ def opened_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
     """Open a safetensors file; its header is checked against its size, and its tensors are mapped, not read.
 
     Raises:
-        InputError: The file is missing, cut off, or none of its kind.
+        InputError: The file is missing, truncated, or of another format.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -77,7 +77,7 @@ def opened_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
     except FileNotFoundError:
         fix = "Copy or write the folder again"
         raise InputError(where=str(path), found="no such file", needed=needed, fix=fix) from None
-    except (SafetensorError, OSError, TypeError) as error:  # the last of a type that torch does not have
+    except (SafetensorError, OSError, TypeError) as error:  # the last: of a type that torch does not have
         found = f"not a whole safetensors file ({error})"
         raise InputError(where=str(path), found=found, fix="Copy or write it again") from None
 
@@ -115,5 +115,5 @@ def _whole(module: nn.Module) -> dict[str, torch.Tensor]:
 
 
 def _cast(tensor: torch.Tensor, dtype: torch.dtype | None) -> torch.Tensor:
-    # A copy in memory of our own: the file may be replaced while the model lives.
+    # A copy in memory: the file may be replaced while the model is in use.
     return tensor.to(dtype or tensor.dtype, copy=True)

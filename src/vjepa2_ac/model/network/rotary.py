@@ -16,12 +16,12 @@ THETA = 10_000
 
 @dataclass(frozen=True)
 class TokenLayout:
-    """How a sequence is laid out: `steps` steps, each of `conditioning` tokens and then `grid` x `grid` patches."""
+    """Layout of a sequence: `steps` steps, each of `conditioning` tokens and then `grid` x `grid` patches."""
 
     steps: int
     grid: int
     conditioning: int = 0
-    start: int = 0  # the first step's place in time
+    start: int = 0  # the first step's position in time
 
     @property
     def tokens_per_step(self) -> int:
@@ -35,7 +35,7 @@ class TokenLayout:
 
 
 class RotaryTables(NamedTuple):
-    """What every layer needs to rotate queries and keys; always float32, so positions stay exact in bfloat16."""
+    """Tables by which every layer rotates queries and keys; always float32, so positions stay exact in bfloat16."""
 
     cosine: Float32[Tensor, "sequence 1 head_dim"]
     signed_sine: Float32[Tensor, "sequence 1 head_dim"]  # minus for the first of a pair, plus for the second
@@ -47,7 +47,7 @@ def rotary_tables(layout: TokenLayout, head_dim: int, device: torch.device) -> R
 
     The head is cut into three equal parts of 2*((head_dim//3)//2) for time, height and width; the rest is not rotated.
     Conditioning tokens are rotated in the time part only. Pairs are neighbours (2i, 2i+1), yet the frequencies are
-    tiled ([w0..w9, w0..w9]), not interleaved: so were the released weights trained.
+    tiled ([w0..w9, w0..w9]), not interleaved: the released weights were trained so.
 
     Raises:
         ValueError: The head has no pairs to rotate: its size is odd.
@@ -70,13 +70,13 @@ def rotary_tables(layout: TokenLayout, head_dim: int, device: torch.device) -> R
 def rotate(
     tokens: Float[Tensor, "batch sequence heads head_dim"], tables: RotaryTables
 ) -> Float[Tensor, "batch sequence heads head_dim"]:
-    """Return queries or keys turned by their position: computed in float32, returned in the type that came in."""
+    """Return queries or keys rotated by their position: computed in float32, returned in the input's type."""
     apply: Callable[..., Tensor] = _Rotation.apply
     return apply(tokens, *tables)
 
 
 class _Rotation(torch.autograd.Function):
-    """Turns pairs, in two passes over the tokens; its gradient is turned back in the same way, and keeps no token."""
+    """Rotates pairs, in two passes over the tokens; its gradient is the inverse rotation, and saves no token."""
 
     @staticmethod
     def forward(ctx: Any, tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
@@ -101,7 +101,7 @@ def _turned(tokens: Tensor, cosine: Tensor, signed_sine: Tensor) -> Tensor:
 
 
 def _swapped(tokens: Tensor) -> Tensor:
-    """Return the neighbours of each pair in each other's place."""
+    """Return the tokens with the two numbers of each pair swapped."""
     return torch.stack((tokens[..., 1::2], tokens[..., 0::2]), dim=-1).flatten(-2)
 
 

@@ -26,7 +26,7 @@ from vjepa2_ac.model.sizes import read_sizes
 
 @dataclass(frozen=True)
 class Adaptation:
-    """What `model.adapter.lora` did to the predictor."""
+    """The adaptation of the predictor by `model.adapter.lora`."""
 
     kind: str  # as in config.AdapterConfig: lora, or none when every weight is trained
     base: str  # fingerprint of the predictor it started from
@@ -37,27 +37,27 @@ class Adaptation:
 
 @dataclass(frozen=True)
 class FreshHeads:
-    """What `input_heads` did to the predictor: encoders for states or actions of other widths than the base's."""
+    """Fresh heads of the predictor by `input_heads`: encoders for states or actions of other widths than the base's."""
 
     replaced: dict[str, Tensor]  # the base's own, by their names in the predictor
-    seed: int  # that decided the new ones
+    seed: int  # of the new ones
 
 
 class AbsentEncoder(nn.Module):
-    """Stands where an encoder was that is not needed any more."""
+    """Placeholder of a removed encoder."""
 
     def __init__(self, fingerprint: str) -> None:
         super().__init__()
-        self.fingerprint = fingerprint  # of the one that was here
+        self.fingerprint = fingerprint  # of the removed one
 
 
 class WorldModel(nn.Module):
     """A frozen encoder and an action-conditioned predictor.
 
     Latents and predictions are layer-normalised over `dim` without affine, and float32 whatever the weights' type:
-    inputs are cast inside. What trains is decided by `model.adapter.lora.add_adapter`; until then nothing does.
+    inputs are cast inside. `model.adapter.lora.add_adapter` selects the trained weights; before that there are none.
 
-    Build one with `random`, `from_pretrained` or `model.checkpoints.official.load_official`.
+    Create one with `random`, `from_pretrained` or `model.checkpoints.official.load_official`.
     """
 
     def __init__(self, sizes: ModelSizes) -> None:
@@ -81,8 +81,8 @@ class WorldModel(nn.Module):
     ) -> WorldModel:
         """Return a freshly initialised model: the same weights for the same sizes, seed and kind of device.
 
-        Weights are drawn as in the released recipe; `at_persistence` lets the predictor begin close to copying. They
-        are drawn where they are to be: the full size takes half a minute of one CPU core, and no time on a GPU.
+        Weights are drawn as in the released recipe; with `at_persistence` the predictor starts close to copying. They
+        are drawn on their device: the full size takes half a minute of one CPU core, and no time on a GPU.
         """
         model = cls.empty(sizes).to_empty(device=device)
         generator = torch.Generator(device).manual_seed(seed)
@@ -116,8 +116,8 @@ class WorldModel(nn.Module):
 
         Raises:
             InputError: The folder cannot be written.
-            ValueError: An adapter is on: merge it first, or save it with `lora.save_trained`. Or the encoder was
-                set aside.
+            ValueError: There is an adapter: merge it first, or save it with `lora.save_trained`. Or the encoder was
+                removed.
         """
         if self.predictor is not self.base_predictor:
             raise ValueError("an adapter is on: merge_adapter makes it part of the model, save_trained saves it alone")
@@ -140,7 +140,7 @@ class WorldModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the predictor's weights are."""
+        """The device of the predictor's weights."""
         return next(self.predictor.parameters()).device
 
     @property
@@ -148,20 +148,20 @@ class WorldModel(nn.Module):
         """The encoder.
 
         Raises:
-            ValueError: It was set aside.
+            ValueError: It was removed.
         """
         if isinstance(self.encoder, Encoder):
             return self.encoder
         raise ValueError("the encoder was set aside: latents come from a cache")
 
     def set_encoder_aside(self) -> None:
-        """Let go of the encoder's weights, for good: latents come from a cache. Its fingerprint stays known."""
+        """Remove the encoder's weights permanently: latents come from a cache. Its fingerprint stays known."""
         if isinstance(self.encoder, Encoder):
             self.encoder = AbsentEncoder(self.encoder_fingerprint())
 
     @property
     def base_predictor(self) -> Any:
-        """The predictor itself, out of whatever adapter is around it."""
+        """The predictor itself, without a surrounding adapter."""
         wrapped = getattr(self.predictor, "get_base_model", None)  # PEFT's
         return wrapped() if wrapped else self.predictor
 
@@ -169,14 +169,14 @@ class WorldModel(nn.Module):
     def encode(
         self, frames: Float[Tensor, "batch time 3 height width"], chunk: int = 16
     ) -> Float[Tensor, "batch time tokens dim"]:
-        """Return the latents of normalised frames, each frame encoded by itself.
+        """Return the latents of normalised frames, each frame encoded independently.
 
         Args:
             frames: Frames normalised as in training (ImageNet mean and std).
             chunk: Frames that go through the encoder at once: bounds the memory.
 
         Raises:
-            ValueError: The frames have another size than `image_size`; or the encoder was set aside.
+            ValueError: The frames have another size than `image_size`; or the encoder was removed.
         """
         features = _normalise(self.present_encoder(frames.flatten(0, 1), chunk))
         return rearrange(features, "(batch time) tokens dim -> batch time tokens dim", batch=len(frames))
@@ -192,7 +192,7 @@ class WorldModel(nn.Module):
     ) -> Float[Tensor, "batch time tokens dim"]:
         """Return, at each step, the prediction of the next step's latents from the given ones (teacher forcing).
 
-        With a cache the given steps come after those in it; the first `keep` of them are added to it (None: all).
+        With a cache the steps come after those in it; the first `keep` of them are added to it (None: all).
         """
         if cache is None:
             return _normalise(self.predictor(latents, actions, states, extrinsics))
@@ -206,15 +206,15 @@ class WorldModel(nn.Module):
         extrinsics: Float[Tensor, "batch time 6"] | None = None,
         cache: KeyValueCache | None = None,
     ) -> Float[Tensor, "batch steps tokens dim"]:
-        """Return predictions of the steps after the context, each fed back to make the next.
+        """Return predictions of the steps after the context, each fed back to predict the next.
 
         With frames counted from 0, the context holds frames 0 .. context-1 and the result frames context .. time: the
         first is predicted from the context alone, so index h - 1 is horizon h, and there are time - context + 1 of
-        them. Actions and states are the true ones throughout. A context need not be true: to go on from a
-        prediction that is already known, append it to the context.
+        them. Actions and states are the true ones throughout. A context need not be true: to continue from a
+        known prediction, append it to the context.
 
-        The context is computed at once, then one step at a time: keys and values are kept. With a cache, context,
-        actions and states come after the steps in it; it is left as it is, so that many rollouts can start from it.
+        The context is computed at once, then one step at a time: keys and values are cached. With a cache, context,
+        actions and states come after the steps in it; it is not changed, so that many rollouts can start from it.
 
         Raises:
             ValueError: There are fewer actions than context latents.
@@ -234,7 +234,7 @@ class WorldModel(nn.Module):
         return torch.cat(predicted, dim=1)
 
     def set_gradient_checkpointing(self, enabled: bool) -> None:
-        """Choose whether predictor blocks are computed again in the backward pass instead of being kept."""
+        """Choose whether predictor blocks are recomputed in the backward pass instead of storing their activations."""
         predictor = self.base_predictor
         predictor.gradient_checkpointing = enabled
         predictor.has_dropout = any(isinstance(one, nn.Dropout) and one.p > 0 for one in predictor.blocks.modules())
@@ -249,13 +249,13 @@ class WorldModel(nn.Module):
         self.base_predictor.attention = kind
 
     def encoder_fingerprint(self) -> str:
-        """Return a hash that says which encoder made a latent: key cached latents by it."""
+        """Return a hash of the encoder: part of the key of cached latents."""
         if isinstance(self.encoder, AbsentEncoder):
             return self.encoder.fingerprint
         return fingerprint(self.encoder.state_dict())
 
     def predictor_fingerprint(self) -> str:
-        """Return a hash of the predictor's own weights; neither an adapter on them nor fresh heads change it."""
+        """Return a hash of the predictor's own weights; independent of an adapter and of fresh heads."""
         replaced = {} if self.fresh_heads is None else self.fresh_heads.replaced
         return fingerprint(base_weights(self.base_predictor) | replaced)
 
@@ -263,7 +263,7 @@ class WorldModel(nn.Module):
 def fingerprint(weights: Mapping[str, Tensor]) -> str:
     """Return the SHA-256 of names, shapes and values rounded to bfloat16.
 
-    Rounding makes it the same whether a checkpoint was loaded in float32 or in bfloat16.
+    Rounding makes it independent of the type in which a checkpoint was loaded, float32 or bfloat16.
     """
     digest = hashlib.sha256()
     for name, value in sorted(weights.items()):

@@ -24,20 +24,20 @@ from vjepa2_ac.storage.remote import RefusedError, UnreachableError, quietly
 logger = logging.getLogger(__name__)
 
 LONGEST_WAIT_S = 3600.0  # for the mirror at the end of a run
-_LOOK_EVERY_S = 0.1  # whether the machine wants to be gone
+_LOOK_EVERY_S = 0.1  # whether the machine is about to stop
 
 
 class Mirror:
-    """Keeps a place elsewhere like a run's folder: in the background, never twice at once.
+    """Keeps another place in sync with a run's folder: in the background, one upload at a time.
 
     Args:
         place: What `storage.place` returned.
         folder: The run's folder.
-        run_id: Whose checkpoints may be there.
-        config: How often, and how many are kept there, as here.
-        damaged: Names of checkpoints that were found damaged there; they are removed.
-        outage_reported: Whether the user was told that the place cannot be reached.
-        now_s: Tells the time, in seconds since whenever.
+        run_id: The run whose checkpoints may be there.
+        config: How often, and how many checkpoints are kept in both places.
+        damaged: Names of damaged checkpoints there; they are removed.
+        outage_reported: Whether the user was already warned that the place cannot be reached.
+        now_s: Returns the time in seconds, from any origin.
     """
 
     def __init__(
@@ -58,13 +58,13 @@ class Mirror:
         self._thread: threading.Thread | None = None
         self._hurry, self._stop = threading.Event(), threading.Event()
         self._begun_s, self._is_off = -float("inf"), False
-        self._aim: str | None = None  # the newest checkpoint of this machine when the thread began
-        self._sent: str | None = None  # the newest one that is there
+        self._aim: str | None = None  # the newest local checkpoint when the thread started
+        self._sent: str | None = None  # the newest remote one
 
     def tick(self) -> None:
-        """Begin to send where it is time to and there is something new; costs next to nothing.
+        """Start an upload if it is due and there is something new; takes next to no time.
 
-        The first checkpoint of a start does not wait.
+        The first checkpoint of a start is sent at once.
         """
         due = self._now_s() - self._begun_s >= 60.0 * self._every_minutes
         if due and not self.is_sending and self._update.newest_here() != self._sent:
@@ -72,15 +72,15 @@ class Mirror:
 
     @property
     def is_sending(self) -> bool:
-        """Whether something is being sent right now."""
+        """Whether an upload is in progress."""
         return self._thread is not None and self._thread.is_alive()
 
     def finish(self, is_asked_to_stop: Callable[[], bool]) -> None:
-        """Send what is newest, and wait for that; warn where the place is not up to date then.
+        """Upload the newest files, and wait for that; warn if the place is not up to date then.
 
         Args:
-            is_asked_to_stop: Whether the machine wants to be gone: from then on `checkpoint.remote_wait_seconds` are
-                waited, and else an hour.
+            is_asked_to_stop: Whether the machine is about to stop: then the wait is `checkpoint.remote_wait_seconds`,
+                else an hour.
         """
         patience = _Patience(is_asked_to_stop, self._wait_s)
         self._hurry.set()
@@ -104,7 +104,7 @@ class Mirror:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Stop sending; but first send what there is where the run ends with an error."""
+        """Stop uploading; if the run ends with an error, upload what exists first."""
         if isinstance(error, Exception) and not self._stop.is_set():
             self.finish(lambda: True)
         self._stop.set()
@@ -147,26 +147,26 @@ class Mirror:
                 reason_of(error), self._every_minutes,
             )  # fmt: skip
             self._outage_reported = True
-        except Exception:  # whatever it is, the run is worth more
+        except Exception:  # no error here may stop the run
             logger.exception("checkpoint.remote: %s is not up to date; training goes on", self._place)
         finally:
             self._update.release()
 
     def _go_on(self) -> None:
-        """Break off where the run has ended, or is about to and has a newer checkpoint."""
+        """Cancel the upload if the run has ended, or is ending and has a newer checkpoint."""
         if self._stop.is_set() or (self._hurry.is_set() and self._update.newest_here() != self._aim):
             raise _BrokenOffError
 
 
 def reason_of(error: Exception) -> str:
-    """Return why a place is not up to date; the way out only where it does not pass by itself."""
+    """Return why a place is not up to date; with a fix only if the reason is permanent."""
     if isinstance(error, UnreachableError) and not isinstance(error, RefusedError):
         return f"{error.where}: {error.found}"
     return str(error).rstrip(".")
 
 
 class NoMirror:
-    """Does nothing: there is no `checkpoint.remote`, or another process sees to it."""
+    """Does nothing: there is no `checkpoint.remote`, or another process handles it."""
 
     def tick(self) -> None:
         """Do nothing."""
@@ -183,18 +183,18 @@ class NoMirror:
 
 
 class _Patience:
-    """Says how long to wait: long, but no longer than `then_s` from when a machine wants to be gone."""
+    """A waiting time: long, but at most `then_s` after a machine has been asked to stop."""
 
     def __init__(self, is_asked_to_stop: Callable[[], bool], then_s: float) -> None:
         self._is_asked_to_stop, self._then_s = is_asked_to_stop, then_s
         self._until_s, self._is_short = time.monotonic() + LONGEST_WAIT_S, False
 
     def lasts(self) -> bool:
-        """Return whether to wait on."""
+        """Return whether to continue waiting."""
         if not self._is_short and self._is_asked_to_stop():
             self._is_short, self._until_s = True, time.monotonic() + self._then_s
         return time.monotonic() < self._until_s
 
 
 class _BrokenOffError(Exception):
-    """What is being sent need not be sent any more."""
+    """The current upload is no longer needed."""

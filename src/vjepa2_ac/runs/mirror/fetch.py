@@ -34,21 +34,21 @@ def fetch_newest(
     claim: Callable[[], None],
     allow_config_change: bool = False,
 ) -> list[str]:
-    """Download a run into `run_dir`, from the first of its checkpoints that is whole.
+    """Download a run into `run_dir`, with the first of its checkpoints that is complete.
 
     Args:
-        remote: Where it lies.
-        names: Its checkpoints that are further on than this machine's, the newest first.
+        remote: Where it is.
+        names: Its checkpoints that are newer than this machine's, the newest first.
         config: The run.
-        note: Told what a person should know.
-        claim: Called before the first file is written; raises where the folder is somebody else's.
+        note: Called with messages for the user.
+        claim: Called before the first file is written; raises if the folder belongs to another run.
         allow_config_change: The run there may have another config.
 
     Returns:
-        The checkpoints that were found damaged; all of `names` where none is whole.
+        The damaged checkpoints; all of `names` if none is complete.
 
     Raises:
-        InputError: The run there has another config; nothing has come then.
+        InputError: The run there has another config; nothing is downloaded then.
         UnreachableError: The place cannot be reached.
     """
     folder, damaged = Path(config.run_dir), []
@@ -78,7 +78,7 @@ def _fetch_small_files(place: str, folder: Path) -> None:
 
 
 def _require_this_config(config: Config, fetched: Path, place: str, *, allow_config_change: bool) -> None:
-    """See that the run there is the one that is asked for, as if its folder were on this machine."""
+    """Check that the run there is the requested one, as for a local folder."""
     try:
         there = with_settled_stride(config.model_copy(update={"run_dir": str(fetched)}))
         check_run_folder(there, allow_config_change=allow_config_change)
@@ -92,7 +92,7 @@ def _require_this_config(config: Config, fetched: Path, place: str, *, allow_con
 
 
 def _fetch(remote: RemoteCheckpoints, name: str, folder: Path) -> Path | None:
-    """Download a checkpoint under a temporary name; None, and a warning, where it is damaged."""
+    """Download a checkpoint under a temporary name; None, and a warning, if it is damaged."""
     remove_leavings(folder / CHECKPOINTS)
     fetched = folder / CHECKPOINTS / f"{FETCHING}{name}"
     problem = remote.fetch(name, fetched)
@@ -104,7 +104,7 @@ def _fetch(remote: RemoteCheckpoints, name: str, folder: Path) -> Path | None:
 
 
 def _fetch_best(remote: RemoteCheckpoints, newest: Path, folder: Path) -> None:
-    """Download the best checkpoint, if the newest names one that is there and is not on this machine."""
+    """Download the best checkpoint, if the newest names one that exists there and not on this machine."""
     step = written_state(newest).best_step
     if step is None or newest.name == f"{FETCHING}{checkpoint_name(step)}":
         return
@@ -121,7 +121,7 @@ def _fetch_best(remote: RemoteCheckpoints, newest: Path, folder: Path) -> None:
 
 
 def _give_name(fetched: Path, name: Path) -> None:
-    if name.is_dir():  # a damaged one of this machine
+    if name.is_dir():  # a damaged local one
         shutil.rmtree(name)
     fetched.rename(name)
     sync(name.parent)

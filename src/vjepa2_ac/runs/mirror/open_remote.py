@@ -25,15 +25,15 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Remote:
-    """What is known of `checkpoint.remote` before the first step."""
+    """State of `checkpoint.remote` before the first step."""
 
     place: str
-    config: Config  # its run_dir has what is to be gone on from
+    config: Config  # its run_dir has the run to resume
     is_reachable: bool = True
     damaged: tuple[str, ...] = ()  # checkpoints there
 
     def mirror(self, run_id: str) -> Mirror:
-        """Return what keeps the place up to date from now on."""
+        """Return the mirror that keeps the place up to date."""
         folder, checkpoint = Path(self.config.run_dir), self.config.checkpoint
         return Mirror(
             self.place, folder, run_id, checkpoint, damaged=self.damaged, outage_reported=not self.is_reachable
@@ -48,20 +48,20 @@ def open_remote(
     allow_config_change: bool = False,
     into: Path | None = None,
 ) -> Remote | None:
-    """Try `checkpoint.remote`, and fetch what is further on there; None where there is none.
+    """Test `checkpoint.remote`, and fetch a newer checkpoint from there; None if it is not set.
 
     A small file is written there and removed again.
 
     Args:
         config: The run.
-        note: Told what a person should know.
-        claim: Called before the first file is fetched; raises where the folder is somebody else's.
+        note: Called with messages for the user.
+        claim: Called before the first file is fetched; raises if the folder belongs to another run.
         allow_config_change: The run there may have another config.
-        into: The folder to fetch into, new or empty, where it is not to be the run's own.
+        into: The folder to fetch into, new or empty, if not the run's own.
 
     Raises:
-        InputError: It cannot be written and that will not pass, it has another run's checkpoints or another config, or
-            what is there is damaged or cannot be fetched and this machine has nothing to go on from.
+        InputError: It can never be written, it has another run's checkpoints or another config, or its checkpoints are
+            damaged or cannot be fetched and this machine has none to resume from.
     """
     if config.checkpoint.remote is None:
         return None
@@ -79,7 +79,7 @@ def open_remote(
     minutes = config.checkpoint.remote_every_minutes
     note(f"{remote.place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
     further = [name for name in complete(listing) if step is None or (step_of(name) or 0) > step]
-    is_begun_there = step is None and owner is not None  # a machine was killed in its first upload, at the latest
+    is_begun_there = step is None and owner is not None  # a machine was killed during its first upload or before
     if not further and not is_begun_there:
         return remote
     target = config if into is None else config.model_copy(update={"run_dir": str(into)})
@@ -97,10 +97,10 @@ def open_remote(
 
 
 def _look(checkpoints: RemoteCheckpoints, run_id: str | None) -> tuple[Listing, str | None]:
-    """Return what is at the place and which run we are, as far as known; having written there and seen that it is ours.
+    """Return the checkpoints there and our run id, as far as known, after checking that the place is writable and ours.
 
     Raises:
-        InputError: It cannot be written for good, or holds checkpoints of another run.
+        InputError: It can never be written, or holds checkpoints of another run.
         UnreachableError: It cannot be reached now.
     """
     try:
@@ -118,7 +118,7 @@ def _look(checkpoints: RemoteCheckpoints, run_id: str | None) -> tuple[Listing, 
 
 
 def _refuse_foreign(checkpoints: RemoteCheckpoints, listing: Listing, run_id: str | None) -> str | None:
-    """Refuse checkpoints, and halves of them, of another run than this machine's or each other's; return that run."""
+    """Refuse checkpoints, also incomplete ones, of several runs or of another run than ours; return the run."""
     for name in sorted(listing, reverse=True):
         owner = checkpoints.run_id(name)
         run_id = owner if run_id is None else run_id
@@ -153,10 +153,10 @@ def _refuse_all_damaged(remote: str, damaged: list[str], step: int | None) -> No
 
 
 def _where_this_machine_stands(run_dir: Path) -> tuple[int | None, str | None]:
-    """Return step and run of the newest whole checkpoint of this machine."""
+    """Return step and run of the newest complete local checkpoint."""
     try:
         checkpoint = newest_checkpoint(run_dir / CHECKPOINTS)
-    except InputError:  # none is whole: what is elsewhere may be
+    except InputError:  # none is complete: a remote one may be
         return None, None
     if checkpoint is None:
         return None, None

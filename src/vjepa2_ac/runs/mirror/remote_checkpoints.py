@@ -28,14 +28,14 @@ Listing = Mapping[str, Mapping[str, int]]
 
 
 def complete(listing: Listing) -> list[str]:
-    """Return the names of the checkpoints that are all there, the newest first."""
+    """Return the names of the complete checkpoints, the newest first."""
     whole = [name for name, files in listing.items() if MANIFEST in files]
     return sorted(whole, key=lambda name: step_of(name) or 0, reverse=True)
 
 
 @dataclass(frozen=True)
 class RemoteCheckpoints:
-    """The checkpoints at a place; every method raises UnreachableError where it cannot be reached.
+    """The checkpoints at a place; every method raises UnreachableError if it cannot be reached.
 
     Attributes:
         place: What `storage.place` returned.
@@ -44,7 +44,7 @@ class RemoteCheckpoints:
     place: str
 
     def listing(self) -> Listing:
-        """Return which checkpoints are there, in full or in part, as one listing tells."""
+        """Return the checkpoints there, complete or not, from one listing."""
         found: dict[str, dict[str, int]] = {}
         for path, size in file_sizes(join(self.place, CHECKPOINTS)).items():
             name, _, file = path.partition("/")
@@ -53,7 +53,7 @@ class RemoteCheckpoints:
         return found
 
     def run_id(self, name: str) -> str | None:
-        """Return the run that a checkpoint is of; None where it does not tell."""
+        """Return the run of a checkpoint; None if unknown."""
         try:
             state = read_json_object(self._path(name, STATE), allow_nan=True)
         except UnreachableError:
@@ -63,22 +63,22 @@ class RemoteCheckpoints:
         return str(state.get("run_id", ""))
 
     def send(self, checkpoint: Path, files: Mapping[str, int], before_each: Callable[[], None]) -> None:
-        """Bring a whole checkpoint of this machine there, as far as it is not there yet.
+        """Upload the missing files of a complete local checkpoint.
 
         Args:
-            checkpoint: Its folder, whose name it keeps.
-            files: What is there of it.
-            before_each: Called before each file; whatever it raises ends the sending.
+            checkpoint: Its folder; the name stays the same.
+            files: Those that are there already.
+            before_each: Called before each file; an exception ends the upload.
         """
         name, manifest = checkpoint.name, (checkpoint / MANIFEST).read_bytes()
         sizes = {path: (checkpoint / path).stat().st_size for path in named_files(manifest)}
         there = self._of_this(name, files, manifest)
         missing = [path for path, size in sizes.items() if there.get(path) != size]
-        if missing and MANIFEST in there:  # somebody took a file away
+        if missing and MANIFEST in there:  # another process removed a file
             remove(self._path(name, MANIFEST))
         if missing and SENDING not in there:
             upload(checkpoint / MANIFEST, self._path(name, SENDING))
-        for path in sorted(missing, key=lambda path: path != STATE):  # first whose it is
+        for path in sorted(missing, key=lambda path: path != STATE):  # first the owner
             before_each()
             upload(checkpoint / path, self._path(name, path))
         if missing or MANIFEST not in there:
@@ -88,11 +88,11 @@ class RemoteCheckpoints:
             remove(self._path(name, SENDING))
 
     def remove(self, name: str) -> None:
-        """Remove a checkpoint; from the first moment on it is none."""
+        """Remove a checkpoint; its manifest goes first, so that it no longer counts."""
         remove_folder(self._path(name), first=MANIFEST)
 
     def fetch(self, name: str, folder: Path) -> str | None:
-        """Download a checkpoint into a new folder; return what is wrong with it, if anything."""
+        """Download a checkpoint into a new folder; return its damage, if any."""
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         try:
@@ -109,7 +109,7 @@ class RemoteCheckpoints:
         return find_damage(folder, name)
 
     def _of_this(self, name: str, files: Mapping[str, int], manifest: bytes) -> Mapping[str, int]:
-        """Return what is there of this very checkpoint; of another by this name nothing is left."""
+        """Return the files of this checkpoint that are there; remove those of another one with the same name."""
         claim = next((claim for claim in (MANIFEST, SENDING) if claim in files), None)
         if claim is not None and read_bounded(self._path(name, claim), MOST_BYTES) == manifest:
             return files

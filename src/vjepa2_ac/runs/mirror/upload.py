@@ -28,22 +28,22 @@ GoOn = Callable[[], None]
 
 
 class ForeignRunError(Exception):
-    """Another run's checkpoints are there; the argument is the name of one."""
+    """There are another run's checkpoints; the argument is the name of one."""
 
 
 class OvertakenError(Exception):
-    """A later start of the same run keeps the place; the argument says which."""
+    """A later start of the same run uses the place; the argument describes it."""
 
 
 class RemoteUpdate:
-    """Brings a place up to date, and remembers what it found there. One call at a time.
+    """Brings a place up to date, and remembers its content. Not for concurrent calls.
 
     Args:
         remote: The place.
         folder: The run's folder.
-        run_id: Whose checkpoints may be there.
-        keep: How many of the newest stay there, besides the best.
-        damaged: Names of checkpoints that were found damaged there; they are removed.
+        run_id: The run whose checkpoints may be there.
+        keep: How many of the newest stay there, in addition to the best.
+        damaged: Names of damaged checkpoints there; they are removed.
     """
 
     def __init__(
@@ -51,17 +51,17 @@ class RemoteUpdate:
     ) -> None:
         self._remote, self._folder, self._run_id, self._keep = remote, folder, run_id, keep
         self._damaged = set(damaged)
-        self._ours: set[str] = set()  # checkpoints there that are known to be of this run
-        self._small: dict[str, tuple[int, int]] = {}  # sizes and times of the small files that were sent
-        self._starts: bytes | None = None  # the list of starts as it was sent: another one there is a later start's
-        self.release()  # what a process that was killed held
+        self._ours: set[str] = set()  # remote checkpoints that are known to be of this run
+        self._small: dict[str, tuple[int, int]] = {}  # sizes and times of the uploaded small files
+        self._starts: bytes | None = None  # the list of starts as uploaded: a different one there is a later start's
+        self.release()  # links held by a killed process
 
     def __call__(self, go_on: GoOn) -> str | None:
-        """Send what is not there; return the newest checkpoint that now is, None where there is none to send.
+        """Upload what is missing; return the newest checkpoint there, None if there is none to upload.
 
         Raises:
             ForeignRunError: The place is another run's.
-            OvertakenError: Another machine began to go on with this run, and keeps the place.
+            OvertakenError: Another machine has resumed this run, and uses the place.
             UnreachableError: It cannot be reached.
             OSError: The run's folder cannot be read, or written for the links.
         """
@@ -87,11 +87,11 @@ class RemoteUpdate:
         return newest.name
 
     def release(self) -> None:
-        """Let go of what was held."""
+        """Remove the links."""
         shutil.rmtree(self._folder / HELD, ignore_errors=True)
 
     def newest_here(self) -> str | None:
-        """Return the newest checkpoint of this machine."""
+        """Return the newest local checkpoint."""
         return next(iter(self._names_here()), None)
 
     def _require_ours(self, listing: Listing) -> None:
@@ -103,7 +103,7 @@ class RemoteUpdate:
                 self._ours.add(name)
 
     def _require_not_overtaken(self) -> None:
-        """Leave the place to whoever started last: two that send by turns would undo each other's."""
+        """Leave the place to the latest start: two uploaders would overwrite each other's files."""
         if self._starts is None:
             return
         path = join(self._remote.place, ENVIRONMENT)
@@ -116,7 +116,7 @@ class RemoteUpdate:
             raise OvertakenError(_last_start(there, path))
 
     def _send_small_files(self, go_on: GoOn) -> None:
-        """Send the files of the run's folder that have changed, as they are now: they may grow meanwhile."""
+        """Upload the changed files of the run's folder in their current state: they may grow meanwhile."""
         for name in SMALL_FILES:
             source, copy = self._folder / name, self._folder / HELD / name
             if not source.is_file():
@@ -134,7 +134,7 @@ class RemoteUpdate:
         return next(filter(None, map(self._hold, self._names_here())), None)
 
     def _hold(self, name: str | None) -> Path | None:
-        """Link a checkpoint's files into a folder of our own; None where it is not whole, or just being removed."""
+        """Link a checkpoint's files into an own folder; None if it is incomplete, or just being removed."""
         held = self._folder / HELD / str(name)
         shutil.rmtree(held, ignore_errors=True)
         try:
@@ -144,21 +144,21 @@ class RemoteUpdate:
         return held if find_damage(held) is None else None
 
     def _remove_halves(self, listing: Listing, newest: str, best: str | None, go_on: GoOn) -> None:
-        """Remove older ones that were left by halves: a full place would never have room again; later ones stay."""
+        """Remove older incomplete ones: else a full place would never have room again; newer ones stay."""
         for name in sorted(set(listing) - {*complete(listing), newest, best}):
             if (step_of(name) or 0) < (step_of(newest) or 0):
                 go_on()
                 self._remote.remove(name)
 
     def _rotate(self, newest: str, best: str | None, go_on: GoOn) -> None:
-        """Remove what is not kept any more."""
+        """Remove checkpoints that are no longer kept."""
         whole = complete(self._remote.listing())
         for name in sorted(set(whole) - {*whole[: self._keep], newest, best}):
             go_on()
             self._remote.remove(name)
 
     def _names_here(self) -> list[str]:
-        """Return the checkpoints of this machine, the newest first."""
+        """Return the local checkpoints, the newest first."""
         with contextlib.suppress(FileNotFoundError):
             return [path.name for path in reversed(listed(self._folder / CHECKPOINTS))]
         return []
@@ -170,7 +170,7 @@ def _best_of(checkpoint: Path) -> str | None:
 
 
 def _last_start(starts: bytes, where: str) -> str:
-    """Return where and when a run was started last, in words."""
+    """Return where and when a run was started last, as text."""
     try:
         last = json_list(starts, where=where)[-1]
         return f"on {shown(last['host'])}, at {shown(last['time'])}"

@@ -77,13 +77,13 @@ def with_retries(
     doing: str = "read",
     progress: Callable[[], int] = lambda: 0,
 ) -> _T:
-    """Return the result of an action, retried while its failures are temporary.
+    """Return what an action returns, trying again while its failures are of a kind that passes.
 
     Args:
-        where: The file that is read or written, for messages.
-        action: Called with its time-out in seconds.
-        policy: Number of attempts, waits and time-outs.
-        access: What to do when permission is missing, as a sentence.
+        where: What is read or written, for messages.
+        action: Called with the seconds that it may take.
+        policy: How often to try, and how long.
+        access: The way out where permission is missing, as a sentence.
         doing: "read" or "written", for messages.
         progress: How far the action is, where a later attempt goes on from there; attempts and time are counted anew
             from the last one that came farther.
@@ -91,7 +91,8 @@ def with_retries(
     Raises:
         InputError: The action raised it.
         OSError: There is no such file, or it is a folder, or the other way round.
-        UnreachableError: The failure lasted too long; a RefusedError if permission is missing or it is permanent.
+        UnreachableError: What failed did not pass in time; a RefusedError where permission is missing, or it does not
+            pass.
     """
     begin, failures, before = time.monotonic(), 0, progress()
     while True:
@@ -110,7 +111,7 @@ def with_retries(
             wait_s, seconds = policy.wait_s(failures), time.monotonic() - begin
             if failures >= policy.attempts or seconds + wait_s > policy.total_s:
                 raise _given_up(where, error, failures, seconds) from error
-            _log_failure(failures, "%s: %s; trying again in %.1f s", where, _summary(error), wait_s)
+            _say(failures, "%s: %s; trying again in %.1f s", where, _words(error), wait_s)
         time.sleep(wait_s)
 
 
@@ -127,7 +128,7 @@ def quietly() -> Iterator[None]:
 _quiet = ContextVar("_quiet", default=False)
 
 
-def _log_failure(failures: int, text: str, *arguments: object) -> None:
+def _say(failures: int, text: str, *arguments: object) -> None:
     """Log a failure; as a warning from the third of a call on, at most once in half a minute."""
     now = time.monotonic()
     is_warning = (
@@ -180,19 +181,19 @@ def _passes(error: Exception) -> bool:
 
 def _refused(where: str, error: Exception, access: str, doing: str) -> RefusedError:
     if status_of(error) in _NO_ACCESS or _is_of_google_login(error):
-        return RefusedError(where=where, found=f"no permission ({_summary(error)})", fix=access)
-    return RefusedError(where=where, found=f"cannot be {doing} ({_summary(error)})", fix="Check the address")
+        return RefusedError(where=where, found=f"no permission ({_words(error)})", fix=access)
+    return RefusedError(where=where, found=f"cannot be {doing} ({_words(error)})", fix="Check the address")
 
 
 def _given_up(where: str, error: Exception, attempts: int, seconds: float) -> UnreachableError:
     return UnreachableError(
         where=where,
-        found=f"not reached in {attempts} attempts over {seconds:.0f} s; the last: {_summary(error)}",
+        found=f"not reached in {attempts} attempts over {seconds:.0f} s; the last: {_words(error)}",
         fix="Check the network, and start again: a run goes on from its last checkpoint",
     )
 
 
-def _summary(error: Exception) -> str:
+def _words(error: Exception) -> str:
     """Return a library's error in one line."""
     status = status_of(error)
     text = re.sub(r"\s+", " ", str(getattr(error, "message", "") or error)).strip()

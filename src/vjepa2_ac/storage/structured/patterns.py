@@ -22,10 +22,10 @@ NEEDED = (
 
 
 def require_quick(pattern: str, *, where: str) -> None:
-    """Refuse a regular expression that may run for ever: backtracking time is a power of its choices.
+    """Refuse a regular expression that may run for ever by backtracking.
 
     Raises:
-        InputError: It repeats a group, has too many choices or repeats, has a back reference, or is not a pattern.
+        InputError: It repeats a group, has too many repeats or groups, a back reference, or is no regular expression.
     """
     plain = _SET.sub("x", _ESCAPED.sub("x", pattern))  # in these, special characters are literal
     too_long = len(pattern) > _MOST_CHARACTERS or len(_REPEAT.findall(plain)) > _MOST_REPEATS

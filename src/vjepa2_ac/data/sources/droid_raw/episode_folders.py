@@ -21,25 +21,25 @@ _OUTCOMES = ("success", "failure")
 
 @dataclass(frozen=True)
 class EpisodeFolder:
-    """What the listing of an episode's folder says."""
+    """The listing of an episode's folder."""
 
-    path: str  # relative to the data set's; "" is that folder itself
+    path: str  # relative to the data set's; "" is the data set's folder itself
     files: tuple[FileInfo, ...]
     videos: tuple[FileInfo, ...]
 
     @property
     def metadata(self) -> str | None:
-        """The name of its metadata file, or None; the uploaders of DROID wrote it last, for whole episodes only."""
+        """The name of its metadata file, or None; DROID's uploaders wrote it last, for complete episodes only."""
         return next((file.name for file in self.files if _is_metadata(file.name)), None)
 
     @property
     def has_trajectory(self) -> bool:
-        """Whether its trajectory is there."""
+        """Whether it has a trajectory."""
         return any(file.name == TRAJECTORY for file in self.files)
 
 
 def find_episodes(root: str, connections: int) -> list[str]:
-    """Return the folders of all episodes, relative to `root`, sorted; "" where `root` is an episode's.
+    """Return the folders of all episodes, relative to `root`, sorted; "" if `root` is an episode's.
 
     Raises:
         OSError: A folder cannot be listed.
@@ -68,9 +68,9 @@ def list_episode(root: str, folder: str) -> EpisodeFolder:
 
 
 def identity_of(root: str, folder: str) -> str:
-    """Return LAB/outcome/DATE/TIME where the path ends so, whatever part of the tree `root` is.
+    """Return LAB/outcome/DATE/TIME if the path ends so, for any part of the tree as `root`.
 
-    Elsewhere it is the path relative to `root`: it changes if `root` does.
+    Otherwise it is the path relative to `root`: it depends on `root`.
     """
     base = root.split("://", 1)[1] if storage.is_url(root) else str(Path(root).resolve())
     parts = [part for part in f"{base}/{folder}".split("/") if part]
@@ -78,15 +78,15 @@ def identity_of(root: str, folder: str) -> str:
 
 
 def success_of(identity: str) -> bool | None:
-    """Return the outcome that an identity tells, or None."""
+    """Return the outcome in an identity, or None."""
     parts = identity.split("/")
     return parts[-3] == "success" if _ends_as_in_droid(parts) else None
 
 
 def _children(root: str, folder: str) -> list[tuple[str, bool]]:
-    """Return the folders in a folder, and whether each is an episode's.
+    """Return the folders in a folder, and whether each is an episode.
 
-    In DROID's own layout the depth tells that, without a listing of every episode.
+    In DROID's own layout the depth shows that, without listing every episode.
     """
     children = [within(folder, name) for name in list_folder(root, folder)[1]]
     return [

@@ -49,13 +49,13 @@ class DroidMetadata:
 
     @property
     def success(self) -> bool | None:
-        """Whether the episode succeeded, where that is told."""
+        """Whether the episode succeeded, if known."""
         value = self.values.get("success")
         return value if isinstance(value, bool) else None
 
     @property
     def labels(self) -> dict[str, str | None]:
-        """What the episode belongs to, as far as it is told: scene, building, operator, task."""
+        """The episode's labels, as far as known: scene, building, operator, task."""
         return {
             "scene": self._short("scene_id"),
             "building": self._short("building"),
@@ -69,6 +69,6 @@ class DroidMetadata:
 
     @property
     def language(self) -> str | None:
-        """The task in words, where it is told."""
+        """The task as text, if known."""
         value = self.values.get("current_task")
         return value if isinstance(value, str) and value else None

@@ -45,7 +45,7 @@ _FIX = "Copy the episode again"
 
 @dataclass(frozen=True)
 class _Place:
-    """Where an episode lies, and what its index entry was made of."""
+    """Location of an episode, and the inputs of its index entry."""
 
     folder: str
     metadata: str
@@ -67,8 +67,8 @@ class RawDroidSource:
     """The episodes of a raw DROID tree, or of a part of it, in the order of their paths.
 
     Nothing is read before the first call. `infos` reads every trajectory and the headers of the MP4s of the config's
-    cameras, once; for data behind a URL it is not looked at again until folders come or go. An episode is known as
-    LAB/outcome/DATE/TIME (`folders.identity_of`).
+    cameras, once; data behind a URL is not checked again until folders are added or removed. An episode's identity is
+    LAB/outcome/DATE/TIME (`episode_folders.identity_of`).
 
     An MP4 holds one frame per control step, in order, whatever rate its header states, and may lack the last step's.
     """
@@ -83,7 +83,7 @@ class RawDroidSource:
         """Return identity, length and outcome of every usable episode.
 
         Raises:
-            InputError: There are no episodes, or not a single one can be used.
+            InputError: There are no episodes, or none can be used.
             OSError: Data behind a URL cannot be read.
         """
         if self._table is None:
@@ -91,7 +91,7 @@ class RawDroidSource:
         return self._table
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - a video is fetched in blocks
-        """Return one episode; of frames, only those that are asked for are decoded.
+        """Return one episode; only requested frames are decoded.
 
         Raises:
             InputError: A file is missing or damaged, or has changed since it was indexed.
@@ -121,7 +121,7 @@ class RawDroidSource:
         )
 
     def _indexed(self, progress: Progress | None) -> EpisodeTable:
-        """Return the kept table, or scan every episode; a local file that changed makes another key."""
+        """Return the cached table, or scan every episode; a changed local file changes the key."""
         config = self._config
         folders = find_episodes(self._root, config.connections)
         if not folders:
@@ -196,7 +196,7 @@ class RawDroidSource:
         return _Place(listed.path, listed.metadata, key_of({"files": listed}), {})
 
     def _counted(self, place: _Place, listed: EpisodeFolder, serials: tuple[str, ...]) -> dict[str, int]:
-        """Return how many frames each camera has."""
+        """Return the number of frames of each camera."""
         counts = {}
         for serial in serials:
             path = self._path(place, f"{VIDEOS}/{serial}.mp4")
@@ -231,7 +231,7 @@ class RawDroidSource:
 
 @dataclass(frozen=True)
 class _VideoReader:
-    """Decodes the frames of one camera that are asked for."""
+    """Decodes requested frames of one camera."""
 
     path: str
     version: str
@@ -242,7 +242,7 @@ class _VideoReader:
         """Return the RGB frames at these control steps, in this order.
 
         Raises:
-            InputError: The MP4 is missing, damaged, or ends before.
+            InputError: The MP4 is missing, damaged, or too short.
             OSError: A file behind a URL cannot be read.
             ValueError: No steps, or a step outside the episode.
         """

@@ -18,7 +18,7 @@ _GRIPPER = "observation/robot_state/gripper_position"
 _SKIP = "observation/timestamp/skip_action"
 _JOINT_VELOCITY = "action/joint_velocity"
 _JOINTS = 7
-_MOST_STEPS = 1_000_000  # a damaged header may promise any number
+_MOST_STEPS = 1_000_000  # a damaged header may claim any number
 _FIX = "Copy the episode again"
 
 
@@ -27,7 +27,7 @@ class Trajectory:
     """The control steps of an episode that have a frame (legend: `vjepa2_ac.episode`)."""
 
     states: Float[np.ndarray, "steps 7"]
-    frame_places: Int[np.ndarray, " steps"]  # place of each step's frame in the MP4
+    frame_places: Int[np.ndarray, " steps"]  # position of each step's frame in the MP4
     skipped: Bool[np.ndarray, " steps"]  # the operator was not in control
     extrinsics: dict[str, np.ndarray | None]  # of each camera, by its serial number: [steps 6]
     joint_velocities: Float[np.ndarray, "steps 7"] | None  # commanded
@@ -47,18 +47,18 @@ def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], frame_c
     """Read the content of a trajectory.h5.
 
     Args:
-        data: The whole file.
-        where: The file, as an error names it.
-        serials: Cameras whose poses are wanted; one without any has None.
+        data: The content of the file.
+        where: The file, for messages.
+        serials: Cameras whose poses are requested; one without poses has None.
         frame_counts: How many each MP4 holds: as many as there are steps, or one more or less. The steps that have a
             frame in every one are returned.
 
     Raises:
-        InputError: Not HDF5, damaged, without what is needed, or of another length than an MP4.
+        InputError: Not HDF5, damaged, incomplete, or of another length than an MP4.
     """
     h5py = _library(where)
     try:
-        # From memory: HDF5 then never waits for a network, nor crashes on a file that shrinks under it.
+        # From memory: HDF5 then never waits for a network, nor crashes on a file that is being truncated.
         with h5py.File(h5py.h5f.open_file_image(data)) as file:
             trajectory = _Reader(file, where).trajectory(serials)
     except (OSError, KeyError, ValueError, TypeError, RuntimeError, MemoryError, OverflowError) as error:
@@ -75,7 +75,7 @@ def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], frame_c
 
 @dataclass(frozen=True)
 class _Reader:
-    """Takes arrays out of an HDF5 file that may hold anything."""
+    """Reads arrays from an untrusted HDF5 file."""
 
     file: Any
     where: str
@@ -97,7 +97,7 @@ class _Reader:
         )
 
     def required(self, name: str, width: int, steps: int | None) -> Float64[np.ndarray, "steps width"]:
-        """Return an array of so many numbers a step; of one number, the second axis may be absent."""
+        """Return an array of `width` numbers per step; for one number, the second axis may be missing."""
         found = self.optional(name, width, steps)
         if found is None:
             there = ", ".join(sorted(self.file))[:200]
@@ -105,7 +105,7 @@ class _Reader:
         return found
 
     def _here(self, name: str) -> Any:
-        """Return what is in this very file under a name, or None: a link may lead to any other on this machine."""
+        """Return the object of a name in this file, or None: a link may lead to any other local file."""
         found: Any = self.file
         for part in name.split("/"):
             if not hasattr(found, "keys") or part not in found.keys():  # noqa: SIM118 - `in` would follow a link
@@ -118,7 +118,7 @@ class _Reader:
         return found
 
     def optional(self, name: str, width: int, steps: int | None) -> Float64[np.ndarray, "steps width"] | None:
-        """Return an array likewise, or None where there is none of this name."""
+        """Return an array likewise, or None if the name does not exist."""
         data = self._here(name)
         if data is None:
             return None

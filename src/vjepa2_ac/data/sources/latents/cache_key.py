@@ -15,19 +15,19 @@ from vjepa2_ac.data.sources.latents.dtypes import DTYPES, CacheType
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import shown
 
-NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: raise it when one of them changes
+NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: increase it when one of them changes
 
-# What a cache alone is checked against. The rest says which data set it was made from, and how that was read.
+# Checked when a cache is used alone. The rest identifies its data set, and how that was read.
 OF_CLIPS = ("data.crop", "data.states", "data.actions", "data.idle", "data.frames", "data.stride", "data.start_every")
 OF_ENCODING = ("encoder", "image_size", "patch_size", "normalisation", "model.dtype", "training.precision")
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """What besides a frame decides its latents, and how many numbers they are; made by `encoding.batch.encoding_of`.
+    """What determines a frame's latents besides the frame, and their size; made by `encoding.batch.encoding_of`.
 
-    How many frames go through the encoder at once is no part of it: with the encoder in use that changes no bit on a
-    CPU (measured, tests/encoding/test_latent_cache.py), and elsewhere no more than the order of a sum.
+    The number of frames per pass of the encoder is not included: with this encoder it changes no bit on a CPU
+    (measured, tests/encoding/test_latent_cache.py), and elsewhere only the order of a sum.
     """
 
     encoder: str  # WorldModel.encoder_fingerprint
@@ -40,7 +40,7 @@ class Encoding:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """The parts of a key that this decides."""
+        """The corresponding parts of a key."""
         return {
             "encoder": self.encoder,
             "image_size": self.image_size,
@@ -53,26 +53,26 @@ class Encoding:
 
 @dataclass(frozen=True)
 class CacheKey:
-    """What decides what is in a cache, as {name: JSON value}; names are those of knobs where there is one."""
+    """What determines the content of a cache, as {name: JSON value}; with the names of knobs where they exist."""
 
     parts: Mapping[str, Any]
 
     @property
     def digest(self) -> str:
-        """A short name for it: of the cache's folder, and in each of its files."""
+        """A short hash of it: the name of the cache's folder, also in each of its files."""
         return hashlib.sha256(json.dumps(dict(self.parts), sort_keys=True).encode()).hexdigest()[:32]
 
     @property
     def kind(self) -> CacheType:
-        """The type in which latents are kept."""
+        """The storage type of latents."""
         kind: CacheType = self.parts["data.cache_dtype"]
         return kind
 
     def require_whole(self, *, where: str, fix: str) -> None:
-        """Refuse a key from a file that lacks what a cache is read by.
+        """Refuse a key from a file without the parts needed to read a cache.
 
         Raises:
-            InputError: It does.
+            InputError: A part is missing.
         """
         cameras, kind = self.parts.get("data.camera"), self.parts.get("data.cache_dtype")
         named = isinstance(cameras, list) and cameras and all(isinstance(camera, str) for camera in cameras)
@@ -83,7 +83,7 @@ class CacheKey:
             )
 
     def differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
-        """Return what is other here than wanted, as "data.stride: 8, not 4"; of these names, or of all."""
+        """Return the differences from the wanted key, as "data.stride: 8, not 4"; of these names, or of all."""
         differing = []
         for name in sorted(self.parts.keys() | wanted) if names is None else names:
             here, there = self.parts.get(name), wanted.get(name)
@@ -93,7 +93,7 @@ class CacheKey:
 
 
 def key_of_cache(config: DataConfig, table: EpisodeTable, encoding: Encoding) -> CacheKey:
-    """Return the key of the cache of a data set that is open, with a stride that is a number."""
+    """Return the cache key of an open data set, whose stride is a number."""
     return CacheKey({
         "format": 1,
         **encoding.parts,
@@ -106,7 +106,7 @@ def key_of_cache(config: DataConfig, table: EpisodeTable, encoding: Encoding) ->
 
 
 def clip_parts(config: DataConfig) -> dict[str, Any]:
-    """Return the parts that decide which frames clips need, and what else they are made of."""
+    """Return the parts that determine which frames and other data clips need."""
     return {
         "data.crop": config.crop,
         "data.states": config.states,
@@ -119,7 +119,7 @@ def clip_parts(config: DataConfig) -> dict[str, Any]:
 
 
 def _reading(config: DataConfig) -> dict[str, Any]:
-    """Return the knobs by which this form of data set is read."""
+    """Return the knobs for reading this form of data set."""
     section = {"rlds": "fields", "droid_raw": "droid_raw", "lerobot": "lerobot"}.get(config.source)
     return {} if section is None else {section: getattr(config, section).model_dump(mode="json")}
 

@@ -17,10 +17,10 @@ _LARGEST = 127
 
 
 def pack_latents(latents: Float[Tensor, "*batch tokens dim"], kind: CacheType) -> StoredLatents:
-    """Return latents in the type that they are kept in.
+    """Return latents in their storage type.
 
-    bf16 rounds to the nearest: off by 2**-8 of the value at most. int8 divides each token by its largest value over
-    127, its scale: off by half a scale at most. fp32 changes nothing.
+    bf16 rounds to nearest: the error is at most 2**-8 of the value. int8 divides each token by its largest value over
+    127, its scale: the error is at most half a scale. fp32 is exact.
     """
     if kind != "int8":
         return StoredLatents(latents.to(DTYPES[kind]))
@@ -31,12 +31,12 @@ def pack_latents(latents: Float[Tensor, "*batch tokens dim"], kind: CacheType) -
     return StoredLatents(values.to(torch.int8), scales)
 
 
-def unpack_latents(kept: StoredLatents) -> Float[Tensor, "*batch tokens dim"]:
-    """Return kept latents as float32, as the encoder gave them but for what `pack_latents` rounded off."""
-    values = kept.values.float()
-    return values if kept.scales is None else values * kept.scales[..., None]
+def unpack_latents(stored: StoredLatents) -> Float[Tensor, "*batch tokens dim"]:
+    """Return stored latents as float32: the encoder's output up to the rounding of `pack_latents`."""
+    values = stored.values.float()
+    return values if stored.scales is None else values * stored.scales[..., None]
 
 
 def bytes_per_frame(tokens: int, dim: int, kind: CacheType) -> int:
-    """Return the room that the latents of a frame take."""
+    """Return the size of a frame's latents."""
     return tokens * dim * DTYPES[kind].itemsize + (tokens * 4 if kind == "int8" else 0)

@@ -39,14 +39,14 @@ from vjepa2_ac.storage.structured import json_object, shown
 FORMAT = "vjepa2-ac latents 1"
 
 _OPTIONAL = ("commands", "extrinsics", "joint_velocities")
-_BY_FRAME = frozenset({"latents", "scales", "pictures"})  # read and checked by frame, when asked for
+_BY_FRAME = frozenset({"latents", "scales", "pictures"})  # read and checked by frame, on request
 _JPEG_QUALITY = 85
 _FIX = "Delete this file, and then run `vjepa2-ac encode` again, as the cache was made; or copy the file again"
 
 
 @dataclass(frozen=True)
 class EpisodeLayout:
-    """What is the same in every file of a cache."""
+    """The properties that all files of a cache share."""
 
     key: str  # of the cache
     kind: CacheType
@@ -64,15 +64,15 @@ def write_episode_file(
     latents: StoredLatents,
     pictures: UInt8[np.ndarray, "frames height width 3"],
 ) -> int:
-    """Write an episode of one camera, whole or not at all, and return the size of the file.
+    """Write the file of an episode and camera atomically, and return its size.
 
     Args:
-        path: The file; missing folders are made.
-        layout: What all files of the cache have in common.
-        episode: Its states and what else a clip needs; no frame of it is read.
-        camera: Whose latents they are.
+        path: The file; missing folders are created.
+        layout: The layout of the cache.
+        episode: Its states and other data for clips; no frame is read.
+        camera: The camera of the latents.
         steps: Control steps of the frames, ascending; there may be none.
-        latents: Of these frames, in the type of the layout (`dtypes.pack_latents` makes them so).
+        latents: Of these frames, in the type of the layout (see `dtypes.pack_latents`).
         pictures: These frames, square as the encoder sees them and small.
 
     Raises:
@@ -122,11 +122,11 @@ def _small_tensors(episode: Episode, steps: Sequence[int], jpegs: Sequence[bytes
 
 
 class EpisodeFile:
-    """An open file: everything but the latents is in memory and has been checked.
+    """An open file: everything except latents and images is in memory and checked.
 
     Args:
         path: The file.
-        layout: What all files of the cache have in common.
+        layout: The layout of the cache.
 
     Raises:
         InputError: The file is missing, damaged, or belongs to another cache.
@@ -154,21 +154,21 @@ class EpisodeFile:
         self._require_shapes(layout)
 
     def __getitem__(self, name: str) -> Any:
-        """Return states, or commands, extrinsics or joint_velocities; None where there are none."""
+        """Return states, commands, extrinsics or joint_velocities; None if there are none."""
         return self._arrays.get(name)
 
     def _read_identity(self) -> tuple[str, str, dict[str, str]]:
-        """Return identity and camera, and the language instruction and the like."""
+        """Return identity, camera, and metadata such as the language instruction."""
         if absent := [name for name in ("id", "camera", "metadata") if name not in self.about]:
             raise _damaged(self.path, f"no {absent[0]} in its header")
         metadata = json_object(self.about["metadata"], where=f"{self.path}: metadata", fix=_FIX)
         return self.about["id"], self.about["camera"], {name: str(text) for name, text in metadata.items()}
 
     def places_of(self, steps: Sequence[int]) -> list[int]:
-        """Return which frames were taken at these control steps.
+        """Return the indices of the frames at these control steps.
 
         Raises:
-            InputError: The cache has none of one of them.
+            InputError: The cache has no frame of one of them.
         """
         places = np.searchsorted(self.frame_steps, np.asarray(steps))
         for place, step in zip(places.tolist(), steps, strict=True):
@@ -185,8 +185,8 @@ class EpisodeFile:
         """Return the latents of frames, read by frame.
 
         Args:
-            places: Which frames.
-            check: Those whose CRC is checked.
+            places: Indices of the frames.
+            check: Indices of those whose CRC is checked.
 
         Raises:
             InputError: A frame is damaged.
@@ -222,7 +222,7 @@ class EpisodeFile:
         return torch.stack([rows[place] for place in places])
 
     def _require_shapes(self, layout: EpisodeLayout) -> None:
-        """Refuse latents of another type or shape: their bytes would be read as something else."""
+        """Refuse latents of another type or shape: their bytes would be misread."""
         names = {"latents": [len(self.frame_steps), layout.tokens, layout.dim]}
         if layout.kind == "int8":
             names["scales"] = names["latents"][:2]
@@ -251,7 +251,7 @@ _SMALL: dict[str, tuple[int, tuple[torch.dtype, ...]]] = {  # axes and types
 
 
 def _require_fitting(path: str, tensors: Mapping[str, Tensor]) -> None:
-    """Refuse what contradicts itself, whatever its CRC says: anybody can write one."""
+    """Refuse inconsistent content, even with a correct CRC: the file is untrusted."""
     if absent := _SMALL.keys() - set(_OPTIONAL) - tensors.keys():
         raise _damaged(path, f"no {', '.join(sorted(absent))}")
     frames, steps = (len(tensors[name]) if tensors[name].ndim else -1 for name in ("frame_steps", "states"))
@@ -271,7 +271,7 @@ _SAFETENSORS_NAMES: dict[CacheType, str] = {"bf16": "BF16", "fp32": "F32", "int8
 
 @contextmanager
 def _reading(path: str) -> Iterator[None]:
-    """Say in the user's words that a file is missing, cut off, or no safetensors file."""
+    """Raise an error for the user if a file is missing, truncated, or no safetensors file."""
     try:
         yield
     except FileNotFoundError:
@@ -295,7 +295,7 @@ def _crc_of_frame(frame: StoredLatents) -> int:
 
 
 def _crc_of_rest(about: Mapping[str, str], tensors: Mapping[str, Tensor]) -> int:
-    """Return the CRC-32 of everything in a file but latents and scales."""
+    """Return the CRC-32 of everything in a file except latents, scales and images."""
     crc = zlib.crc32(json.dumps({name: text for name, text in about.items() if name != "crc"}, sort_keys=True).encode())
     for name, tensor in sorted(tensors.items()):
         crc = zlib.crc32(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode(), crc)

@@ -42,7 +42,7 @@ _AGAIN = (
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a cache says of itself."""
+    """The description of a cache."""
 
     key: Mapping[str, Any]  # the parts of its `CacheKey`
     digest: str
@@ -50,26 +50,26 @@ class Manifest:
     dim: Annotated[int, Field(ge=1, le=16_384)]
     control_rate_hz: Annotated[float, Field(gt=0.0, le=1000.0)]
     episodes: int  # of the data set
-    encoded: int  # of them, for each camera at least
+    encoded: int  # at least one of them per camera
     frames: int  # of all cameras
     bytes: int
-    broken: Mapping[str, str]  # episodes that could not be read when it was made, and why
-    checksums: Mapping[str, int]  # CRC-32 of the files beside it
-    about: Mapping[str, Any]  # whatever else is worth knowing; never interpreted
+    broken: Mapping[str, str]  # episodes that could not be read while encoding, and why
+    checksums: Mapping[str, int]  # CRC-32 of the other files in the folder
+    about: Mapping[str, Any]  # other information; never interpreted
 
     @property
     def layout(self) -> EpisodeLayout:
-        """What all files of the cache have in common."""
+        """The layout of all files of the cache."""
         return EpisodeLayout(self.digest, self.cache_key.kind, self.tokens, self.dim)
 
     @property
     def cache_key(self) -> CacheKey:
-        """Everything that decided what is in the cache."""
+        """Everything that determined the content of the cache."""
         return CacheKey(self.key)
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Whose latents there are."""
+        """The cameras of the latents."""
         return tuple(self.key["data.camera"])
 
     def to_text(self) -> str:
@@ -78,7 +78,7 @@ class Manifest:
 
 
 def path_of(folder: Path, number: int, camera: str) -> Path:
-    """Return the file of an episode, by its place in the data set, and a camera."""
+    """Return the file of an episode, by its index in the data set, and a camera."""
     return folder / "episodes" / f"{number // 1000:03d}" / f"{number:06d}-{quote(camera, safe='')}.safetensors"
 
 
@@ -88,7 +88,7 @@ def size_column(place: int) -> str:
 
 
 def size_of(path: Path) -> int | None:
-    """Return the size of a file, or None where there is none."""
+    """Return the size of a file, or None if there is none."""
     try:
         return os.stat(path).st_size  # noqa: PTH116 - a third of the time, for as many files as there are episodes
     except OSError:
@@ -96,7 +96,7 @@ def size_of(path: Path) -> int | None:
 
 
 def is_whole(folder: Path) -> bool:
-    """Return whether a folder holds a cache that was finished."""
+    """Return whether a folder has a complete cache."""
     return (folder / MANIFEST).is_file()
 
 
@@ -104,7 +104,7 @@ def read_manifest(folder: Path) -> Manifest:
     """Read cache.json.
 
     Raises:
-        InputError: It is not there, or cannot be what was written.
+        InputError: It is missing, or invalid.
     """
     where = str(folder / MANIFEST)
     try:
@@ -126,7 +126,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def read_episodes(folder: Path, manifest: Manifest) -> tuple[EpisodeTable, FoundRanges | None]:
-    """Read the episodes of a cache and, where its idle rule is not none, what that rule keeps of them.
+    """Read the episodes of a cache and, if it has an idle rule, the ranges that the rule keeps.
 
     Raises:
         InputError: One of the files is missing or damaged.

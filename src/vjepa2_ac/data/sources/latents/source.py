@@ -43,8 +43,8 @@ class _Opened:
 class LatentSource:
     """The episodes of the data set that a latent cache was made from, in that data set's order.
 
-    Nothing is read before the first call. An episode that could not be read when the cache was made is among them, and
-    cannot be read here either: so the clips are those of the data set, in their order.
+    Nothing is read before the first call. An episode that could not be read while encoding is included, and raises an
+    error here, too: so the clips are those of the data set, in their order.
     """
 
     def __init__(self, config: DataConfig) -> None:
@@ -54,41 +54,41 @@ class LatentSource:
         self._checked: dict[tuple[int, str], bytearray] = {}  # frames whose CRC this process has checked
 
     def __getstate__(self) -> dict[str, Any]:
-        """Travel to a loader worker with the index."""
+        """Pickle for a loader worker, with the index."""
         return {"_config": self._config, "_folder": self._folder, "_known": self._known}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Arrive at a worker."""
+        """Unpickle in a loader worker."""
         self.__dict__ |= state | {"_opening": threading.Lock(), "_checked": {}}
 
     @property
     def manifest(self) -> Manifest:
-        """What the cache says of itself."""
+        """The manifest of the cache."""
         return self._open().manifest
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Those that clips are drawn from: the config's, or all that the cache has."""
+        """The cameras that clips are drawn from: the config's, or all of the cache."""
         return self.manifest.cameras if self._config.camera is None else self._config.cameras
 
     @property
     def settled_config(self) -> DataConfig:
-        """The config with the cameras by name."""
+        """The config with the names of the cameras."""
         return self._config.model_copy(update={"camera": self.cameras})
 
     def infos(self, progress: Progress | None = None) -> EpisodeTable:  # noqa: ARG002 - at once
         """Return identity, length and outcome of every episode.
 
         Raises:
-            InputError: No whole cache, or one of clips that the config does not ask for.
+            InputError: No complete cache, or one of other clips than the config's.
         """
         return self._open().table
 
     def kept_ranges(self) -> FoundRanges:
-        """Return what `data.idle` keeps, as it was found when the cache was made; its rule is not none.
+        """Return the ranges that `data.idle` keeps, from the cache; its rule is not none.
 
         Raises:
-            InputError: No whole cache, or one of clips that the config does not ask for.
+            InputError: No complete cache, or one of other clips than the config's.
         """
         kept = self._open().kept
         if kept is None:  # `_require_fit` has compared the rules
@@ -98,10 +98,10 @@ class LatentSource:
         return kept
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched
-        """Return one episode; of its latents, only those that are asked for are read.
+        """Return one episode; only requested latents are read.
 
         Raises:
-            InputError: The file is missing or damaged, or the episode could not be read when the cache was made.
+            InputError: The file is missing or damaged, or the episode could not be read while encoding.
             ValueError: A camera that the cache does not have.
         """
         opened, camera = self._open(), camera or self.cameras[0]
@@ -130,7 +130,7 @@ class LatentSource:
         )
 
     def wrong_files(self) -> list[EpisodeProblem]:
-        """Return the episodes of which a file is missing or has another size than it was written with."""
+        """Return the episodes with a missing file, or a file of another size than written."""
         opened, problems = self._open(), []
         for place, camera in enumerate(opened.manifest.cameras):
             sizes = opened.table.locators[size_column(place)]
@@ -144,10 +144,10 @@ class LatentSource:
         return problems
 
     def require_encoded(self, episodes: Int[np.ndarray, " episodes"]) -> None:
-        """Refuse to make clips of episodes that were left out when the cache was made.
+        """Refuse to make clips of episodes that were skipped while encoding.
 
         Raises:
-            InputError: Some of these were.
+            InputError: There are some.
         """
         opened = self._open()
         table, broken = opened.table, opened.manifest.broken
@@ -174,7 +174,7 @@ class LatentSource:
             return self._known
 
     def _require_fit(self, manifest: Manifest) -> None:
-        """Refuse a cache of other clips than the config asks for; name what differs."""
+        """Refuse a cache of other clips than the config's; name the differences."""
         differing = manifest.cache_key.differences(clip_parts(self._config), OF_CLIPS)
         for camera in () if self._config.camera is None else self._config.cameras:
             if camera not in manifest.cameras:
@@ -184,7 +184,7 @@ class LatentSource:
 
 
 def another_cache(folder: Path, differing: Sequence[str]) -> InputError:
-    """Return the error of a cache that was made with other settings than those in use."""
+    """Return the error of a cache with other settings than those in use."""
     return InputError(
         where=str(folder),
         found=f"a latent cache that was made otherwise: {'; '.join(differing)}",
@@ -203,7 +203,7 @@ class _LatentReader:
         """Return the latents at these control steps, in this order.
 
         Raises:
-            InputError: There are none of such a step, or they are damaged.
+            InputError: A step has none, or they are damaged.
         """
         places = self.record.places_of(steps)
         check = {"never": [], "always": places}.get(self.check_crc)
@@ -223,7 +223,7 @@ class _FrameReader:
         """Return small frames at these control steps, in this order: square, as the encoder saw them.
 
         Raises:
-            InputError: There is none of such a step, or it is damaged.
+            InputError: A step has none, or it is damaged.
         """
         return self.record.pictures(self.record.places_of(steps))
 

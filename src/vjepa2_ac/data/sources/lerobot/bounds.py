@@ -7,7 +7,7 @@ from typing import Any
 
 from vjepa2_ac.errors import InputError
 
-# All of this is far more than any data set has.
+# All limits are far beyond any data set.
 MOST_ROWS = 5_000_000  # of one row group, or of one episode
 MOST_NUMBERS = 1 << 27  # of one column in a row group
 MOST_TABLE_BYTES = 1 << 28  # of a table of episodes or tasks
@@ -20,16 +20,16 @@ _ROWS_AT_ONCE = 64  # where one value may be as large as an image
 def parts_of(
     file: Any, path: str, columns: Sequence[str], most_bytes: int, **which: list[int]
 ) -> Iterator[dict[str, list[Any]]]:
-    """Yield some columns a few rows at a time, as Python's own values, as long as they are no larger than that in all.
+    """Yield some columns a few rows at a time, as Python values, within a limit of their total size.
 
-    What they take is counted in values: of equal ones the table holds one, and Python a copy for each.
+    Sizes are counted as Python values: the table stores equal ones once, Python a copy of each.
 
     Args:
         file: An open Parquet file.
         path: Its path, for messages.
-        columns: Which.
-        most_bytes: Of all values together.
-        which: Of which row groups, where not of all.
+        columns: Their names.
+        most_bytes: Of all values.
+        which: The row groups, if not all.
 
     Raises:
         InputError: They are larger.
@@ -47,7 +47,7 @@ def parts_of(
 
 
 def _bytes_in(value: Any) -> int:
-    """Return about how many bytes nested lists and dicts of numbers, texts and images take."""
+    """Return the approximate size in bytes of nested lists and dicts of numbers, texts and images."""
     if isinstance(value, str | bytes):
         return len(value)
     if isinstance(value, dict):
@@ -56,10 +56,10 @@ def _bytes_in(value: Any) -> int:
 
 
 def require_few(file: Any, number: int, columns: Sequence[str], path: str) -> None:
-    """Refuse a row group whose lists are longer than any robot's, before they are unpacked.
+    """Refuse a row group whose lists are longer than any robot's, before they are decompressed.
 
     Raises:
-        InputError: It is one.
+        InputError: They are.
     """
     group, schema = file.metadata.row_group(number), file.metadata.schema
     for place in range(group.num_columns):
@@ -74,10 +74,10 @@ def require_few(file: Any, number: int, columns: Sequence[str], path: str) -> No
 
 
 def require_sane(rows: Sequence[int], path: str, total: int | None = None) -> None:
-    """Refuse numbers of rows that no file has, or that are not those of all row groups together.
+    """Refuse implausible numbers of rows, or a total that differs from the sum of the row groups.
 
     Raises:
-        InputError: They are so.
+        InputError: There are such.
     """
     if any(not 0 <= count <= MOST_ROWS for count in rows) or (total is not None and sum(rows) != total):
         raise InputError(

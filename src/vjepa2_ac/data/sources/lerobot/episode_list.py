@@ -29,17 +29,17 @@ _STATISTICS = ("min", "max", "mean", "std")
 
 @dataclass(frozen=True)
 class VideoPlace:
-    """Where the frames of one camera of an episode lie."""
+    """The location of one camera's frames of an episode."""
 
     chunk: int
     file: int
     start_s: float  # of the episode's first frame
-    length_s: float | None  # None: the data set does not say
+    length_s: float | None  # None: unknown
 
 
 @dataclass(frozen=True)
 class EpisodeRow:
-    """What the data set's own tables say of one episode."""
+    """The entry of one episode in the data set's tables."""
 
     index: int
     length: int
@@ -58,14 +58,14 @@ class EpisodeRow:
 
 @dataclass(frozen=True)
 class StatisticsColumns:
-    """Columns of which the tables' statistics tell something."""
+    """Columns whose statistics in the tables are used."""
 
-    states: tuple[str, ...]  # whether two episodes have the same states; none: their rows are read
-    success: str | None  # whether an episode succeeded
+    states: tuple[str, ...]  # to find episodes with the same states; none: their rows are read
+    success: str | None  # the episode's success
 
 
 def identity(index: int) -> str:
-    """Return how an episode is called: by its number, the only name that LeRobot gives."""
+    """Return the identity of an episode: its number, the only name in LeRobot."""
     return f"episode_{index:06d}"
 
 
@@ -91,13 +91,13 @@ def read_episodes(
     Args:
         info: Of the data set.
         tables: The files that list the episodes, within the data set.
-        keys: Videos whose places are wanted.
-        wanted: Columns of which statistics are wanted; of v2.1 none are read.
-        open_file: Gives what to open for a path.
+        keys: Videos whose locations are requested.
+        wanted: Columns whose statistics are requested; v2.1 has none.
+        open_file: Returns the path or file to open for a path.
 
     Raises:
-        InputError: The tables are missing, damaged, or list other episodes than meta/info.json counts.
-        OSError: A file far away cannot be read.
+        InputError: The tables are missing, damaged, or do not match the count in meta/info.json.
+        OSError: A remote file cannot be read.
     """
     videos = [key for key in keys if info.features[key].dtype == "video"]
     if info.version == "v3.0":
@@ -190,7 +190,7 @@ def _episode_of_row(
 
 
 def _hash_of(length: object, statistics: Sequence[object]) -> int:
-    """Return what stands for an episode's states where its rows are not read: their statistics, all of them."""
+    """Return a hash that represents an episode's states without reading its rows: of all their statistics."""
     if not statistics or any(one is None for one in statistics):
         return UNKNOWN
     return hash_of_bytes(json.dumps([length, *statistics], default=str).encode())
@@ -212,7 +212,7 @@ def _checked(where: str, read: Callable[..., _T], *arguments: object) -> _T:
 
 
 def _count(value: object) -> int:
-    """Return a number of things; other than by `int`, neither True nor 1.5 nor "1" is one."""
+    """Return a count; unlike for `int`, True, 1.5 and "1" are none."""
     if isinstance(value, bool) or not isinstance(value, int | float) or value != int(value) or not 0 <= value < 2**31:
         raise ValueError(f"{value!r} is no count")
     return int(value)

@@ -21,7 +21,7 @@ _FIX = "Copy the file again, or leave the episode out"
 
 @dataclass(frozen=True)
 class EpisodeContent:
-    """What is read of an episode beside its frames."""
+    """The data of an episode except its frames."""
 
     states: Float[np.ndarray, "steps state_dim"]
     joint_velocities: Float[np.ndarray, "steps joints"] | None
@@ -30,7 +30,7 @@ class EpisodeContent:
 
 
 def wanted_columns(config: DataConfig) -> list[str]:
-    """Return the columns that are read where a file has them."""
+    """Return the columns that are read if a file has them."""
     fields = config.lerobot
     optional = [name for name in (fields.joint_velocity, fields.success) if name is not None]
     commands = fields.action if config.actions == "recorded" else ()
@@ -38,17 +38,17 @@ def wanted_columns(config: DataConfig) -> list[str]:
 
 
 def content_of(rows: Columns, length: int, info: DatasetInfo, config: DataConfig, where: str) -> EpisodeContent:
-    """Return what the rows of an episode hold.
+    """Return the data in the rows of an episode.
 
     Args:
         rows: As `ParquetRows.rows` returns them.
-        length: How many there must be.
-        info: What the data set says of its columns.
-        config: Names and conventions of the columns, and what a state is.
-        where: File and episode, for the message.
+        length: Their expected number.
+        info: The description of the data set's columns.
+        config: Names and conventions of the columns, and the kind of state.
+        where: File and episode, for messages.
 
     Raises:
-        InputError: Rows or columns are missing, are of another width, or are not a robot's states.
+        InputError: Rows or columns are missing, have another width, or are implausible states.
     """
     _require_rows(rows, length, info.fps, where)
     fields = config.lerobot
@@ -77,7 +77,7 @@ def content_of(rows: Columns, length: int, info: DatasetInfo, config: DataConfig
 
 
 def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
-    """Check that the rows are those of the episode, all of them, in order, at the data set's rate."""
+    """Check that the rows are those of the episode, complete, in order, at the data set's rate."""
     found = len(rows[EPISODE]) if rows else 0
     if found != length:
         raise InputError(where=where, found=f"{found} rows", needed=f"{length}, says the data set", fix=_FIX)

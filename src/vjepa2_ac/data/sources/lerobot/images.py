@@ -32,7 +32,7 @@ class VideoFrames:
 
         Raises:
             InputError: The video is missing, damaged, or shows no frame within half a step of the time.
-            OSError: It is far away and cannot be read.
+            OSError: It is remote and cannot be read.
             ValueError: No steps, or a step outside the episode.
         """
         _require_within(steps, self.num_steps, self.where)
@@ -47,7 +47,7 @@ class VideoFrames:
 
 @dataclass(frozen=True)
 class StoredImages:
-    """Decodes images of an episode that the table holds as PNG or JPEG; they are read when the first is asked for."""
+    """Decodes images of an episode from PNG or JPEG in the table; they are read with the first request."""
 
     read: Callable[[], list[bytes]]
     num_steps: int
@@ -58,7 +58,7 @@ class StoredImages:
 
         Raises:
             InputError: An image is neither PNG nor JPEG, is damaged, or differs in size from the first.
-            OSError: The table is far away and cannot be read.
+            OSError: The table is remote and cannot be read.
             ValueError: No steps, or a step outside the episode.
         """
         _require_within(steps, self.num_steps, self.where)

@@ -28,12 +28,12 @@ Check = Callable[[EpisodeRow], EpisodeContent]  # reads an episode's rows
 def find_problems(
     info: DatasetInfo, rows: Sequence[EpisodeRow], files: Set[str], keys: Sequence[str]
 ) -> dict[int, InputError]:
-    """Return why episodes cannot be used, as far as the data set's own tables tell, by number.
+    """Return the problems of episodes that the data set's tables show, by number.
 
     Args:
         info: Of the data set.
         rows: Its episodes.
-        files: What is there, within the data set.
+        files: The existing files, within the data set.
         keys: Features of the cameras that are used.
     """
     found: dict[int, InputError] = {}
@@ -54,10 +54,10 @@ def check_rows(
     connections: int,
     progress: Progress | None,
 ) -> list[EpisodeRow]:
-    """Return the episodes with what their rows tell; those that cannot be used join `problems`.
+    """Return the episodes with the facts in their rows; unusable ones are added to `problems`.
 
     Raises:
-        OSError: A file far away cannot be read.
+        OSError: A remote file cannot be read.
     """
     by_file: dict[str, list[EpisodeRow]] = {}
     for row in rows:
@@ -111,7 +111,7 @@ def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], tex
 
 
 def row_of(table: EpisodeTable, place: int) -> EpisodeRow:
-    """Return where an episode of a table lies; its tasks stay in the table."""
+    """Return the location of an episode of a table; its tasks stay in the table."""
     at = table.locators
     keys = [name.removesuffix(".start_s") for name in at if name.endswith(".start_s")]
     return EpisodeRow(
@@ -132,7 +132,7 @@ def row_of(table: EpisodeTable, place: int) -> EpisodeRow:
 def _checked(row: EpisodeRow, check: Check) -> tuple[EpisodeRow, InputError | None]:
     try:
         content = check(row)
-    except UnreachableError:  # says nothing of the episode
+    except UnreachableError:  # not an error of the episode
         raise
     except InputError as error:
         return row, error

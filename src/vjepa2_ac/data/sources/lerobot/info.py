@@ -32,24 +32,24 @@ class Feature:
 
     @property
     def width(self) -> int:
-        """How many numbers it has at each step."""
+        """Its width: numbers per step."""
         return math.prod(self.shape)
 
     @property
     def is_camera(self) -> bool:
-        """Whether it holds frames."""
+        """Whether it contains frames."""
         return self.dtype in {"video", "image"}
 
 
 @dataclass(frozen=True)
 class DatasetInfo:
-    """What meta/info.json says, as far as it is used."""
+    """The used part of meta/info.json."""
 
     root: str
     version: str
     fps: float
     episodes: int
-    chunk_episodes: int  # v2.1: episodes in a chunk's folder
+    chunk_episodes: int  # v2.1: episodes per chunk folder
     data_path: str
     video_path: str | None
     features: Mapping[str, Feature]
@@ -63,7 +63,7 @@ class DatasetInfo:
         """Check that the data set has what `data.lerobot` and `data.camera` name, before anything large is read.
 
         Raises:
-            InputError: A column or camera is not there (lists those that are), or they do not make up a state.
+            InputError: A column or camera is missing (lists the existing ones), or they do not form a state.
         """
         fields = config.lerobot
         columns = [name for name, feature in self.features.items() if not feature.is_camera]
@@ -98,7 +98,7 @@ class DatasetInfo:
 
 
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
-    """Return the error of something that is not there, with what is, and what may have been meant."""
+    """Return the error of a missing name, with the existing ones, and a suggestion."""
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"Did you mean {close[0]}? " if close else ""

@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow import parquet
 
-Opener = Callable[[str], "str | BlockCachedFile"]  # a path, or a file far away
+Opener = Callable[[str], "str | BlockCachedFile"]  # a path, or a remote file
 
 EPISODE = "episode_index"
 
 _CACHED_BYTES = 64 << 20  # of decoded row groups, in a process
-_BUFFER_BYTES = 4096  # of a column from which nothing is read
+_BUFFER_BYTES = 4096  # of a column that is not read
 _CACHED_FOOTERS = 256
 
 
@@ -43,21 +43,21 @@ _CACHED_FOOTERS = 256
 class _Footer:
     metadata: parquet.FileMetaData
     schema: pa.Schema
-    first: list[int | None]  # least and greatest episode of each row group, where the file says
+    first: list[int | None]  # least and greatest episode of each row group, if the file has them
     last: list[int | None]
 
 
 class ParquetRows:
-    """Reads rows of Parquet files; the last footers and decoded row groups are kept. Safe in several threads.
+    """Reads rows of Parquet files; the last footers and decoded row groups are cached. Thread-safe.
 
     Args:
-        open_file: Gives what to open for a path.
-        columns: Those that are wanted, where a file has them; the index of the episode is read in any case.
-        kept: Where rows stay on this machine that share their row group with those of other episodes.
+        open_file: Returns the path or file to open for a path.
+        columns: The wanted ones, if a file has them; the index of the episode is always read.
+        row_cache: Local cache of rows that share their row group with other episodes.
     """
 
-    def __init__(self, open_file: Opener, columns: Sequence[str], kept: RowCache | None = None) -> None:
-        self._row_cache = kept
+    def __init__(self, open_file: Opener, columns: Sequence[str], row_cache: RowCache | None = None) -> None:
+        self._row_cache = row_cache
         self._open, self._columns = open_file, list(dict.fromkeys([EPISODE, *columns]))
         self._lock = threading.Lock()
         self._footers: OrderedDict[str, _Footer] = OrderedDict()
@@ -67,8 +67,8 @@ class ParquetRows:
         """Return the rows of one episode, as columns of shape [rows, numbers].
 
         Raises:
-            InputError: The file is missing or damaged, or a column holds something other than numbers.
-            OSError: A file far away cannot be read.
+            InputError: The file is missing or damaged, or a column does not contain numbers.
+            OSError: A remote file cannot be read.
         """
         if self._row_cache is not None and (known := self._row_cache.read(path, episode)) is not None:
             return known
@@ -92,8 +92,8 @@ class ParquetRows:
         """Return the encoded images of one episode from a column of {bytes, path}.
 
         Raises:
-            InputError: The file is missing or damaged, or the column does not hold images.
-            OSError: A file far away cannot be read.
+            InputError: The file is missing or damaged, or the column does not contain images.
+            OSError: A remote file cannot be read.
         """
         found: list[bytes] = []
         opened = self._open(path)
@@ -137,11 +137,11 @@ class ParquetRows:
 
 
 def read_table(opened: str | BlockCachedFile, path: str, wanted: Callable[[str], bool]) -> dict[str, list[Any]]:
-    """Return the columns of a small Parquet file whose names are wanted, as lists of Python's own values.
+    """Return the wanted columns of a small Parquet file, as lists of Python values.
 
     Raises:
         InputError: It is missing or damaged.
-        OSError: A file far away cannot be read.
+        OSError: A remote file cannot be read.
     """
     with _opened(opened, path) as file:
         _require_sane_groups(file, path)
@@ -157,7 +157,7 @@ def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
     """Return a column of numbers, or of lists of equally many numbers, as [rows, numbers].
 
     Raises:
-        InputError: It holds something else, or gaps.
+        InputError: It contains something else, or gaps.
     """
     import pyarrow as pa
 
@@ -183,7 +183,7 @@ def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
 
 @contextmanager
 def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.ParquetFile]:
-    """Open a Parquet file with its pages' checksums verified; say in the user's words what is wrong with it."""
+    """Open a Parquet file with verified page checksums; its errors become errors for the user."""
     pa, parquet = _library(path)
     try:
         with parquet.ParquetFile(
@@ -195,7 +195,7 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
     except (pa.ArrowException, OSError, ValueError, KeyError, MemoryError, OverflowError) as error:
         if isinstance(opened, BlockCachedFile) and opened.failure is not None:
             raise opened.failure from None
-        if isinstance(error, OSError) and error.errno is not None:  # of the system, not of the file's content
+        if isinstance(error, OSError) and error.errno is not None:  # a system error, not one of the content
             raise storage.unreadable(path, error, fix=FIX) from None
         reason = str(error).strip().splitlines()[:1]
         raise InputError(
@@ -204,7 +204,7 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
 
 
 def _places_of(group: Columns, episode: int) -> slice | Shaped[np.ndarray, " rows"]:
-    """Return the rows of an episode in a row group: as a slice where they stand together, as they should."""
+    """Return the rows of an episode in a row group: as a slice if they are contiguous, as they should be."""
     places = np.flatnonzero(group[EPISODE][:, 0] == episode)
     together = len(places) > 0 and places[-1] - places[0] == len(places) - 1
     return slice(int(places[0]), int(places[-1]) + 1) if together else places
@@ -228,10 +228,10 @@ def _footer_of(file: parquet.ParquetFile, path: str) -> _Footer:
 
 
 def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile, columns: Sequence[str]) -> None:
-    """Refuse what contradicts itself in the footer's account of some columns, in every row group.
+    """Refuse an inconsistent footer entry of some columns, in any row group.
 
-    Asking pyarrow for that account (`row_group(n).column(p)`) ends the process where it does: a C++ exception that its
-    binding does not expect. A reader of no rows makes the same checks, reads nothing, and raises.
+    Reading such an entry with pyarrow (`row_group(n).column(p)`) ends the process: a C++ exception that its binding
+    does not expect. A reader of no rows makes the same checks, reads nothing, and raises.
 
     Raises:
         pyarrow.ArrowException, OSError: It is damaged.

@@ -15,10 +15,10 @@ _NUMBERS = {"chunk_index", "file_index", "episode_chunk", "episode_index"}
 
 
 def require_template(template: object, where: str) -> str:
-    """Return a template of paths as meta/info.json names it.
+    """Return a path template of meta/info.json.
 
     Raises:
-        InputError: It is none, leads out of the data set, or has places that LeRobot does not have.
+        InputError: It is no template, leads out of the data set, or has placeholders unknown to LeRobot.
     """
     if isinstance(template, str) and template and not template.startswith("/") and ".." not in template.split("/"):
         rest = _PLACE.sub("", template)
@@ -33,7 +33,7 @@ def require_template(template: object, where: str) -> str:
 
 
 def filled(template: str, chunk: int, file: int, key: str = "") -> str:
-    """Return the path, within the data set, of a file: of v3.0 by chunk and file, of v2.1 by chunk and episode."""
+    """Return the path, within the data set, of a file: in v3.0 by chunk and file, in v2.1 by chunk and episode."""
     numbers = {"chunk_index": chunk, "episode_chunk": chunk, "file_index": file, "episode_index": file}
 
     def value(place: re.Match[str]) -> str:
@@ -72,7 +72,7 @@ def list_by_template(root: str, template: str, key: str = "", *, connections: in
 
 
 def fingerprint(*listings: Mapping[str, FileInfo]) -> Sequence[tuple[str, int, str]]:
-    """Return what differs when any of the files does."""
+    """Return a version that changes with any of the files."""
     return [(path, info.size, info.version) for files in listings for path, info in files.items()]
 
 
@@ -82,5 +82,5 @@ def _names(template: str) -> list[str]:
 
 def _fits(name: str, part: str) -> bool:
     pieces = re.split(r"\{\w+(?::0\dd)?\}", part)
-    # Possessive: a template of many places would else be tried in every way that there is.
+    # Possessive: otherwise a template of many placeholders would be matched in exponentially many ways.
     return re.fullmatch(r"\d++".join(re.escape(piece) for piece in pieces), name) is not None

@@ -21,15 +21,15 @@ class RowCache:
     """Rows of episodes on this machine's disk.
 
     Args:
-        cache: Holds them.
-        version: Differs when the data set or the wanted columns do.
+        cache: Stores them.
+        version: Changes with the data set or the wanted columns.
     """
 
     cache: DiskCache
     version: str
 
     def read(self, path: str, episode: int) -> Columns | None:
-        """Return what was kept, or None."""
+        """Return the cached rows, or None."""
         data = self.cache.read(self._key(path, episode))
         if data is None:
             return None
@@ -39,7 +39,7 @@ class RowCache:
             return None
 
     def write(self, path: str, episode: int, columns: Columns) -> None:
-        """Keep the rows of one episode."""
+        """Cache the rows of one episode."""
         file = io.BytesIO()
         np.savez(file, **columns)  # type: ignore[arg-type] # names are columns, none is called allow_pickle
         self.cache.write(self._key(path, episode), file.getvalue())

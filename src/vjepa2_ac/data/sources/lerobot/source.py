@@ -42,10 +42,10 @@ logger = logging.getLogger(__name__)
 class LeRobotSource:
     """The episodes of a LeRobot data set, v3.0 or v2.1, in the order of their numbers.
 
-    Nothing is read before the first call. Of a data set on this machine `infos` checks the states of every episode; of
-    one far away it reads what lies in meta, and states are checked when an episode is read (all of them at once where
-    `data.outcome` asks for what only the rows tell). `read` fetches the row groups with the episode's rows; frames
-    are fetched and decoded when they are asked for.
+    Nothing is read before the first call. Of a local data set `infos` checks the states of every episode; of a remote
+    one it reads the files in meta, and states are checked when an episode is read (all of them at once if
+    `data.outcome` needs a value that only the rows have). `read` fetches the row groups with the episode's rows;
+    frames are fetched and decoded on request.
     """
 
     def __init__(self, config: DataConfig) -> None:
@@ -53,20 +53,20 @@ class LeRobotSource:
         self._lock = threading.RLock()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Travel to a loader worker with the index, without what was read of the data."""
+        """Pickle for a loader worker: with the index, without cached data."""
         return {name: self.__dict__[name] for name in ("_config", "_info", "_table") if name in self.__dict__}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Arrive in a loader worker."""
+        """Unpickle in a loader worker."""
         self.__dict__ |= state | {"_lock": threading.RLock()}
 
     def infos(self, progress: Progress | None = None) -> EpisodeTable:
-        """Return identity, length and outcome of every episode that can be used, and the problems of the others.
+        """Return identity, length and outcome of every usable episode, and the problems of the others.
 
         Raises:
-            InputError: No data set, one of another version, damaged metadata, or none of its episodes has what the
-                config names.
-            OSError: It is far away and cannot be read.
+            InputError: No data set, one of another version, damaged metadata, or none of its episodes has the data that
+                the config names.
+            OSError: It is remote and cannot be read.
         """
         with self._lock:
             if "_table" not in self.__dict__:
@@ -77,8 +77,8 @@ class LeRobotSource:
         """Return one episode; see `episode.EpisodeSource`.
 
         Raises:
-            InputError: Its rows are missing or damaged, lack a column, or hold what cannot be a robot's state.
-            OSError: They are far away and cannot be read.
+            InputError: Its rows are missing or damaged, lack a column, or have implausible states.
+            OSError: They are remote and cannot be read.
         """
         table = self.infos()
         info, row = table[index], row_of(table, index)
@@ -110,8 +110,8 @@ class LeRobotSource:
 
     @cached_property
     def _parquet(self) -> ParquetRows:
-        kept = RowCache(fetched_data(self._config.disk_cache), self._data_version)
-        return ParquetRows(self._open, wanted_columns(self._config), kept)
+        row_cache = RowCache(fetched_data(self._config.disk_cache), self._data_version)
+        return ParquetRows(self._open, wanted_columns(self._config), row_cache)
 
     @cached_property
     def _files(self) -> EpisodeFiles:
@@ -127,7 +127,7 @@ class LeRobotSource:
 
     @property
     def _data_version(self) -> str:
-        """What differs when a file of the data set does, or what is wanted of it."""
+        """A version that changes with the data set's files and the wanted columns."""
         return self._table.texts["version"] if "_table" in self.__dict__ else self._version
 
     def _open(self, path: str) -> str | BlockCachedFile:

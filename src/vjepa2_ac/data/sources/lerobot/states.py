@@ -19,10 +19,10 @@ _FIX = "Check data.lerobot: state, select, rotation, gripper_open and gripper_cl
 def states_of(
     columns: Sequence[Shaped[np.ndarray, "steps _"]], fields: LeRobotFields, where: str
 ) -> Float[np.ndarray, "steps 7"]:
-    """Return states (legend: `vjepa2_ac.episode`) of the joined columns of an episode.
+    """Return states (legend: `vjepa2_ac.episode`) from the concatenated columns of an episode.
 
     Raises:
-        InputError: They are not a robot's states under these settings: NaN, no unit quaternion, out of reach.
+        InputError: They are implausible under these settings: NaN, no unit quaternion, out of reach.
     """
     joined = np.concatenate([column.astype(np.float64) for column in columns], axis=1)
     if fields.select is not None:
@@ -37,7 +37,7 @@ def states_of(
 def vectors_of(
     columns: Sequence[Shaped[np.ndarray, "steps _"]], select: Sequence[int] | None, where: str
 ) -> Float[np.ndarray, "steps width"]:
-    """Return the joined columns of an episode as they are, or the selected ones of their numbers.
+    """Return the concatenated columns of an episode, all numbers or the selected ones.
 
     Raises:
         InputError: A number is not finite, or there are no steps.

@@ -43,7 +43,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_size import require_bounded
 from vjepa2_ac.storage.npz_reader import NpzFile
 
-_MOST_NUMBERS = 1 << 25  # of an array besides frames: 88 hours of 7 numbers at 15 Hz; 256 MB as float64
+_MOST_NUMBERS = 1 << 25  # of an array other than frames: 88 hours of 7 numbers at 15 Hz; 256 MB as float64
 _MOST_LETTERS = 1 << 16
 LABELS = ("scene", "building", "operator", "day")
 FORMAT_HELP = "docs/data.md says what an episode holds"
@@ -51,7 +51,7 @@ FORMAT_HELP = "docs/data.md says what an episode holds"
 
 @dataclass(frozen=True)
 class NpzEpisode:
-    """What an episode's file holds, but for the frames (legend: `vjepa2_ac.episode`)."""
+    """The content of an episode's file, except the frames (legend: `vjepa2_ac.episode`)."""
 
     states: Float[np.ndarray, "steps state_dim"]
     fps_hz: float
@@ -60,25 +60,25 @@ class NpzEpisode:
     extrinsics: dict[str, Any]  # of each camera: [steps 6], or None
     joint_velocities: Float[np.ndarray, "steps joints"] | None
     commands: Float[np.ndarray, "steps action_dim"] | None
-    labels: dict[str, str | None]  # what the episode belongs to
+    labels: dict[str, str | None]  # the episode's labels
 
     @property
     def widths(self) -> tuple[int, int | None]:
-        """How many numbers a state and a command have."""
+        """The widths of a state and a command."""
         return self.states.shape[1], None if self.commands is None else self.commands.shape[1]
 
 
 def read_episode(opened: str | BlockCachedFile, path: str, cameras: Sequence[str], config: DataConfig) -> NpzEpisode:
-    """Read all of a file but the frames, whose shape is checked.
+    """Read a file except the frames, whose shape is checked.
 
     Args:
-        opened: What to open to read: the path, or a file far away.
+        opened: The path, or an open remote file.
         path: Of the file, for messages.
-        cameras: Whose frames must be there.
-        config: Whether camera poses and commands must be, too, and what a state is.
+        cameras: The cameras whose frames must exist.
+        config: Whether camera poses and commands must exist, too, and the kind of state.
 
     Raises:
-        InputError: It is no episode, or cannot be a robot's.
+        InputError: It is no episode, or impossible for a robot.
     """
     with opened_npz(opened, path) as file:
         arrays = _Arrays(file, path)
@@ -113,10 +113,10 @@ def read_episode(opened: str | BlockCachedFile, path: str, cameras: Sequence[str
 
 @contextmanager
 def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
-    """Open an .npz file to read from.
+    """Open an .npz file for reading.
 
     Raises:
-        InputError: It is missing, or no .npz file; an UnreachableError where it cannot be read.
+        InputError: It is missing, or no .npz file; an UnreachableError if it cannot be read.
     """
     try:
         with closing(storage.open_to_read(opened) if isinstance(opened, str) else opened) as file:
@@ -128,17 +128,17 @@ def opened_npz(opened: str | BlockCachedFile, path: str) -> Iterator[NpzFile]:
 
 
 def require_frames(file: NpzFile, camera: str, steps: int, path: str, *, count: int = 1) -> None:
-    """Refuse what cannot be the frames of a camera, without reading them.
+    """Refuse an array that cannot be the frames of a camera, without reading it.
 
     Args:
         file: The episode's.
         camera: The name of the array.
         steps: Of the episode.
         path: The file's, for messages.
-        count: How many are to be read together.
+        count: Frames that are read together.
 
     Raises:
-        InputError: There is no such array, or it is not [steps, height, width, 3] of uint8; they are too large.
+        InputError: There is no such array, it is not [steps, height, width, 3] of uint8, or too large.
     """
     _require_array(file, camera, (steps, None, None, 3), "u", "frames (steps, height, width, 3)", path)
     header = file.header_of_rows(camera)
@@ -150,13 +150,13 @@ def require_frames(file: NpzFile, camera: str, steps: int, path: str, *, count: 
 
 @dataclass(frozen=True)
 class _Arrays:
-    """Takes arrays of known shapes out of a file that may hold anything."""
+    """Reads arrays of known shapes from an untrusted file."""
 
     file: NpzFile
     path: str
 
     def numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
-        """Return finite numbers of a shape, None standing for any length."""
+        """Return finite numbers of a shape; None stands for any length."""
         self._require(name, shape, "biuf", "numbers")
         self._require_small(name, prod(self.file.header(name).shape), _MOST_NUMBERS, "numbers")
         values = self.file.array(name).astype(np.float64)
@@ -169,7 +169,7 @@ class _Arrays:
         return values
 
     def is_text(self, name: str) -> bool:
-        """Return whether there is an array of this name that is one text; a camera may be called so, too."""
+        """Return whether there is an array of this name with one text; a camera may have that name, too."""
         return name in self.file.names and (self.file.header(name).shape, self.file.header(name).dtype.kind) == (
             (),
             "U",
@@ -182,7 +182,7 @@ class _Arrays:
         return str(self.file.array(name))
 
     def extrinsics(self, camera: str, steps: int) -> Float64[np.ndarray, "steps 6"] | None:
-        """Return the poses of a camera, a fixed one's repeated; None where there are none."""
+        """Return the poses of a camera, repeated for a fixed one; None if there are none."""
         for name in (f"extrinsics_{camera}", "extrinsics"):
             if name in self.file.names:
                 one_pose = len(self.file.header(name).shape) == 1
@@ -191,7 +191,7 @@ class _Arrays:
         return None
 
     def _require_small(self, name: str, count: int, most: int, of_what: str) -> None:
-        """Refuse what claims to be far larger than any episode's, before it is unpacked: zeros pack a thousandfold."""
+        """Refuse an array far larger than any episode's before it is decompressed: zeros compress a thousandfold."""
         if count > most:
             raise InputError(
                 where=f"{self.path}: {name}",
@@ -207,7 +207,7 @@ class _Arrays:
 def _require_array(
     file: NpzFile, name: str, shape: tuple[int | None, ...], kinds: str, meaning: str, path: str
 ) -> None:
-    """Refuse an array that is not there, or is of another shape or kind."""
+    """Refuse an array that is missing, or of another shape or type."""
     if name not in file.names:
         there = ", ".join(file.names)[:200] or "none"
         raise InputError(

@@ -35,22 +35,22 @@ _SUFFIX = ".npz"
 class NpzSource:
     """The episodes of a folder of .npz files, in the order of their paths; a path without .npz is the identity.
 
-    Nothing is read before the first call. `infos` reads all of every file but the frames. What is fetched of files
-    behind URLs stays on this machine.
+    Nothing is read before the first call. `infos` reads every file except the frames. Data from URLs is cached on this
+    machine.
     """
 
     def __init__(self, config: DataConfig) -> None:
         self._config = config
         self._root = config.path
         self._files = EpisodeFiles(config)
-        self._version = ""  # of all files together: the key of the index
+        self._version = ""  # of all files: the key of the index
         self._table: EpisodeTable | None = None
 
     def infos(self, progress: Progress | None = None) -> EpisodeTable:
         """Return identity, length and outcome of every usable episode.
 
         Raises:
-            InputError: There are no episodes, or not a single one can be used.
+            InputError: There are no episodes, or none can be used.
             OSError: Data behind a URL cannot be read.
         """
         if self._table is None:
@@ -58,7 +58,7 @@ class NpzSource:
         return self._table
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - files are fetched in blocks
-        """Return one episode; of its frames, only those that are asked for are read.
+        """Return one episode; only requested frames are read.
 
         Raises:
             InputError: The file is missing or damaged, or has changed since it was indexed.
@@ -87,7 +87,7 @@ class NpzSource:
         )
 
     def _indexed(self, progress: Progress | None) -> EpisodeTable:
-        """Return the kept table, or read every episode; a file that changed makes another key."""
+        """Return the cached table, or read every episode; a changed file changes the key."""
         config = self._config
         listed = sorted(
             (within(folder, file.name), file.size, file.version)
@@ -172,7 +172,7 @@ class NpzSource:
 
 @dataclass(frozen=True)
 class _FrameReader:
-    """Reads the frames of one camera that are asked for."""
+    """Reads requested frames of one camera."""
 
     opened: Callable[[], str | BlockCachedFile]
     path: str

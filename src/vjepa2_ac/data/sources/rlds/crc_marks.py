@@ -8,16 +8,16 @@ from pathlib import Path
 
 logger = logging.getLogger(__name__)
 
-_CHECKED = b"\xc3"  # no byte of zeros or ones, so that a damaged file seldom says more than is true
+_CHECKED = b"\xc3"  # not all bits equal, so that a damaged file seldom contains false marks
 
 
 class CrcMarks:
     """A mark for each record, in a file that all loader processes share: one byte each.
 
-    A mark that cannot be read is not there; one that cannot be written costs a warning and another check.
+    A mark that cannot be read counts as missing; one that cannot be written causes a warning and another check.
 
     Args:
-        path: The file; made when the first mark is.
+        path: The file; created with the first mark.
     """
 
     def __init__(self, path: Path) -> None:
@@ -37,7 +37,7 @@ class CrcMarks:
             os.close(handle)
 
     def add(self, number: int) -> None:
-        """Remember that a record has been checked."""
+        """Mark a record as checked."""
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             handle = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o666)

@@ -18,12 +18,12 @@ _MOST_EPISODES = 100_000  # of a shard; DROID's have some 50
 
 @dataclass(frozen=True)
 class Shard:
-    """One TFRecord file of a data set, and how many episodes it must hold."""
+    """One TFRecord file of a data set, and its expected number of episodes."""
 
     path: str
     episodes: int
     size: int = 0  # bytes
-    version: str = ""  # as `storage.list_files` says it: differs when the content does
+    version: str = ""  # as from `storage.list_files`: changes with the content
 
     @property
     def name(self) -> str:
@@ -32,10 +32,10 @@ class Shard:
 
 
 def find_shards(folder: str) -> list[Shard]:
-    """Return the shards of every split that dataset_info.json lists, in its order; empty shards are left out.
+    """Return the shards of every split that dataset_info.json lists, in its order; without empty shards.
 
     Raises:
-        InputError: No data set, an unreadable or foreign description, or missing shards (names them).
+        InputError: No data set, an unreadable or unsupported description, or missing shards (names them).
     """
     where = storage.join(folder, _INFO)
     info = _read_info(folder, where)
@@ -55,10 +55,10 @@ def find_shards(folder: str) -> list[Shard]:
 
 
 def index_shards(shards: list[Shard]) -> list[RecordSpan]:
-    """Return where every episode lies, shard by shard.
+    """Return the position of every episode, shard by shard.
 
     Raises:
-        InputError: A shard is not a TFRecord, is truncated, or holds another number of episodes than promised.
+        InputError: A shard is not a TFRecord, is truncated, or has another number of episodes than expected.
     """
     spans: list[RecordSpan] = []
     for shard in shards:
@@ -120,7 +120,7 @@ def _shards_of(folder: str, dataset: str, split: dict[str, Any]) -> list[Shard]:
 
 
 def _count(value: object) -> int:
-    """Return how many episodes a shard has: TFDS writes a number, or its digits."""
+    """Return the number of episodes of a shard: TFDS writes a number, or a string."""
     count = int(str(value))
     if not 0 <= count <= _MOST_EPISODES:
         raise ValueError(f"a shard of {count:,} episodes")
@@ -128,7 +128,7 @@ def _count(value: object) -> int:
 
 
 def _as_listed(folder: str, shards: list[Shard]) -> list[Shard]:
-    """Return the shards with size and version, from one look at the folder."""
+    """Return the shards with size and version, from one listing of the folder."""
     if len({shard.path for shard in shards}) < len(shards):
         raise InputError(
             where=storage.join(folder, _INFO), found="shards of one name", needed="a filepathTemplate that numbers them"

@@ -26,12 +26,12 @@ from vjepa2_ac.errors import InputError
 
 
 class ExampleRecord:
-    """The features of one Example, read when asked for.
+    """The features of one Example, read on request.
 
     Args:
         read: Returns bytes of the file.
-        span: The record's place in it.
-        located: Where each feature lies, where that is known already.
+        span: The record's position in it.
+        located: The position of each feature, if known already.
     """
 
     def __init__(self, read: Read, span: RecordSpan, located: dict[str, Located] | None = None) -> None:
@@ -41,7 +41,7 @@ class ExampleRecord:
 
     @cached_property
     def located(self) -> dict[str, Located]:
-        """Where each feature lies."""
+        """The position of each feature."""
         try:
             return locate_features(self._read, self._span.data_offset, self._span.length)
         except NotAnExampleError as error:
@@ -57,7 +57,7 @@ class ExampleRecord:
         """Return the numbers of a feature.
 
         Raises:
-            InputError: There is no such feature, or it holds no floats.
+            InputError: There is no such feature, or it has no floats.
         """
         packed = packed_numbers(self.serialised(name), FLOAT_LIST)
         if packed is None or len(packed) % 4:
@@ -65,14 +65,14 @@ class ExampleRecord:
         return np.frombuffer(packed, "<f4")
 
     def is_float(self, name: str) -> bool:
-        """Return whether a feature holds floats, as far as its first byte tells."""
+        """Return whether a feature has floats, judged by its first byte."""
         return self._read(self.located[name].offset, 1) == bytes([FLOAT_LIST << 3 | DELIMITED])
 
     def count_integers(self, name: str) -> int:
-        """Return how many integers a feature holds.
+        """Return the number of integers in a feature.
 
         Raises:
-            InputError: There is no such feature, or it holds no integers.
+            InputError: There is no such feature, or it has no integers.
         """
         packed = packed_numbers(self.serialised(name), INT64_LIST)
         if packed is None or (packed and packed[-1] >= 0x80):
@@ -80,33 +80,33 @@ class ExampleRecord:
         return int(np.count_nonzero(np.frombuffer(packed, np.uint8) < 0x80))
 
     def items(self, name: str, count: int | None = None) -> tuple[list[int], list[int]]:
-        """Return offsets and lengths of the texts or images of a feature, of the first `count`, reading none of them.
+        """Return offsets and lengths of the texts or images of a feature, of the first `count`, without reading them.
 
         Raises:
-            InputError: There is no such feature, or it holds something else.
+            InputError: There is no such feature, or it has another type.
         """
         self.require([name])
         try:
             return locate_items(self._read, self.located[name], count)
         except NotAnExampleError as error:
-            self.values(name, "bytes_list")  # says better what it is, where it can
+            self.values(name, "bytes_list")  # has a better message, if it raises
             raise not_an_example(self._span, error) from None
 
     def first_text(self, name: str) -> str:
-        """Return the first text of a feature; empty where it has none.
+        """Return the first text of a feature; empty if it has none.
 
         Raises:
-            InputError: There is no such feature, or it holds something else.
+            InputError: There is no such feature, or it has another type.
         """
         for offset, length in zip(*self.items(name, 1), strict=True):
             return self._read(offset, length).decode(errors="replace")
         return ""
 
     def values(self, name: str, *kinds: Kind) -> Sequence[Any]:
-        """Return a feature's values, of any kind, in any form.
+        """Return a feature's values, in any valid encoding.
 
         Raises:
-            InputError: There is no such feature, or it holds values of another kind.
+            InputError: There is no such feature, or it has values of another type.
         """
         data = self.serialised(name)
         where = f"{self._span}: {name}"
@@ -116,7 +116,7 @@ class ExampleRecord:
         return values
 
     def serialised(self, name: str) -> bytes:
-        """Return a feature as it is in the file.
+        """Return the bytes of a feature in the file.
 
         Raises:
             InputError: There is no such feature, or the file ends within it.
@@ -143,5 +143,5 @@ class ExampleRecord:
 
 
 def not_an_example(span: RecordSpan, error: NotAnExampleError) -> InputError:
-    """Return what to tell the user of a record that cannot be read as features."""
+    """Return the error of a record that cannot be read as features."""
     return InputError(where=str(span), found=f"not a tf.train.Example ({error})", needed="an RLDS data set")

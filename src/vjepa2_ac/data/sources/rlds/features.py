@@ -16,7 +16,7 @@ STEP_FLAG = "steps/is_first"
 
 
 def identity_of(record: ExampleRecord, fields: RldsFields) -> str:
-    """Return what tells an episode from all others, whatever the order of records.
+    """Return the identity of an episode, which does not depend on the order of records.
 
     Raises:
         InputError: A feature of the identity is missing, or neither text nor integers.
@@ -29,23 +29,23 @@ def identity_of(record: ExampleRecord, fields: RldsFields) -> str:
 
 
 def info_of(identity: str, num_steps: int) -> EpisodeInfo:
-    """Return what is known of an episode; DROID says in the path whether it succeeded, other sets do not say."""
+    """Return the facts about an episode; its success is known for DROID only, from the path."""
     success = True if "/success/" in identity else False if "/failure/" in identity else None
     return EpisodeInfo(id=identity, num_steps=num_steps, success=success)
 
 
 def features_of_steps(config: DataConfig) -> tuple[str, ...]:
-    """Return the features that states and recorded actions are made of."""
+    """Return the features of states and recorded actions."""
     return config.fields.state + (config.fields.action if config.actions == "recorded" else ())
 
 
 def num_steps_of(record: ExampleRecord, config: DataConfig) -> int:
-    """Count the steps by their first flag; a data set without it by its states, where these are poses.
+    """Count the steps by their first flag; without it by the states, if these are poses.
 
     Raises:
-        InputError: Neither is there.
+        InputError: There is neither.
     """
-    if config.states == "vector":  # of any width: only the flag tells
+    if config.states == "vector":  # of any width: only the flag gives the count
         record.require([STEP_FLAG])
     if STEP_FLAG in record.located:
         return record.count_integers(STEP_FLAG)
@@ -55,10 +55,10 @@ def num_steps_of(record: ExampleRecord, config: DataConfig) -> int:
 def states_of(
     record: ExampleRecord, config: DataConfig, steps: int, where: str
 ) -> Float[np.ndarray, "steps state_dim"]:
-    """Return the measured states (legend: `vjepa2_ac.episode`), which are what a robot's can be.
+    """Return the measured states (legend: `vjepa2_ac.episode`), checked for plausibility.
 
     Raises:
-        InputError: A feature is missing, is not of one shape for all steps, or holds what cannot be states.
+        InputError: A feature is missing, has no uniform shape over all steps, or has implausible states.
     """
     if steps == 0:
         raise zero_steps(where)
@@ -82,10 +82,10 @@ def states_of(
 def commands_of(
     record: ExampleRecord, config: DataConfig, steps: int, where: str
 ) -> Float[np.ndarray, "steps action_dim"] | None:
-    """Return the recorded actions where `data.actions` asks for them.
+    """Return the recorded actions, if `data.actions` requests them.
 
     Raises:
-        InputError: A feature is missing, is not of one shape for all steps, or holds numbers that are not finite.
+        InputError: A feature is missing, has no uniform shape over all steps, or has numbers that are not finite.
     """
     if config.actions != "recorded":
         return None
@@ -97,10 +97,10 @@ def commands_of(
 def joint_velocities_of(
     record: ExampleRecord, fields: RldsFields, steps: int, where: str
 ) -> Float[np.ndarray, "steps joints"] | None:
-    """Return the commanded joint velocities, or None where the data set has none.
+    """Return the commanded joint velocities, or None if the data set has none.
 
     Raises:
-        InputError: There is not the same number for every step.
+        InputError: Their number differs between steps.
     """
     if fields.joint_velocity is None or fields.joint_velocity not in record.located:
         return None
@@ -108,7 +108,7 @@ def joint_velocities_of(
 
 
 def language_of(record: ExampleRecord, fields: RldsFields) -> dict[str, str]:
-    """Return the instruction as metadata; nothing where there is none.
+    """Return the instruction as metadata; empty if there is none.
 
     Raises:
         InputError: The feature is no text.

@@ -17,7 +17,7 @@ from vjepa2_ac.media.jpeg import decode_jpegs
 
 @dataclass(frozen=True)
 class LocalImages:
-    """Hops over the images of one camera in a file on this machine, and reads and decodes those asked for."""
+    """Skips over the images of one camera in a local file, and reads and decodes requested ones."""
 
     shard: Shard
     feature: Located
@@ -37,7 +37,7 @@ class LocalImages:
 
 @dataclass(frozen=True)
 class ImagesAt:
-    """The same, of a file that is open, or of a record that is in memory."""
+    """The same for an open file, or a record in memory."""
 
     read: Read
     feature: Located

@@ -30,24 +30,24 @@ from vjepa2_ac.media.jpeg import decode_jpegs, looks_like_jpeg
 from vjepa2_ac.storage.structured import json_object
 
 _HOP_WINDOW = 1 << 16
-_TEXT_BYTES = 512  # of a feature with one text for every step, of which the first is read
+_TEXT_BYTES = 512  # of a feature with one text per step, of which only the first is read
 _HOP_BYTES = 32
-_GROUP_STEPS = 64  # images of so many steps lie in one entry of the cache
-_GAP_BYTES = 1 << 15  # images that lie as near to each other are fetched by one read
+_GROUP_STEPS = 64  # images of so many steps are one entry of the cache
+_GAP_BYTES = 1 << 15  # images at most this far apart are fetched by one read
 _FOR_EVER = 1 << 62
 
 
 @dataclass(frozen=True)
 class RemoteCache:
-    """What is kept on this machine of one data set."""
+    """The local cache of one data set."""
 
-    key: str  # of the index: another one when the files are others
-    places: DiskCache  # of images in their files: small, without limit
+    key: str  # of the index: changes with the files
+    places: DiskCache  # positions of images in their files: small, without limit
     contents: DiskCache
 
     @classmethod
     def of(cls, config: DiskCacheConfig, key: str) -> RemoteCache:
-        """Return what is kept of the data set whose index has a key."""
+        """Return the cache of the data set whose index has a key."""
         return cls(key, DiskCache(cache_folder(config) / "places", _FOR_EVER), fetched_data(config))
 
 
@@ -56,20 +56,20 @@ class RemoteEpisode:
 
     Args:
         shard: Its file.
-        span: Its place in the file.
-        cache: What is kept of its data set.
+        span: Its position in the file.
+        cache: The cache of its data set.
     """
 
     def __init__(self, shard: Shard, span: RecordSpan, cache: RemoteCache) -> None:
         self._shard, self._span, self._cache = shard, span, cache
-        self._key = f"{cache.key} {shard.name} {span.offset}"  # whatever place an index made anew gives it
+        self._key = f"{cache.key} {shard.name} {span.offset}"  # independent of its position in a rebuilt index
 
     def record(self, whole: Sequence[str], texts: Sequence[str]) -> ExampleRecord:
-        """Return the record with some features here, those of them that it has.
+        """Return the record with some features fetched, if it has them.
 
         Args:
-            whole: Features of numbers, and the identity.
-            texts: Features with a text for every step, of which the first is enough.
+            whole: Features to fetch completely: numbers, and the identity.
+            texts: Features with a text per step, of which the first is enough.
 
         Raises:
             InputError: It cannot be read, or is no Example.
@@ -95,9 +95,9 @@ class RemoteEpisode:
 
         Args:
             feature: The camera's.
-            located: Where the record's features lie.
+            located: Positions of the record's features.
             num_steps: Of the episode.
-            needed: Steps whose images are worth keeping; None: all.
+            needed: Steps whose images are cached; None: all.
             where: File, record, identity and feature, for messages.
         """
         keep = tuple((max(0, start), min(end, num_steps)) for start, end in needed or [(0, num_steps)])
@@ -106,7 +106,7 @@ class RemoteEpisode:
         )
 
     def _head_of(self, place: Located) -> tuple[int, int]:
-        """Return enough of a feature for its first text, and for hopping a little further than that."""
+        """Return enough of a feature for its first text, and a little more."""
         end = min(place.offset + min(place.length, _TEXT_BYTES) + _HOP_BYTES, self._shard.size)
         return place.offset, end - place.offset
 
@@ -121,10 +121,10 @@ class RemoteEpisode:
 
 @dataclass(frozen=True)
 class RemoteImages:
-    """Reads images of one camera of one episode: from this machine, or those that are asked for from afar.
+    """Reads requested images of one camera of one episode: from the cache, or from the URL.
 
-    The first time all of the camera's images are fetched, for nothing less tells where each lies; those of the needed
-    steps are kept.
+    The first time all of the camera's images are fetched, because only that gives their positions; those of the needed
+    steps are cached.
     """
 
     shard: Shard
@@ -163,7 +163,7 @@ class RemoteImages:
         return found | self._fetch(missing, places)
 
     def _fetch(self, steps: Sequence[int], places: Int64[np.ndarray, "steps 2"]) -> dict[int, bytes]:
-        """Fetch single images, neighbours by one read."""
+        """Fetch single images, adjacent ones by one read."""
         runs: list[list[int]] = []
         for step in steps:
             if runs and int(places[step, 0]) - int(places[runs[-1][-1]].sum()) <= _GAP_BYTES:
@@ -179,7 +179,7 @@ class RemoteImages:
         return found
 
     def _first_time(self, steps: Sequence[int]) -> dict[int, bytes]:
-        """Fetch all of the camera's images, and keep where they lie and those that are needed."""
+        """Fetch all of the camera's images, and cache their positions and the needed ones."""
         [data] = read_in_parallel(self.shard.path, [self.feature])
         start = self.feature.offset
 
@@ -196,7 +196,7 @@ class RemoteImages:
         self.cache.places.write(self.key, np.array([offsets, lengths], np.int64).T.tobytes())
         groups: dict[int, list[tuple[int, bytes]]] = {}
         for step in (step for first, end in self.needed for step in range(first, end)):
-            if looks_like_jpeg(images[step]):  # anything else may be the network's doing
+            if looks_like_jpeg(images[step]):  # anything else may be a network error
                 groups.setdefault(step // _GROUP_STEPS, []).append((step, images[step]))
         for group, members in groups.items():
             self.cache.contents.write(f"{self.key} {group}", _pack(members))
@@ -204,7 +204,7 @@ class RemoteImages:
 
 
 def whole_record(shard: Shard, span: RecordSpan) -> Read:
-    """Return a whole record, with its CRC, as something to read from.
+    """Return a complete record, with its CRC, as a read function.
 
     Raises:
         InputError: It cannot be read.
@@ -218,13 +218,13 @@ def whole_record(shard: Shard, span: RecordSpan) -> Read:
 
 
 def _pack(parts: Sequence[tuple[int, bytes]]) -> bytes:
-    """Return numbered bytes as one piece."""
+    """Return numbered bytes as one piece of bytes."""
     head = struct.pack("<I", len(parts)) + b"".join(struct.pack("<QI", number, len(data)) for number, data in parts)
     return head + b"".join(data for _, data in parts)
 
 
 def _unpack(packed: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield what `_pack` was given."""
+    """Yield the arguments of `_pack`."""
     [count] = struct.unpack_from("<I", packed)
     position = 4 + 12 * count
     for number, length in struct.iter_unpack("<QI", packed[4:position]):

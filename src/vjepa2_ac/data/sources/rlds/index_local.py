@@ -35,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ScannedEpisode:
-    """An episode that can be used, and its record."""
+    """A usable episode, and its record."""
 
     info: EpisodeInfo
     span: RecordSpan
@@ -49,17 +49,17 @@ Examine = Callable[[Read, RecordSpan], Found]
 def index_local(
     shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str], *, threads: int, progress: Progress | None
 ) -> EpisodeTable:
-    """Return every episode of shards on this machine; its states are checked, its images only found to be there.
+    """Return every episode of local shards; its states are checked, of its images only the presence.
 
     Args:
         shards: All of the data set's.
         config: Names of the features, and what a state is.
-        cameras: Features with images that every episode must have.
+        cameras: Image features that every episode must have.
         threads: Shards that are read at once.
-        progress: Told how many of the episodes have been looked at.
+        progress: Called with the number of scanned episodes.
 
     Raises:
-        InputError: A shard cannot be read, or no episode at all can be used.
+        InputError: A shard cannot be read, or no episode can be used.
     """
 
     def examine(read: Read, span: RecordSpan) -> Found:
@@ -73,7 +73,7 @@ def index_local(
 
 
 def scan_shard(read: Read, shard: Shard, examine: Examine) -> Iterator[Found]:
-    """Yield what is found of each record that a shard must hold; after damage that hides the others, a problem each."""
+    """Yield the result of each expected record of a shard; after damage that hides the others, a problem for each."""
     offset = 0
     for number in range(shard.episodes):
         if offset == shard.size:
@@ -82,7 +82,7 @@ def scan_shard(read: Read, shard: Shard, examine: Examine) -> Iterator[Found]:
         try:
             span = span_at(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
         except UnreachableError:
-            raise  # says nothing of the record
+            raise  # not an error of the record
         except InputError as error:
             yield as_problem(error, _place(shard, number))
             yield from _missing(shard, number + 1, f"cannot be found behind the damage at byte {offset}")
@@ -110,7 +110,7 @@ def _promise_broken(shard: Shard, number: int, found: str) -> EpisodeProblem:
 def in_parallel(
     scan: Callable[[Shard], list[Found]], shards: Sequence[Shard], threads: int, progress: Progress | None
 ) -> Iterator[list[Found]]:
-    """Yield what is found in each shard, in their order, several being read at once."""
+    """Yield the results of each shard, in order, with several read at once."""
     total = sum(shard.episodes for shard in shards)
     done = 0
     pool = ThreadPoolExecutor(min(threads, len(shards)))
@@ -125,10 +125,10 @@ def in_parallel(
 
 
 def table_of(shards: Sequence[Shard], found: Iterator[list[Found]]) -> EpisodeTable:
-    """Return the table of what was found, shard by shard; of episodes of one identity the first stays.
+    """Return the table of the results, shard by shard; of episodes with one identity the first stays.
 
     Raises:
-        InputError: No episode can be used: then that is the first one's error.
+        InputError: No episode can be used: the first one's error.
     """
     rows: list[ScannedEpisode] = []
     problems: list[EpisodeProblem] = []
@@ -162,12 +162,12 @@ def table_of(shards: Sequence[Shard], found: Iterator[list[Found]]) -> EpisodeTa
 
 
 def place_of(span: RecordSpan) -> str:
-    """Return what to call an episode of which not even the identity can be read."""
+    """Return a name for an episode whose identity cannot be read."""
     return f"{span.path.replace(chr(92), '/').rsplit('/', 1)[-1]}: record {span.number}"
 
 
 def _examine(read: Read, span: RecordSpan, config: DataConfig, cameras: Sequence[str]) -> Found:
-    """Look at identity, steps, states and the presence of the images."""
+    """Check identity, steps, states and the presence of the images."""
     name = place_of(span)
     record = ExampleRecord(read, span)
     try:
@@ -182,7 +182,7 @@ def _examine(read: Read, span: RecordSpan, config: DataConfig, cameras: Sequence
 
 
 def _damage_or(error: InputError, read: Read, span: RecordSpan) -> InputError:
-    """Return what the CRC says, if it says that the record is damaged: then that is the error to show."""
+    """Return the CRC's error if the record is damaged, which is then the error to show."""
     try:
         require_intact(read, span)
     except InputError as damage:

@@ -47,26 +47,26 @@ from vjepa2_ac.storage.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
-FEWEST_IN_FLIGHT = 128  # reads of an index are small and wait for one another within a shard
+FEWEST_IN_FLIGHT = 128  # reads of an index are small and sequential within a shard
 
 _SAMPLES = 16
-_PIECES = 8  # reads of a record that are kept: its end holds the head of the next
-_NAME_BYTES = 160  # more than a feature's name and headers take
+_PIECES = 8  # buffered reads of a record: its end contains the head of the next
+_NAME_BYTES = 160  # more than the size of a feature's name and headers
 _SAMPLE_WINDOW = 1 << 16
 _WINDOWS = tuple(1 << power for power in range(10, 16))
-_ASSUMED_LATENCY_S, _ASSUMED_REQUEST_S, _ASSUMED_BYTES_PER_S = 0.04, 5e-4, 1e8  # a request: of Python's own time
-_FLAGS = (STEP_FLAG, "steps/is_last", "steps/is_terminal")  # one byte a step, always
+_ASSUMED_LATENCY_S, _ASSUMED_REQUEST_S, _ASSUMED_BYTES_PER_S = 0.04, 5e-4, 1e8  # a request: Python's own time
+_FLAGS = (STEP_FLAG, "steps/is_last", "steps/is_terminal")  # always one byte per step
 
 
 @dataclass(frozen=True)
 class RecordLayout:
-    """What a few whole records say of all: how many bytes of which feature are one step, and what to read at once."""
+    """Facts about all records from a few complete ones: bytes per step of each feature, and the size of a read."""
 
     step_bytes: dict[str, int]
     window: int
 
     def steps_in(self, name: str, length: int) -> int | None:
-        """Return the number of steps that a feature's length tells, or None where it does not."""
+        """Return the number of steps implied by a feature's length, or None."""
         payload = _payload(_payload(length))
         width = self.step_bytes.get(name)
         if width is None or payload is None or payload % width:
@@ -82,9 +82,9 @@ def index_remote(
     Args:
         shards: All of the data set's.
         config: Names of the features, and what a state is.
-        cameras: Features with images that episodes must have; looked for in a few of them.
+        cameras: Image features that episodes must have; checked in a few of them.
         threads: Shards that are read at once, at least `FEWEST_IN_FLIGHT`.
-        progress: Told how many of the episodes have been found.
+        progress: Called with the number of episodes found.
 
     Raises:
         InputError: No episode can be used; a shard cannot be read.
@@ -95,7 +95,7 @@ def index_remote(
         return _examine(read, span, config, layout)
 
     def scan(shard: Shard) -> list[Found]:
-        return list(scan_shard(RemoteFile(shard, window=layout.window, kept=_PIECES), shard, examine))
+        return list(scan_shard(RemoteFile(shard, window=layout.window, buffered=_PIECES), shard, examine))
 
     threads = max(threads, FEWEST_IN_FLIGHT)
     table = table_of(shards, in_parallel(scan, shards, threads, progress))
@@ -103,17 +103,17 @@ def index_remote(
 
 
 def learn_layout(shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str]) -> RecordLayout:
-    """Look at the first record of a few shards, as closely as at a local one.
+    """Check the first record of a few shards as thoroughly as a local one.
 
     Raises:
-        InputError: None of them can be used: the settings are at fault, or the data set is.
+        InputError: None of them can be used: the settings or the data set are wrong.
     """
 
     def first_record(shard: Shard) -> tuple[ExampleRecord, int] | InputError:
         try:
             return _whole_record(shard, config, cameras)
         except UnreachableError:
-            raise  # says nothing of the record
+            raise  # not an error of the record
         except InputError as error:
             return error
 
@@ -145,7 +145,7 @@ def _whole_record(shard: Shard, config: DataConfig, cameras: Sequence[str]) -> t
 
 
 def _step_bytes(records: Iterable[tuple[ExampleRecord, int]], fields: RldsFields) -> dict[str, int]:
-    """Return the bytes of a step of every feature that has as many for each step, in all of the records."""
+    """Return the bytes per step of every feature with a constant number per step in all of the records."""
     found: dict[str, set[float]] = {}
     for record, steps in records:
         for name, place in record.located.items():
@@ -156,7 +156,7 @@ def _step_bytes(records: Iterable[tuple[ExampleRecord, int]], fields: RldsFields
 
 
 def _cost_s(record: ExampleRecord, fields: RldsFields, telling: Iterable[str], window: int) -> float:
-    """Return the seconds that it takes to find identity and steps with reads of a window: latency, and its bytes."""
+    """Return the time in seconds to find identity and steps with reads of a window: latency plus transfer."""
     reads = 0
     places, wanted = record.located, frozenset(fields.identity)
     first, last = min(place.offset for place in places.values()), max(sum(place) for place in places.values())
@@ -188,7 +188,7 @@ def _cost_s(record: ExampleRecord, fields: RldsFields, telling: Iterable[str], w
 
 
 def _examine(read: Read, span: RecordSpan, config: DataConfig, layout: RecordLayout) -> Found:
-    """Look at the record's head; if need be at its end, with the head of the next; then hop from one to the other."""
+    """Read the record's head; if needed its end, with the head of the next; then the features between."""
     name = place_of(span)
     try:
         found, steps = _search(read, span, config.fields, layout)
@@ -198,7 +198,7 @@ def _examine(read: Read, span: RecordSpan, config: DataConfig, layout: RecordLay
         if steps == 0:
             raise zero_steps(f"{span} ({name})")
     except UnreachableError:
-        raise  # says nothing of the record
+        raise  # not an error of the record
     except InputError as error:
         return as_problem(error, name)
     return ScannedEpisode(info_of(name, steps), span)
@@ -207,7 +207,7 @@ def _examine(read: Read, span: RecordSpan, config: DataConfig, layout: RecordLay
 def _search(
     read: Read, span: RecordSpan, fields: RldsFields, layout: RecordLayout
 ) -> tuple[dict[str, Located], int | None]:
-    """Return features, the identity's among them, and the number of steps; of a record without them, all features."""
+    """Return features, including the identity's, and the number of steps; of a record without them, all features."""
     found: dict[str, Located] = {}
     steps: int | None = None
     end = span.data_offset + span.length
@@ -230,7 +230,7 @@ def _search(
 
 
 def _payload(length: int | None) -> int | None:
-    """Return how long the content of a length-delimited field is that takes `length` bytes with its tag and length."""
+    """Return the content size of a length-delimited field of `length` bytes including its tag and length."""
     if length is None:
         return None
     for header in range(2, 7):

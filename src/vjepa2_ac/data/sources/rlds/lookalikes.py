@@ -26,13 +26,15 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.remote import UnreachableError
 
 _WINDOW = 1 << 16
-_LENGTH_BYTES = 5  # that grow with a name: of the text, its list, the feature, the entry of the map, and of them all
+_LENGTH_BYTES = (
+    5  # lengths that grow with a name: of the text, its list, the feature, the entry of the map, and all of them
+)
 
 
 def hashes_of_lookalikes(
     table: EpisodeTable, shards: Sequence[Shard], config: DataConfig, *, threads: int
 ) -> UInt64[np.ndarray, " episodes"]:
-    """Return the hash of the states of every record that could be a copy of another; of the others, `UNKNOWN`.
+    """Return the state hash of every record that could be a copy of another; `UNKNOWN` for the others.
 
     Raises:
         UnreachableError: The network fails.
@@ -46,9 +48,9 @@ def hashes_of_lookalikes(
             record = ExampleRecord(RemoteFile(shard, window=_WINDOW), span)
             return hash_of_states(states_of(record, config, int(table.num_steps[index]), str(span)))
         except UnreachableError:
-            raise  # says nothing of the record
+            raise  # not an error of the record
         except InputError:
-            return UNKNOWN  # said when the episode is read
+            return UNKNOWN  # reported when the episode is read
 
     found = np.full(len(table), UNKNOWN, np.uint64)
     chosen = lookalikes(table, tolerance=_LENGTH_BYTES * max(1, len(config.fields.identity)))
@@ -59,11 +61,11 @@ def hashes_of_lookalikes(
 
 
 def lookalikes(table: EpisodeTable, *, tolerance: int) -> Int64[np.ndarray, " lookalikes"]:
-    """Return the episodes that have as many steps as another, and a record as long but for its name.
+    """Return the episodes with the same number of steps as another, and the same record length except for the name.
 
     Args:
         table: With the lengths of the records.
-        tolerance: Bytes by which the rest may differ, as the lengths of names take bytes, too.
+        tolerance: Bytes by which the rest may differ, because encoded lengths of names vary in size.
     """
     rest = table.locators["length"] - np.diff(table.id_ends, prepend=0)
     order = np.lexsort((rest, table.num_steps))

@@ -12,20 +12,20 @@ _CHUNK_BYTES = 1 << 20  # long pieces are fetched in parallel chunks of this siz
 
 
 class RemoteFile:
-    """Reads a file by ranged requests, each as long as a window at least, and keeps what came.
+    """Reads a file by ranged requests of at least a window each, and buffers the results.
 
     Args:
         shard: The file.
-        window: Bytes of a request, at least: what is read next lies most often behind what is read now.
-        kept: How many of the latest pieces stay; None: all.
+        window: Minimum bytes of a request: the next read usually follows the current one.
+        buffered: How many of the latest pieces stay; None: all.
     """
 
-    def __init__(self, shard: Shard, *, window: int, kept: int | None = None) -> None:
+    def __init__(self, shard: Shard, *, window: int, buffered: int | None = None) -> None:
         self._shard, self._window = shard, window
-        self._pieces: deque[tuple[int, bytes]] = deque(maxlen=kept)
+        self._pieces: deque[tuple[int, bytes]] = deque(maxlen=buffered)
 
     def __call__(self, offset: int, length: int) -> bytes:
-        """Return bytes of the file; fewer where it ends.
+        """Return bytes of the file; fewer if it ends.
 
         Raises:
             OSError: It cannot be read.
@@ -42,18 +42,18 @@ class RemoteFile:
         return piece[:length]
 
     def fetch(self, places: Sequence[tuple[int, int]]) -> None:
-        """Bring (offset, length) places here at the same time, those that are not."""
+        """Fetch missing (offset, length) ranges concurrently."""
         missing = [place for place in places if not self._has(*place)]
         pieces = read_in_parallel(self._shard.path, missing)
         self._pieces.extend((start, piece) for (start, _), piece in zip(missing, pieces, strict=True))
 
     def pieces_of(self, places: Sequence[tuple[int, int]]) -> list[tuple[int, bytes]]:
-        """Return (offset, bytes) of places, fetching what is not here."""
+        """Return (offset, bytes) of ranges, fetching missing ones."""
         self.fetch(places)
         return [(offset, self(offset, length)) for offset, length in places]
 
     def hold(self, pieces: Sequence[tuple[int, bytes]]) -> None:
-        """Take (offset, bytes) that were fetched before."""
+        """Add (offset, bytes) that were fetched before."""
         self._pieces.extend(pieces)
 
     def _has(self, offset: int, length: int) -> bool:
@@ -61,7 +61,7 @@ class RemoteFile:
 
 
 def read_in_parallel(url: str, places: Sequence[tuple[int, int]]) -> list[bytes]:
-    """Return (offset, length) places of a file, each whole, long ones in chunks, all at the same time.
+    """Return (offset, length) ranges of a file, each complete, long ones in chunks, all fetched concurrently.
 
     Raises:
         OSError: The file cannot be read, or ends within one.

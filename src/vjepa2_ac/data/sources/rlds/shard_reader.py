@@ -14,12 +14,12 @@ from vjepa2_ac.errors import InputError
 
 @contextmanager
 def open_shard(shard: Shard) -> Iterator[Read]:
-    """Open a shard on this machine to read at any offset; several threads may.
+    """Open a local shard for random access, also from several threads.
 
-    Nothing is mapped into memory: a file that is cut while it is in use gives short reads, not a dead process.
+    Nothing is mapped into memory: a file that is truncated during use gives short reads, not a crash.
 
     Raises:
-        InputError: The file cannot be read, or is another one than when the data set was opened.
+        InputError: The file cannot be read, or has changed since the data set was opened.
     """
     try:
         handle = os.open(shard.path, os.O_RDONLY)
@@ -42,5 +42,5 @@ def open_shard(shard: Shard) -> Iterator[Read]:
 
 
 def unreadable(shard: Shard, error: OSError) -> InputError:
-    """Return what to tell the user of a file that the system refuses to read."""
+    """Return the error of a file that the system refuses to read."""
     return storage.unreadable(shard.path, error, needed="a TFRecord file")

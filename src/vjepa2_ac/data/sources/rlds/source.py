@@ -38,7 +38,7 @@ from vjepa2_ac.errors import InputError
 
 @dataclass(frozen=True)
 class _Opened:
-    """What is known once the data set was looked at."""
+    """The state of an indexed data set."""
 
     shards: tuple[Shard, ...]
     table: EpisodeTable
@@ -49,13 +49,13 @@ class _Opened:
 class RldsSource:
     """The episodes of an RLDS data set, in the order of its shards.
 
-    Nothing is read before the first call. `infos` hops through every record once and keeps what it found; `read` reads
-    the states alone, and its images are read and decoded when asked for. With `check_crc: once` a record is read
-    whole the first time on this machine: its CRC is checked, and that each camera has one image for every step.
+    Nothing is read before the first call. `infos` scans every record once and caches the result; `read` reads the
+    states only, and images are read and decoded on request. With `check_crc: once` a record is read completely the
+    first time on this machine: its CRC is checked, and that each camera has one image for every step.
 
-    Behind a URL only parts of a record are fetched, and no CRC is of a part: checked are then the CRCs of the lengths,
-    that features and images lie within one another as they should, and the images' own form; the rest is up to the
-    transport. There `always` fetches whole records, every time, and checks their CRC.
+    Behind a URL only parts of a record are fetched, and parts have no CRC: checked are the CRCs of the lengths, the
+    nesting of features and images, and the images' format; the rest is left to the transport. There `always` fetches
+    complete records, every time, and checks their CRC.
     """
 
     def __init__(self, config: DataConfig) -> None:
@@ -64,16 +64,16 @@ class RldsSource:
         self._opening = threading.Lock()
 
     def __getstate__(self) -> dict[str, Any]:
-        """Travel to a loader worker with the index."""
+        """Pickle for a loader worker, with the index."""
         return {"_config": self._config, "_known": self._known}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Arrive at a worker."""
+        """Unpickle in a loader worker."""
         self.__dict__ |= state
         self._opening = threading.Lock()
 
     def infos(self, progress: Progress | None = None) -> EpisodeTable:
-        """Return identity, length and outcome of every episode that can be used.
+        """Return identity, length and outcome of every usable episode.
 
         Raises:
             InputError: No data set, missing shards, or no episode that can be used.
@@ -84,7 +84,7 @@ class RldsSource:
         """Return one episode.
 
         Raises:
-            InputError: The record is damaged, has changed, lacks a feature, or holds what cannot be a robot's state.
+            InputError: The record is damaged, has changed, lacks a feature, or has implausible states.
             UnreachableError: The network fails.
             ValueError: A camera that the config does not know.
         """
@@ -150,7 +150,7 @@ class RldsSource:
     def _check(
         self, record: ExampleRecord, read: Read, span: RecordSpan, num_steps: int, features: Iterable[str], where: str
     ) -> None:
-        """Look at all of a record: its CRC, unless that is never to be checked, and the number of its images."""
+        """Check a complete record: its CRC, unless disabled, and the number of its images."""
         if self._config.check_crc != "never":
             require_intact(read, span)
         for feature in features:
@@ -202,7 +202,7 @@ def _place_of(opened: _Opened, index: int) -> tuple[Shard, RecordSpan]:
 
 
 def _require_as_indexed(record: ExampleRecord, info: EpisodeInfo, config: DataConfig, where: str) -> None:
-    """Refuse a record that is not the one that the index speaks of."""
+    """Refuse a record that does not match the index."""
     found = info_of(identity_of(record, config.fields), num_steps_of(record, config))
     if found != info:
         raise InputError(

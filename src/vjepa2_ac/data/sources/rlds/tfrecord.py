@@ -34,7 +34,7 @@ _MASK_DELTA = 0xA282EAD8
 
 @dataclass(frozen=True)
 class RecordSpan:
-    """Where one record lies in its file."""
+    """The position of one record in its file."""
 
     path: str
     number: int
@@ -56,11 +56,11 @@ class RecordSpan:
 
 
 def span_at(header: bytes, path: str, number: int, offset: int, size: int) -> RecordSpan:
-    """Return where a record lies, from the bytes at its offset.
+    """Return the position of a record, from the bytes at its offset.
 
     Args:
-        header: At least the first 12 bytes of the record, where the file has so many.
-        path: The file, as messages name it.
+        header: At least the first 12 bytes of the record, if the file has them.
+        path: The file, for messages.
         number: Of the record in the file.
         offset: Of the record in the file.
         size: Of the file.
@@ -85,10 +85,10 @@ def span_at(header: bytes, path: str, number: int, offset: int, size: int) -> Re
 
 
 def require_intact(read: Callable[[int, int], bytes], span: RecordSpan) -> None:
-    """Check the CRC of a record's data, reading it piece by piece.
+    """Check the CRC of a record's data, read in chunks.
 
     Args:
-        read: Returns bytes of the file: (offset, length) -> those bytes, fewer where the file ends.
+        read: Returns bytes of the file: (offset, length) -> those bytes, fewer if the file ends.
         span: The record.
 
     Raises:
@@ -109,7 +109,7 @@ def require_intact(read: Callable[[int, int], bytes], span: RecordSpan) -> None:
 
 
 def index_records(path: str | Path) -> list[RecordSpan]:
-    """Return where the records of a file lie, reading nothing but their headers.
+    """Return the positions of a file's records, reading only their headers.
 
     Raises:
         InputError: The file cannot be read, is not a TFRecord, is damaged in a header, or ends within a record.
@@ -224,7 +224,7 @@ def _values(feature: Any) -> tuple[Kind | None, Sequence[Any]]:
 
 
 def _declare_example() -> dict[str, Any]:
-    """Declare tf.train.Example in a pool of its own: no generated file, no clash with TensorFlow's declaration."""
+    """Declare tf.train.Example in a separate pool: no generated file, no conflict with TensorFlow's declaration."""
     field = descriptor_pb2.FieldDescriptorProto
     file = descriptor_pb2.FileDescriptorProto(name="example.proto", package="tensorflow", syntax="proto3")
     one, many = field.LABEL_OPTIONAL, field.LABEL_REPEATED

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-Read = Callable[[int, int], bytes]  # (offset, length) -> those bytes; fewer where the file ends
+Read = Callable[[int, int], bytes]  # (offset, length) -> those bytes; fewer if the file ends
 
 BYTES_LIST, FLOAT_LIST, INT64_LIST = 1, 2, 3  # field numbers of tf.train.Feature
 
@@ -29,14 +29,14 @@ class NotAnExampleError(ValueError):
 
 
 class Located(NamedTuple):
-    """Where a part of a record lies."""
+    """The position of a part of a record."""
 
     offset: int  # in the file
     length: int
 
 
 def locate_features(read: Read, start: int, length: int) -> dict[str, Located]:
-    """Return where each feature's serialised tf.train.Feature lies. What it returns has passed no CRC.
+    """Return the position of each feature's serialised tf.train.Feature. No CRC is checked.
 
     Raises:
         NotAnExampleError: The bytes are not an Example.
@@ -45,7 +45,7 @@ def locate_features(read: Read, start: int, length: int) -> dict[str, Located]:
 
 
 def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str, Located]]:
-    """Yield the name and place of each feature as they lie, reading no further than asked for.
+    """Yield the name and position of each feature in file order, reading only as far as the caller iterates.
 
     Raises:
         NotAnExampleError: The bytes are not an Example.
@@ -56,10 +56,10 @@ def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str,
 
 
 def features_behind(name: str, piece: bytes, offset: int) -> dict[str, Located]:
-    """Return a feature and all those behind it, from the last bytes of an Example; nothing where it is not in there.
+    """Return a feature and all following ones, from the last bytes of an Example; nothing if it is not found.
 
-    Nothing tells where an entry of the map begins but those before it. So the name is searched, and believed only if
-    the entries from there on fill the Example to its last byte.
+    The start of a map entry is known only from the previous entries. So the name is searched, and accepted only if the
+    entries from there on fill the Example to its last byte.
 
     Args:
         name: The feature's.
@@ -110,12 +110,12 @@ def locate_items(read: Read, feature: Located, count: int | None = None) -> tupl
 
 
 def packed_numbers(feature: bytes, kind: int) -> memoryview | None:
-    """Return the packed numbers of a serialised tf.train.Feature, or None where it is not of this plain form.
+    """Return the packed numbers of a serialised tf.train.Feature, or None if it is encoded differently.
 
-    The plain form is what every writer makes: one list, packed.
+    The usual encoding of every writer is one packed list.
 
     Args:
-        feature: The whole feature.
+        feature: The complete feature.
         kind: FLOAT_LIST (little-endian float32) or INT64_LIST (varints).
     """
     try:
@@ -145,7 +145,7 @@ def _entries(read: Read, start: int, end: int) -> Iterator[tuple[str, Located]]:
 
 
 def _plain_entry(head: bytes, position: int, end: int) -> tuple[str, Located, int] | None:
-    """Read one entry of the map as every writer makes it: the name, then the feature. None: it is of another form."""
+    """Read one entry of the map in the usual encoding: the name, then the feature. None: it is encoded differently."""
     try:
         if head[0] != _FIRST_FIELD:
             return None
@@ -180,7 +180,7 @@ def _any_entry(read: Read, start: int, end: int) -> tuple[str, Located]:
 
 
 def _delimited_fields(read: Read, start: int, end: int) -> Iterator[tuple[int, Located]]:
-    """Yield number and place of the length-delimited fields between two offsets; skip the others."""
+    """Yield number and position of the length-delimited fields between two offsets; skip the others."""
     position = start
     while position < end:
         head = read(position, _HEAD_BYTES)
@@ -204,7 +204,7 @@ def _delimited_fields(read: Read, start: int, end: int) -> Iterator[tuple[int, L
 
 
 def _varint(data: bytes, start: int) -> tuple[int, int]:
-    """Return a number of variable length, and where it ends."""
+    """Return a varint, and the offset of its end."""
     value = shift = 0
     for place in range(start, min(len(data), start + _VARINT_BYTES)):
         byte = data[place]

@@ -38,7 +38,7 @@ def droid_features(sizes: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
 
 
 def dataset_info(name: str, version: str, counts: Sequence[int], num_bytes: int) -> dict[str, Any]:
-    """Return dataset_info.json of one `train` split with so many episodes in each shard."""
+    """Return dataset_info.json of one `train` split with these numbers of episodes per shard."""
     split = {
         "filepathTemplate": "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}",
         "name": "train",

@@ -31,7 +31,7 @@ _INFO = "dataset_info.json"
 
 @dataclass(frozen=True)
 class DroidCommands:
-    """What the controller was told at every control step (DROID's `action_dict`)."""
+    """The controller's commands at every control step (DROID's `action_dict`)."""
 
     cartesian_position: Float[np.ndarray, "steps 6"]  # metres, extrinsic xyz Euler angles
     cartesian_velocity: Float[np.ndarray, "steps 6"]
@@ -43,7 +43,7 @@ class DroidCommands:
 
 @dataclass(frozen=True)
 class DroidMeasurements:
-    """What the robot measured at every control step (DROID's `observation`, without images)."""
+    """The robot's measurements at every control step (DROID's `observation`, without images)."""
 
     cartesian_position: Float[np.ndarray, "steps 6"]  # metres, extrinsic xyz Euler angles
     gripper_position: Float[np.ndarray, "steps 1"]  # closedness: 0 open .. 1 closed
@@ -54,7 +54,7 @@ class DroidMeasurements:
 class DroidEpisode:
     """One demonstration as DROID records it.
 
-    Discount, reward and the first, last and terminal flags follow from the length and from `/success/` in the path.
+    Discount, reward and the first, last and terminal flags follow from the length and `/success/` in the path.
     """
 
     file_path: str  # …/success/… or …/failure/…; with the folder it is the episode's identity
@@ -81,11 +81,11 @@ def write_droid_rlds(
 ) -> Path:
     """Write episodes as a data set in DROID's RLDS schema and return its folder; one episode is in memory at a time.
 
-    Episodes are dealt to the shards in turn. The folder is a data set when it is whole.
+    Episodes are assigned to the shards in turn. An incomplete folder is never a data set.
 
     Raises:
         InputError: The folder exists and is not empty, or cannot be written, or there are fewer episodes than shards.
-        ValueError: An episode's arrays and images do not fit together.
+        ValueError: An episode's arrays and images are inconsistent.
     """
     folder = Path(folder)
     storage.require_new_folder(folder)
