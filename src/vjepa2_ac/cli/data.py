@@ -1,4 +1,4 @@
-"""What can be asked about data on the command line? check, index, inspect, calibrate."""
+"""The data commands: check, index, inspect and calibrate."""
 
 from __future__ import annotations
 

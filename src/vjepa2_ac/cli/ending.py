@@ -1,6 +1,6 @@
-"""How does a command end that is told to? It leaves nothing half-written behind, then dies of the signal as any other.
+"""Signal handling of commands: on SIGTERM or SIGHUP, remove partial files, then exit with that signal.
 
-For commands that have no way of their own: a training run finishes its step first (`distributed.preemption`).
+For commands without handling of their own: a training run finishes its step first (`distributed.preemption`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What can be asked about how good something is, on the command line? evaluate, compare."""
+"""The evaluate and compare commands: metrics of runs and models on held-out episodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What do the commands of the command line have in common? How one is added, and how numbers are read."""
+"""Shared parts of the commands: adding a subcommand, and parsing numbers."""
 
 from __future__ import annotations
 

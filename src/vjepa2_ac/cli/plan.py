@@ -1,4 +1,4 @@
-"""What can be asked about what a robot should do, on the command line? plan."""
+"""The plan command: the next action of a robot for given images and states."""
 
 from __future__ import annotations
 

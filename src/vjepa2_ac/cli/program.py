@@ -1,4 +1,4 @@
-"""What can be asked for on the command line? Parse, call one function, print."""
+"""The command-line program: parse the arguments, call one function, print its result."""
 
 from __future__ import annotations
 

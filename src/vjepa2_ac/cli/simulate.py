@@ -1,4 +1,4 @@
-"""What can be asked of the simulated arm on the command line? Demonstrations of it, or how well a model steers it."""
+"""The simulate commands: record demonstrations of the simulated arm, or test a model on it in closed loop."""
 
 from __future__ import annotations
 

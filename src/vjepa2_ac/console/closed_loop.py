@@ -1,4 +1,4 @@
-"""How does a contest in closed loop look in a terminal?"""
+"""Console output of a closed-loop benchmark."""
 
 from __future__ import annotations
 

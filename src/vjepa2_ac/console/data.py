@@ -1,4 +1,4 @@
-"""How does a data set look in a terminal? The lines and tables of check, index, inspect and calibrate."""
+"""Console output of the data commands: the lines and tables of check, index, inspect and calibrate."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How do the figures of an evaluation look in a terminal?"""
+"""Console output of an evaluation: tables of its metrics."""
 
 from __future__ import annotations
 

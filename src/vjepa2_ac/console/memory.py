@@ -1,4 +1,4 @@
-"""How does a run's memory look in a terminal? The lines of doctor."""
+"""Console output of doctor: the memory of a run, part by part."""
 
 from __future__ import annotations
 

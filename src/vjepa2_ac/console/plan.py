@@ -1,4 +1,4 @@
-"""How does a plan look in a terminal?"""
+"""Console output of a plan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does a run look in a terminal? Progress, tables, numbers; plain lines where there is no terminal."""
+"""Console output of a run: progress, tables and numbers; plain lines where there is no terminal."""
 
 from __future__ import annotations
 

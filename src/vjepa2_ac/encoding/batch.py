@@ -1,6 +1,6 @@
-"""Pixels to latents: where is the frozen encoder run, or are the latents of a cache taken instead?
+"""Batches of latents: from the frozen encoder, or from a latent cache.
 
-Training, evaluation and planning see only what comes out of here.
+Training, evaluation and planning only see the result of this module.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How is the encoder kept full? Frames of neighbouring episodes share a chunk, and every chunk has one shape."""
+"""Encoder batching: frames of neighbouring episodes share a chunk, and all chunks have the same shape."""
 
 from __future__ import annotations
 

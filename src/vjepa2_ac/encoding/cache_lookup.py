@@ -1,4 +1,4 @@
-"""Which frames of a data set need latents, where are they kept, and how is the data set opened through them?"""
+"""Latent cache lookup: the frames that need latents, the cache folder, and a data set read through it."""
 
 from __future__ import annotations
 

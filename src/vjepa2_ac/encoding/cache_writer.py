@@ -1,4 +1,4 @@
-"""How is a latent cache written? An episode at a time, by any number of processes, and finished by one of them."""
+"""Latent cache writer: one file per episode, written by any number of processes and finalized by one of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much room does a cache of latents take, and is it there? Asked before the first frame is encoded."""
+"""Disk space of a latent cache: how much is needed, and is it free? Checked before the first frame is encoded."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""How is a data set encoded before it is trained on, by itself or at the start of a run?
+"""Encoding of a whole data set before training, as a command or at the start of a run.
 
-By itself it needs no word between processes: each has its share of the episodes, and a file says when one is done.
+As a command, processes do not communicate: each encodes its share of the episodes and marks each finished one by a
+file.
 """
 
 from __future__ import annotations

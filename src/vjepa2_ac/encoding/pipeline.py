@@ -1,7 +1,7 @@
-"""How are the latents of a data set written? Decoded ahead, encoded a chunk at a time, an episode to a file.
+"""The encoding pipeline: prefetched frames, encoded in chunks, written as one file per episode.
 
-An episode counts when its file has its name: whoever is killed loses the ones under way. The process that finds nothing
-lacking makes the cache whole.
+An episode is complete once its file has its final name: a process that is killed loses only the episodes in progress.
+The process that finds nothing missing finalizes the cache.
 """
 
 from __future__ import annotations

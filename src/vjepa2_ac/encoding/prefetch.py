@@ -1,4 +1,4 @@
-"""How are pictures decoded before the encoder asks for them? By threads, a part of an episode at a time, in order."""
+"""Frame prefetching for the encoder: threads decode parts of episodes in order."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What of a whole cache is missing or damaged after all, and how is it encoded again? As it was made: a file at a time.
+"""Latent cache repair: finds missing or damaged files of a finished cache and encodes them again, one file at a time.
 
-A file that is missing, cut off or was never wanted before is found by its size, without reading it.
+A file that is missing, truncated or newly needed is found by its size, without reading it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Do the clips of a run come from a latent cache? It is encoded on first use, asked for, or taken where it is there."""
+"""The latent cache of a run: encoded on first use, required, or used if present, as the config requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What of a cache is still to be written, and by which process?"""
+"""The work left in a latent cache, and its division among processes."""
 
 from __future__ import annotations
 

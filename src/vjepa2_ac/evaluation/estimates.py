@@ -1,4 +1,4 @@
-"""What do the measured arrays say? Means and ratios with their intervals over episodes; the base's and ours paired."""
+"""Estimates from measured arrays: means and ratios with intervals over episodes, paired between base and run."""
 
 from __future__ import annotations
 

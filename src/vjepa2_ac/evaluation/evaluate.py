@@ -1,4 +1,4 @@
-"""Did training help? What was trained, its base and others side by side on clips of held-out episodes."""
+"""Evaluation of models: a trained model, its base and others on the same clips of held-out episodes."""
 
 from __future__ import annotations
 

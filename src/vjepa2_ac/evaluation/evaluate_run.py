@@ -1,4 +1,4 @@
-"""How good is a run, or a model, on held-out episodes? Load it and what it is compared with, measure, write it down."""
+"""Evaluation of a run or a model on held-out episodes: load it and its references, measure, write the results."""
 
 from __future__ import annotations
 

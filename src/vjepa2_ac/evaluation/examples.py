@@ -1,4 +1,4 @@
-"""What do good and bad predictions look like? Clips in pictures: error of each patch, and latents as colours."""
+"""Example clips of good and bad predictions: error maps per patch, and latents as colours."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""How sure is a figure? An estimate with its 95 % interval, from drawing whole episodes again and again.
+"""Bootstrap intervals: an estimate with its 95 % interval, from resampling whole episodes.
 
-Clips of one episode resemble each other: drawing clips would make intervals too narrow. Plain percentiles of the drawn
-values are too narrow, too, where there are few episodes; they are taken as much farther out as Student's t lies beyond
-the normal distribution.
+Clips of one episode are correlated: resampling clips would make intervals too narrow. Plain percentiles of the
+resampled values are also too narrow with few episodes, so they are widened by the ratio of Student's t to the normal
+distribution.
 
 Source: Hesterberg (2015), What Teachers Should Know About the Bootstrap, the expanded percentile interval.
 """

@@ -1,7 +1,7 @@
-"""How far are predicted latents from the true ones, and how far would doing nothing be?
+"""Prediction metrics: errors between predicted and true latents, beside the error of persistence.
 
-Every error compares layer-normalised latents, per clip and model step. Beside it stands *persistence*: the error of
-copying a frame that was seen. A ratio of 1 means: as good as doing nothing; 0: perfect.
+All errors compare layer-normalised latents, per clip and model step. *Persistence* is the error of copying a frame that
+was seen. A ratio of 1 means: as good as doing nothing; 0: perfect.
 """
 
 from __future__ import annotations

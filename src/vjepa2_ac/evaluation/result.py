@@ -1,9 +1,9 @@
-"""What was measured on held-out episodes? Records of plain arrays, which estimates, tables and the report are made of.
+"""Evaluation results: records of plain arrays, the input of estimates, tables and the report.
 
-Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). Every error compares
+Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). All errors compare
 layer-normalised latents: L1 is the mean absolute difference, L2 the mean *squared* difference (no root), cosine one
-minus the cosine similarity of a token, mean over tokens: 0 is perfect for each. Figures with intervals are made of
-these by `evaluation.estimates`, words by `evaluation.verdict`.
+minus the cosine similarity of a token, mean over tokens: 0 is perfect for each. Metrics with intervals are computed
+from these by `evaluation.estimates`, the verdict as text by `evaluation.verdict`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which steps are hard? Those in which the robot moves, and how far: clips' steps by what the true action does."""
+"""Strata of steps by difficulty: steps grouped by how the robot moves and how far, from the true action."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What do the figures say, in words? Whether it helped, how sure that is, and whether actions are used."""
+"""The verdict as text: did training help, how certain is that, and are the actions used?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does a trained run leave the house? As one merged model, as Meta's checkpoint, or as an adapter for the Hub."""
+"""Export of a trained run: as one merged model, as Meta's checkpoint, or as an adapter for the Hub."""
 
 from __future__ import annotations
 

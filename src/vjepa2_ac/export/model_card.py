@@ -1,4 +1,4 @@
-"""What should one read who finds an adapter on the Hub? A model card: base, data, training, figures, how to use it."""
+"""The model card of an exported adapter: base, data, training, metrics and usage."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which actions are allowed? Limits per axis, a ball, axes that are held, and how a finished plan is rounded."""
+"""The action space: limits per axis, a norm ball, fixed axes, and rounding of a finished plan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What should the robot do now? A goal picture once, then an action for every picture and state."""
+"""The controller: set a goal image once, then get one action for each image and state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What would the robot do here, and why? One decision, with all that is needed to judge it."""
+"""A planning decision: one planned action, with all data needed to judge it."""
 
 from __future__ import annotations
 

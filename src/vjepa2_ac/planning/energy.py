@@ -1,4 +1,4 @@
-"""How far from the goal would these actions lead? The energy of action sequences in a world model."""
+"""The planning energy: distance to the goal after an action sequence, predicted by the world model."""
 
 from __future__ import annotations
 

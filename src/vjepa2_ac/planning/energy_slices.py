@@ -1,4 +1,4 @@
-"""What would it cost to do something else? Energies around the first action of a plan, two axes at a time."""
+"""Energy slices: energies around the first action of a plan, over two axes at a time."""
 
 from __future__ import annotations
 

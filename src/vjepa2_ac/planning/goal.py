@@ -1,4 +1,4 @@
-"""What is wanted, and when? One goal picture or a sequence of them, perhaps only in a part of the image."""
+"""Goals: one goal image or a sequence of them, optionally limited to a region of the image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Can this be planned from? Pictures and states as a robot gives them, refused before they do harm."""
+"""Input checks of planning: images and states of a robot are refused if they are invalid."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What is asked of a planner, and what does it answer? A cost in, a plan out.
+"""Interfaces of planners: a cost function in, a plan out.
 
-Axes: samples (action sequences), decisions (actions that are chosen), steps (of the model; a decision is repeated for
-`ActionSpace.repeat` of them), dim (numbers of an action). All on the CPU.
+Axes: samples (action sequences), decisions (chosen actions), steps (of the model; a decision is repeated for
+`ActionSpace.repeat` of them), dim (components of an action). All on the CPU.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is done to a model before it is planned with? Merged, in eval mode; compiled or in 8 bits if asked for."""
+"""Model setup for planning: merged, in eval mode; on request compiled or quantized to 8 bits."""
 
 from __future__ import annotations
 

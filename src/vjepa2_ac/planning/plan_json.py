@@ -1,4 +1,4 @@
-"""What stands in plan.json? A decision as plain values, by a schema that docs/planning.md explains."""
+"""The content of plan.json: a decision as plain values, by the schema in docs/planning.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which actions cost least? The loop around every search: a time budget, bad energies, limits, a record of it all."""
+"""The planner: the loop around each solver, with a time budget, limits, bad energies and a record of all steps."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Where does an arm get to? Poses integrated with actions, batched, on any device, and differentiable.
+"""Pose integration: poses after a sequence of actions, batched, on any device, and differentiable.
 
-The same as `geometry.apply_action` (NumPy, SciPy), but that the gripper stays between open and closed.
+The same as `geometry.apply_action` (NumPy, SciPy), except that the gripper is limited to between open and closed.
 """
 
 from __future__ import annotations

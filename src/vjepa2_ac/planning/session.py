@@ -1,4 +1,4 @@
-"""What is planned with? A model of its own or what a run has learned, and the settings that go with it."""
+"""The planning session: a model or a run's adapter, loaded with its settings."""
 
 from __future__ import annotations
 

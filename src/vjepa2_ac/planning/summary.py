@@ -1,4 +1,4 @@
-"""How is a decision said in a few sentences? How far it goes, what it is worth, and what a reader should beware of."""
+"""The summary of a decision as text: distance, expected gain, and warnings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands in metrics.json of plans? Every figure as plain values, by the schema of docs/evaluation.md."""
+"""The planning part of metrics.json: all metrics as plain values, by the schema in docs/evaluation.md."""
 
 from __future__ import annotations
 

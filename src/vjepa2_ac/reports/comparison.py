@@ -1,6 +1,6 @@
-"""Which run is best? Runs side by side that were measured on the same clips, from their metrics.json alone.
+"""Comparison of runs that were measured on the same clips, from their metrics.json alone.
 
-Nothing is measured here: what `vjepa2-ac evaluate` has not written yet is asked for.
+Nothing is measured here: missing results have to be written by `vjepa2-ac evaluate` first.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What stands in metrics.json? Every figure as plain values, by a schema that docs/evaluation.md explains.
+"""The content of metrics.json: all metrics as plain values, by the schema in docs/evaluation.md.
 
-Pictures are not in it: they are in the report.
+It holds no images: these are in the report.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which validation went best? Only errors of the same clips, over the same time, of the same latents compare."""
+"""The best validation of a run. Only errors of the same clips, time span and latents are compared."""
 
 from __future__ import annotations
 

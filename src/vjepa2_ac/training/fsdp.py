@@ -1,9 +1,10 @@
-"""How do processes share the weights that they train, and not only the clips? FSDP2, for a predictor trained whole.
+"""FSDP2: processes share the trained weights and not only the clips, for a predictor trained whole.
 
-`accelerate launch --use_fsdp --fsdp_version 2` asks for it: it sets ACCELERATE_USE_FSDP and FSDP_VERSION for each
-process. A process then keeps a part of each weight, gradient and moment; a block's weights are put together where it
+`accelerate launch --use_fsdp --fsdp_version 2` requests it: it sets ACCELERATE_USE_FSDP and FSDP_VERSION for each
+process. A process then holds a part of each weight, gradient and moment; a block's weights are gathered where it
 computes. Gradients are summed over the processes after every micro-batch, so no process may be without a clip. The
-frozen encoder stays whole, and a checkpoint is what one process alone writes: it goes on shared or not.
+frozen encoder stays whole. A checkpoint has the format that one process alone writes: a run resumes from it with or
+without FSDP2.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The training loop: what happens before, during and after the steps.
 
-What makes a run exact: the clips of a step, its learning rate and its random numbers are pure functions of (config,
-step). A run that was killed continues from its newest checkpoint as if nothing had happened.
+A run is reproducible because the clips of a step, its learning rate and its random numbers are pure functions of
+(config, step). A run that was killed continues from its newest checkpoint as if it had not been interrupted.
 """
 
 from __future__ import annotations

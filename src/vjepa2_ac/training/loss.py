@@ -1,4 +1,4 @@
-"""How wrong are the predictions? Teacher forcing plus a short rollout, on normalised latents."""
+"""The training loss: teacher forcing plus a short rollout, on normalised latents."""
 
 from __future__ import annotations
 

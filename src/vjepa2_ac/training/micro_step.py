@@ -1,8 +1,8 @@
-"""What is one micro-step? Losses of some clips and their gradients, added to those that are there; perhaps as a graph.
+"""The micro-step: losses of some clips, and their gradients added to the existing ones; optionally as a CUDA graph.
 
-At one or two clips a GPU has computed a micro-step before Python has asked for its 6,000 kernels. A CUDA graph
-(`training.cuda_graph`) asks for all of them at once: it is captured from the first batch, with the shapes and addresses
-that it had then, and replayed on every batch of the same size. Others take the plain way.
+At one or two clips a GPU finishes a micro-step faster than Python launches its 6,000 kernels. A CUDA graph
+(`training.cuda_graph`) launches all of them at once: it is captured from the first batch, with its shapes and
+addresses, and replayed on each batch of the same size. Other batches run without a graph.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Does the model take this robot's states and actions, and if not, who learns to? Asked before the first step."""
+"""Checks for a new robot: does the model accept its states and actions, and which layers learn them?"""
 
 from __future__ import annotations
 

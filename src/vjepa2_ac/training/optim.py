@@ -1,4 +1,4 @@
-"""Which parameters move, by which rule, and how fast at which step?"""
+"""The optimizer: trained parameters, update rule, and learning rate schedule."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The reporter of a run: what is a person shown while it trains, and what do processes use that show nothing?"""
+"""The reporter of a run: what is shown while it trains; silent in all other processes."""
 
 from __future__ import annotations
 

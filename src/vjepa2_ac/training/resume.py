@@ -1,4 +1,4 @@
-"""How does a run go on where it stood? Its newest checkpoint, on whatever number of processes."""
+"""Resuming a run: from its newest checkpoint, on any number of processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What must stand before the first step? Device, data, model, adapter, optimizer and the newest checkpoint, checked."""
+"""Setup of a run before the first step: device, data, model, adapter, optimizer and newest checkpoint, with checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is one optimizer step? Micro-batches in, gradients accumulated and clipped, weights moved, or a refusal."""
+"""The optimizer step: gradients of micro-batches accumulated and clipped, weights updated, or the step refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which stride does a run take where `data.stride` is auto? The one that its model chose before the first step."""
+"""Stride choice of a run with `data.stride: auto`: the stride that its model chose before the first step."""
 
 from __future__ import annotations
 

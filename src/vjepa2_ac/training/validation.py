@@ -1,4 +1,4 @@
-"""Validation: how does the run do on held-out clips, and is its base worth adapting?"""
+"""Validation of a run on held-out clips, and the check that its base is worth adapting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Would it plan what people did? Plans from frames of held-out clips, to be held against the demonstrated actions.
+"""Action Score measurement: plans from frames of held-out clips, compared with the demonstrated actions.
 
 Two plans from each start: one step towards the next frame, by the settings of the config's `planning`; and three steps
 towards the frame that came three steps later, by the Action Score's protocol (`planning_protocol`).

@@ -1,4 +1,4 @@
-"""How close are plans to what was demonstrated? The Action Score, errors in cm and degrees, with their intervals."""
+"""Metrics of plans: the Action Score, and errors in cm and degrees, with their intervals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How is the Action Score measured? Its protocol, which no option changes: figures of different runs are to compare.
+"""The protocol of the Action Score. No option changes it, so that scores of different runs are comparable.
 
 Source: facebookresearch/jepa-wms @ 6eafb14, configs/evals/simu_env_planning/droid/vj2ac,
 evals/simu_env_planning/planning (planner.py: CEMPlanner; objectives.py: ReprTargetDistMPCObjective; plan_evaluator.py:

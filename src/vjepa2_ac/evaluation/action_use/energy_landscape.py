@@ -1,4 +1,4 @@
-"""Which action would a planner take? The energy over a grid of (dx, dy, dz), and where it is lowest.
+"""Energy landscapes: the energy over a grid of (dx, dy, dz), and its minimum.
 
 Source: facebookresearch/vjepa2 @ c2963a4, notebooks/energy_landscape_example.ipynb: the energy of a grid of actions
 after one step from one frame. There the grid is centred on zero; here it also has a node at the true action.

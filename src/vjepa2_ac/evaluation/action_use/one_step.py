@@ -1,4 +1,4 @@
-"""What would a model predict from one frame under many actions, and how far from the truth? The energy of an action."""
+"""One-step action energies: the prediction error of one frame under each of many actions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Does a model listen to its actions? How predictions change with them, and where the true one ranks by its energy."""
+"""Action sensitivity: how predictions change with the actions, and the rank of the true action by energy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which reading of the data of a config does a model fit best? See `evaluation.data_variants.measure`."""
+"""Measurement of data variants from a config. See `evaluation.data_variants.measure`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Under which variant of a data set does a model that knows robots predict best? As it is, mirrored, shifted, ...?
+"""Comparison of data variants: under which does a trained model predict best: unchanged, mirrored, shifted, ...?
 
-A model's one-step error is lowest where actions and states are those of the pictures. So the same clips are measured as
-they are and with one thing changed at a time; what surely fits better is most likely how the data really are.
+A model's one-step error is lowest where actions and states match the frames. So the same clips are measured unchanged
+and with one thing changed at a time; a variant that is certainly better is most likely the true reading of the data.
 """
 
 from __future__ import annotations

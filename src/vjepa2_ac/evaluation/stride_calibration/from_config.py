@@ -1,4 +1,4 @@
-"""Which stride does a model choose on the data of a config, outside of a run?"""
+"""Stride calibration from a config, outside of a run."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""How long is a model step? The model itself says: at which stride is its prediction best, beside doing nothing?
+"""Stride calibration: the stride with the lowest prediction error relative to persistence.
 
-The step length of the released weights is unsettled (see IMPLEMENTATION_NOTES), and a robot of another control rate has
-another. At each candidate stride the same clips begin at the same control steps of the same held-out episodes.
+The step length of the released weights is unknown (see IMPLEMENTATION_NOTES), and robots differ in their control rate.
+At each candidate stride, the same clips begin at the same control steps of the same held-out episodes.
 """
 
 from __future__ import annotations

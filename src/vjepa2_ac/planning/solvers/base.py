@@ -1,4 +1,4 @@
-"""How does a planner try and learn? What all of them share: samples, their energies, the best of them."""
+"""The base of all solvers: samples, their energies, and the best of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cross-entropy method: draw from a normal distribution, move it to the best, again."""
+"""Cross-entropy method: sample from a normal distribution, fit it to the elites, repeat."""
 
 from __future__ import annotations
 

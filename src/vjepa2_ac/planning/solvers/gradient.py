@@ -1,4 +1,4 @@
-"""Gradient descent through the model: several action sequences go downhill at once."""
+"""Gradient descent through the model, on several action sequences in parallel."""
 
 from __future__ import annotations
 

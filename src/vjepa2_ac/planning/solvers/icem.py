@@ -1,4 +1,4 @@
-"""Improved cross-entropy method: noise that is smooth in time, and elites that take part again."""
+"""Improved cross-entropy method: noise correlated in time, and elites reused in the next iteration."""
 
 from __future__ import annotations
 

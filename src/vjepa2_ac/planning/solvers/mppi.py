@@ -1,4 +1,4 @@
-"""Model predictive path integral control: the mean of all samples, each weighted by how little it costs."""
+"""Model predictive path integral control: the mean of all samples, weighted by their cost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How do pictures side by side look with a few words above them? One frame of a video."""
+"""Captioned frames: images side by side with a caption above each, as one frame of a video."""
 
 from __future__ import annotations
 

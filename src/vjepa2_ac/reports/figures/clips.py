@@ -1,4 +1,4 @@
-"""What is in these clips? A row each: some of its frames, and below them its states and actions over time."""
+"""The figure of clips: one row per clip with some of its frames, and its states and actions over time."""
 
 from __future__ import annotations
 

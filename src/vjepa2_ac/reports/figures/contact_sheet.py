@@ -1,4 +1,4 @@
-"""What does a data set look like? Episodes as film strips over their motion, under what is known of all of them."""
+"""The contact sheet of a data set: episodes as film strips and their motion, below a summary of the data set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which episodes, pictures and figures go on the contact sheet of a data set?"""
+"""Content of the contact sheet: the selection of episodes, frames and metrics of a data set."""
 
 from __future__ import annotations
 

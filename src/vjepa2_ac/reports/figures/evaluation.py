@@ -1,4 +1,4 @@
-"""What does it look like? One picture: error by horizon, use of the actions, and where predictions are wrong."""
+"""The figure of an evaluation: error by horizon, action use, and maps of the prediction error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where does something stand on a picture that is a page? Measured in inches from the top left."""
+"""Page layout of a figure: positions in inches from the top left."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How did a planner come to its plan? One picture: what was seen, where it searched, what else would have cost."""
+"""The figure of a plan: the observed image, the search, and the energy of other actions."""
 
 from __future__ import annotations
 

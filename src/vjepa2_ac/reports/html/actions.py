@@ -1,4 +1,4 @@
-"""Does the model use its actions? Costs of wrong ones, the place of the true one among others, energy landscapes."""
+"""Report section on action use: costs of wrong actions, the rank of the true action, energy landscapes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does a curve stand on a page, light or dark? As SVG whose colours are the page's: lines, bands, legend, axes."""
+"""Charts as SVG in the page's colours, light or dark: lines, bands, legend, axes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How are figures spread? The ranks of the true action against chance, and all episodes from best to worst."""
+"""Distribution charts: ranks of the true action against chance, and all episodes from best to worst."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How large are the errors, how far ahead, and how do they compare? Curves and tables by horizon and by stratum."""
+"""Report section on errors: curves and tables by horizon and by stratum, compared between models."""
 
 from __future__ import annotations
 

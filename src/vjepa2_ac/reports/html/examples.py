@@ -1,4 +1,4 @@
-"""What do predictions look like? Clips frame by frame: where errors are, what latents are like, and the same moving."""
+"""Report section of example clips, frame by frame: errors, latents as colours, and an animation of them."""
 
 from __future__ import annotations
 

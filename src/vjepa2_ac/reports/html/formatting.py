@@ -1,4 +1,4 @@
-"""How is a number written? With its unit, as many digits as mean something, and its interval in brackets."""
+"""Number formatting: unit, significant digits, and the interval in brackets."""
 
 from __future__ import annotations
 

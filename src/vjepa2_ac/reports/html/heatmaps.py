@@ -1,4 +1,4 @@
-"""Where is the energy low? A map of it over two axes of the action, with the true action and the minimum marked."""
+"""Heatmaps of the energy over two axes of the action, with the true action and the minimum marked."""
 
 from __future__ import annotations
 

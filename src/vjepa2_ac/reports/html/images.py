@@ -1,4 +1,4 @@
-"""How does an array become a picture within a page? As data: URL: PNG for numbers as colours, JPEG for photographs."""
+"""Images within the page, as data: URLs: PNG for arrays as colours, JPEG for photographs."""
 
 from __future__ import annotations
 

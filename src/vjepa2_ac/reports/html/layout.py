@@ -1,4 +1,4 @@
-"""What are the pieces of the page? Sections, figures with a word on how to read them, tables, folded parts."""
+"""Page elements: sections, figures with a reading hint, tables, collapsible parts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does text become HTML that nothing in it can break? Elements that escape all they are given."""
+"""HTML markup: elements that escape all text and attributes."""
 
 from __future__ import annotations
 

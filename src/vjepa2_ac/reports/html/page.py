@@ -1,4 +1,4 @@
-"""What does the whole page look like? The verdict on top, then everything that was measured, and how to read it."""
+"""The whole report page: the verdict first, then all measurements and how to read them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Would it plan what people did? The Action Score and errors beside plans without a model, and where each plan ends."""
+"""Report section on planning: Action Score and errors beside model-free plans, and the end of each plan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What else is known of the run? Episodes from best to worst, how training went, at which stride it is best."""
+"""Report section on the run: episodes from best to worst, training curves, stride calibration."""
 
 from __future__ import annotations
 

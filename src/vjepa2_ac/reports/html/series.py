@@ -1,4 +1,4 @@
-"""Which colour and which name has each curve? The same ones in every chart and table of the page."""
+"""Colours and names of the models, the same in each chart and table of the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How does a model steer beside doing nothing, chance and an oracle? The same problems for all, and files of it."""
+"""The closed-loop benchmark: a model beside doing nothing, random actions and an oracle, on the same problems."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What would one do who knows where the block is? Scripts that push and pick: the upper bound, and demonstrations."""
+"""Oracles: scripts that know the position of the block, push and pick. Upper bound and source of demonstrations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who drives the simulated robot? A planner, and those it is compared with: nothing, chance, and one who knows all."""
+"""Policies of the simulated robot: a planner, and its references: doing nothing, random actions and an oracle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What came of episodes in closed loop? What happened in each, and the figures of all together."""
+"""Closed-loop results: a record of each episode, and the metrics over all of them."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""How well does a policy do what it is asked, when it sees what its actions lead to? Episodes and their figures.
+"""Closed-loop rollouts: a policy acts on what it observes, and each episode is measured.
 
-Every model step the policy sees a picture and the measured state and names an action; the state it leads to is sent as
-the command for `stride` control steps. What counts is where things are at the *end*: "once on the way" flatters.
+At each model step the policy sees an image and the measured state and returns an action; the state it leads to is sent
+as the command for `stride` control steps. Success is judged by the state at the *end*, not by passing it on the way.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What is the simulated robot to do? Problems: where arm and block begin, where they shall be, and what counts as done.
+"""Tasks of the simulated robot: start and target of arm and block, and the criterion of success.
 
 They are drawn in the world frame: a problem looks the same in every domain, however the robot is mounted.
 """

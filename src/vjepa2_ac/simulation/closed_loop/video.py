@@ -1,4 +1,4 @@
-"""What do episodes in closed loop look like? The camera beside the goal, step by step, as a video."""
+"""Videos of closed-loop episodes: the camera image beside the goal image, step by step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How is a data set of the simulated arm recorded? Random reaching, filmed, written as RLDS in DROID's schema."""
+"""Recording of a simulated data set: random reaching, filmed, written as RLDS in DROID's schema."""
 
 from __future__ import annotations
 

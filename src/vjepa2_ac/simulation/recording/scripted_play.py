@@ -1,6 +1,6 @@
-"""How is a demonstration with a block made? An oracle with unsteady hands, or random play around the block.
+"""Demonstrations with a block: an oracle with noise, or random play around the block.
 
-Commands are those of the closed loop: every model step one state is sent, and held for the step.
+Commands are as in the closed loop: one target state per model step, held for that step.
 """
 
 from __future__ import annotations

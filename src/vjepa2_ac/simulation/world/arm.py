@@ -1,4 +1,4 @@
-"""What is the simulated robot? An arm that goes where it is told, with a lag, and is filmed by three cameras."""
+"""The simulated arm: follows commands with a lag and is filmed by three cameras."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""What happens where the arm touches things? The same arm with servos in MuJoCo's dynamics, and a block to move.
+"""The simulated arm with contacts: servos in MuJoCo's dynamics, and a block to move.
 
-Its joints follow the same commands with the same lag as those of `SimulatedArm`, as long as nothing is in the way.
+Its joints follow the same commands with the same lag as those of `SimulatedArm`, as long as there is no contact.
 """
 
 from __future__ import annotations

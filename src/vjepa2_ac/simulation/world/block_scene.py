@@ -1,4 +1,4 @@
-"""How does the scene become one in which things touch? A block on the table, friction, fingers that hold, servos."""
+"""The scene with contacts: a block on the table, friction, a gripper that holds, servos."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What does a camera see? Pictures by ray casting: no OpenGL, no display.
+"""Simulated cameras: images by ray casting, without OpenGL or a display.
 
-MuJoCo says which geom each pixel's ray meets, and where; colour, light and shadow are numpy. What never moves is cast
-and lit once per camera; per picture only the arm is cast, and its shadow, and only where they can be.
+MuJoCo finds the geom and the point that each pixel's ray meets; colour, light and shadow are numpy. Static parts are
+cast and lit once per camera; per image only the arm and its shadow are cast, and only where they can be.
 """
 
 from __future__ import annotations

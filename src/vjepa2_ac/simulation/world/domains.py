@@ -1,7 +1,7 @@
-"""In which worlds is the arm filmed? Where the camera stands, how things look, how the arm is mounted.
+"""Domains of the simulated arm: camera positions, appearance, and how the arm is mounted.
 
-The world frame stands on the table under the robot: x to the front, y to the robot's left, z up. The robot base may be
-mounted turned about z (`base_yaw_deg`); states and actions are in the *base* frame, pictures show the world.
+The origin of the world frame is on the table under the robot: x to the front, y to the robot's left, z up. The robot
+base may be rotated about z (`base_yaw_deg`); states and actions are in the *base* frame, images show the world.
 """
 
 from __future__ import annotations

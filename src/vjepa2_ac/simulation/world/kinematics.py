@@ -1,4 +1,4 @@
-"""Where is the flange for given joint angles, and which joint angles bring it to a pose?
+"""Forward and inverse kinematics of the arm: the flange pose of joint angles, and joint angles for a pose.
 
 Franka's published kinematics as plain arithmetic: no simulator is needed to know where the arm is. Poses are 6 numbers
 in the robot base frame: x, y, z in metres; roll, pitch, yaw in radians, extrinsic xyz Euler (legend: episode.py).

@@ -1,7 +1,8 @@
-"""How does the arm move in a demonstration? Smooth random reaching, as commanded and as measured.
+"""Motion of a demonstration: smooth random reaching, as commanded and as measured.
 
-Every model step the flange is sent a random way further, inside a box over the table; the gripper points down, turns a
-little and now and then opens or closes. The measured joints follow the commanded ones with a lag, as on a real robot.
+At every model step the flange target moves by a random amount, inside a box over the table; the gripper points down,
+rotates a little and sometimes opens or closes. The measured joints follow the commanded ones with a lag, as on a real
+robot.
 """
 
 from __future__ import annotations

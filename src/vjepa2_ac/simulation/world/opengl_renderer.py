@@ -1,4 +1,4 @@
-"""What does a camera see through MuJoCo's own renderer, where OpenGL works?"""
+"""The OpenGL renderer: camera images by MuJoCo's own renderer, where OpenGL works."""
 
 from __future__ import annotations
 

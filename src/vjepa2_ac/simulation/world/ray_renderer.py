@@ -1,4 +1,4 @@
-"""Which rays meet the arm, and where? MuJoCo casts them; those that pass it by are sorted out beforehand."""
+"""The ray renderer: which rays meet the arm, and where? Cast by MuJoCo; rays that cannot meet it are skipped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stands in the simulated room? The arm from primitives, a table with things on it, walls: our own MJCF."""
+"""The simulated scene: the arm from primitives, a table with objects, walls. Our own MJCF."""
 
 from __future__ import annotations
 

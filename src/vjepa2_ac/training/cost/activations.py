@@ -1,4 +1,4 @@
-"""What does autograd keep of a training objective until the backward pass? Teacher forcing, rollout, and losses."""
+"""Activation memory of the training objective: what autograd saves for teacher forcing, rollout and losses."""
 
 from __future__ import annotations
 

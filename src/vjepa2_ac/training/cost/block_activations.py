@@ -1,13 +1,13 @@
-"""What does autograd keep of one layer or one block of the predictor? Counted operation by operation, in bytes.
+"""Activation memory of one layer or block of the predictor, counted operation by operation, in bytes.
 
-Only what a gradient needs is kept. A frozen linear layer keeps nothing of its input; its adapter, or a weight that is
-trained whole, keeps it, in the arithmetic's type, and an adapter its own two matrices, cast. A norm keeps its input and
-two statistics a token, attention keeps query, key, value, output and a log-sum-exp a head, GELU its input, dropout its
-mask. DoRA, as PEFT computes it, keeps two outputs of each layer, and with dropout a copy of the weights.
+Only what a gradient needs is saved. A frozen linear layer saves nothing of its input; its adapter, or a weight that is
+trained whole, saves it, in the arithmetic's type, and an adapter its own two matrices, cast. A norm saves its input and
+two statistics a token, attention saves query, key, value, output and a log-sum-exp a head, GELU its input, dropout its
+mask. DoRA, as PEFT computes it, saves two outputs of each layer, and with dropout a copy of the weights.
 
 Devices differ in two of these. Where weights have another type than the arithmetic, CUDA's autocast computes norms from
-a float32 copy and keeps that, where the CPU's leaves the input as it is; and CUDA keeps a mask of one byte, the CPU one
-of the masked tensor's type.
+a float32 copy and saves that, while the CPU's leaves the input unchanged; and CUDA saves a mask of one byte, the CPU
+one of the masked tensor's type.
 """
 
 from __future__ import annotations

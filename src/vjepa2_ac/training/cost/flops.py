@@ -1,10 +1,10 @@
-"""How much arithmetic is one clip, or one plan? Operations by formula: no model is built and torch is not needed.
+"""FLOPs of one clip or one plan, by formula: no model is built and torch is not needed.
 
-What counts is what the mathematics asks for, once (model FLOPs): a product of matrices is two operations per pair of
-numbers; forward, backward with respect to inputs wherever a gradient has to pass, with respect to weights only for what
-is trained. What is computed again (gradient checkpointing, the scores in a fused attention's backward pass) does not
-count, nor do norms, activations and rotations, which are no products of matrices. Attention is counted as the
-block-causal it is: a token of step t looks at the tokens of steps up to t.
+Model FLOPs are counted: only what the mathematics requires, once. A matrix product is two operations per pair of
+numbers; forward, backward with respect to inputs wherever a gradient has to pass, and with respect to weights only for
+trained ones. Recomputation (gradient checkpointing, the scores in a fused attention's backward pass) is not counted,
+nor are norms, activations and rotations, which are no matrix products. Attention is counted as block-causal: a token of
+step t attends to the tokens of steps up to t.
 
 Not counted: the norms of weights that DoRA needs.
 """

@@ -1,7 +1,7 @@
-"""Will a run fit on the GPU? Its memory, part by part, by arithmetic: no model is built and torch is not needed.
+"""GPU memory of a run, part by part, by arithmetic: no model is built and torch is not needed.
 
-The counts of parameters are exact. What autograd keeps (`training.cost.activations`) is held by a test to what PyTorch
-really keeps on a CPU. The whole has not yet been compared with the peak that a GPU measures.
+The parameter counts are exact. What autograd saves (`training.cost.activations`) is tested against what PyTorch saves
+on a CPU. The total has not yet been compared with the peak that a GPU measures.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Has training made the model worse? Said once for each cause, in metrics.jsonl and to the person who watches.
+"""Divergence warnings: has training made the model worse? One warning per cause, in metrics.jsonl and on the console.
 
-What is looked at is the journal's rows alone, so that a run that goes on says neither less nor the same once more.
+Only the rows of the metrics log are used, so that a resumed run neither loses nor repeats a warning.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Which clips made a loss or gradient that is not finite? They are saved for a look, in RUN/not_finite/step-XXXXXXXX.
+"""Clips whose loss or gradient is not finite: saved for inspection in RUN/not_finite/step-XXXXXXXX.
 
-Each process saves its own: an npz per clip (frames, states, actions, episode_id, start) and one picture of them. Clips
-from a latent cache have no frames: their latents are saved instead, as float32, and the film is blank.
+Each process saves its own: an npz per clip (frames, states, actions, episode_id, start) and one figure of all. Clips
+from a latent cache have no frames: their latents are saved instead, as float32, and their film strip is blank.
 """
 
 from __future__ import annotations

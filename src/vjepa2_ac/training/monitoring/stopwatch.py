@@ -1,4 +1,4 @@
-"""How long was it waited? By the host's clock, or by what a CUDA device stood idle meanwhile."""
+"""The stopwatch for waiting time: by the host's clock, or by the idle time of a CUDA device."""
 
 from __future__ import annotations
 

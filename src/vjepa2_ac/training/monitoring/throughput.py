@@ -1,12 +1,12 @@
-"""Is a run well, and is the machine busy? Figures of one optimizer step, for the journal and for the console.
+"""Training and throughput metrics of one optimizer step, for the metrics log and the console.
 
 update_to_weight    norm of the update over the norm of the weights before it, of all that is trained together
-data_wait_share     share of the step's wall time that was spent waiting for the loader; on CUDA only what the device
-                    stood idle, since it computes what it has while the host waits
+data_wait_share     share of the step's wall time spent waiting for the loader; on CUDA only the device's idle time,
+                    since it computes queued work while the host waits
 samples_per_second  clips, of all processes
 tokens_per_second   patch tokens of the frames of these clips
-mfu                 model FLOPs per second (`training.cost.flops`) over the ceiling: what this device does in a large
-                    product of matrices in the run's precision, measured for a fraction of a second at the start
+mfu                 model FLOPs per second (`training.cost.flops`) over the ceiling: the rate of this device in a large
+                    matrix product in the run's precision, measured for a fraction of a second at the start
 memory_gb           peak so far in 10^9 bytes: of PyTorch's allocator on CUDA, resident elsewhere
 """
 
