@@ -69,7 +69,7 @@ def test_each_episode_gets_its_own_frames_back_from_chunks_of_one_shape(scales: 
     for number, one in enumerate(done):
         expected = 10 * number + np.arange(lengths[number])
         assert one.latents.values[:, 2, 1].tolist() == expected.tolist()
-        assert one.pictures[:, 0, 0, 0].tolist() == expected.tolist()
+        assert one.small_frames[:, 0, 0, 0].tolist() == expected.tolist()
         assert one.recording.info.id == str(number)
         assert (one.latents.scales is not None) == scales
         if scales:

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from latent_sets import encode_for
-from same_run import assert_same_run, figures, trained_weights
+from same_run import assert_same_run, metrics, trained_weights
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.errors import InputError
@@ -66,7 +66,7 @@ def test_training_on_a_rounded_cache_differs_by_what_is_rounded_off(
     train(on_the_fly, reporter)
     folder = encoded(on_the_fly)
     train(make_config(run_dir=str(tmp_path / "cached"), **(changes | of_cache(folder))), reporter)
-    pairs = zip(figures(tmp_path / "fly"), figures(tmp_path / "cached"), strict=True)
+    pairs = zip(metrics(tmp_path / "fly"), metrics(tmp_path / "cached"), strict=True)
     losses = [(one["loss"], other["loss"]) for one, other in pairs if one["kind"] == "train"]
     assert losses
     assert all(0 < abs(one / other - 1) < most for one, other in losses)

@@ -138,13 +138,13 @@ def test_the_same_evaluation_twice_gives_the_same_file_and_another_seed_other_ac
     assert not np.array_equal(first.change_by_clip, second.change_by_clip)
 
 
-def values(figures: object) -> list[float]:
+def values(metrics: object) -> list[float]:
     """Return every number in there, in order."""
-    if isinstance(figures, dict):
-        return [number for one in figures.values() for number in values(one)]
-    if isinstance(figures, list):
-        return [number for one in figures for number in values(one)]
-    return [float(figures)] if isinstance(figures, int | float) else []
+    if isinstance(metrics, dict):
+        return [number for one in metrics.values() for number in values(one)]
+    if isinstance(metrics, list):
+        return [number for one in metrics for number in values(one)]
+    return [float(metrics)] if isinstance(metrics, int | float) else []
 
 
 def test_episodes_are_ranked_by_how_well_they_are_predicted() -> None:

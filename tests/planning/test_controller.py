@@ -160,10 +160,10 @@ def test_a_model_in_bfloat16_plans_as_well(planner: str) -> None:
 @pytest.mark.parametrize(
     ("frame", "complaint"),
     [
-        (picture(0, 48, 60), "as the goal's picture"), (picture(0, 60, 60), "as the goal's picture"),
-        (picture(0, 50, 48), "as the goal's picture"), (picture(0)[..., 0], "RGB picture"),
-        (np.dstack([picture(0), picture(0)]), "RGB picture"),
-        (picture(0).astype(np.float32), "RGB picture"), (picture(0)[:4, :4], "RGB picture"),
+        (picture(0, 48, 60), "as the goal image"), (picture(0, 60, 60), "as the goal image"),
+        (picture(0, 50, 48), "as the goal image"), (picture(0)[..., 0], "RGB image"),
+        (np.dstack([picture(0), picture(0)]), "RGB image"),
+        (picture(0).astype(np.float32), "RGB image"), (picture(0)[:4, :4], "RGB image"),
     ],
 )  # fmt: skip
 def test_a_picture_that_cannot_be_used_is_refused(frame: np.ndarray, complaint: str) -> None:

@@ -8,7 +8,7 @@ from safetensors.torch import load_file
 
 from paths import ROOT
 from ranks import finish, free_port, start_rank
-from same_run import figures, optimizer_state
+from same_run import metrics, optimizer_state
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.distributed.launch import check_launch
 from vjepa2_ac.errors import InputError
@@ -33,7 +33,7 @@ def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
     for key, values in moments.items():
         for name, value in values.items():
             torch.testing.assert_close(same[key][name], value, rtol=1e-3, atol=1e-6, msg=f"{key} {name}")
-    for row, again in zip(figures(one), figures(other), strict=True):
+    for row, again in zip(metrics(one), metrics(other), strict=True):
         assert row.keys() == again.keys()
         assert row.pop("kind") == again.pop("kind")
         assert all(again[name] == pytest.approx(value, rel=1e-4) for name, value in row.items())

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from copied_sets import write_rlds
-from same_run import assert_same_run, figures, trained_weights
+from same_run import assert_same_run, metrics, trained_weights
 from vjepa2_ac.config import CheckpointConfig, Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.clips import loader
@@ -90,8 +90,8 @@ def test_how_often_a_run_is_measured_and_saved_changes_nothing(make_config, repo
     assert len(list((tmp_path / "often/checkpoints").iterdir())) > len(
         list((tmp_path / "seldom/checkpoints").iterdir())
     )
-    rows = {(row["kind"], row["step"]): row for row in figures(tmp_path / "often")}
-    assert all(rows[row["kind"], row["step"]] == row for row in figures(tmp_path / "seldom"))
+    rows = {(row["kind"], row["step"]): row for row in metrics(tmp_path / "often")}
+    assert all(rows[row["kind"], row["step"]] == row for row in metrics(tmp_path / "seldom"))
     one, other = trained_weights(tmp_path / "seldom"), trained_weights(tmp_path / "often")
     assert all(torch.equal(one[key], other[key]) for key in one)
 
@@ -126,7 +126,7 @@ def test_the_best_by_validation_is_written_kept_and_remembered(make_config, repo
 def test_another_seed_is_another_run(make_config, reporter, tmp_path) -> None:
     train(make_config(run_dir=str(tmp_path / "a"), training__steps=2), reporter)
     train(make_config(run_dir=str(tmp_path / "b"), training__steps=2, seed=1), reporter)
-    assert figures(tmp_path / "a") != figures(tmp_path / "b")
+    assert metrics(tmp_path / "a") != metrics(tmp_path / "b")
 
 
 def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporter) -> None:
@@ -182,7 +182,7 @@ def test_training_lowers_the_loss(make_config, reporter) -> None:
         validation__every=60, checkpoint__every=60,
     )  # fmt: skip
     train(config, reporter)
-    validations = [row for row in figures(Path(config.run_dir)) if row["kind"] == "validation"]
+    validations = [row for row in metrics(Path(config.run_dir)) if row["kind"] == "validation"]
     assert [row["step"] for row in validations] == [0, 60]
     assert validations[-1]["error_over_persistence"] < 0.8 * validations[0]["error_over_persistence"]
 

@@ -130,16 +130,16 @@ def _question(options: argparse.Namespace) -> PlanRequest:
     """Read what was given and refuse what cannot be planned with, before a model is loaded."""
     from vjepa2_ac.media.image_file import read_image
     from vjepa2_ac.planning.decision import PlanRequest
-    from vjepa2_ac.planning.input_checks import require_mask, require_picture, require_pose
+    from vjepa2_ac.planning.input_checks import require_image, require_mask, require_pose
 
     state = _numbers(options.state, "--state")
     require_pose(state, where="--state")
     durations = _durations(options.durations, len(options.goal)) if options.durations else ()
     goals = [read_image(path) for path in options.goal]
     for path, picture in zip(options.goal, goals, strict=True):
-        require_picture(picture, where=f"--goal {path}", like=goals[0])
+        require_image(picture, where=f"--goal {path}", like=goals[0])
     start = read_image(options.start)
-    require_picture(start, where=f"--start {options.start}", like=goals[0])
+    require_image(start, where=f"--start {options.start}", like=goals[0])
     mask = None if options.mask is None else read_image(options.mask).max(axis=-1)
     if mask is not None:
         require_mask(mask, where=f"--mask {options.mask}", like=goals[0])

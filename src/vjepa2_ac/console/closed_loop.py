@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rich.table import Table
 
-from vjepa2_ac.console.progress import FigureTable
+from vjepa2_ac.console.progress import MetricsTable
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
@@ -16,7 +16,7 @@ _USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that
 def contest_table(contest: ClosedLoopBenchmark) -> Table:
     """Return a row for each who did the task; the intervals are 95 %, over episodes."""
     asked, threshold = contest.asked, f"{100 * SUCCESS_M[contest.asked.task]:g} cm"
-    table = FigureTable(
+    table = MetricsTable(
         f"{asked.task} in domain {asked.domain}: {asked.episodes} problems of seed {asked.seed},"
         f" {contest.results[0].steps} steps of {contest.seconds_per_step:.2f} s (95 % interval over episodes)",
     )

@@ -9,7 +9,7 @@ from typing import Literal
 
 from rich.table import Table
 
-from vjepa2_ac.console.progress import FigureTable, LateProgress
+from vjepa2_ac.console.progress import LateProgress, MetricsTable
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.action_score.metrics import AXES, PlanMetrics, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
@@ -63,7 +63,7 @@ def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 def comparison_table(comparison: Comparison) -> Table:
     """Return the table of `compare`, a row per run."""
-    table = FigureTable(comparison.title)
+    table = MetricsTable(comparison.title)
     table.add_column("run")
     for column in comparison.columns:
         table.add_column(column, justify="right")
@@ -153,10 +153,10 @@ def _plans(evaluation: Evaluation, study: PlanningStudy) -> Table:
     ways = {**found, **ways_of(evaluation)}
     for name in ways:
         table.add_column(name, justify="right")
-    figures = [metrics_of(study, plans) for plans in ways.values()]
+    metrics = [metrics_of(study, plans) for plans in ways.values()]
 
     def row(label: str, of: Callable[[PlanMetrics], Estimate], digits: int = 1) -> None:
-        cells = [_short(of(one), digits, interval=name not in found) for name, one in zip(ways, figures, strict=True)]
+        cells = [_short(of(one), digits, interval=name not in found) for name, one in zip(ways, metrics, strict=True)]
         table.add_row(label, *cells)
 
     row(f"Action Score (best {BEST_SCORE:.0f})", lambda one: one.score)
@@ -177,8 +177,8 @@ def _plans(evaluation: Evaluation, study: PlanningStudy) -> Table:
     return table
 
 
-def _on(name: Literal["axes_cm", "signs"], axis: int, figures: PlanMetrics) -> Estimate:
-    estimates = {"axes_cm": figures.axes_cm, "signs": figures.signs}
+def _on(name: Literal["axes_cm", "signs"], axis: int, metrics: PlanMetrics) -> Estimate:
+    estimates = {"axes_cm": metrics.axes_cm, "signs": metrics.signs}
     return estimates[name][axis]
 
 
@@ -192,7 +192,7 @@ def _clips(number: int) -> str:
 
 
 def _table(title: str, first: str) -> Table:
-    table = FigureTable(title)
+    table = MetricsTable(title)
     table.add_column(first)
     return table
 

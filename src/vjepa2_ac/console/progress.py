@@ -36,7 +36,7 @@ class PlainConsole(Console):
         return super().render_str(printable(text), **options)
 
 
-class FigureTable(Table):
+class MetricsTable(Table):
     """A table whose figures and words stay whole: where the terminal is narrow, cells go on below at their spaces.
 
     A cell may not squeeze the others, however long it is.
@@ -193,7 +193,7 @@ class ConsoleReporter:
         self._validation = ""
 
     def note(self, text: str) -> None:
-        """Say something once."""
+        """Show a message."""
         console.print(text)
 
     def indexed(self, done: int, total: int) -> None:
@@ -208,15 +208,15 @@ class ConsoleReporter:
         """Begin the bar."""
         self._bar = ProgressBar("training", total, done)
 
-    def stepped(self, step: int, figures: Mapping[str, float]) -> None:
+    def stepped(self, step: int, metrics: Mapping[str, float]) -> None:
         """Move the bar."""
         if self._bar is not None:
-            speed = figures["samples_per_second"]
-            words = [f"loss {figures['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
-            if "bytes_per_clip" in figures:
-                words.append(f"{figures['bytes_per_clip'] / 1e6:.2f} MB/clip")
-            if figures.get("data_wait_share", 0.0) > _MUCH_WAITING:
-                words.append(f"waits for data {figures['data_wait_share']:.0%} of the time")
+            speed = metrics["samples_per_second"]
+            words = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
+            if "bytes_per_clip" in metrics:
+                words.append(f"{metrics['bytes_per_clip'] / 1e6:.2f} MB/clip")
+            if metrics.get("data_wait_share", 0.0) > _MUCH_WAITING:
+                words.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
             self._bar.advance_to(step, "  ".join(word for word in words if word))
 
     def validated(self, step: int, errors: PredictionErrors) -> None:

@@ -29,7 +29,7 @@ class Encoded:
     wanted: FramesToEncode
     recording: Episode
     latents: StoredLatents  # of all its frames, on the CPU
-    pictures: UInt8[np.ndarray, "frames side side 3"]
+    small_frames: UInt8[np.ndarray, "frames side side 3"]
 
 
 class Chunks:
@@ -52,7 +52,7 @@ class Chunks:
         self._owners: list[FramesToEncode] = []  # of each of these frames
         self._under_way: deque[tuple[Callable[[], StoredLatents], list[FramesToEncode]]] = deque()
         self._done: dict[FramesToEncode, list[StoredLatents]] = {}
-        self._pictures: dict[FramesToEncode, list[np.ndarray]] = {}
+        self._small_frames: dict[FramesToEncode, list[np.ndarray]] = {}
         self._ends: deque[tuple[FramesToEncode, Episode]] = deque()  # all of whose frames are here, in order
         self.frames = 0  # encoded so far
 
@@ -61,7 +61,7 @@ class Chunks:
         for part in parts:
             if isinstance(part, Unreadable):
                 self._done.pop(part.wanted, None)
-                self._pictures.pop(part.wanted, None)
+                self._small_frames.pop(part.wanted, None)
                 yield part
                 continue
             self._add(part)
@@ -78,7 +78,7 @@ class Chunks:
         self._inputs.append(pixels_to_input(arrived[None], self._image_size)[0])
         self._owners += [part.wanted] * len(frames)
         self._done.setdefault(part.wanted, [])
-        self._pictures.setdefault(part.wanted, []).append(part.pictures)
+        self._small_frames.setdefault(part.wanted, []).append(part.small_frames)
         if part.is_last:
             self._ends.append((part.wanted, part.recording))
 
@@ -100,8 +100,8 @@ class Chunks:
             self._hand_out(fetched().mapped(_unpinned), owners)
         while self._ends and self._is_whole(self._ends[0][0]):
             wanted, recording = self._ends.popleft()
-            pictures = np.concatenate(self._pictures.pop(wanted))
-            yield Encoded(wanted, recording, _joined(self._done.pop(wanted)), pictures)
+            small_frames = np.concatenate(self._small_frames.pop(wanted))
+            yield Encoded(wanted, recording, _joined(self._done.pop(wanted)), small_frames)
 
     def _hand_out(self, latents: StoredLatents, owners: list[FramesToEncode]) -> None:
         """Give each its own frames of a chunk."""

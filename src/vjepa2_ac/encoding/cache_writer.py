@@ -45,24 +45,24 @@ class CacheWriter:
         *,
         steps: Sequence[int],
         latents: StoredLatents,
-        pictures: UInt8[np.ndarray, "frames height width 3"],
+        small_frames: UInt8[np.ndarray, "frames height width 3"],
     ) -> int:
         """Write an episode of one camera and return the size of its file.
 
         Args:
             number: Place of the episode in the data set.
             camera: One of `data.camera`.
-            episode: What the source gave for this camera; no picture of it is read.
+            episode: What the source gave for this camera; no frame of it is read.
             steps: Control steps of the frames, as `latent_cache.needed_frames` names them.
             latents: Of these frames, in the type that the key names (`precision.stored` makes them so).
-            pictures: Of these frames, square as the encoder sees them and small; for people to look at.
+            small_frames: Of these frames, square as the encoder sees them and small; for people to look at.
 
         Raises:
             InputError: The folder cannot be written, or the disk is full.
         """
         layout = EpisodeLayout(self.key.digest, self.key.kind, self.encoding.tokens, self.encoding.dim)
         path = path_of(self.folder, number, camera)
-        return write_episode_file(path, layout, episode, camera, steps=steps, latents=latents, pictures=pictures)
+        return write_episode_file(path, layout, episode, camera, steps=steps, latents=latents, pictures=small_frames)
 
     def finish(
         self, dataset: Dataset, *, broken: Mapping[str, str], frames: int, about: Mapping[str, Any] | None = None

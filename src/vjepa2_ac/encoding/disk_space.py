@@ -10,7 +10,7 @@ from vjepa2_ac.errors import InputError
 
 GIGABYTE = 10**9
 FRAMES_AT_ONCE = 64  # that are decoded in one go: a run of a video, and 180 MB of 720p at most
-PICTURE_SIDE = 192  # pixels, at most, of the small pictures for people to look at
+SMALL_FRAME_SIDE = 192  # pixels, at most, of the small frames for people to look at
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class CacheSize:
 
     frames: int  # of the whole cache
     frames_left: int
-    bytes_per_frame: int  # with its small picture
+    bytes_per_frame: int  # with its small frame
     hours: float  # of robot data that clips come from
 
     @property
@@ -44,14 +44,14 @@ class CacheSize:
         )
 
 
-def picture_side(image_size: int) -> int:
-    """Return height and width of the small pictures of a model's frames."""
-    return min(PICTURE_SIDE, image_size)
+def small_frame_side(image_size: int) -> int:
+    """Return height and width of the small frames of a model's frames."""
+    return min(SMALL_FRAME_SIDE, image_size)
 
 
-def picture_bytes(image_size: int) -> int:
-    """Return what a small picture takes as JPEG, about, with a share of the states."""
-    return 1000 + picture_side(image_size) ** 2 // 3
+def small_frame_bytes(image_size: int) -> int:
+    """Return what a small frame takes as JPEG, about, with a share of the states."""
+    return 1000 + small_frame_side(image_size) ** 2 // 3
 
 
 def free_bytes(folder: Path) -> int:

@@ -54,10 +54,10 @@ def encode_config(
 
     Args:
         config: The data, the model whose encoder is used, device and precision.
-        note: Told what a person should know.
+        note: Receives messages for the user.
         out: The folder of the cache; None: where `data.cache` looks for it.
-        indexed: Told how far the data set is looked through.
-        progress: Told (done, total) in frames.
+        indexed: Called with the progress of indexing.
+        progress: Called with (done, total) in frames.
 
     Raises:
         InputError: Something cannot be used, or there is no room for it.
@@ -88,7 +88,7 @@ def require_encodable(config: Config) -> None:
     data = config.data
     if data.source == "latents":
         raise InputError(
-            where="data.source", found="latents: they are encoded already", needed="a data set of pictures"
+            where="data.source", found="latents: they are encoded already", needed="a data set of frames"
         )
     if data.stride == "auto":
         raise InputError(

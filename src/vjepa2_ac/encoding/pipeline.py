@@ -21,7 +21,7 @@ from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.data.sources.latents.dtypes import pack_latents
 from vjepa2_ac.data.sources.latents.manifest import Manifest
 from vjepa2_ac.encoding.batching import Chunks, Encode, Encoded
-from vjepa2_ac.encoding.disk_space import picture_side
+from vjepa2_ac.encoding.disk_space import small_frame_side
 from vjepa2_ac.encoding.prefetch import Unreadable, prefetched
 from vjepa2_ac.encoding.workload import Workload, broken_in, forget_broken, note_broken
 from vjepa2_ac.episode import Progress, StoredLatents
@@ -54,8 +54,8 @@ def build(work: Workload, encoder: EncoderAtWork, *, threads: int, progress: Pro
     Args:
         work: What is to be done.
         encoder: What encodes.
-        threads: That decode pictures ahead of it.
-        progress: Told (done, total) in frames of this process.
+        threads: That decode frames ahead of it.
+        progress: Called with (done, total) in frames of this process.
 
     Returns:
         What the cache says of itself; None while other processes are at work.
@@ -81,7 +81,7 @@ def build(work: Workload, encoder: EncoderAtWork, *, threads: int, progress: Pro
 def _written(work: Workload, encoder: EncoderAtWork, threads: int) -> Iterator[int]:
     """Write episode after episode; yield how many frames are done, at first 0; those of unreadable ones count."""
     yield 0
-    side = picture_side(encoder.world_model.image_size)
+    side = small_frame_side(encoder.world_model.image_size)
     chunks = Chunks(
         _storing(work, encoder),
         chunk=encoder.chunk,
@@ -124,7 +124,7 @@ def _write(work: Workload, one: Encoded) -> int:
     wanted = one.wanted
     return work.writer.write_episode(
         wanted.episode, wanted.camera, one.recording,
-        steps=wanted.steps.tolist(), latents=one.latents, pictures=one.pictures,
+        steps=wanted.steps.tolist(), latents=one.latents, small_frames=one.small_frames,
     )  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.remote import UnreachableError
 
-_PARTS_AHEAD = 2  # for each thread: one that is made, and one that is ready
+_PREFETCHED_PARTS = 2  # for each thread: one that is made, and one that is ready
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +39,7 @@ class Part:
     wanted: FramesToEncode
     recording: Episode
     frames: UInt8[np.ndarray, "frames height width 3"]
-    pictures: UInt8[np.ndarray, "frames side side 3"]  # the same, small, for people to look at
+    small_frames: UInt8[np.ndarray, "frames side side 3"]  # the same, small, for people to look at
     is_last: bool
 
 
@@ -60,7 +60,7 @@ def prefetched(
         dataset: Where they come from.
         wanted: Which ones.
         threads: How many decode at once.
-        side: Height and width of the small pictures, in pixels.
+        side: Height and width of the small frames, in pixels.
 
     Raises:
         UnreachableError: It is not the episode's fault.
@@ -71,7 +71,7 @@ def prefetched(
     failed: FramesToEncode | None = None
     try:
         while True:
-            while len(waiting) < threads * _PARTS_AHEAD and (task := next(tasks, None)) is not None:
+            while len(waiting) < threads * _PREFETCHED_PARTS and (task := next(tasks, None)) is not None:
                 waiting.append(pool.submit(task))
             if not waiting:
                 return
@@ -140,7 +140,7 @@ class _Recording:
 
 
 def _small(frames: UInt8[np.ndarray, "frames height width 3"], side: int) -> UInt8[np.ndarray, "frames side side 3"]:
-    """Return pictures squashed to a square, as the encoder sees them."""
+    """Return frames squashed to a square, as the encoder sees them."""
     pixels = torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2)
     small = torch.nn.functional.interpolate(
         pixels, size=(side, side), mode="bilinear", align_corners=False, antialias=True

@@ -40,9 +40,9 @@ def with_latents(
         dataset: As it was opened, at its stride.
         model: Whose encoder is asked.
         accelerator: Its processes share the encoding.
-        note: Told what a person should know.
-        encoding: Told (done, total) in frames of this process.
-        check_only: Encode nothing: say what would be, and leave the clips as pictures.
+        note: Receives messages for the user.
+        encoding: Called with (done, total) in frames of this process.
+        check_only: Encode nothing: say what would be, and leave the clips as frames.
 
     Raises:
         InputError: The cache is another encoder's, is required and not there, or cannot be made.

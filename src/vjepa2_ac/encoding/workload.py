@@ -16,7 +16,7 @@ from vjepa2_ac.data.sources.latents.dtypes import bytes_per_frame
 from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest
 from vjepa2_ac.encoding.cache_lookup import needed_frames
 from vjepa2_ac.encoding.cache_writer import CacheWriter
-from vjepa2_ac.encoding.disk_space import CacheSize, picture_bytes
+from vjepa2_ac.encoding.disk_space import CacheSize, small_frame_bytes
 from vjepa2_ac.encoding.prefetch import FramesToEncode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import read_json_object, record_of
@@ -67,7 +67,7 @@ class Workload:
         writer, table = self.writer, self.dataset.table
         steps = int(table.num_steps[np.unique(self.dataset.starts.episode)].sum())
         per_frame = bytes_per_frame(writer.encoding.tokens, writer.encoding.dim, writer.key.kind)
-        per_frame += picture_bytes(writer.encoding.image_size)
+        per_frame += small_frame_bytes(writer.encoding.image_size)
         return CacheSize(self.frames, self.left_of_all, per_frame, steps / self.dataset.control_rate_hz / 3600)
 
     @property

@@ -37,7 +37,7 @@ from vjepa2_ac.evaluation.result import (
 from vjepa2_ac.evaluation.strata import clips_of, strata_of
 
 ClipName = tuple[str, int]  # id of the episode, first control step
-Pictures = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the batch at hand
+FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the batch at hand
 _NOT_ASKED = "{} is 0: no {} were asked for."
 _NO_PLANS = "No plans: they are poses' displacements, and the states here are plain numbers."
 _NO_LANDSCAPES = "No energy landscapes: an action has {} numbers, and a landscape is over three."
@@ -71,10 +71,10 @@ class ProbeOptions:
 
 @dataclass(frozen=True)
 class RepeatableClips:
-    """Clips that can be read more than once: all of them, or some by name; batches of latents with their pictures."""
+    """Clips that can be read more than once: all of them, or some by name; batches of latents with their frames."""
 
     count: int
-    read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, Pictures]]]
+    read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]
 
 
 def evaluate(
@@ -290,13 +290,13 @@ def _examples(
     names = [(known.episode_ids[clip], known.starts[clip]) for clip in chosen]
     reasons = dict(zip(names, chosen.values(), strict=True))
     found = {}
-    for batch, pictures in clips.read(names):
+    for batch, frames_of_row in clips.read(names):
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             predicted = {}
             for contender in contenders:
                 with contender.switched():
                     predicted[contender.name] = predicted_rollout(contender.model, batch, row)
-            found[name] = make_example(reasons[name], batch, row, predicted, pictures(row))
+            found[name] = make_example(reasons[name], batch, row, predicted, frames_of_row(row))
     return tuple(found[name] for name in names if name in found)
 
 

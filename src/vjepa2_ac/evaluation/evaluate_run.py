@@ -28,7 +28,7 @@ from vjepa2_ac.encoding.training_cache import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_score.protocol import FRAMES
-from vjepa2_ac.evaluation.evaluate import ClipName, Contender, Pictures, ProbeOptions, RepeatableClips, evaluate
+from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, ProbeOptions, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.examples import seen_by_the_encoder
 from vjepa2_ac.evaluation.result import About, Evaluation, Role, TrainingCurve
 from vjepa2_ac.evaluation.stride_calibration.measure import calibrate_model
@@ -68,7 +68,7 @@ class Measured:
     """What was measured."""
 
     evaluation: Evaluation
-    checkpoint: str  # which one, in words; "" of a model
+    checkpoint: str  # which one, as text; "" of a model
     folder: Path  # for what is written of it
 
 
@@ -309,16 +309,16 @@ def _clips(
     """Return the clips at these windows, to be read as often as it takes."""
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
 
-    def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, Pictures]]:
+    def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
         wanted = windows if names is None else [by_name[name] for name in names]
         for batch in batches(dataset, wanted):
-            yield encode(batch), partial(_pictures, dataset, batch, image_size)
+            yield encode(batch), partial(_frames_of_row, dataset, batch, image_size)
 
     return RepeatableClips(len(windows), read)
 
 
-def _pictures(dataset: Dataset, batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"]:
-    """Return what the encoder sees of a clip; of cached latents, small pictures made large."""
+def _frames_of_row(dataset: Dataset, batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"]:
+    """Return what the encoder sees of a clip; of cached latents, small frames made large."""
     return seen_by_the_encoder(torch.from_numpy(pictures_of(dataset, batch, row)), size)
 
 

@@ -57,14 +57,14 @@ def make_example(
     predicted: Mapping[str, Float[Tensor, "horizon tokens dim"]],
     frames: UInt8[np.ndarray, "time height width 3"] | None,
 ) -> Example:
-    """Return one clip in pictures.
+    """Return one clip in frames.
 
     Args:
         why: It was chosen.
         batch: Where it is.
         row: Its place there.
         predicted: What each model makes of it.
-        frames: Its pictures, if there are any.
+        frames: Its frames, if there are any.
     """
     true = batch.latents[row].float().cpu()
     grid = math.isqrt(true.shape[1])
@@ -89,7 +89,7 @@ def make_example(
 def seen_by_the_encoder(
     frames: UInt8[Tensor, "time height width 3"], size: int
 ) -> UInt8[np.ndarray, "time size size 3"]:
-    """Return frames as the encoder sees them, as pictures."""
+    """Return frames as the encoder sees them, as frames."""
     inputs = pixels_to_input(frames[None], size)[0]
     low, high = inputs.amin(), inputs.amax()
     shown = (inputs - low) / (high - low).clamp(min=1e-6) * 255

@@ -41,8 +41,8 @@ class Estimate:
 
     def as_dict(self) -> dict[str, float | None]:
         """Return plain values, for JSON; None where there is no value or no interval."""
-        figures = {"value": self.value, "low": self.low, "high": self.high}
-        return {name: number if math.isfinite(number) else None for name, number in figures.items()}
+        metrics = {"value": self.value, "low": self.low, "high": self.high}
+        return {name: number if math.isfinite(number) else None for name, number in metrics.items()}
 
     def __str__(self) -> str:
         return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]" if self.has_interval else f"{self.value:.3f}"

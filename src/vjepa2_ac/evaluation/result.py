@@ -33,7 +33,7 @@ class About:
     """What was measured, and on what."""
 
     subject: str  # the run or model, as it was named
-    checkpoint: str  # which one, in words; "" where the subject is a model
+    checkpoint: str  # which one, as text; "" where the subject is a model
     checkpoint_path: str  # likewise
     source: str  # data.source
     data: str  # data.path
@@ -215,12 +215,12 @@ class Stratum:
 
 @dataclass(frozen=True)
 class Example:
-    """One clip in pictures, and how each model predicts it in a rollout from its first frame."""
+    """One clip in frames, and how each model predicts it in a rollout from its first frame."""
 
     why: str  # it was chosen: best, worst, median, most motion
     episode_id: str
     start: int
-    frames: UInt8[np.ndarray, "time height width 3"] | None  # as the encoder sees them; None: no pictures (a cache)
+    frames: UInt8[np.ndarray, "time height width 3"] | None  # as the encoder sees them; None: no frames (a cache)
     errors: Mapping[str, Float[np.ndarray, "horizon grid grid"]]  # model or persistence -> L1 error of each patch
     true_colours: UInt8[np.ndarray, "time grid grid 3"]  # three principal components of the true latents, as RGB
     predicted_colours: Mapping[str, UInt8[np.ndarray, "horizon grid grid 3"]]  # model -> in the same basis and scale

@@ -44,7 +44,7 @@ class Exported:
     """What was written."""
 
     path: Path  # the file or folder
-    checkpoint: str  # which one it was made of, in words
+    checkpoint: str  # the one it was made from, as text
 
 
 def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoint: str = NEWEST) -> Exported:
@@ -172,10 +172,10 @@ def _read_evaluation(folder: Path) -> dict[str, Any] | None:
     """Return what `evaluate` wrote of a run, without paths of this machine; None where it was never run."""
     if not (folder / METRICS_FILE).exists():
         return None
-    figures = read_metrics(folder)
+    metrics = read_metrics(folder)
     try:
-        about = {**figures["about"], "subject": folder.resolve().name}
-        return {**figures, "about": {**about, "checkpoint_path": Path(about["checkpoint_path"]).name}}
+        about = {**metrics["about"], "subject": folder.resolve().name}
+        return {**metrics, "about": {**about, "checkpoint_path": Path(about["checkpoint_path"]).name}}
     except (TypeError, KeyError) as error:
         raise _damaged(folder, f"figures that cannot be used ({error!r})") from None
 

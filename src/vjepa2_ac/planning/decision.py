@@ -22,7 +22,7 @@ class PlanRequest:
     state: Float[np.ndarray, " numbers"]  # measured; a pose is refused or taken by the controller
     goals: tuple[np.ndarray, ...]
     durations: tuple[int, ...] = ()  # model steps of each goal but the last
-    mask: np.ndarray | None = None  # what of the picture counts: height x width
+    mask: np.ndarray | None = None  # what of the image counts: height x width
 
     def with_equal_durations(self, horizon: int) -> PlanRequest:
         """Return the same, every goal counting for an equal share of so many model steps, the last for the rest."""
@@ -73,7 +73,7 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0) -> 
         nodes: Of an energy slice along each axis; below 3: no slices.
 
     Raises:
-        InputError: A picture, the state or the mask cannot be used.
+        InputError: An image, the state or the mask cannot be used.
         ValueError: There is not one duration for each goal but the last.
     """
     began = time.perf_counter()

@@ -56,7 +56,7 @@ def patch_weights(
     """Return how much each patch counts: the mean of a mask over what it covers, patches row by row.
 
     Args:
-        mask: Over the picture as the model sees it (cropped), of any resolution; 1 counts, 0 does not.
+        mask: Over the image as the model sees it (cropped), of any resolution; 1 counts, 0 does not.
         grid: Patches along one side.
 
     Raises:

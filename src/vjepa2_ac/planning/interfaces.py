@@ -36,7 +36,7 @@ class PlanStart:
 
 @dataclass(frozen=True)
 class Iteration:
-    """One round of trying and learning, for a picture of it later."""
+    """One round of trying and learning, for an image of it later."""
 
     samples: int
     finite: int  # of these, how many have an energy

@@ -24,11 +24,11 @@ _NUMBERS = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null),?\s+)+)\]")  # a list of
 
 
 def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
-    """Write a decision as JSON; the file appears whole or not at all.
+    """Write a decision as JSON; the file is written atomically.
 
     Args:
         answer: The decision.
-        about: What answered, and where the pictures came from: plain values.
+        about: What answered, and where the images came from: plain values.
         path: The file.
     """
     text = json.dumps(plan_as_dict(answer, about), indent=1, allow_nan=False)

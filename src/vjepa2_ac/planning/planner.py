@@ -43,7 +43,7 @@ class Planner:
             config: Which one, and how long it searches.
             space: What is allowed; None: an arm's actions within `planning.limits`.
             clock: What the time budget is measured by.
-            progress: Is told how many iterations of a plan are done.
+            progress: Called with the number of finished iterations of a plan.
         """
         self.config = config
         self.space = pose_space(config) if space is None else space
@@ -71,7 +71,7 @@ class Planner:
             if self._progress is not None:
                 self._progress(len(record), self.config.iterations)
         stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"
-        actions, energy, tried = self._chosen(search.result(), best, cost, lowest=stopped == "out of time")
+        actions, energy, evaluated = self._chosen(search.result(), best, cost, lowest=stopped == "out of time")
         if actions is None:
             actions, stopped = torch.zeros(self.space.steps, self.space.dim), "no finite energy"
         return Plan(
@@ -83,7 +83,7 @@ class Planner:
             repeat=self.space.repeat,
             planner=self.config.planner,
             seed=generator.initial_seed(),
-            evaluations=sum(one.samples for one in record) + tried,
+            evaluations=sum(one.samples for one in record) + evaluated,
             seconds=self._clock() - began,
         )
 
@@ -106,15 +106,15 @@ class Planner:
     def _iterate(self, search: Solver, cost: Cost, best: _Best) -> Iteration:
         began = self._clock()
         decisions = search.sample()
-        tried = self._try(cost, decisions, gradients=search.uses_gradients)
-        elites = tried.best(search.elites)
+        evaluated = self._try(cost, decisions, gradients=search.uses_gradients)
+        elites = evaluated.best(search.elites)
         if len(elites.energies) and float(elites.energies[0]) < best.energy:
             best.decisions, best.energy = elites.decisions[0], float(elites.energies[0])
-        search.update(tried)
+        search.update(evaluated)
         found = bool(len(elites.energies))
         return Iteration(
             samples=len(decisions),
-            finite=len(tried.energies),
+            finite=len(evaluated.energies),
             lowest=float(elites.energies[0]) if found else math.inf,
             elite_energy=float(elites.energies.mean()) if found else math.inf,
             elites=elites.decisions,
@@ -145,17 +145,17 @@ class Planner:
 
         With `lowest`, whichever of the two costs less: a mean that has hardly been moved may lead nowhere.
         """
-        chosen, lowest_energy, tried = None, math.nan, 0
+        chosen, lowest_energy, evaluated = None, math.nan, 0
         for decisions in (answer, best.decisions):
             if decisions is None or (chosen is not None and not lowest):
                 continue
             done, energies = self.space.finished(decisions), [best.energy]
             if decisions is not best.decisions or not torch.equal(done, decisions):
                 energies = self._try(cost, done[None], gradients=False).energies.tolist()
-                tried += 1
+                evaluated += 1
             if energies and not energies[0] >= lowest_energy:
                 chosen, lowest_energy = self.space.over_steps(done), energies[0]
-        return chosen, lowest_energy, tried
+        return chosen, lowest_energy, evaluated
 
 
 @dataclass

@@ -30,7 +30,7 @@ from vjepa2_ac.runs.folder import CONFIG
 from vjepa2_ac.runs.loading import is_run, load_run
 
 # Settings that planning heeds; the others are of training, and changing them here would do nothing.
-_HEEDED = ("planning.", "seed", "data.crop", "data.stride", "model.dtype", "model.sizes.", "training.device")
+_USED_KNOBS = ("planning.", "seed", "data.crop", "data.stride", "model.dtype", "model.sizes.", "training.device")
 _ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
 
 
@@ -57,7 +57,7 @@ class PlanningSession:
     world_model: WorldModel
     config: Config  # of it: planning, seed, data.crop and data.stride count
     subject: str  # what was named
-    checkpoint: str  # which one, in words; "" of a model
+    checkpoint: str  # which one, as text; "" of a model
     fingerprints: Fingerprints | None = None  # of a run's weights before they were merged; None: of the world model
 
     def controller(
@@ -72,7 +72,7 @@ class PlanningSession:
         Args:
             seed: Of all decisions; None: the config's.
             extrinsics: Pose of the camera, where the model uses it.
-            progress: Is told how many iterations of a decision are done.
+            progress: Called with the number of finished iterations of a decision.
 
         Raises:
             InputError: The model's states are no poses, or it needs a camera pose and there is none.
@@ -124,7 +124,7 @@ def load_to_plan(
     Raises:
         InputError: There is no such thing, it cannot be planned with, or a setting is wrong or does not matter.
     """
-    _require_heeded(overrides)
+    _require_used(overrides)
     its = _run_config(subject, config, overrides) if is_run(subject) else _model_config(subject, config, overrides)
     if its.data.states == "vector":
         raise InputError(
@@ -179,13 +179,13 @@ def _model_config(subject: str, config: str | Path | None, overrides: Sequence[s
     return its.model_copy(update={"model": its.model.model_copy(update={"base": subject, "random": None})})
 
 
-def _require_heeded(overrides: Sequence[str]) -> None:
+def _require_used(overrides: Sequence[str]) -> None:
     for override in overrides:
         key = override.partition("=")[0]
-        is_heeded = any(key == known or (known.endswith(".") and key.startswith(known)) for known in _HEEDED)
+        is_heeded = any(key == known or (known.endswith(".") and key.startswith(known)) for known in _USED_KNOBS)
         if key.split(".")[0] in Config.model_fields and not is_heeded:  # of others the config says what is wrong
             raise InputError(
                 where=f"command line: {override}",
                 found="a setting that planning does not heed",
-                needed=f"one of {', '.join(known + '…' * known.endswith('.') for known in _HEEDED)}",
+                needed=f"one of {', '.join(known + '…' * known.endswith('.') for known in _USED_KNOBS)}",
             )

@@ -15,7 +15,7 @@ def summarize(answer: PlanResult) -> str:
     """Return what was decided, in a sentence or more."""
     plan, why = answer.decision.plan, answer.decision.why
     if why == "at the goal" or plan is None:
-        return "Does nothing: what the model sees now is what it sees in the goal's picture."
+        return "Does nothing: what the model sees now is what it sees in the goal image."
     if why == "no finite energy":
         return (
             "Does nothing: the model gives no finite energy for any of"

@@ -55,7 +55,7 @@ _NUMBERS = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null|true|false),?\s+)+)\]")  
 
 
 def write_metrics(evaluation: Evaluation, path: Path) -> Path:
-    """Write every figure of an evaluation; the file appears whole or not at all."""
+    """Write every figure of an evaluation; the file is written atomically."""
     text = json.dumps(metrics_as_dict(evaluation), indent=1, allow_nan=False)
     write_atomically(path, _NUMBERS.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n")
     return path
@@ -70,18 +70,18 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     path = folder / METRICS_FILE
     fix = f"Write it with `vjepa2-ac evaluate {folder}`"
     try:
-        figures = read_json_object(path, most_bytes=_MOST_BYTES, fix=fix)
+        metrics = read_json_object(path, most_bytes=_MOST_BYTES, fix=fix)
     except FileNotFoundError:
         raise InputError(
             where=str(folder), found=f"no {METRICS_FILE}" if folder.is_dir() else "no such folder", fix=fix
         ) from None
     except OSError as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", fix=fix) from None
-    if figures.get("format") != FORMAT:
+    if metrics.get("format") != FORMAT:
         raise InputError(
-            where=str(path), found=f"format {shown(figures.get('format'))}", needed=f"format {FORMAT}", fix=fix
+            where=str(path), found=f"format {shown(metrics.get('format'))}", needed=f"format {FORMAT}", fix=fix
         )
-    return figures
+    return metrics
 
 
 def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
@@ -137,16 +137,16 @@ def _model(evaluation: Evaluation, model: ModelResult) -> dict[str, Any]:
 
 
 def _errors(evaluation: Evaluation, name: str, mode: Mode, metric: Metric) -> dict[str, Any]:
-    figures = {
+    metrics = {
         "error": _curve(mean_error(evaluation, name, mode, metric)),
         "over_persistence": _curve(over_persistence(evaluation, name, mode, metric)),
         "over_persistence_zero_actions": _curve(over_persistence(evaluation, name, mode, metric, "zero")),
         "over_persistence_shuffled_actions": _curve(over_persistence(evaluation, name, mode, metric, "shuffled")),
     }
     if evaluation.base is not None and name != evaluation.base:
-        figures["gain_over_base"] = _curve(gain_over(evaluation, name, evaluation.base, mode, metric))
-        figures["difference_to_base"] = _curve(difference_to(evaluation, name, evaluation.base, mode, metric))
-    return figures
+        metrics["gain_over_base"] = _curve(gain_over(evaluation, name, evaluation.base, mode, metric))
+        metrics["difference_to_base"] = _curve(difference_to(evaluation, name, evaluation.base, mode, metric))
+    return metrics
 
 
 def _stratum(evaluation: Evaluation, stratum: Stratum) -> dict[str, Any]:

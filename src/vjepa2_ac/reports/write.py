@@ -22,7 +22,7 @@ class Evaluated:
     """What was measured."""
 
     evaluation: Evaluation
-    checkpoint: str  # which one, in words; "" of a model
+    checkpoint: str  # which one, as text; "" of a model
     files: tuple[Path, ...]  # that were written
 
 

@@ -116,16 +116,16 @@ def _train(
         open_run_folder(config, run.state.run_id, allow_config_change=allow_config_change)
     if run.calibration is not None and writes:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
-    with _open_journal(run, folder, reporter) as journal:
+    with _open_metrics_log(run, folder, reporter) as metrics_log:
         if first is not None:
-            journal.write("validation", 0, validation_metrics(first))
+            metrics_log.write("validation", 0, validation_metrics(first))
         with remote.mirror(run.state.run_id) if remote else NoMirror() as mirror:
-            _loop(run, folder, journal, mirror, reporter)
+            _loop(run, folder, metrics_log, mirror, reporter)
     run.accelerator.end_training()
     return folder
 
 
-def _open_journal(run: Run, folder: Path, reporter: Reporter) -> MetricsLog | NullMetricsLog:
+def _open_metrics_log(run: Run, folder: Path, reporter: Reporter) -> MetricsLog | NullMetricsLog:
     if not run.accelerator.is_main_process:
         return NullMetricsLog()
     done = run.state.step
@@ -134,7 +134,7 @@ def _open_journal(run: Run, folder: Path, reporter: Reporter) -> MetricsLog | Nu
 
 
 def _loop(
-    run: Run, folder: Path, journal: MetricsLog | NullMetricsLog, mirror: Mirror | NoMirror, reporter: Reporter
+    run: Run, folder: Path, metrics_log: MetricsLog | NullMetricsLog, mirror: Mirror | NoMirror, reporter: Reporter
 ) -> None:
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
@@ -147,17 +147,17 @@ def _loop(
         for step in range(run.state.step + 1, training.steps + 1):
             last = step == training.steps
             is_logged = step % training.log_every == 0 or last
-            figures = _timed_step(run, timed, step, throughput, measure_update=is_logged)
-            reporter.stepped(step, figures)
+            metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
+            reporter.stepped(step, metrics)
             if is_logged:
-                journal.write("train", step, figures)
+                metrics_log.write("train", step, metrics)
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
-            is_best = validate_if_due(run, journal, reporter)
+            is_best = validate_if_due(run, metrics_log, reporter)
             # Agreed among all processes, and read once: a signal after this waits for the next step.
-            is_due = clock.is_due(step) or is_best or last or journal.is_behind
+            is_due = clock.is_due(step) or is_best or last or metrics_log.is_behind
             stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
-                with journal.before_a_checkpoint():
+                with metrics_log.before_a_checkpoint():
                     save_checkpoint(run, folder)
                 clock.restart()
             mirror.tick()
@@ -173,9 +173,9 @@ def _timed_step(
     run: Run, batches: TimedBatches, step: int, throughput: Throughput, *, measure_update: bool
 ) -> dict[str, float]:
     started, waited_s = time.perf_counter(), batches.waited_s
-    figures = training_step(run, batches, step, measure_update=measure_update)
-    clips = run.clips_per_step - figures.get("clips_left_out", 0.0)
-    return figures | throughput.figures(clips, time.perf_counter() - started, batches.waited_s - waited_s)
+    metrics = training_step(run, batches, step, measure_update=measure_update)
+    clips = run.clips_per_step - metrics.get("clips_left_out", 0.0)
+    return metrics | throughput.metrics(clips, time.perf_counter() - started, batches.waited_s - waited_s)
 
 
 @contextlib.contextmanager

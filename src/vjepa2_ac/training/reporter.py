@@ -14,7 +14,7 @@ class Reporter(Protocol):
     """Shows a run to a person."""
 
     def note(self, text: str) -> None:
-        """Say something once."""
+        """Show a message."""
         ...
 
     def indexed(self, done: int, total: int) -> None:
@@ -29,7 +29,7 @@ class Reporter(Protocol):
         """The loop begins after `done` of `total` optimizer steps."""
         ...
 
-    def stepped(self, step: int, figures: dict[str, float]) -> None:
+    def stepped(self, step: int, metrics: dict[str, float]) -> None:
         """An optimizer step is done."""
         ...
 
@@ -53,7 +53,7 @@ class NullReporter:
     def started(self, done: int, total: int) -> None:
         """Show nothing."""
 
-    def stepped(self, step: int, figures: dict[str, float]) -> None:
+    def stepped(self, step: int, metrics: dict[str, float]) -> None:
         """Show nothing."""
 
     def validated(self, step: int, errors: PredictionErrors) -> None:
@@ -63,7 +63,7 @@ class NullReporter:
 class NullMetricsLog:
     """Writes nothing."""
 
-    def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
+    def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Write nothing."""
 
     is_behind = False

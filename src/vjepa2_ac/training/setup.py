@@ -70,7 +70,7 @@ class Run:
 
     @property
     def encodes(self) -> bool:
-        """Whether clips are pictures that go through the encoder, not latents of a cache."""
+        """Whether clips are frames that go through the encoder, not latents of a cache."""
         return self.dataset.config.source != "latents"
 
     @cached_property
@@ -123,8 +123,8 @@ def set_up(
 
     Args:
         config: The run.
-        note: Told what a person should know.
-        indexed: Told how far the data set is looked through, where that was not done before.
+        note: Receives messages for the user.
+        indexed: Called with the progress of indexing, where that was not done before.
         accelerator: What `make_accelerator` gave for this config; None: it is made here.
         encoding: Told how many frames are encoded, where `data.cache` is auto and they are not there yet.
         check_only: Leave such a cache alone, and say how large it would be.

@@ -138,12 +138,12 @@ def _settle(run: Run, factor: float) -> float:
 
 def _about_the_data(run: Run, taken: Gradients) -> dict[str, float]:
     data = run.config.data
-    figures: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     if data.broken_episodes == "skip":
-        figures["clips_left_out"] = float(run.clips_per_step - taken.clips)
+        metrics["clips_left_out"] = float(run.clips_per_step - taken.clips)
     if is_url(data.path):
-        figures["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
-    return figures
+        metrics["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
+    return metrics
 
 
 def step_seed(seed: int, step: int, rank: int) -> int:

@@ -15,17 +15,17 @@ from vjepa2_ac.training.setup import Run, encode
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: the longest look ahead is what planning leans on
 
 
-def validate_if_due(run: Run, journal: MetricsLog | NullMetricsLog, reporter: Reporter) -> bool:
+def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter: Reporter) -> bool:
     """Measure and note, where it is time to; return whether no earlier measurement was as good."""
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
         return False
-    figures = validation_metrics(validate(run, reporter))
-    journal.write("validation", step, figures)
+    metrics = validation_metrics(validate(run, reporter))
+    metrics_log.write("validation", step, metrics)
     if not config.checkpoint.keep_best:
         return False
     before = run.state
-    run.state = before.measured(figures[BEST_BY])
+    run.state = before.measured(metrics[BEST_BY])
     return run.state != before
 
 

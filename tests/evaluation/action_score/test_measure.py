@@ -266,11 +266,11 @@ def test_of_vectors_no_plans_are_made_and_the_reason_is_said() -> None:
 @pytest.mark.usefixtures("quick")
 def test_without_planning_the_file_holds_nothing_new_but_nulls() -> None:
     quiet = ProbeOptions(sensitivity_clips=0, examples=0)
-    figures = metrics_as_dict(planned(Copier(), probes=quiet))
-    assert figures.pop("planning") is None
-    assert figures["models"]["adapter"].pop("planning") is None
-    assert "planning" not in str(figures)
+    metrics = metrics_as_dict(planned(Copier(), probes=quiet))
+    assert metrics.pop("planning") is None
+    assert metrics["models"]["adapter"].pop("planning") is None
+    assert "planning" not in str(metrics)
     with_plans = metrics_as_dict(planned(Copier(), probes=QUICK))
     assert with_plans["planning"]["three_steps_settings"] == SCORED.model_dump(mode="json")
-    del with_plans["planning"], with_plans["models"]["adapter"]["planning"], with_plans["verdict"], figures["verdict"]
-    assert with_plans == figures
+    del with_plans["planning"], with_plans["models"]["adapter"]["planning"], with_plans["verdict"], metrics["verdict"]
+    assert with_plans == metrics

@@ -49,7 +49,7 @@ def test_the_pictures_show_the_measured_state(recorded: Path) -> None:
     arm = SimulatedArm(DOMAIN_B)
     for step in (0, STEPS - 1):
         arm.set_state(np.asarray(episode.states[step], dtype=np.float64))
-        difference = np.abs(episode.read_frames([step])[0].astype(int) - arm.picture())
+        difference = np.abs(episode.read_frames([step])[0].astype(int) - arm.image())
         assert difference.mean() < 4.0  # JPEG, and the arm's spare degree of freedom
 
 

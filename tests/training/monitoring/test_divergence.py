@@ -32,7 +32,7 @@ def validation(one_step: float, rollout: float | None = None) -> dict[str, float
 def said(config: Config, *rows: tuple[int, dict[str, Any]]) -> dict[int, list[str]]:
     """Return what is said of validations, by step."""
     watch = Watch(config)
-    found = {step: watch("validation", step, figures) for step, figures in rows}
+    found = {step: watch("validation", step, metrics) for step, metrics in rows}
     return {step: texts for step, texts in found.items() if texts}
 
 
@@ -160,7 +160,7 @@ def test_rows_that_a_stranger_wrote_do_no_harm(config: Config, tmp_path: Path) -
     ]  # fmt: skip
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     notes: list[str] = []
-    with WatchedMetricsLog(tmp_path, config=config, note=notes.append, first_step=1) as journal:
-        journal.write("validation", 2, validation(1.2))
+    with WatchedMetricsLog(tmp_path, config=config, note=notes.append, first_step=1) as metrics_log:
+        metrics_log.write("validation", 2, validation(1.2))
     assert not notes
     assert not warnings_of(tmp_path / "metrics.jsonl")

@@ -121,7 +121,7 @@ def measure_plans(
         model: What predicts.
         starts: From where; one or more.
         config: How one step is planned; of three, only how many samples are computed at once.
-        progress: Told how many plans are done.
+        progress: Called with the number of finished plans.
     """
     began = time.perf_counter()
     one, scored = Planner(one_step_settings(config)), Planner(_as_protocol(config))

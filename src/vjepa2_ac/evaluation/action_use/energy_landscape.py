@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vjepa2_ac.episode import Progress
-from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, try_actions
+from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.intervals import Estimate, mean_of
 from vjepa2_ac.evaluation.metrics import Predictor
 from vjepa2_ac.evaluation.result import Landscape, Landscapes
@@ -41,7 +41,7 @@ def measure_landscapes(
         nodes: Along each axis.
         reach: The grid spans at least -reach .. reach (metres; of vectors: in its own numbers).
         at_once: Samples that are computed together.
-        progress: Told how many starts are done.
+        progress: Called with the number of finished starts.
 
     Raises:
         ValueError: No starts, fewer than three nodes, or actions of fewer than three numbers.
@@ -77,10 +77,10 @@ def _landscape(
     model: Predictor, start: RolloutStart, axes: np.ndarray, true: np.ndarray, unit: float, at_once: int
 ) -> Landscape:
     nodes = axes.shape[1]
-    tried = np.tile(start.action.cpu().numpy().astype(np.float64), (nodes**3, 1))
-    tried[:, :3] = _places(axes)
-    energy = try_actions(model, start, tried, at_once=at_once).energy.reshape(nodes, nodes, nodes)
-    minimum = tried[lowest(energy).ravel(), :3].mean(axis=0)
+    evaluated = np.tile(start.action.cpu().numpy().astype(np.float64), (nodes**3, 1))
+    evaluated[:, :3] = _places(axes)
+    energy = evaluate_actions(model, start, evaluated, at_once=at_once).energy.reshape(nodes, nodes, nodes)
+    minimum = evaluated[lowest(energy).ravel(), :3].mean(axis=0)
     return Landscape(
         episode_id=start.episode_id,
         start=start.first_step,

@@ -38,7 +38,7 @@ class RolloutStart:
 
 
 @dataclass(frozen=True)
-class TriedActions:
+class EvaluatedActions:
     """What came of each action that was tried from a start."""
 
     energy: Float[np.ndarray, " samples"]  # L1 distance of the prediction to the true next frame
@@ -66,9 +66,9 @@ def start_of(batch: LatentBatch, row: int, step: int, clip: int) -> RolloutStart
 
 
 @torch.no_grad()
-def try_actions(
+def evaluate_actions(
     model: Predictor, start: RolloutStart, actions: Float[np.ndarray, "samples action_dim"], *, at_once: int
-) -> TriedActions:
+) -> EvaluatedActions:
     """Predict one step from one frame under each action; the true state and camera throughout.
 
     Args:
@@ -83,7 +83,7 @@ def try_actions(
         predicted = _predict(model, start, part)
         energies.append((predicted - start.following.float()).abs().mean(dim=(1, 2)))
         changes.append((predicted - expected).abs().mean(dim=(1, 2)))
-    return TriedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
+    return EvaluatedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
 
 
 def _predict(

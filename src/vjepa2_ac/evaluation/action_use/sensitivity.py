@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.episode import Progress
-from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, try_actions
+from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.intervals import mean_of, ratio
 from vjepa2_ac.evaluation.metrics import Predictor
 from vjepa2_ac.evaluation.result import Ranking, Sensitivity
@@ -45,9 +45,9 @@ class ActionPool:
         drawn = generator.uniform(-1.0, 1.0, size=(samples, len(true)))
         if not self.is_pose:
             return np.asarray(drawn * half)
-        tried = np.tile(true, (samples, 1))
-        tried[:, :3] = drawn[:, :3] * self.reach
-        return tried
+        evaluated = np.tile(true, (samples, 1))
+        evaluated[:, :3] = drawn[:, :3] * self.reach
+        return evaluated
 
     def words(self, drawn_from: Literal["clips", "box"]) -> str:
         """Say where actions are drawn from."""
@@ -77,7 +77,7 @@ def measure_sensitivity(
         samples: Others per start, from each of the two places.
         seed: Decides which; a start gets the same ones whatever else is measured.
         at_once: Samples that are computed together.
-        progress: Told how many starts are done.
+        progress: Called with the number of finished starts.
     """
     changes, persistence = [], []
     ranks: dict[Literal["clips", "box"], list[tuple[float, float]]] = {"clips": [], "box": []}
@@ -85,11 +85,11 @@ def measure_sensitivity(
         generator = start.generator(seed)
         true = start.action.cpu().numpy().astype(np.float64)[None]
         drawn = [pool.of_others(start, samples, generator), pool.in_box(start, samples, generator)]
-        tried = try_actions(model, start, np.concatenate([true, *drawn]), at_once=at_once)
-        own, others, boxed = np.split(tried.energy, [1, 1 + samples])
+        evaluated = evaluate_actions(model, start, np.concatenate([true, *drawn]), at_once=at_once)
+        own, others, boxed = np.split(evaluated.energy, [1, 1 + samples])
         ranks["clips"].append(_place(own[0], others))
         ranks["box"].append(_place(own[0], boxed))
-        changes.append(float(tried.change[1 : 1 + samples].mean()))
+        changes.append(float(evaluated.change[1 : 1 + samples].mean()))
         persistence.append(start.persistence)
         if progress is not None:
             progress(done, len(starts))

@@ -27,7 +27,7 @@ def probe_config(
         dataset: The data.
         model: What `model.base` takes, or the folder of a run.
         clips: To measure, of the validation episodes; of training episodes where there are no others.
-        progress: Told how many clips are measured.
+        progress: Called with the number of measured clips.
 
     Raises:
         InputError: The data or the model cannot be used.

@@ -31,11 +31,11 @@ _GAIN = 0.01  # of persistence: what is less changes nothing
 
 
 @dataclass(frozen=True)
-class TriedVariant:
+class VariantResult:
     """How well a model predicts under a variant."""
 
     name: str
-    mend: str
+    repair: str
     ratio: Estimate  # one-step error over persistence
     difference: Estimate  # of this to that of the data as they are, on the same clips; below 0: fits better
 
@@ -45,17 +45,17 @@ class VariantProbe:
     """What was found of each variant."""
 
     ratio: Estimate  # one-step error over persistence, of the data as they are
-    tried: tuple[TriedVariant, ...]
+    results: tuple[VariantResult, ...]
     clips: int
     episodes: int
 
     @property
-    def better(self) -> TriedVariant | None:
+    def better(self) -> VariantResult | None:
         """The variant that fits best, where it surely fits better than the data as they are."""
-        surely = [one for one in self.tried if self._is_surely_better(one)]
+        surely = [one for one in self.results if self._is_surely_better(one)]
         return min(surely, key=lambda one: one.difference.value) if surely else None
 
-    def _is_surely_better(self, one: TriedVariant) -> bool:
+    def _is_surely_better(self, one: VariantResult) -> bool:
         difference = one.difference
         if not difference.has_interval or self.episodes < _EPISODES_TO_BE_SURE:
             return False
@@ -63,22 +63,22 @@ class VariantProbe:
         return difference.value < -_GAIN and limit < 0 and one.ratio.high < 1  # else it only fails less
 
     def verdict(self) -> str:
-        """Say in words whether the data fit the model best as they are."""
-        said = f"error / persistence {self.ratio} on {self.clips} clips of {self.episodes} episodes"
+        """State as text whether the data fit the model best as they are."""
+        text = f"error / persistence {self.ratio} on {self.clips} clips of {self.episodes} episodes"
         if (better := self.better) is not None:
             less = f"{-better.difference.value:.3f} [{-better.difference.high:.3f}, {-better.difference.low:.3f}]"
-            return f"{said}, and {less} less with {better.name}: {better.mend}"
+            return f"{text}, and {less} less with {better.name}: {better.repair}"
         if self.episodes < _EPISODES_TO_BE_SURE:
-            return f"{said}: too few episodes to compare, {_EPISODES_TO_BE_SURE} are needed"
+            return f"{text}: too few episodes to compare, {_EPISODES_TO_BE_SURE} are needed"
         if self.ratio.value >= 1:
-            return f"{said}: the model predicts none of this better than persistence, and cannot tell"
-        return f"{said}; no variant surely fits better"
+            return f"{text}: the model predicts none of this better than persistence, and cannot tell"
+        return f"{text}; no variant surely fits better"
 
 
 def rows_of(probe: VariantProbe) -> Iterator[tuple[str, str, str]]:
     """Yield name, error over persistence, and difference, for a table; the data as they are first."""
     yield "as they are", str(probe.ratio), ""
-    for one in probe.tried:
+    for one in probe.results:
         yield one.name, str(one.ratio), str(one.difference)
 
 
@@ -101,7 +101,7 @@ def probe_variants(
         split: Which episodes.
         clips: How many, at most.
         batch_size: Clips that are measured at once.
-        progress: Told (clips done, clips in all).
+        progress: Called with (clips done, clips in total).
 
     Raises:
         InputError: The split is empty, or a clip cannot be read.
@@ -122,15 +122,15 @@ def probe_variants(
     plain, *others = [
         _Errors(*map(np.concatenate, zip(*of_one, strict=True))) for of_one in zip(*measured, strict=True)
     ]
-    tried = [
-        TriedVariant(variant.name, variant.mend, ratio(*one, ids), ratio_difference(one, plain, ids))
+    results = [
+        VariantResult(variant.name, variant.repair, ratio(*one, ids), ratio_difference(one, plain, ids))
         for variant, one in zip(variants, others, strict=True)
     ]
-    return VariantProbe(ratio(*plain, ids), tuple(tried), len(ids), len(set(ids)))
+    return VariantProbe(ratio(*plain, ids), tuple(results), len(ids), len(set(ids)))
 
 
 class _Errors(NamedTuple):
-    """Of each clip; persistence is another one where a variant changes the pictures."""
+    """Of each clip; persistence is another one where a variant changes the frames."""
 
     one_step: Float[np.ndarray, " clips"]
     persistence: Float[np.ndarray, " clips"]
@@ -160,10 +160,10 @@ def _under(
     windows: list[tuple[int, int]],
     plain: LatentBatch,
 ) -> _Errors:
-    """Return the errors of the same clips under a variant; pictures are encoded again only where it changes them."""
+    """Return the errors of the same clips under a variant; frames are encoded again only where it changes them."""
     source = ChangedSource(dataset.source, variant)
     changed = next(iter(batches_of(replace(dataset, source=source), windows, batch_size=len(windows))))
-    if variant.changes_pictures:
+    if variant.changes_frames:
         return _errors(model, encode(changed))
     device = plain.states.device
     return _errors(model, replace(plain, states=changed.states.to(device), actions=changed.actions.to(device)))

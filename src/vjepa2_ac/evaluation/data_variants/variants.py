@@ -22,9 +22,9 @@ class Variant:
     """Another reading of the same data."""
 
     name: str
-    mend: str  # what to do where it fits better
+    repair: str  # what to do where it fits better
     change: Callable[[Episode], Episode]
-    changes_pictures: bool = False
+    changes_frames: bool = False
 
 
 def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
@@ -32,29 +32,29 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
 
     Args:
         config: The data.
-        shifts: Control steps by which to shift pictures against states.
+        shifts: Control steps by which to shift frames against states.
     """
     found = [
         Variant(
-            f"pictures {_steps(shift)} {'late' if shift > 0 else 'early'}",
-            f"give each picture the state of {_steps(shift)} {'before' if shift > 0 else 'after'}",
+            f"frames {_steps(shift)} {'late' if shift > 0 else 'early'}",
+            f"give each frame the state of {_steps(shift)} {'before' if shift > 0 else 'after'}",
             partial(_shifted, late=shift),
         )
         for size in shifts
         for shift in (size, -size)
     ]
     if config.actions == "difference":  # a command has no opposite
-        found.append(Variant("the states backwards", "turn the order of the pictures", _backwards))
+        found.append(Variant("the states backwards", "reverse the order of the frames", _backwards))
     if config.states == "pose":
         for axis, name in enumerate("xy"):
-            mend = f"negate {name}, with the rotation (as of a mirror)"
-            found.append(Variant(f"{name} negated", mend, partial(_with_mirrored_states, axis=axis)))
+            repair = f"negate {name}, with the rotation (as of a mirror)"
+            found.append(Variant(f"{name} negated", repair, partial(_with_mirrored_states, axis=axis)))
         found.append(Variant("the gripper inverted", _GRIPPER[config.source], _with_gripper_inverted))
     if config.source != "latents":
-        mend = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
-        found.append(Variant("red and blue exchanged", mend, _with_channels_exchanged, changes_pictures=True))
-        mend = "flip the pictures, left to right, where the data is written"
-        found.append(Variant("pictures mirrored", mend, _with_mirrored_pictures, changes_pictures=True))
+        repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
+        found.append(Variant("red and blue exchanged", repair, _with_channels_exchanged, changes_frames=True))
+        repair = "flip the frames, left to right, where the data is written"
+        found.append(Variant("frames mirrored", repair, _with_mirrored_frames, changes_frames=True))
     return found
 
 
@@ -77,7 +77,7 @@ def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarra
 
 @dataclass(frozen=True)
 class ChangedSource:
-    """A source under a variant; without pictures where the variant leaves these as they are."""
+    """A source under a variant; without frames where the variant does not change them."""
 
     source: EpisodeSource
     variant: Variant
@@ -89,9 +89,9 @@ class ChangedSource:
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
         """Return an episode, changed."""
         episode = self.variant.change(self.source.read(index, camera, needed))
-        if self.variant.changes_pictures:
+        if self.variant.changes_frames:
             return episode
-        return replace(episode, read_frames=_no_pictures, read_latents=None)
+        return replace(episode, read_frames=_no_frames, read_latents=None)
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class RememberingSource:
         return self.episodes[index, camera]
 
 
-def _no_pictures(steps: Sequence[int]) -> np.ndarray:
+def _no_frames(steps: Sequence[int]) -> np.ndarray:
     return np.zeros((len(steps), 1, 1, 3), np.uint8)
 
 
@@ -142,14 +142,14 @@ def _with_gripper_inverted(episode: Episode) -> Episode:
 
 
 def _with_channels_exchanged(episode: Episode) -> Episode:
-    return _with_pictures(episode, lambda frames: frames[..., ::-1])
+    return _with_changed_frames(episode, lambda frames: frames[..., ::-1])
 
 
-def _with_mirrored_pictures(episode: Episode) -> Episode:
-    return _with_pictures(episode, lambda frames: frames[:, :, ::-1])
+def _with_mirrored_frames(episode: Episode) -> Episode:
+    return _with_changed_frames(episode, lambda frames: frames[:, :, ::-1])
 
 
-def _with_pictures(episode: Episode, change: Callable[[np.ndarray], np.ndarray]) -> Episode:
+def _with_changed_frames(episode: Episode, change: Callable[[np.ndarray], np.ndarray]) -> Episode:
     def read(steps: Sequence[int]) -> np.ndarray:
         return np.ascontiguousarray(change(episode.read_frames(steps)))
 

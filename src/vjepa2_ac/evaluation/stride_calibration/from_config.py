@@ -29,7 +29,7 @@ def calibrate_config(
 ) -> Calibration:
     """Calibrate the model of a config, or another one, on the config's data.
 
-    A latent cache has the frames of one stride's clips only, so pictures are encoded on the fly.
+    A latent cache has the frames of one stride's clips only, so frames are encoded on the fly.
 
     Args:
         config: The data, the model, the device and the precision.
@@ -37,8 +37,8 @@ def calibrate_config(
         split: Episodes to measure on.
         clips: At each stride.
         frames: Of a clip; None: the config's, but 8 at most.
-        indexing: Told where the data set is looked through.
-        measuring: Told how many clips are measured.
+        indexing: Called with the progress of indexing.
+        measuring: Called with the number of measured clips.
 
     Raises:
         InputError: The data or the model cannot be used.

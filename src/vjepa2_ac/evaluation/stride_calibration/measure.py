@@ -34,7 +34,7 @@ _EPISODES_TO_BE_SURE = 10  # an interval that is drawn from fewer is too narrow
 
 
 @dataclass(frozen=True)
-class TriedStride:
+class StrideResult:
     """The one-step, teacher-forced error of a model at one stride."""
 
     stride: int
@@ -51,7 +51,7 @@ class TriedStride:
 class Calibration:
     """What was found at each stride, and which one is best."""
 
-    tried: tuple[TriedStride, ...]
+    results: tuple[StrideResult, ...]
     impossible: dict[int, str]  # stride -> why it could not be tried
     frames: int
     split: Split
@@ -59,9 +59,9 @@ class Calibration:
     difference: Estimate | None  # of the two best ratios, the best's minus the other's, paired by clip
 
     @property
-    def best(self) -> TriedStride:
+    def best(self) -> StrideResult:
         """The stride with the lowest ratio."""
-        return min(self.tried, key=lambda one: one.ratio.value)
+        return min(self.results, key=lambda one: one.ratio.value)
 
     @property
     def is_certain(self) -> bool:
@@ -74,7 +74,7 @@ class Calibration:
         )
 
     def verdict(self) -> str:
-        """Say in words which stride to take, and how sure that is."""
+        """State as text which stride to take, and how sure that is."""
         best = self.best
         words = (
             f"Best: stride {best.stride} ({best.seconds_per_step:.2f} s per model step), error/persistence {best.ratio}"
@@ -91,18 +91,18 @@ class Calibration:
 
     def lines(self) -> list[str]:
         """Return what was found as lines of text, the verdict last."""
-        tried = [
+        results = [
             f"  stride {one.stride} ({one.seconds_per_step:.2f} s): error/persistence {one.ratio},"
             f" {one.clips} clips of {one.episodes} episodes"
-            for one in self.tried
+            for one in self.results
         ]
-        return [*tried, *(f"  stride {n}: not possible: {why}" for n, why in self.impossible.items()), self.verdict()]
+        return [*results, *(f"  stride {n}: not possible: {why}" for n, why in self.impossible.items()), self.verdict()]
 
     def as_dict(self) -> dict[str, Any]:
         """Return every figure as plain values, for `calibration.json`."""
         strides = [
-            {**{name: getattr(one, name) for name in _FIGURES}, "error_over_persistence": one.ratio.as_dict()}
-            for one in self.tried
+            {**{name: getattr(one, name) for name in _METRICS}, "error_over_persistence": one.ratio.as_dict()}
+            for one in self.results
         ]
         return {
             "stride": self.best.stride,
@@ -117,7 +117,7 @@ class Calibration:
         }
 
 
-_FIGURES = ("stride", "seconds_per_step", "error", "persistence", "moved_cm", "clips", "episodes")
+_METRICS = ("stride", "seconds_per_step", "error", "persistence", "moved_cm", "clips", "episodes")
 
 
 def _interval(difference: Estimate) -> str:
@@ -152,7 +152,7 @@ def calibrate(
         clips: At each stride.
         batch_size: Clips that are measured at once.
         copies: How they get to the model's device.
-        progress: Told (clips done, clips in all).
+        progress: Called with (clips done, clips in total).
 
     Raises:
         InputError: The split is empty, no stride fits into any of its episodes, or a clip cannot be read.
@@ -167,12 +167,12 @@ def calibrate(
     for done, stride in enumerate(possible):
         batches = batches_of(views[stride], chosen, batch_size=batch_size, copies=copies)
         parts = _measure(model, encode, batches, is_pose=settings.states == "pose")
-        tell = _told(progress, done * len(chosen), len(possible) * len(chosen))
+        tell = _with_progress(progress, done * len(chosen), len(possible) * len(chosen))
         measured[stride] = _Measured.joined(list(tell(parts)))
     runner_up, difference = _compared(measured)
     rate = dataset.control_rate_hz
-    tried = tuple(one.summary(stride, stride / rate) for stride, one in measured.items())
-    return Calibration(tried, impossible, frames, split, runner_up, difference)
+    results = tuple(one.summary(stride, stride / rate) for stride, one in measured.items())
+    return Calibration(results, impossible, frames, split, runner_up, difference)
 
 
 @dataclass(frozen=True)
@@ -201,8 +201,8 @@ class _Measured:
     def value(self) -> float:
         return float(self.errors.sum() / self.persistence.sum())
 
-    def summary(self, stride: int, seconds_per_step: float) -> TriedStride:
-        return TriedStride(
+    def summary(self, stride: int, seconds_per_step: float) -> StrideResult:
+        return StrideResult(
             stride=stride,
             seconds_per_step=seconds_per_step,
             ratio=ratio(self.errors, self.persistence, self.episode_ids),
@@ -226,7 +226,9 @@ def _measure(
         yield _Measured(errors, persistence, moved_cm, tuple(zip(batch.episode_ids, batch.starts, strict=True)))
 
 
-def _told(progress: Progress | None, before: int, total: int) -> Callable[[Iterator[_Measured]], Iterator[_Measured]]:
+def _with_progress(
+    progress: Progress | None, before: int, total: int
+) -> Callable[[Iterator[_Measured]], Iterator[_Measured]]:
     def tell(parts: Iterator[_Measured]) -> Iterator[_Measured]:
         done = before
         for part in parts:

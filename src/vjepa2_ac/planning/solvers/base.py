@@ -47,7 +47,7 @@ class Solver(Protocol):
         """Return what to try next: allowed decisions."""
         ...
 
-    def update(self, tried: EvaluatedPlans) -> None:
+    def update(self, evaluated: EvaluatedPlans) -> None:
         """Take what came of it into account. Without any finite energy, everything stays as it is."""
         ...
 

@@ -41,9 +41,9 @@ class CemSolver:
             noise[0] = 0.0
         return self._space.allowed(self.mean + self.std * noise)
 
-    def update(self, tried: EvaluatedPlans) -> None:
+    def update(self, evaluated: EvaluatedPlans) -> None:
         """Move the distribution towards the best; one alone says nothing of the standard deviation."""
-        best = tried.best(self.elites).decisions
+        best = evaluated.best(self.elites).decisions
         if len(best):
             self.mean = self._keep_mean * self.mean + (1 - self._keep_mean) * best.mean(dim=0)
         if len(best) > 1:

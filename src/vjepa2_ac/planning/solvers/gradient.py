@@ -48,15 +48,15 @@ class GradientSolver:
         """Return where each descent is."""
         return self._space.allowed(self._place * self._unit)
 
-    def update(self, tried: EvaluatedPlans) -> None:
+    def update(self, evaluated: EvaluatedPlans) -> None:
         """Take a step downhill.
 
         Raises:
             ValueError: There are no gradients.
         """
-        if tried.gradients is None:
+        if evaluated.gradients is None:
             raise ValueError("the cost has no gradients")
-        self._place.grad = tried.gradients * self._unit
+        self._place.grad = evaluated.gradients * self._unit
         self._adam.step()
         self._fall.step()
         with torch.no_grad():

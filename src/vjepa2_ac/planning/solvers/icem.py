@@ -44,15 +44,15 @@ class IcemSolver:
         noise = coloured_noise(
             count, self._space.decisions, self._space.dim, self._config.noise_exponent, self._generator
         )
-        tried = [self.mean + self.std * noise, self._kept]
+        evaluated = [self.mean + self.std * noise, self._kept]
         self._iteration += 1
         if self._iteration == self._iterations:
-            tried.append(self.mean[None])
-        return self._space.allowed(torch.cat(tried))
+            evaluated.append(self.mean[None])
+        return self._space.allowed(torch.cat(evaluated))
 
-    def update(self, tried: EvaluatedPlans) -> None:
+    def update(self, evaluated: EvaluatedPlans) -> None:
         """Move the distribution to the best, and keep some of them."""
-        best = tried.best(self.elites).decisions
+        best = evaluated.best(self.elites).decisions
         keep = self._config.momentum
         if len(best):
             self.mean = keep * self.mean + (1 - keep) * best.mean(dim=0)

@@ -38,13 +38,15 @@ class MppiSolver:
         noise[0] = 0.0
         return self._space.allowed(self.mean + self.std * noise)
 
-    def update(self, tried: EvaluatedPlans) -> None:
+    def update(self, evaluated: EvaluatedPlans) -> None:
         """Move the mean to the weighted mean of the samples."""
-        if not len(tried.energies):
+        if not len(evaluated.energies):
             return
-        spread = tried.energies.std(correction=0).clamp(min=torch.finfo(torch.float32).tiny)
-        weights = torch.softmax((tried.energies.min() - tried.energies) / (self._config.temperature * spread), dim=0)
-        self.mean = torch.einsum("s,sdn->dn", weights, tried.decisions)
+        spread = evaluated.energies.std(correction=0).clamp(min=torch.finfo(torch.float32).tiny)
+        weights = torch.softmax(
+            (evaluated.energies.min() - evaluated.energies) / (self._config.temperature * spread), dim=0
+        )
+        self.mean = torch.einsum("s,sdn->dn", weights, evaluated.decisions)
         self.std = self.std * self._config.std_decay
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:

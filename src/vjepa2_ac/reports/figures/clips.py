@@ -32,7 +32,7 @@ class ClipFigure:
 
 
 def plot_clips(title: str, clips: Sequence[ClipFigure], path: Path) -> Path:
-    """Write a picture of some clips as PNG; numbers that are not finite are marked. It appears whole or not at all.
+    """Write a picture of some clips as PNG; numbers that are not finite are marked. It is written atomically.
 
     Raises:
         ValueError: There is no clip.

@@ -71,7 +71,7 @@ def pictures_per_row(height: int, width: int) -> int:
 
 
 def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
-    """Write the picture of a data set as PNG; it appears whole or not at all."""
+    """Write the picture of a data set as PNG; it is written atomically."""
     facts = [line for fact in sheet.facts for line in textwrap.wrap(fact, 205, subsequent_indent="    ")]
     head = _TITLE + _LINE * len(facts) + 0.3 + _PANELS + 0.75
     row = _PICTURE + _PLOT + _AXIS + _BETWEEN

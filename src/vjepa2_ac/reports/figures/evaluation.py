@@ -28,7 +28,7 @@ _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
-    """Write the picture of an evaluation as PNG; it appears whole or not at all."""
+    """Write the picture of an evaluation as PNG; it is written atomically."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(13, 6.2), layout="constrained")
         FigureCanvasAgg(figure)
@@ -45,7 +45,7 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
 
 
 def plot_comparison(comparison: Comparison, path: Path) -> Path:
-    """Write the curves of several runs as PNG; it appears whole or not at all."""
+    """Write the curves of several runs as PNG; it is written atomically."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(9.5, 4.5), layout="constrained")
         FigureCanvasAgg(figure)

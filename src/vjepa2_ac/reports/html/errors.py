@@ -51,7 +51,7 @@ _HOW = {
     ),
 }
 
-Figures = Callable[[Evaluation, Series, Mode, Metric], Sequence[Estimate]]
+CurveOf = Callable[[Evaluation, Series, Mode, Metric], Sequence[Estimate]]
 
 
 def error_section(evaluation: Evaluation) -> ReportSection:
@@ -62,7 +62,7 @@ def error_section(evaluation: Evaluation) -> ReportSection:
         wrong = [_line(evaluation, one, _ratios(evaluation, one, mode, "l1")) for one in wrong_actions_of(evaluation)]
         lines = [*(replace(line, low=None, high=None) for line in wrong), *lines]
         y_axis = nice_axis("L1 error / persistence", [*_reached(lines), 1.0], from_zero=True)
-        says = f"Error over persistence by horizon, {_MODES[mode]}: {_in_words(lines)}."
+        says = f"Error over persistence by horizon, {_MODES[mode]}: {_as_text(lines)}."
         chart = line_chart(says, lines, _time_axis(evaluation), y_axis, level=1.0)
         key = legend([Line("persistence (doing nothing)", (), (), "s-persistence"), *reversed(lines)])
         drawings.append(figure(f"Error by horizon, {_MODES[mode]}", joined(chart, key), _HOW[mode]))
@@ -97,7 +97,7 @@ def base_section(evaluation: Evaluation) -> ReportSection:
         for line in lines
     ]
     y_axis = nice_axis("gain over the base (%)", [*_reached(in_percent), 0.0])
-    says = f"Gain over the base in percent by horizon, open-loop rollout: {_in_words(in_percent, 1)}."
+    says = f"Gain over the base in percent by horizon, open-loop rollout: {_as_text(in_percent, 1)}."
     chart = joined(line_chart(says, in_percent, _time_axis(evaluation), y_axis, level=0.0), legend(in_percent))
     how = (
         "By which share of the base's error the model's is smaller. Both predict the same clips, so what makes a clip"
@@ -139,10 +139,10 @@ def _means(evaluation: Evaluation, one: Series, mode: Mode, metric: Metric) -> S
     return mean_error(evaluation, one.model, mode, metric, one.actions)
 
 
-def _table(evaluation: Evaluation, mode: Mode, metric: Metric, figures: Figures, over: str) -> Markup:
+def _table(evaluation: Evaluation, mode: Mode, metric: Metric, curve_of: CurveOf, over: str) -> Markup:
     shown = (*models_of(evaluation), *wrong_actions_of(evaluation))
     shown = shown if over else (persistence(), *shown)
-    columns = [figures(evaluation, one, mode, metric) for one in shown]
+    columns = [curve_of(evaluation, one, mode, metric) for one in shown]
     digits = 3 if over else 4
     rows = [
         [horizon_name(evaluation, h + 1), *(value(column[h], digits) for column in columns)]
@@ -205,7 +205,7 @@ def _reached(lines: Sequence[Line]) -> list[float]:
     return [each for line in lines for side in (line.y, line.low, line.high) if side is not None for each in side]
 
 
-def _in_words(lines: Sequence[Line], digits: int = 2) -> str:
+def _as_text(lines: Sequence[Line], digits: int = 2) -> str:
     """Return where each curve begins and ends."""
     return "; ".join(f"{line.name} from {line.y[0]:.{digits}f} to {line.y[-1]:.{digits}f}" for line in reversed(lines))
 

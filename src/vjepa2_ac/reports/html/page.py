@@ -39,7 +39,7 @@ _GLOSSARY = {
 
 
 def write_report(evaluation: Evaluation, verdict: str, path: Path) -> Path:
-    """Write the page; it appears whole or not at all. The same evaluation gives the same bytes."""
+    """Write the page; it is written atomically. The same evaluation gives the same bytes."""
     write_atomically(path, report_page(evaluation, verdict))
     return path
 

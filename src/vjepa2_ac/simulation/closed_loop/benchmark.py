@@ -49,7 +49,7 @@ class ClosedLoopBenchmark:
     """The results of a model (first), doing nothing, chance and the oracle, on the same problems."""
 
     subject: str
-    checkpoint: str  # which one, in words; "" of a model
+    checkpoint: str  # which one, as text; "" of a model
     asked: BenchmarkOptions
     planning: dict[str, Any]  # settings, as plain values
     planning_seed: int
@@ -104,7 +104,7 @@ def run_benchmark(
             seed=asked.seed,
             steps=asked.steps,
             stride=stride,
-            keep_pictures=asked.films if isinstance(policy, Planning) else 0,
+            keep_frames=asked.films if isinstance(policy, Planning) else 0,
             arm=arm,
             progress=stage(f"{asked.task}: {policy.name}") if stage else None,
         )
@@ -137,7 +137,7 @@ def benchmark_as_dict(contest: ClosedLoopBenchmark) -> dict[str, Any]:
             "version": __version__,
             "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         },
-        "policies": {result.policy: _figures(result) for result in contest.results},
+        "policies": {result.policy: _metrics(result) for result in contest.results},
     }
 
 
@@ -151,7 +151,7 @@ def _policies(steering: PlanningSession, asked: BenchmarkOptions, arm: Simulated
     return model, DoNothing(), RandomActions(limits, seed=asked.seed), oracle_for(asked.task, limits, arm)
 
 
-def _figures(result: ClosedLoopResult) -> dict[str, Any]:
+def _metrics(result: ClosedLoopResult) -> dict[str, Any]:
     return {
         "success": result.success_rate.as_dict(),
         "success_ever": result.success_ever_rate.as_dict(),

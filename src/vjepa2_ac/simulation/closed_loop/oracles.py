@@ -34,7 +34,7 @@ class _Scripted:
 class PushOracle(_Scripted):
     """Pushes the block along the line to its goal. Rotation is left as it is."""
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
         """Learn the goal."""
         self._goal, self._end = _block(problem.block_goal)[:2], problem.goal
         way = self._goal - _block(problem.block_start)[:2]
@@ -42,7 +42,7 @@ class PushOracle(_Scripted):
 
     def act(
         self,
-        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
         state: Float[np.ndarray, " 7"],
     ) -> Float[np.ndarray, " 7"]:
         """Return the next step of the push: ahead, straight behind the block."""
@@ -61,13 +61,13 @@ class PushOracle(_Scripted):
 class PickOracle(_Scripted):
     """Goes over the block, down, closes, and lifts. Rotation is left as it is."""
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
         """Learn the goal."""
         self._end = problem.goal
 
     def act(
         self,
-        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
         state: Float[np.ndarray, " 7"],
     ) -> Float[np.ndarray, " 7"]:
         """Return the next step of the grasp."""

@@ -22,11 +22,11 @@ class Policy(Protocol):
     name: str
     why: str  # of the last action, in a few words that can be counted
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:
-        """Begin an episode. Only a policy that is to know more than the pictures looks into the problem."""
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Begin an episode. Only a policy that is to know more than the images looks into the problem."""
 
     def act(
-        self, picture: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
+        self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
     ) -> Float[np.ndarray, " 7"]:
         """Return the action of the next model step from what the camera sees and the measured state, in base frame."""
 
@@ -36,12 +36,12 @@ class DoNothing:
 
     name, why = "do nothing", "nothing"
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:
         """Need nothing."""
 
     def act(
         self,
-        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
         state: Float[np.ndarray, " 7"],  # noqa: ARG002
     ) -> Float[np.ndarray, " 7"]:
         """Return no motion."""
@@ -62,13 +62,13 @@ class RandomActions:
         self._limits, self._seed = limits, seed
         self._rng = np.random.default_rng(seed)
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
         """Begin the draws of this problem."""
         self._rng = np.random.default_rng([self._seed, problem.index])
 
     def act(
         self,
-        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
         state: Float[np.ndarray, " 7"],  # noqa: ARG002
     ) -> Float[np.ndarray, " 7"]:
         """Return the next draw."""
@@ -88,13 +88,13 @@ class Oracle:
         self._limits = limits
         self._problem: TaskProblem | None = None
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
         """Learn the goal."""
         self._problem = problem
 
     def act(
         self,
-        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
         state: Float[np.ndarray, " 7"],
     ) -> Float[np.ndarray, " 7"]:
         """Return the next step towards the goal.
@@ -110,7 +110,7 @@ class Oracle:
 
 
 class Planning:
-    """A world model that plans: sees the pictures and the measured state, nothing else.
+    """A world model that plans: sees the images and the measured state, nothing else.
 
     Args:
         controller: Plans with the model; its last `decision` can be looked at after every action.
@@ -120,15 +120,15 @@ class Planning:
     def __init__(self, controller: Controller, name: str = "model") -> None:
         self.controller, self.name, self.why = controller, name, ""
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Give the planner the goal's picture."""
-        self.controller.reset(goal_picture)
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+        """Give the planner the goal image."""
+        self.controller.reset(goal_image)
 
     def act(
-        self, picture: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
+        self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
     ) -> Float[np.ndarray, " 7"]:
         """Return the first action of a plan."""
-        action = self.controller.act(picture, state)
+        action = self.controller.act(image, state)
         self.why = self.controller.decision.why if self.controller.decision else ""
         return action
 

@@ -14,7 +14,7 @@ from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M, TaskName, TaskProb
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """What happened. Index 0 of `states`, `distances_m` and `pictures` is before the first action."""
+    """What happened. Index 0 of `states`, `distances_m` and `frames` is before the first action."""
 
     problem: TaskProblem
     states: Float[np.ndarray, "time 7"]  # measured, in the robot base frame
@@ -24,8 +24,8 @@ class EpisodeResult:
     seconds: Float[np.ndarray, " steps"]  # that the policy took
     whys: tuple[str, ...]  # of each action
     unreachable: int  # commands that the arm could not follow to their end
-    goal_picture: UInt8[np.ndarray, "height width 3"]
-    pictures: UInt8[np.ndarray, "time height width 3"] | None  # where they are kept
+    goal_image: UInt8[np.ndarray, "height width 3"]
+    frames: UInt8[np.ndarray, "time height width 3"] | None  # where they are kept
 
     @property
     def success(self) -> bool:

@@ -34,7 +34,7 @@ def run_task(
     seed: int = 0,
     steps: int | None = None,
     stride: int = 4,
-    keep_pictures: int = 0,
+    keep_frames: int = 0,
     arm: SimulatedArm | None = None,
     progress: Progress | None = None,
 ) -> ClosedLoopResult:
@@ -48,9 +48,9 @@ def run_task(
         seed: Which problems. Settings that were chosen on one seed are to be reported on another.
         steps: Model steps of an episode; None: as many as the task has by default.
         stride: Control steps of a model step (15 per second).
-        keep_pictures: Of so many episodes, the first ones, for a video.
+        keep_frames: Of so many episodes, the first ones, for a video.
         arm: In this domain, from `arm_for` of this task, to be used again; None: a new one.
-        progress: Told how many episodes are done.
+        progress: Called with the number of finished episodes.
 
     Raises:
         InputError: MuJoCo is not installed, or no such domain.
@@ -64,8 +64,8 @@ def run_task(
     done: list[EpisodeResult] = []
     for index in range(episodes):
         problem = make_problem(task, domain, seed, index)
-        kept = index < keep_pictures
-        done.append(run_episode(arm, policy, problem, steps=steps, stride=stride, keep_pictures=kept))
+        kept = index < keep_frames
+        done.append(run_episode(arm, policy, problem, steps=steps, stride=stride, keep_frames=kept))
         if progress:
             progress(index + 1, episodes)
     return ClosedLoopResult(task, domain.name, policy.name, seed, steps, stride, tuple(done))
@@ -78,7 +78,7 @@ def run_episode(
     *,
     steps: int = 8,
     stride: int = 4,
-    keep_pictures: bool = False,
+    keep_frames: bool = False,
 ) -> EpisodeResult:
     """Let a policy solve a problem, and return what happened.
 
@@ -90,7 +90,7 @@ def run_episode(
         problem: What is to be done.
         steps: Model steps.
         stride: Control steps of each.
-        keep_pictures: Whether the result holds what the camera saw.
+        keep_frames: Whether the result holds what the camera saw.
 
     Raises:
         UnreachableError: The problem's own start or goal cannot be reached.
@@ -98,21 +98,21 @@ def run_episode(
     """
     if min(steps, stride) < 1:
         raise ValueError(f"{steps} model steps of {stride} control steps")
-    goal_picture = put(arm, problem.goal, problem.block_goal).picture()
+    goal_image = put(arm, problem.goal, problem.block_goal).image()
     put(arm, problem.start, problem.block_start)
-    policy.reset(problem, goal_picture)
-    states, blocks, pictures = [arm.state], [arm.block], [arm.picture()]
+    policy.reset(problem, goal_image)
+    states, blocks, frames = [arm.state], [arm.block], [arm.image()]
     actions, seconds, whys, unreachable = [], [], [], 0
     for _ in range(steps):
         began = time.perf_counter()
-        action = np.asarray(policy.act(pictures[-1], states[-1]), dtype=np.float64)
+        action = np.asarray(policy.act(frames[-1], states[-1]), dtype=np.float64)
         seconds.append(time.perf_counter() - began)
         actions.append(_checked(action, policy))
         whys.append(policy.why)
         unreachable += not _send(arm, action, stride)
         states.append(arm.state)
         blocks.append(arm.block)
-        pictures.append(arm.picture())
+        frames.append(arm.image())
     return EpisodeResult(
         problem=problem,
         states=np.stack(states),
@@ -122,8 +122,8 @@ def run_episode(
         seconds=np.array(seconds),
         whys=tuple(whys),
         unreachable=unreachable,
-        goal_picture=goal_picture,
-        pictures=np.stack(pictures) if keep_pictures else None,
+        goal_image=goal_image,
+        frames=np.stack(frames) if keep_frames else None,
     )
 
 

@@ -60,7 +60,7 @@ class TaskProblem:
     task: TaskName
     index: int
     start: Float[np.ndarray, " 7"]
-    goal: Float[np.ndarray, " 7"]  # of the arm in the goal picture
+    goal: Float[np.ndarray, " 7"]  # of the arm in the goal image
     block_start: Float[np.ndarray, " 4"] | None = None  # None: there is no block
     block_goal: Float[np.ndarray, " 4"] | None = None
 

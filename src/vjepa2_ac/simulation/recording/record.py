@@ -28,7 +28,7 @@ from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRec
 from vjepa2_ac.simulation.world.scene import load_mujoco
 
 SUCCESS_SHARE = 0.9
-JPEG_QUALITY = 85  # some 11 KB a picture, as in DROID
+JPEG_QUALITY = 85  # some 11 KB an image, as in DROID
 _INSTRUCTIONS = {None: "reach around over the table", "push": "push the block", "pick": "pick up the block"}
 _SIMULATED_CAMERAS = dict(zip(CAMERAS, ("exterior_1", "exterior_2", "wrist"), strict=True))
 
@@ -60,7 +60,7 @@ def record_dataset(
         steps: Control steps of each (15 per second).
         seed: Decides motion, outcome and, for `random`, the worlds.
         shards: TFRecord files; one for every 32 episodes by default.
-        cameras: 1: the three pictures of a step are the same one. 3: each camera sees its own.
+        cameras: 1: the three images of a step are the same one. 3: each camera sees its own.
         workers: Processes. More than one needs `if __name__ == "__main__":` in a script that calls this.
         renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
         recipe: How the arm moves, without a task.
@@ -164,8 +164,8 @@ def _film(world: Domain, motion: Motion, cameras: int, renderer: Renderer) -> di
 def _take(arm: SimulatedArm, films: dict[str, list[bytes]], cameras: int) -> None:
     """Add what the cameras see now to their films."""
     for feature in CAMERAS[:cameras]:
-        picture = arm.picture(_SIMULATED_CAMERAS[feature])
-        films.setdefault(feature, []).append(encode_jpeg(picture, quality=JPEG_QUALITY))
+        image = arm.image(_SIMULATED_CAMERAS[feature])
+        films.setdefault(feature, []).append(encode_jpeg(image, quality=JPEG_QUALITY))
 
 
 def _commands(motion: Motion) -> DroidCommands:

@@ -29,7 +29,7 @@ class SimulatedArm:
     Args:
         domain: The world it stands in.
         renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
-        height, width: Size of the pictures.
+        height, width: Size of the images.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
@@ -120,15 +120,15 @@ class SimulatedArm:
         self.set_joints(joints, closedness + grip_left * (self._closedness - closedness))
         return self.state
 
-    def picture(self, camera: str = "exterior_1") -> UInt8[np.ndarray, "height width 3"]:
+    def image(self, camera: str = "exterior_1") -> UInt8[np.ndarray, "height width 3"]:
         """Return what `exterior_1`, `exterior_2` or `wrist` sees now."""
         eye = self._camera(camera)
         if camera == "wrist":
             eye.move(self._wrist_pose())
-        return np.asarray(eye.picture(self._data))
+        return np.asarray(eye.image(self._data))
 
     def extrinsics(self, camera: str = "exterior_1") -> Float[np.ndarray, " 6"]:
-        """Return the pose of a camera in the robot base frame: x right, y down, z into the picture."""
+        """Return the pose of a camera in the robot base frame: x right, y down, z into the image."""
         pose = np.linalg.inv(self.domain.base_pose()) @ self._camera_pose(camera)
         return np.concatenate([pose[:3, 3], euler_from_matrices(pose[:3, :3])])
 

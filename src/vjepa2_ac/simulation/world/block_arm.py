@@ -31,7 +31,7 @@ class ContactArm(SimulatedArm):
     Args:
         domain: The world it stands in.
         renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
-        height, width: Size of the pictures.
+        height, width: Size of the images.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.

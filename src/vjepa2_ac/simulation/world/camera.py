@@ -17,7 +17,7 @@ from vjepa2_ac.simulation.world.ray_renderer import Caster, Hits, View, lamp_vie
 from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, light_position, load_mujoco
 
 FRAME_HEIGHT, FRAME_WIDTH = 180, 320
-"""Size of DROID's pictures in RLDS."""
+"""Size of DROID's images in RLDS."""
 
 _SHADOW = 0.35  # share of the lamp's light that reaches a shadowed spot all the same
 _FAR_M = 20.0  # where the background of a ray that meets nothing is taken to be
@@ -41,9 +41,9 @@ class RayCamera:
     Args:
         model: The scene as `scene.compile_scene` gives it.
         domain: Its look.
-        pose: The camera's frame in the world: x right, y down, z into the picture.
-        vertical_fov_deg: Angle from the upper to the lower edge of the picture.
-        height, width: Size of the picture.
+        pose: The camera's frame in the world: x right, y down, z into the image.
+        vertical_fov_deg: Angle from the upper to the lower edge of the image.
+        height, width: Size of the image.
     """
 
     def __init__(
@@ -64,11 +64,11 @@ class RayCamera:
         self._background: _Background | None = None
 
     def move(self, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Put the camera elsewhere; the next picture is cast anew, walls and table included."""
+        """Put the camera elsewhere; the next image is cast anew, walls and table included."""
         self._pose = pose
         self._background = None
 
-    def picture(self, data: Any) -> UInt8[np.ndarray, "height width 3"]:
+    def image(self, data: Any) -> UInt8[np.ndarray, "height width 3"]:
         """Return what the camera sees of this `mujoco.MjData`, whose kinematics must be up to date."""
         behind = self._background = self._background or self._see_background(data)
         pixels = behind.lit.copy()
@@ -109,7 +109,7 @@ class RayCamera:
 
 
 class _Colours:
-    """Colours by geom, and by place for those that carry a pattern, so that pictures have texture."""
+    """Colours by geom, and by place for those that carry a pattern, so that images have texture."""
 
     def __init__(self, model: Any) -> None:
         mujoco = load_mujoco()

@@ -30,7 +30,7 @@ class CameraPlace:
     vertical_fov_deg: float = 36.0
 
     def pose(self) -> Float[np.ndarray, "4 4"]:
-        """Return the camera's frame in the world: x right, y down, z into the picture (OpenCV's convention)."""
+        """Return the camera's frame in the world: x right, y down, z into the image (OpenCV's convention)."""
         azimuth, elevation = np.deg2rad(self.azimuth_deg), np.deg2rad(self.elevation_deg)
         outward = np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -69,7 +69,7 @@ class Domain:
     camera: CameraPlace
     look: Look
     base_yaw_deg: float = (
-        0.0  # mounting of the robot: the same action moves the arm in another direction in the picture
+        0.0  # mounting of the robot: the same action moves the arm in another direction in the image
     )
     lag_s: float = 0.08  # time constant with which the measured pose follows the commanded one
     clutter_seed: int = 0  # decides what lies on the table, and where

@@ -1,4 +1,4 @@
-"""The OpenGL renderer: camera images by MuJoCo's own renderer, where OpenGL works."""
+"""The OpenGL renderer: cameran images by MuJoCo's own renderer, where OpenGL works."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class OpenGlCamera:
         self._eye.azimuth = np.rad2deg(np.arctan2(forward[1], forward[0]))
         self._eye.elevation = np.rad2deg(np.arcsin(forward[2]))
 
-    def picture(self, data: Any) -> UInt8[np.ndarray, "height width 3"]:
+    def image(self, data: Any) -> UInt8[np.ndarray, "height width 3"]:
         """Return what the camera sees of this `mujoco.MjData`."""
         self._model.vis.global_.fovy = self._fov
         self._renderer.update_scene(data, camera=self._eye)

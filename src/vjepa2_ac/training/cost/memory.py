@@ -41,7 +41,7 @@ class MemoryEstimate:
     trained: int
     gradients: int
     moments: int
-    arriving: int  # the next batch, on its way to the GPU; pictures as if they were of the model's size
+    arriving: int  # the next batch, on its way to the GPU; frames as if they were of the model's size
     latents: int
     encoding: int  # activations of the encoder, for one chunk of frames, and the frames
     teacher_forcing: int

@@ -32,7 +32,7 @@ class WatchedMetricsLog(MetricsLog):
     Args:
         run_dir: The run's folder.
         config: Its config, for what to turn.
-        note: Told what a person should know.
+        note: Receives messages for the user.
         first_step: As of `MetricsLog`.
         trackers: As of `MetricsLog`.
     """
@@ -51,10 +51,10 @@ class WatchedMetricsLog(MetricsLog):
         for row in read_metrics_log(self.path):
             self._watch(str(row.get("kind")), row["step"], row)
 
-    def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
+    def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Append a row, and behind it what it warns of."""
-        super().write(kind, step, figures)
-        for text in self._watch(kind, step, figures):
+        super().write(kind, step, metrics)
+        for text in self._watch(kind, step, metrics):
             super().write(WARNING, step, {"text": text})
             self._note(f"Warning: {text}")
 
@@ -73,15 +73,15 @@ class Watch:
         self._losses: deque[float] = deque(maxlen=_LOSSES)
         self._lowest = math.inf
 
-    def __call__(self, kind: str, step: int, figures: Mapping[str, Any]) -> list[str]:
+    def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> list[str]:
         """Return what is to be said of a row: nothing where all is well or it was said before."""
         found = {"validation": self._of_validation, "train": self._of_loss}.get(kind)
-        new = {cause: text for cause, text in found(step, figures) if cause not in self._said} if found else {}
+        new = {cause: text for cause, text in found(step, metrics) if cause not in self._said} if found else {}
         self._said |= set(new)
         return [f"at step {step:,} {text}. {way_out(self._config)}" for text in new.values()]
 
-    def _of_validation(self, step: int, figures: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        now = {name: _number(figures.get(key)) for key, name in _MEASURES.items()}
+    def _of_validation(self, step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        now = {name: _number(metrics.get(key)) for key, name in _MEASURES.items()}
         if step == 0:
             self._at_start = now
             return
@@ -97,9 +97,9 @@ class Watch:
         last = step == self._config.training.steps
         yield f"{worse} {beyond} {last}", f"{told} of persistence's in the validation{copying}"
 
-    def _of_loss(self, step: int, figures: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    def _of_loss(self, step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         del step
-        loss = _number(figures.get("loss"))
+        loss = _number(metrics.get("loss"))
         if not math.isfinite(loss):  # a step without clips, or one that was refused
             return
         self._losses.append(loss)

@@ -51,7 +51,7 @@ class ClipRecorder:
             for number, (batch, place) in enumerate(chosen):
                 _write(batch, place, folder / f"process{process}-clip{number:02d}.npz")
             _draw(chosen, folder / f"process{process}.png")
-        except Exception as error:  # a full disk, no permission, a picture that cannot be drawn
+        except Exception as error:  # a full disk, no permission, a frame that cannot be drawn
             return f"they could not all be saved in {folder}: {type(error).__name__}: {error}"
         return f"{len(chosen)} of them are saved in {folder}"
 
@@ -93,7 +93,7 @@ def _draw(chosen: Sequence[tuple[Batch, int]], path: Path) -> None:
     from vjepa2_ac.reports.figures.clips import ClipFigure, plot_clips
 
     blank = np.full((1, 9, 16, 3), 224, np.uint8)
-    pictures = [
+    frames = [
         ClipFigure(
             name=f"{batch.episode_ids[place]} from step {batch.starts[place]}",
             frames=_seen(batch, place).get("frames", blank),
@@ -101,4 +101,4 @@ def _draw(chosen: Sequence[tuple[Batch, int]], path: Path) -> None:
         )
         for batch, place in chosen
     ]
-    plot_clips(f"Clips of a step whose loss or gradient is not finite ({len(pictures)})", pictures, path)
+    plot_clips(f"Clips of a step whose loss or gradient is not finite ({len(frames)})", frames, path)

@@ -95,7 +95,7 @@ class Throughput:
         flops = clip_flops(config, sizes)
         return cls(flops.total if encodes else flops.predictor, tokens, ceiling, device)
 
-    def figures(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
+    def metrics(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
         """Return the figures of one step.
 
         Args:
