@@ -122,7 +122,7 @@ def test_a_plan_that_is_no_better_than_doing_nothing_is_said_to_be() -> None:
     found = asked()
     assert "better than doing nothing" not in summarize(found)
     object.__setattr__(found, "doing_nothing", -1.0)
-    assert "Nothing that was tried is predicted to be better than doing nothing." in summarize(found)
+    assert "None of the evaluated actions is predicted to be better than doing nothing." in summarize(found)
 
 
 def test_running_out_of_time_is_said() -> None:

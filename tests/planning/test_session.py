@@ -94,7 +94,7 @@ def test_the_builtin_model_plans_at_once() -> None:
 @pytest.mark.parametrize(
     ("given", "complaint"),
     [
-        ({"overrides": ["training.steps=3"]}, r"training\.steps=3: a setting that planning does not heed"),
+        ({"overrides": ["training.steps=3"]}, r"training\.steps=3: a setting that planning does not use"),
         ({"overrides": ["horizon=3"]}, r"did you mean planning\.horizon"),
         ({"overrides": ["planning.horizon=0"]}, r"planning\.horizon.*greater than or equal to 1"),
         ({"overrides": ["planning.limits.xyz=[-0.1, 0, 0]"]}, r"planning\.limits\.xyz"),

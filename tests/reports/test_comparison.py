@@ -88,7 +88,7 @@ def test_figures_of_other_shapes_are_named(tmp_path: Path) -> None:
     metrics = json.loads((other / METRICS_FILE).read_text())
     metrics["by_clip"]["persistence"] = 0.5
     (other / METRICS_FILE).write_text(json.dumps(metrics))
-    with pytest.raises(InputError, match="figures that cannot be used"):
+    with pytest.raises(InputError, match="metrics that cannot be used"):
         compare([one, other])
 
 
@@ -97,7 +97,7 @@ def test_damaged_figures_are_named(tmp_path: Path) -> None:
     metrics = json.loads((other / METRICS_FILE).read_text())
     del metrics["by_clip"]
     (other / METRICS_FILE).write_text(json.dumps(metrics))
-    with pytest.raises(InputError, match="figures that cannot be used"):
+    with pytest.raises(InputError, match="metrics that cannot be used"):
         compare([one, other])
     (other / METRICS_FILE).write_text('{"format": 99}')
     with pytest.raises(InputError, match="format 99"):

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class CacheWriter:
     """Writes one cache into a folder. Several processes may each have one for the same folder.
 
-    To go on after a kill: leave out the episodes that `has` knows; a file appears under its name when it is whole.
+    To resume after a kill, leave out the episodes that `has` knows: a file gets its final name when it is complete.
     """
 
     folder: Path
@@ -34,7 +34,7 @@ class CacheWriter:
     encoding: Encoding
 
     def has(self, number: int, camera: str) -> bool:
-        """Return whether an episode, by its place in the data set, has been written."""
+        """Return whether an episode, by its index in the data set, has been written."""
         return path_of(self.folder, number, camera).is_file()
 
     def write_episode(
@@ -50,12 +50,12 @@ class CacheWriter:
         """Write an episode of one camera and return the size of its file.
 
         Args:
-            number: Place of the episode in the data set.
+            number: Index of the episode in the data set.
             camera: One of `data.camera`.
-            episode: What the source gave for this camera; no frame of it is read.
+            episode: From the source for this camera; none of its frames is read.
             steps: Control steps of the frames, as `latent_cache.needed_frames` names them.
-            latents: Of these frames, in the type that the key names (`precision.stored` makes them so).
-            small_frames: Of these frames, square as the encoder sees them and small; for people to look at.
+            latents: Of these frames, in the type that the key names (`precision.stored` converts them).
+            small_frames: Of these frames, square as the encoder sees them and small; for display.
 
         Raises:
             InputError: The folder cannot be written, or the disk is full.
@@ -67,13 +67,13 @@ class CacheWriter:
     def finish(
         self, dataset: Dataset, *, broken: Mapping[str, str], frames: int, about: Mapping[str, Any] | None = None
     ) -> Manifest:
-        """Make the cache whole, when every episode of which clips are made is written: one process does this, once.
+        """Finalize the cache, when every episode with clips is written: one process does this, once.
 
         Args:
-            dataset: What was encoded, as it was opened: without a cache.
+            dataset: The encoded data set, opened without a cache.
             broken: Identities of the episodes that could not be read (`data.broken_episodes` is skip), and why.
-            frames: How many were encoded, of all cameras; for people to know.
-            about: Whatever else is worth knowing, as JSON.
+            frames: Number of encoded frames, of all cameras; for information.
+            about: Further information, as JSON.
 
         Raises:
             InputError: The folder cannot be written.
@@ -109,7 +109,7 @@ class CacheWriter:
         """Return the size of every file, a column for each camera.
 
         Raises:
-            ValueError: One that clips need is not there, and its episode is not broken.
+            ValueError: One that clips need is missing, and its episode is not broken.
         """
         found = [dataset.table.find(name) for name in broken]
         unread = np.array([place for place in found if place is not None], np.int64)

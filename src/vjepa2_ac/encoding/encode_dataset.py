@@ -36,7 +36,7 @@ Note = Callable[[str], None]
 
 @dataclass(frozen=True)
 class EncodedSet:
-    """What became of a cache."""
+    """The result of encoding a cache."""
 
     folder: Path
     manifest: Manifest | None  # None: other processes are still at work
@@ -55,12 +55,12 @@ def encode_config(
     Args:
         config: The data, the model whose encoder is used, device and precision.
         note: Receives messages for the user.
-        out: The folder of the cache; None: where `data.cache` looks for it.
+        out: The folder of the cache; None: the one of `data.cache`.
         indexed: Called with the progress of indexing.
         progress: Called with (done, total) in frames.
 
     Raises:
-        InputError: Something cannot be used, or there is no room for it.
+        InputError: Some input cannot be used, or the disk space is too small.
     """
     require_encodable(config)
     device = computing_device(config.training)
@@ -80,16 +80,14 @@ def encode_config(
 
 
 def require_encodable(config: Config) -> None:
-    """Refuse a config of which no cache can be made, before anything is opened.
+    """Refuse a config that cannot have a cache, before anything is opened.
 
     Raises:
         InputError: The data are a cache, the stride is not known, or clips are augmented.
     """
     data = config.data
     if data.source == "latents":
-        raise InputError(
-            where="data.source", found="latents: they are encoded already", needed="a data set of frames"
-        )
+        raise InputError(where="data.source", found="latents: they are encoded already", needed="a data set of frames")
     if data.stride == "auto":
         raise InputError(
             where="data.stride",
@@ -107,14 +105,14 @@ def require_encodable(config: Config) -> None:
 
 
 def writer_for(config: Config, dataset: Dataset, model: WorldModel, out: Path | None = None) -> CacheWriter:
-    """Return what writes the cache of a data set that is open, made with the encoder of this model."""
+    """Return the cache writer of an open data set, for the encoder of this model."""
     encoding = encoding_of(model, config)
     key = key_for(dataset, encoding)
     return CacheWriter(folder_of(config.data, key) if out is None else out, key, encoding)
 
 
 def encoder_at_work(config: Config, model: WorldModel, device: torch.device) -> EncoderAtWork:
-    """Put the encoder of a model on a device, and it alone."""
+    """Move the encoder of a model, and only the encoder, to a device."""
     model.present_encoder.to(device)
     return EncoderAtWork(model, device, partial(autocast, config.training, device), config.model.encode_chunk)
 
@@ -128,7 +126,7 @@ def encode_share(
     note: Note,
     progress: Progress | None = None,
 ) -> Manifest | None:
-    """Say what is to be done, see that there is room, and do the share of one process.
+    """Report the work, check the disk space, and encode the share of one process.
 
     Raises:
         InputError: As `encode_config`.
@@ -145,12 +143,12 @@ def encode_share(
 
 
 def duration(frames: int, per_second: float) -> str:
-    """Return how long frames take, in words."""
+    """Return as text how long encoding takes."""
     return str(timedelta(seconds=round(frames / per_second)))
 
 
 def smaller_caches(config: Config) -> tuple[str, ...]:
-    """Return the knobs that would make a cache smaller."""
+    """Return the knobs that would reduce the size of a cache."""
     data = config.data
     knobs = [] if data.cache_dtype == "int8" else ["data.cache_dtype: int8"]
     if data.start_every % data.model_stride:

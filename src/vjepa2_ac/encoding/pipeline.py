@@ -27,14 +27,14 @@ from vjepa2_ac.encoding.workload import Workload, broken_in, forget_broken, note
 from vjepa2_ac.episode import Progress, StoredLatents
 from vjepa2_ac.model.network.world_model import WorldModel
 
-_WRITES_UNDER_WAY = 2  # files: bounds the memory
+_WRITES_UNDER_WAY = 2  # files: limits the memory
 
 Autocast = Callable[[], contextlib.AbstractContextManager[object]]
 
 
 @dataclass(frozen=True, eq=False)
 class EncoderAtWork:
-    """The frozen encoder of a model that is on its device, and how it computes."""
+    """The frozen encoder of a model on its device, and its settings."""
 
     world_model: WorldModel
     device: torch.device
@@ -49,20 +49,20 @@ class EncoderAtWork:
 
 
 def build(work: Workload, encoder: EncoderAtWork, *, threads: int, progress: Progress | None = None) -> Manifest | None:
-    """Encode what this process has to, and make the cache whole if nothing is lacking by then.
+    """Encode the share of this process, and finalize the cache if nothing is missing by then.
 
     Args:
-        work: What is to be done.
-        encoder: What encodes.
-        threads: That decode frames ahead of it.
+        work: The work.
+        encoder: The encoder.
+        threads: Number of threads that decode frames in advance.
         progress: Called with (done, total) in frames of this process.
 
     Returns:
-        What the cache says of itself; None while other processes are at work.
+        The manifest of the cache; None while other processes are still encoding.
 
     Raises:
         InputError: An episode cannot be read and `data.broken_episodes` does not skip it, or too many are; or the
-            folder cannot be written. What was written stays.
+            folder cannot be written. Written files stay.
     """
     folder, dataset = work.writer.folder, work.dataset
     for episode in sorted({one.episode for one in work.left}):
@@ -79,7 +79,7 @@ def build(work: Workload, encoder: EncoderAtWork, *, threads: int, progress: Pro
 
 
 def _written(work: Workload, encoder: EncoderAtWork, threads: int) -> Iterator[int]:
-    """Write episode after episode; yield how many frames are done, at first 0; those of unreadable ones count."""
+    """Write episode after episode; yield the number of finished frames, first 0; those of unreadable ones count."""
     yield 0
     side = small_frame_side(encoder.world_model.image_size)
     chunks = Chunks(
@@ -129,14 +129,14 @@ def _write(work: Workload, one: Encoded) -> int:
 
 
 def _leave_out(work: Workload, one: Unreadable) -> None:
-    """Do what `data.broken_episodes` says, and note it where the other processes see it."""
+    """Apply `data.broken_episodes`, and record the episode for the other processes."""
     work.dataset.leave_out(one.wanted.episode, one.error)
     name = work.dataset.table.identity(one.wanted.episode)
     note_broken(work.writer.folder, one.wanted.episode, name, str(one.error))
 
 
 def frames_per_second(encoder: EncoderAtWork) -> float:
-    """Return how fast a chunk of black frames is encoded; where a device warms up, by one that does not count."""
+    """Measure the encoding speed on a chunk of black frames, after a warm-up chunk where a device needs one."""
     size = encoder.world_model.image_size
     black = torch.zeros(encoder.chunk, 3, size, size, device=encoder.device)
     if encoder.device.type != "cpu":

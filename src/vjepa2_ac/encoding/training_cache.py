@@ -33,19 +33,19 @@ def with_latents(
     encoding: Progress | None = None,
     check_only: bool = False,
 ) -> Dataset:
-    """Return the data set of a run, its clips from the latent cache where the config has one.
+    """Return the data set of a run, with its clips from the latent cache if the config has one.
 
     Args:
-        config: The run.
-        dataset: As it was opened, at its stride.
-        model: Whose encoder is asked.
+        config: The config of the run.
+        dataset: The open data set, at its stride.
+        model: The model whose encoder is used.
         accelerator: Its processes share the encoding.
         note: Receives messages for the user.
         encoding: Called with (done, total) in frames of this process.
-        check_only: Encode nothing: say what would be, and leave the clips as frames.
+        check_only: Encode nothing: report what would be encoded, and leave the clips as frames.
 
     Raises:
-        InputError: The cache is another encoder's, is required and not there, or cannot be made.
+        InputError: The cache is another encoder's, is required and missing, or cannot be made.
     """
     if config.data.source == "latents" or config.data.cache == "off":
         require_same_encoder(model, dataset, config)
@@ -59,7 +59,7 @@ def with_latents(
             restart(writer, lacking)
     if not broadcast_object(accelerator, is_whole(writer.folder)):
         if config.data.cache == "require":
-            return through_cache(dataset, writer.encoding)  # which says what is there instead
+            return through_cache(dataset, writer.encoding)  # which reports what was found instead
         if check_only:
             _say_what_would_be(config, dataset, model, accelerator, writer, note)
             return dataset
@@ -69,7 +69,7 @@ def with_latents(
 
 
 def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -> Dataset:
-    """Return a data set with its clips from the latent cache if there is a whole one of this encoder, else as it is.
+    """Return a data set with its clips from a finished latent cache of this encoder if there is one, else unchanged.
 
     Raises:
         InputError: The data set is itself a cache, of another encoder.
@@ -82,7 +82,7 @@ def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -
 
 
 def _lacking(config: Config, dataset: Dataset, accelerator: Accelerator, writer: CacheWriter) -> list[MissingFiles]:
-    """Return what a cache lacks that is whole by its own account: the first process looks, for all of them."""
+    """Return what a finished cache lacks: the first process checks, for all of them."""
     looks = accelerator.is_main_process and config.data.cache == "auto" and is_whole(writer.folder)
     return broadcast_object(accelerator, missing_files(dataset, writer) if looks else [])
 

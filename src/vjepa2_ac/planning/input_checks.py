@@ -10,18 +10,18 @@ from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.errors import InputError
 
 _LEAST_SIDE = 16  # pixels
-_REACH_M = 5.0  # beyond this it is no arm's reach in metres
+_REACH_M = 5.0  # larger positions are not in metres
 _ANGLE = 2 * math.pi + 0.01
-_GRIPPER_SLACK = 0.1  # what a measured closedness may be beyond 0 .. 1
+_GRIPPER_SLACK = 0.1  # a measured closedness may exceed 0 .. 1 by this
 
 
 def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = None) -> None:
-    """Refuse what is no RGB image, or not of another's size.
+    """Refuse an array that is no RGB image, or of another size than a given one.
 
     Args:
-        image: As given.
-        where: What it is called.
-        like: An image that it is compared with later, and that the same camera should have made.
+        image: The array.
+        where: Its name in errors.
+        like: An image of the same camera, of the required size.
 
     Raises:
         InputError: Says what was found.
@@ -69,7 +69,7 @@ def require_pose(state: np.ndarray, *, where: str) -> None:
 
 
 def require_extrinsics(extrinsics: np.ndarray, *, where: str) -> None:
-    """Refuse what is not a camera's pose in the robot base frame.
+    """Refuse an array that is no camera pose in the robot base frame.
 
     Raises:
         InputError: Says what was found.

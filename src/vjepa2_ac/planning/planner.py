@@ -25,9 +25,9 @@ Clock = Callable[[], float]  # seconds, from anywhere
 
 
 class Planner:
-    """Searches the action sequence of least cost, and knows nothing else of what it plans for.
+    """Searches the action sequence of lowest cost, and knows nothing else about the model.
 
-    Whatever the cost says, the actions of a plan are within the limits; where it says nothing finite, they are zero.
+    Whatever the cost returns, the actions of a plan are within the limits; if no cost is finite, they are zero.
     """
 
     def __init__(
@@ -37,12 +37,12 @@ class Planner:
         clock: Clock = time.perf_counter,
         progress: Progress | None = None,
     ) -> None:
-        """Choose a planner.
+        """Select a planner.
 
         Args:
-            config: Which one, and how long it searches.
-            space: What is allowed; None: an arm's actions within `planning.limits`.
-            clock: What the time budget is measured by.
+            config: The solver, and how long it searches.
+            space: The allowed actions; None: an arm's actions within `planning.limits`.
+            clock: Measures the time budget.
             progress: Called with the number of finished iterations of a plan.
         """
         self.config = config
@@ -50,15 +50,15 @@ class Planner:
         self._clock, self._progress = clock, progress
 
     def plan(self, cost: Cost, generator: Generator, start: PlanStart | None = None) -> Plan:
-        """Return the best plan that was found.
+        """Return the best plan found.
 
         Args:
-            cost: What an action sequence costs. Called without gradients but for planner gradient.
-            generator: On the CPU; the same seed gives the same plan. Its first seed is recorded.
-            start: What an earlier plan left (`Plan.start_after`).
+            cost: The cost of action sequences. Called without gradients except by planner gradient.
+            generator: On the CPU; the same seed gives the same plan. Its initial seed is recorded.
+            start: Left by an earlier plan (`Plan.start_after`).
 
         Raises:
-            ValueError: The cost gives other than one number a sample, or `start` is of another shape.
+            ValueError: The cost does not return one number per sample, or `start` is of another shape.
         """
         began = self._clock()
         if start is not None and start.mean.shape != self.space.lower.shape:
@@ -98,7 +98,7 @@ class Planner:
         return GradientSolver(space, config.gradient, config.iterations, generator, start)
 
     def _has_time(self, began: float, record: list[Iteration]) -> bool:
-        """Say whether an iteration as long as the longest so far would end within the budget."""
+        """Return whether an iteration as long as the longest so far would end within the budget."""
         if self.config.budget_s is None or not record:
             return True
         return self._clock() - began + max(one.seconds for one in record) <= self.config.budget_s
@@ -141,9 +141,9 @@ class Planner:
     def _chosen(
         self, answer: Tensor | None, best: _Best, cost: Cost, *, lowest: bool
     ) -> tuple[Float[Tensor, "steps dim"] | None, float, int]:
-        """Return actions, their energy, and how many more were tried: the answer, or else the best that was tried.
+        """Return actions, their energy, and the number of extra evaluations: the result, or else the best sample.
 
-        With `lowest`, whichever of the two costs less: a mean that has hardly been moved may lead nowhere.
+        With `lowest`, the one of lower cost: a mean that has hardly moved may lead nowhere.
         """
         chosen, lowest_energy, evaluated = None, math.nan, 0
         for decisions in (answer, best.decisions):
@@ -160,7 +160,7 @@ class Planner:
 
 @dataclass
 class _Best:
-    """The best decisions that were tried so far."""
+    """The best decisions evaluated so far."""
 
     decisions: Tensor | None = None
     energy: float = math.inf

@@ -29,9 +29,9 @@ from vjepa2_ac.runs.checkpoint_selection import NEWEST
 from vjepa2_ac.runs.folder import CONFIG
 from vjepa2_ac.runs.loading import is_run, load_run
 
-# Settings that planning heeds; the others are of training, and changing them here would do nothing.
+# Settings that planning uses; the others belong to training, and changing them here would have no effect.
 _USED_KNOBS = ("planning.", "seed", "data.crop", "data.stride", "model.dtype", "model.sizes.", "training.device")
-_ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
+_ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does not use: weights may be of any type
 
 
 class Fingerprints(NamedTuple):
@@ -39,11 +39,11 @@ class Fingerprints(NamedTuple):
 
     encoder: str
     base: str  # of the predictor before it was adapted
-    predictor: str  # with what was trained
+    predictor: str  # with the trained weights
 
     @classmethod
     def of(cls, model: WorldModel) -> Fingerprints:
-        """Hash a model, an adapter apart from its base."""
+        """Hash a model, with its adapter separate from its base."""
         known, whole = model.adaptation, fingerprint(model.predictor.state_dict())
         if known is not None:
             return cls(known.encoder, known.base, whole)
@@ -52,11 +52,11 @@ class Fingerprints(NamedTuple):
 
 @dataclass(frozen=True)
 class PlanningSession:
-    """A world model on its device, in eval mode, what was trained merged into it; and how to plan with it."""
+    """A world model on its device, in eval mode, with trained weights merged; and its planning settings."""
 
     world_model: WorldModel
-    config: Config  # of it: planning, seed, data.crop and data.stride count
-    subject: str  # what was named
+    config: Config  # of it: planning, seed, data.crop and data.stride are used
+    subject: str  # the run or model as given
     checkpoint: str  # which one, as text; "" of a model
     fingerprints: Fingerprints | None = None  # of a run's weights before they were merged; None: of the world model
 
@@ -71,7 +71,7 @@ class PlanningSession:
 
         Args:
             seed: Of all decisions; None: the config's.
-            extrinsics: Pose of the camera, where the model uses it.
+            extrinsics: Pose of the camera, if the model uses it.
             progress: Called with the number of finished iterations of a decision.
 
         Raises:
@@ -87,7 +87,7 @@ class PlanningSession:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return which model this is, as plain values: what was named, and hashes of the weights."""
+        """Return the identity of the model as plain values: its name, and hashes of the weights."""
         model = self.world_model
         dtype = next(model.parameters()).dtype
         return {
@@ -109,20 +109,20 @@ class PlanningSession:
 def load_to_plan(
     subject: str, *, checkpoint: str = NEWEST, config: str | Path | None = None, overrides: Sequence[str] = ()
 ) -> PlanningSession:
-    """Load what to plan with.
+    """Load a run or a model for planning.
 
     The settings of a run are those of its config: planning, seed, crop, stride, type of the weights. Those of a model
-    are the given config's; without one the defaults, and float32 weights where the device has no bfloat16, or is a CPU.
-    What a run has trained is merged before it is on the device (see `planning.model_setup`): it is there once.
+    are the given config's; without one the defaults, and float32 weights if the device has no bfloat16, or is a CPU.
+    Trained weights are merged before the model moves to the device (see `planning.model_setup`): it is there once.
 
     Args:
-        subject: The folder of a run; or a model: what `model.base` takes.
+        subject: The folder of a run; or a model, as in `model.base`.
         checkpoint: Of a run: newest, best, or a number of optimizer steps.
         config: A config file, for a model.
         overrides: Such as planning.horizon=2.
 
     Raises:
-        InputError: There is no such thing, it cannot be planned with, or a setting is wrong or does not matter.
+        InputError: It does not exist, cannot be used for planning, or a setting is invalid or has no effect.
     """
     _require_used(overrides)
     its = _run_config(subject, config, overrides) if is_run(subject) else _model_config(subject, config, overrides)
@@ -146,10 +146,10 @@ def load_to_plan(
 
 
 def _device_to_plan_on(config: Config) -> torch.device:
-    """Return the device, once it is certain that it computes in the type that planning does: without autocast.
+    """Return the device, after checking that it supports the type used in planning, without autocast.
 
     Raises:
-        InputError: It does not, or not in the 8 bits that are asked for.
+        InputError: It does not, or it does not support the requested 8 bits.
     """
     device = torch.device("cpu" if is_on_cpu(config.training) else "cuda")
     require_type_of_weights(config.model, device)
@@ -183,9 +183,9 @@ def _require_used(overrides: Sequence[str]) -> None:
     for override in overrides:
         key = override.partition("=")[0]
         is_heeded = any(key == known or (known.endswith(".") and key.startswith(known)) for known in _USED_KNOBS)
-        if key.split(".")[0] in Config.model_fields and not is_heeded:  # of others the config says what is wrong
+        if key.split(".")[0] in Config.model_fields and not is_heeded:  # for others the config reports the error
             raise InputError(
                 where=f"command line: {override}",
-                found="a setting that planning does not heed",
+                found="a setting that planning does not use",
                 needed=f"one of {', '.join(known + '…' * known.endswith('.') for known in _USED_KNOBS)}",
             )

@@ -50,7 +50,7 @@ def compare(folders: Sequence[Path]) -> Comparison:
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InputError(
             where=", ".join(str(folder / METRICS_FILE) for folder in folders),
-            found=f"figures that cannot be used ({error!r})",
+            found=f"metrics that cannot be used ({error!r})",
             fix="Write them again with `vjepa2-ac evaluate`",
         ) from None
 

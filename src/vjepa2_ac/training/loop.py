@@ -44,19 +44,19 @@ from vjepa2_ac.training.validation import refuse_weak_base, validate, validate_i
 
 
 def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
-    """Train as the config says, from the newest checkpoint of its run folder if there is one.
+    """Train by a config, from the newest checkpoint of its run folder if there is one.
 
     Args:
         config: The run.
         reporter: Shows progress.
         check_only: Do everything that can fail, and stop before the first step and before anything is written.
-        allow_config_change: Go on with this config where the run folder has another one, and say what changes.
+        allow_config_change: Continue with this config if the run folder has another one, and report the changes.
 
     Returns:
         The folder of the run.
 
     Raises:
-        InputError: Something the user gave cannot be used; raised before the first step wherever that can be known.
+        InputError: An input cannot be used; raised before the first step wherever possible.
         StoppedError: A signal asked the run to stop between its first and last step; see `distributed.preemption`.
     """
     accelerator = make_accelerator(config)
@@ -71,11 +71,11 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             config = with_settled_stride(config)
             check_run_folder(config, allow_config_change=allow_config_change)
             require_start_folder(config, Path(config.run_dir))
-            if not check_only and Path(config.run_dir).is_dir():  # a new one is made, and locked, when all else is well
+            if not check_only and Path(config.run_dir).is_dir():  # a new one is created, and locked, after all checks
                 lock.take()
-            # What is checked only is fetched to where it does not last.
+            # A check downloads into a temporary folder.
             trial = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run") if check_only else None
-            # Taken before anything is fetched into the run's folder: whoever else came to it would still be writing.
+            # Locked before anything is downloaded into the run's folder: another process could still be writing there.
             remote = open_remote(
                 config,
                 reporter.note,
@@ -153,7 +153,7 @@ def _loop(
                 metrics_log.write("train", step, metrics)
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             is_best = validate_if_due(run, metrics_log, reporter)
-            # Agreed among all processes, and read once: a signal after this waits for the next step.
+            # Agreed among all processes, and read once: a signal after this takes effect at the next step.
             is_due = clock.is_due(step) or is_best or last or metrics_log.is_behind
             stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
@@ -163,7 +163,7 @@ def _loop(
             mirror.tick()
             if stopped_by and not last:
                 mirror.finish(lambda: True)
-                run.accelerator.wait_for_everyone()  # whoever ended first would have the others ended by the launcher
+                run.accelerator.wait_for_everyone()  # the launcher ends all processes once one has ended
                 raise StoppedError(folder, step, signal.Signals(stopped_by).name)
         mirror.finish(lambda: stop.reason is not None)
     run.accelerator.wait_for_everyone()

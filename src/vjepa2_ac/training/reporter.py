@@ -11,18 +11,18 @@ from vjepa2_ac.evaluation.metrics import PredictionErrors
 
 @runtime_checkable
 class Reporter(Protocol):
-    """Shows a run to a person."""
+    """Shows the progress of a run."""
 
     def note(self, text: str) -> None:
         """Show a message."""
         ...
 
     def indexed(self, done: int, total: int) -> None:
-        """So much of a data set that was not known before is looked through."""
+        """Show the progress of indexing a data set."""
         ...
 
     def encoded(self, done: int, total: int) -> None:
-        """So many frames are encoded into the latent cache."""
+        """Show the progress of encoding frames into the latent cache."""
         ...
 
     def started(self, done: int, total: int) -> None:
@@ -42,7 +42,7 @@ class NullReporter:
     """Shows nothing."""
 
     def note(self, text: str) -> None:
-        """Say nothing."""
+        """Show nothing."""
 
     def indexed(self, done: int, total: int) -> None:
         """Show nothing."""
@@ -74,7 +74,7 @@ class NullMetricsLog:
         yield
 
     def __enter__(self) -> NullMetricsLog:
-        """Return the journal."""
+        """Return this metrics log."""
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -12,11 +12,11 @@ from vjepa2_ac.training.new_embodiment import NOT_ASKED
 from vjepa2_ac.training.reporter import NullMetricsLog, Reporter
 from vjepa2_ac.training.setup import Run, encode
 
-BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: the longest look ahead is what planning leans on
+BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: planning depends on the longest horizon
 
 
 def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter: Reporter) -> bool:
-    """Measure and note, where it is time to; return whether no earlier measurement was as good."""
+    """Measure and log the validation, if it is due; return whether it is the best so far."""
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
         return False
@@ -30,7 +30,7 @@ def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter
 
 
 def validation_metrics(errors: PredictionErrors) -> dict[str, Any]:
-    """Return what a validation writes into the journal."""
+    """Return what a validation writes into the metrics log."""
     by_horizon, one_step = ratios_by_horizon(errors), one_step_ratios(errors)
     return {
         "error_over_persistence": one_step["true"].value,

@@ -15,9 +15,9 @@ _RECORDED = 10
 
 
 class MppiSolver:
-    """Weights exp(-energy / temperature); the noise gets less by a fixed share, and the mean is tried itself.
+    """Weights exp(-energy / temperature); the noise decays by a fixed factor, and the mean is evaluated itself.
 
-    The term of the original that charges for control is left out: limits say what an action may be.
+    The control cost of the original is left out: the limits define the allowed actions.
 
     Source: Williams et al., Information Theoretic MPC for Model-Based Reinforcement Learning, ICRA 2017, algorithm 2.
     """

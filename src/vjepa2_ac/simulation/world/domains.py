@@ -68,9 +68,7 @@ class Domain:
     name: str
     camera: CameraPlace
     look: Look
-    base_yaw_deg: float = (
-        0.0  # mounting of the robot: the same action moves the arm in another direction in the image
-    )
+    base_yaw_deg: float = 0.0  # mounting of the robot: the same action moves the arm in another direction in the image
     lag_s: float = 0.08  # time constant with which the measured pose follows the commanded one
     clutter_seed: int = 0  # decides what lies on the table, and where
 

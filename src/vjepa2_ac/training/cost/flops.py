@@ -28,7 +28,7 @@ class ClipFlops:
 
     @property
     def predictor(self) -> int:
-        """What is left where the latents are there already."""
+        """The work if the latents are cached."""
         return self.forward + self.backward
 
     @property
@@ -53,12 +53,12 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
 
 
 def plan_flops(sizes: ModelSizes, steps: int, before: int = 0) -> int:
-    """Return the operations of predicting where one action sequence leads, with no adapter beside the weights.
+    """Return the operations of predicting the result of one action sequence, without an adapter beside the weights.
 
     Args:
         sizes: Of the model.
         steps: Actions of the sequence.
-        before: Frames seen before the present one, whose keys and values are there already.
+        before: Frames before the current one, whose keys and values are cached.
     """
     passes = _Passes(sizes)
     return sum(
@@ -91,7 +91,7 @@ class _Passes:
     def __init__(
         self, sizes: ModelSizes, ranks: Mapping[str, int] | None = None, whole: Collection[str] = frozenset()
     ) -> None:
-        """Take a model.
+        """Create a counter for a model.
 
         Args:
             sizes: Of the model.
@@ -104,7 +104,7 @@ class _Passes:
 
     @classmethod
     def of(cls, config: Config, sizes: ModelSizes) -> _Passes:
-        """Take the model as a run trains it."""
+        """Create a counter for the model as a run trains it."""
         everything = config.adapter.kind == "none"
         whole = linear_layers(sizes) if everything else config.adapter.modules_to_save
         return cls(sizes, adapter_ranks(config, sizes), whole)
@@ -114,8 +114,8 @@ class _Passes:
 
         Args:
             steps: Steps whose tokens are computed.
-            keys: For each of them, how many steps its tokens look at.
-            fed_back: Whether its latents are predictions, through which gradients pass.
+            keys: For each of them, the number of steps that its tokens attend to.
+            fed_back: Whether its latents are predictions, through which gradients flow.
         """
         patches = steps * _patches(self._sizes)
         work = self._linear("predictor_embed", patches, into=fed_back)
@@ -130,13 +130,13 @@ class _Passes:
         return work + self._linear("predictor_proj", patches, into=flowing)
 
     def _block(self, block: str, tokens: int, pairs: int, *, flowing: bool) -> tuple[_Work, bool]:
-        """Return the work of a block, and whether a gradient has to pass through what comes out.
+        """Return the work of a block, and whether its output needs a gradient.
 
         Args:
             block: Its name.
             tokens: Whose queries are computed.
-            pairs: Queries and keys that meet.
-            flowing: Whether a gradient has to pass through what comes in.
+            pairs: Pairs of queries and keys.
+            flowing: Whether its input needs a gradient.
         """
         work = _Work()
         projections = [f"{block}.attn.{name}" for name in ("q", "k", "v")]

@@ -20,18 +20,18 @@ _MEASURES = {
     "error_over_persistence": "one-step error",
     "rollout_over_persistence_last": "rollout error at the last horizon",
 }
-_NOISE = 1.01  # validation clips are always the same ones; as much changes without meaning anything
-_LOSSES = 10  # rows of `train` whose median is compared, and as few as
+_NOISE = 1.01  # validation clips are always the same; smaller changes mean nothing
+_LOSSES = 10  # number of `train` rows whose median is compared
 _FEWEST_LOSSES = 5
-_FAR_ABOVE = 2.0  # the lowest such median
+_FAR_ABOVE = 2.0  # times the lowest such median
 
 
 class WatchedMetricsLog(MetricsLog):
-    """A journal that says when its rows tell that training goes wrong.
+    """A metrics log that warns when its rows show that training diverges.
 
     Args:
         run_dir: The run's folder.
-        config: Its config, for what to turn.
+        config: Its config, for the knobs to change.
         note: Receives messages for the user.
         first_step: As of `MetricsLog`.
         trackers: As of `MetricsLog`.
@@ -52,7 +52,7 @@ class WatchedMetricsLog(MetricsLog):
             self._watch(str(row.get("kind")), row["step"], row)
 
     def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
-        """Append a row, and behind it what it warns of."""
+        """Append a row, followed by its warnings."""
         super().write(kind, step, metrics)
         for text in self._watch(kind, step, metrics):
             super().write(WARNING, step, {"text": text})
@@ -60,7 +60,7 @@ class WatchedMetricsLog(MetricsLog):
 
 
 class Watch:
-    """Looks at row after row of a journal.
+    """Checks the rows of a metrics log one after the other.
 
     Args:
         config: Of the run.
@@ -74,7 +74,7 @@ class Watch:
         self._lowest = math.inf
 
     def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> list[str]:
-        """Return what is to be said of a row: nothing where all is well or it was said before."""
+        """Return the warnings of a row: none if it is fine or the cause is known already."""
         found = {"validation": self._of_validation, "train": self._of_loss}.get(kind)
         new = {cause: text for cause, text in found(step, metrics) if cause not in self._said} if found else {}
         self._said |= set(new)
@@ -112,7 +112,7 @@ class Watch:
 
 
 def way_out(config: Config) -> str:
-    """Return what to turn in a config whose training has made the model worse."""
+    """Return the knobs to change in a config whose training has made the model worse."""
     training, adapter = config.training, config.adapter
     knobs = [f"lower training.learning_rate ({training.learning_rate:g})"]
     if adapter.kind == "lora":
@@ -125,5 +125,5 @@ def way_out(config: Config) -> str:
 
 
 def _number(value: Any) -> float:
-    """Return a figure; NaN for one that JSON could not hold."""
+    """Return a number; NaN for one that JSON could not hold."""
     return float(value) if isinstance(value, int | float) else math.nan
