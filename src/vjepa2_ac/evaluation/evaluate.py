@@ -37,7 +37,7 @@ from vjepa2_ac.evaluation.result import (
 from vjepa2_ac.evaluation.strata import clips_of, strata_of
 
 ClipName = tuple[str, int]  # id of the episode, first control step
-FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the batch at hand
+FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the current batch
 _NOT_ASKED = "{} is 0: no {} were asked for."
 _NO_PLANS = "No plans: they are poses' displacements, and the states here are plain numbers."
 _NO_LANDSCAPES = "No energy landscapes: an action has {} numbers, and a landscape is over three."
@@ -45,18 +45,20 @@ _NO_LANDSCAPES = "No energy landscapes: an action has {} numbers, and a landscap
 
 @dataclass(frozen=True)
 class Contender:
-    """A model that is measured."""
+    """A model to measure."""
 
     name: str
     role: Role
     model: Predictor
-    switched: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext  # on while it predicts
-    to_plan: Callable[[], Predictor] | None = None  # gives what plans in its place, and is held only while it does
+    switched: Callable[[], contextlib.AbstractContextManager[object]] = (
+        contextlib.nullcontext
+    )  # while it predicts
+    to_plan: Callable[[], Predictor] | None = None  # returns the model that plans in its place, held only for that time
 
 
 @dataclass(frozen=True)
 class ProbeOptions:
-    """How much is done beyond the errors; 0 clips: nothing."""
+    """Options of the measurements beyond the errors; 0 clips: none."""
 
     sensitivity_clips: int = 32
     samples: int = 64  # other actions per clip, drawn in each of two ways
@@ -64,14 +66,14 @@ class ProbeOptions:
     nodes: int = 9  # along each axis of a landscape
     reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
     examples: int = 4
-    at_once: int = 64  # samples that are computed together
-    planning_clips: int = 0  # of these, plans are held against the demonstration; of poses only
-    planning: PlanningConfig = field(default_factory=PlanningConfig)  # how one step is planned
+    at_once: int = 64  # samples per batch
+    planning_clips: int = 0  # number of clips whose plans are compared with the demonstration; of poses only
+    planning: PlanningConfig = field(default_factory=PlanningConfig)  # settings of one-step plans
 
 
 @dataclass(frozen=True)
 class RepeatableClips:
-    """Clips that can be read more than once: all of them, or some by name; batches of latents with their frames."""
+    """Clips that can be read repeatedly: all of them, or some by name; batches of latents with their frames."""
 
     count: int
     read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]
@@ -90,12 +92,12 @@ def evaluate(
     Args:
         contenders: In the order of the table; one of them has the role trained.
         clips: What to measure on.
-        about: What this is.
-        probes: How much is done beyond the errors.
-        stage: Gives a bar for a part of the work, by its title.
+        about: Description of the evaluation.
+        probes: Options of the measurements beyond the errors.
+        stage: Returns a progress bar for a part of the work, by its title.
 
     Raises:
-        ValueError: No clips; or to plan they have too few frames.
+        ValueError: No clips; or too few frames for planning.
     """
     probes = probes or ProbeOptions()
     seen = _see_all(contenders, clips, probes, about, _bar(stage, "measuring"))
@@ -135,7 +137,7 @@ def evaluate(
 
 
 def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[str, ...]:
-    """Return what a reader must know of what was not measured: by an option, or as there is no such thing."""
+    """Return notes on what was not measured: by an option, or because it does not apply."""
     notes = []
     if not probes.sensitivity_clips:
         notes.append(_NOT_ASKED.format("--sensitivity-clips", "other actions and no energy landscapes"))
@@ -152,7 +154,7 @@ def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[s
 
 @dataclass
 class _Seen:
-    """What is kept of all clips: figures and actions, and one frame and the next of some."""
+    """Data of all clips: errors and actions, and one frame and the next of some."""
 
     ids: list[str]
     firsts: list[int]
@@ -199,7 +201,7 @@ def _see_all(
 
 
 def _largest_step(actions: Float[torch.Tensor, "time action_dim"], about: About) -> int:
-    """Return the step of a clip in which most is done: of poses the translation decides."""
+    """Return the step of a clip with the largest action: for poses, by the translation."""
     return int((actions[:, :3] if about.is_pose else actions).norm(dim=-1).argmax())
 
 
@@ -280,7 +282,7 @@ def _episodes(evaluation: Evaluation) -> tuple[EpisodeScore, ...]:
 def _examples(
     contenders: Sequence[Contender], clips: RepeatableClips, evaluation: Evaluation, probes: ProbeOptions
 ) -> tuple[Example, ...]:
-    """Read the clips again that are worth a look: which ones these are is known only now."""
+    """Read the clips of the examples again: which ones these are is known only now."""
     known = evaluation.clips
     trained = evaluation.models[evaluation.trained].true.rollout
     moved = known.action_size.sum(axis=1)

@@ -50,26 +50,26 @@ _NO_BASE = "There is no base to compare with: it takes states or actions of othe
 
 @dataclass(frozen=True)
 class EvaluationOptions:
-    """What is asked of an evaluation."""
+    """The options of an evaluation."""
 
     split: Split = "test"
     clips: int = 256  # at most, spread over the episodes
     checkpoint: str = NEWEST  # of a run: newest, best, or a number of optimizer steps
-    data: Config | None = None  # other data than the run's own; a model has none of its own
+    data: Config | None = None  # data other than the run's own; a model has none of its own
     against: tuple[str, ...] | None = None  # base, runs, models; None: the base of a run, nothing for a model
-    out: Path | None = None  # folder for what is written; None: the run's
+    out: Path | None = None  # output folder; None: the run's
     probes: ProbeOptions = field(default_factory=ProbeOptions)
-    calibrate: bool = False  # measure the error at other strides, too
+    calibrate: bool = False  # also measure the error at other strides
     planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured."""
+    """The result of an evaluation."""
 
     evaluation: Evaluation
     checkpoint: str  # which one, as text; "" of a model
-    folder: Path  # for what is written of it
+    folder: Path  # of the output
 
 
 def measure_subject(
@@ -78,12 +78,12 @@ def measure_subject(
     """Measure a run or a model on held-out episodes. Cheap failures first.
 
     Args:
-        subject: The folder of a run; or a model: what `model.base` takes.
-        asked: How.
-        stage: Gives a bar for a part of the work, by its title.
+        subject: The folder of a run; or a model, as in `model.base`.
+        asked: The options.
+        stage: Returns a progress bar for a part of the work, by its title.
 
     Raises:
-        InputError: The subject, the data, or what to compare with cannot be used; the split is empty.
+        InputError: The subject, the data, or a model to compare with cannot be used; the split is empty.
     """
     asked = asked or EvaluationOptions()
     config, folder = _config_of(subject, asked)
@@ -139,12 +139,12 @@ def measure_subject(
 
 
 def _warnings(folder: Path) -> list[str]:
-    """Return what training warned of, as sentences."""
+    """Return the warnings of the training, as sentences."""
     return [f"In training, {text}." for text in warnings_of(folder / METRICS)]
 
 
 def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
-    """Return every figure of a run's metrics.jsonl that is one number, over optimizer steps."""
+    """Return all scalar metrics of a run's metrics.jsonl, over optimizer steps."""
     points: dict[str, list[tuple[int, float]]] = {}
     for row in read_metrics_log(folder / METRICS):
         for name, value in row.items():
@@ -157,7 +157,7 @@ def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
 
 
 def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
-    """Return the config to measure with, and the folder for what is found."""
+    """Return the config to measure with, and the output folder."""
     if is_run(subject):
         config, needed = read_run_config(Path(subject)), [DATA] if asked.data is None else []
         config = with_paths_from_start(config, Path(subject), needed=needed)
@@ -198,10 +198,10 @@ def _nothing_to_measure(subject: str) -> InputError:
 
 
 def _planning_of(config: Config, asked: EvaluationOptions) -> PlanningConfig:
-    """Return how one step is planned: the config's settings, some of them replaced.
+    """Return the settings of one-step plans: the config's, some of them replaced.
 
     Raises:
-        InputError: A setting is wrong, or is none of planning.
+        InputError: A setting is wrong, or does not belong to planning.
     """
     for setting in asked.planning:
         if not setting.startswith("planning."):
@@ -235,7 +235,7 @@ def _load_model(name: str, config: Config) -> WorldModel:
 def _contenders(
     subject: str, config: Config, run: TrainedRun | None, world_model: WorldModel, asked: EvaluationOptions
 ) -> tuple[list[Contender], tuple[str, ...]]:
-    """Return the models to measure, the base first and the subject last; and what a reader must know of them."""
+    """Return the models to measure, the base first and the subject last; and notes on them."""
     against = asked.against if asked.against is not None else (BASE,) * (run is not None)
     found: list[Contender] = []
     notes: tuple[str, ...] = ()
@@ -262,7 +262,7 @@ def _contenders(
 def _contender(
     name: str, role: Role, model: WorldModel, switched: Callable[[], AbstractContextManager[object]] = nullcontext
 ) -> Contender:
-    """Return a model to measure as it is; a merged copy plans in its place (see `planning.model_setup`)."""
+    """Return a model to measure unmerged; a merged copy plans in its place (see `planning.model_setup`)."""
     adaptation = model.adaptation
     plans_as_it_is = adaptation is None or (role == "base" and adaptation.kind == "lora")  # whose adapter is off then
     return Contender(name, role, model, switched, None if plans_as_it_is else partial(unadapted_copy, model))
@@ -306,7 +306,7 @@ def _clips(
     encode: Callable[[Batch], LatentBatch],
     image_size: int,
 ) -> RepeatableClips:
-    """Return the clips at these windows, to be read as often as it takes."""
+    """Return the clips at these windows, which can be read repeatedly."""
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
 
     def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
@@ -318,7 +318,7 @@ def _clips(
 
 
 def _frames_of_row(dataset: Dataset, batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"]:
-    """Return what the encoder sees of a clip; of cached latents, small frames made large."""
+    """Return the frames of a clip as the encoder sees them; of cached latents, enlarged small frames."""
     return seen_by_the_encoder(torch.from_numpy(pictures_of(dataset, batch, row)), size)
 
 

@@ -19,12 +19,12 @@ from jaxtyping import Float
 from scipy import stats
 
 RESAMPLES = 2000
-_SHARE = 0.95  # of what happens, that an interval is to cover
+_SHARE = 0.95  # probability that an interval covers the true value
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure with a 95 % bootstrap interval over episodes; NaN where there is one episode only."""
+    """A number with a 95 % bootstrap interval over episodes; NaN where there is one episode only."""
 
     value: float
     low: float
@@ -32,11 +32,11 @@ class Estimate:
 
     @property
     def has_interval(self) -> bool:
-        """Whether there were episodes enough to say how sure the value is."""
+        """Whether there were enough episodes for an interval."""
         return not math.isnan(self.low)
 
     def side(self, of: float) -> int:
-        """Return -1 or 1 where the whole interval lies below or above a number, else 0: not sure."""
+        """Return -1 or 1 if the whole interval is below or above a number, else 0: uncertain."""
         return -1 if self.high < of else 1 if self.low > of else 0
 
     def as_dict(self) -> dict[str, float | None]:
@@ -56,14 +56,14 @@ def bootstrapped(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> tuple[Estimate, ...]:
-    """Return an estimate of each figure, which is a function of sums over clips.
+    """Return an estimate of each metric, which is a function of sums over clips.
 
     Args:
-        of_sums: Turns sums [columns, ..., figures] into values [..., figures].
-        columns: What is summed. All columns are drawn together, so a comparison of two on the same clips is paired.
+        of_sums: Turns sums [columns, ..., metrics] into values [..., metrics].
+        columns: The summands. All columns are resampled together, so a comparison of two on the same clips is paired.
         episode_ids: Of each clip.
-        resamples: How often as many episodes as there are are drawn, with replacement.
-        seed: Decides which.
+        resamples: Number of bootstrap samples, each of as many episodes as there are, with replacement.
+        seed: Of the samples.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         values = of_sums(columns.sum(axis=1))
@@ -96,7 +96,7 @@ def ratio(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Estimate:
-    """Return mean error over mean other error, most often persistence: clips weigh by how much there is to predict."""
+    """Return mean error over mean other error, most often persistence: clips are weighted by the denominator."""
     columns = np.stack([errors, others])[:, :, None]
     return bootstrapped(lambda sums: sums[0] / sums[1], columns, episode_ids, resamples=resamples, seed=seed)[0]
 
@@ -111,7 +111,7 @@ def ratio_difference(
 ) -> Estimate:
     """Return the `ratio` of one pair of (errors, persistence) minus that of another on the same clips.
 
-    Both are drawn together, so what makes an episode hard for both does not widen the interval.
+    Both are resampled together, so what makes an episode hard for both does not widen the interval.
     """
     columns = np.stack([*one, *other])[:, :, None]
     return bootstrapped(
@@ -135,10 +135,10 @@ def _with_interval(value: float, drawn: np.ndarray, tail: float) -> Estimate:
 
 
 def share_of(successes: int, tries: int) -> Estimate:
-    """Return the share of tries that succeeded, with Wilson's 95 % interval: it stays within 0 .. 1.
+    """Return the share of successes with Wilson's 95 % interval, which stays within 0 .. 1.
 
     Raises:
-        ValueError: No tries, or more successes than tries.
+        ValueError: No trials, or more successes than trials.
     """
     found = stats.binomtest(successes, tries)
     low, high = found.proportion_ci(_SHARE, method="wilson")

@@ -24,7 +24,7 @@ from vjepa2_ac.evaluation.result import Errors, Predicted
 
 @runtime_checkable
 class Predictor(Protocol):
-    """What is measured: something that predicts latents. `WorldModel` is one; so is an oracle in a test."""
+    """A predictor of latents: `WorldModel`, or an oracle in a test."""
 
     def predict(
         self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None
@@ -63,7 +63,7 @@ def persistence_of(batch: LatentBatch) -> Predicted:
 def distances(
     predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"]
 ) -> Errors:
-    """Return how far predictions are from the truth, in each metric of `evaluation.result`, computed in float32."""
+    """Return the error of predictions in each metric of `evaluation.result`, computed in float32."""
     predicted, true = predicted.float(), true.float()
     difference = predicted - true
     similarity = cosine_similarity(predicted, true, dim=-1)
@@ -77,9 +77,9 @@ def distances(
 def with_other_actions(
     batches: Iterable[LatentBatch],
 ) -> Iterator[tuple[LatentBatch, Float[Tensor, "batch time action_dim"]]]:
-    """Yield each batch with other actions for its clips: those of the clip before, whatever the size of a batch.
+    """Yield each batch with other actions for its clips: those of the clip before, whatever the batch size.
 
-    The first clip gets those of the second; if it is alone, its own backwards.
+    The first clip gets those of the second; if it is alone, its own reversed.
     """
     rest = iter(batches)
     head = [batch for _, batch in zip(range(1), rest, strict=False)]
@@ -110,7 +110,7 @@ class PredictionErrors:
 
 @torch.no_grad()
 def prediction_errors(model: Predictor, batches: Iterable[LatentBatch]) -> PredictionErrors:
-    """Measure a model on clips of held-out episodes, batch after batch, so that no latents need be kept.
+    """Measure a model on clips of held-out episodes, batch after batch, so that no latents are stored.
 
     Raises:
         ValueError: No clips.
@@ -148,7 +148,7 @@ def ratios_by_horizon(errors: PredictionErrors) -> list[Estimate]:
 def one_step_ratios(errors: PredictionErrors) -> dict[str, Estimate]:
     """Return the teacher-forced error over persistence with the true, zero and shuffled actions.
 
-    A model that uses its actions is much better with the true ones than with the other two.
+    A model that uses its actions is much better with the true ones than with the others.
     """
     tried = {
         "true": errors.one_step,

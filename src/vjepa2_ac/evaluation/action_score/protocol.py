@@ -9,7 +9,7 @@ Where it differs: docs/evaluation.md.
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 
 STEPS = 3  # of a scored plan
-FRAMES = STEPS + 1  # that a clip needs
+FRAMES = STEPS + 1  # required of a clip
 FRAMES_SEEN = 2  # by the model at most, predicted ones included
 BEST_SCORE = 80.0
 SCORED = PlanningConfig(

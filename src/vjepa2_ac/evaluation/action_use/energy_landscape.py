@@ -17,7 +17,7 @@ from vjepa2_ac.evaluation.intervals import Estimate, mean_of
 from vjepa2_ac.evaluation.metrics import Predictor
 from vjepa2_ac.evaluation.result import Landscape, Landscapes
 
-_ROOM = 1.25  # how far the grid reaches beyond the largest true action
+_ROOM = 1.25  # extent of the grid relative to the largest true action
 _SAME = 1e-6  # energies this close, as a share, are equally low
 _CM = 100.0
 
@@ -35,12 +35,12 @@ def measure_landscapes(
     """Compute the energy over a grid of the first three numbers of the action, the others being the true ones.
 
     Args:
-        model: What predicts.
+        model: The predictor.
         starts: One frame of each clip; one or more.
         is_pose: The numbers are dx, dy, dz in metres, and are reported in cm.
         nodes: Along each axis.
         reach: The grid spans at least -reach .. reach (metres; of vectors: in its own numbers).
-        at_once: Samples that are computed together.
+        at_once: Samples per batch.
         progress: Called with the number of finished starts.
 
     Raises:
@@ -61,14 +61,14 @@ def measure_landscapes(
 
 
 def grid_axes(true: Float[np.ndarray, " 3"], half: float, nodes: int) -> Float[np.ndarray, "3 nodes"]:
-    """Return the values along each axis: evenly apart, from about -half to half, one of them exactly the true one."""
+    """Return the values along each axis: equally spaced, from about -half to half, one of them exactly the true one."""
     distance = 2 * half / (nodes - 1)
     place = np.clip(np.round((true + half) / distance), 0, nodes - 1)
     return true[:, None] + distance * (np.arange(nodes)[None] - place[:, None])
 
 
 def lowest(energy: Float[np.ndarray, ...]) -> Bool[np.ndarray, ...]:
-    """Return where the energy is lowest; everywhere, where it is flat."""
+    """Return where the energy is lowest; everywhere, if it is flat."""
     least = energy.min()
     return np.asarray(energy <= least + _SAME * abs(least))
 
@@ -110,9 +110,9 @@ def _summary(maps: tuple[Landscape, ...], names: tuple[str, str, str], unit: str
 
 
 def _signs(maps: Sequence[Landscape], axis: int, least: float) -> tuple[Estimate, float, int]:
-    """Return how often the minimum lies on the true action's side of zero, the same of any node, and of how many clips.
+    """Return how often the minimum has the true action's sign, the same of any node, and the number of clips.
 
-    Clips that hardly move along the axis have no sign to agree with.
+    Clips that hardly move along the axis are not counted.
     """
     counted = [one for one in maps if abs(one.true[axis]) >= least]
     if not counted:

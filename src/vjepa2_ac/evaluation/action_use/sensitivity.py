@@ -16,12 +16,12 @@ from vjepa2_ac.evaluation.metrics import Predictor
 from vjepa2_ac.evaluation.result import Ranking, Sensitivity
 
 TOP = (1, 5, 10)
-_SAME = 1e-6  # energies whose difference is a smaller share of them are equal: rounding decides no rank
+_SAME = 1e-6  # relative difference below which energies are equal: rounding decides no rank
 
 
 @dataclass(frozen=True)
 class ActionPool:
-    """Actions of all clips, to draw others from."""
+    """Actions of all clips, a pool to draw others from."""
 
     actions: Float[np.ndarray, "count action_dim"]
     episode_ids: tuple[str, ...]  # of each action
@@ -31,7 +31,7 @@ class ActionPool:
     def of_others(
         self, start: RolloutStart, samples: int, generator: np.random.Generator
     ) -> Float[np.ndarray, "samples action_dim"]:
-        """Draw actions of other episodes, with replacement; of the same one where there is no other."""
+        """Draw actions of other episodes, with replacement; of the same one if there is no other."""
         others = np.flatnonzero(np.array(self.episode_ids) != start.episode_id)
         chosen = generator.choice(others if len(others) else np.arange(len(self.actions)), size=samples)
         return np.asarray(self.actions[chosen])
@@ -39,7 +39,7 @@ class ActionPool:
     def in_box(
         self, start: RolloutStart, samples: int, generator: np.random.Generator
     ) -> Float[np.ndarray, "samples action_dim"]:
-        """Draw uniformly: of poses (dx, dy, dz) in the box, the rest as it truly was; of vectors every number."""
+        """Draw uniformly: for poses (dx, dy, dz) in the box, the rest being true; for vectors every number."""
         true = start.action.cpu().numpy().astype(np.float64)
         half = np.abs(self.actions).max(axis=0)
         drawn = generator.uniform(-1.0, 1.0, size=(samples, len(true)))
@@ -50,7 +50,7 @@ class ActionPool:
         return evaluated
 
     def words(self, drawn_from: Literal["clips", "box"]) -> str:
-        """Say where actions are drawn from."""
+        """Return as text where actions are drawn from."""
         if drawn_from == "clips":
             return "actions of other episodes"
         if self.is_pose:
@@ -68,15 +68,15 @@ def measure_sensitivity(
     at_once: int,
     progress: Progress | None = None,
 ) -> Sensitivity:
-    """Try other actions from each start.
+    """Evaluate other actions from each start.
 
     Args:
-        model: What predicts.
-        starts: One frame of each clip that is measured.
-        pool: Where others come from.
-        samples: Others per start, from each of the two places.
-        seed: Decides which; a start gets the same ones whatever else is measured.
-        at_once: Samples that are computed together.
+        model: The predictor.
+        starts: One frame of each clip.
+        pool: The pool of other actions.
+        samples: Others per start, from each of the two sources.
+        seed: A start gets the same actions whatever else is measured.
+        at_once: Samples per batch.
         progress: Called with the number of finished starts.
     """
     changes, persistence = [], []
@@ -103,7 +103,7 @@ def measure_sensitivity(
 
 
 def _place(true: float, others: Float[np.ndarray, " samples"]) -> tuple[float, float]:
-    """Return how many others have a lower energy, and how many the same."""
+    """Return how many others have a lower energy, and how many an equal one."""
     same = np.abs(others - true) <= _SAME * max(abs(true), 1e-12)
     return float(((others < true) & ~same).sum()), float(same.sum())
 

@@ -20,13 +20,13 @@ from vjepa2_ac.evaluation.stride_calibration.from_config import load_named
 def probe_config(
     config: Config, dataset: Dataset, *, model: str, clips: int = 64, progress: Progress | None = None
 ) -> VariantProbe:
-    """Probe the data of a config, which is open at a stride that is a number, with a model.
+    """Probe the data of a config, opened at a fixed stride, with a model.
 
     Args:
         config: The device and the precision.
         dataset: The data.
         model: What `model.base` takes, or the folder of a run.
-        clips: To measure, of the validation episodes; of training episodes where there are no others.
+        clips: Number of clips, of the validation episodes; of training episodes if there are no others.
         progress: Called with the number of measured clips.
 
     Raises:

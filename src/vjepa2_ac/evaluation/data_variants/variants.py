@@ -22,13 +22,13 @@ class Variant:
     """Another reading of the same data."""
 
     name: str
-    repair: str  # what to do where it fits better
+    repair: str  # the fix, if it fits better
     change: Callable[[Episode], Episode]
     changes_frames: bool = False
 
 
 def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
-    """Return the variants that make sense of this data.
+    """Return the variants that apply to this data.
 
     Args:
         config: The data.
@@ -68,7 +68,7 @@ _GRIPPER = {
 
 
 def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarray, "steps 7"]:
-    """Return poses as a mirror across the plane of two axes shows them: one coordinate and two rotations negated."""
+    """Return poses mirrored across the plane of two axes: one coordinate and two rotations negated."""
     mirror = np.ones(3)
     mirror[axis] = -1
     rotations = matrices_from_euler(states[:, 3:6]) * mirror[:, None] * mirror
@@ -83,7 +83,7 @@ class ChangedSource:
     variant: Variant
 
     def infos(self, progress: Progress | None = None) -> Sequence[EpisodeInfo]:
-        """Return those of the source."""
+        """Return the infos of the source."""
         return self.source.infos(progress)
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
@@ -96,17 +96,17 @@ class ChangedSource:
 
 @dataclass(frozen=True)
 class RememberingSource:
-    """A source that reads each episode once: of one far away, or in a large record, that takes long."""
+    """A source that reads each episode once: a remote one, or one in a large record, takes long."""
 
     source: EpisodeSource
     episodes: dict[tuple[int, str | None], Episode] = field(default_factory=dict)
 
     def infos(self, progress: Progress | None = None) -> Sequence[EpisodeInfo]:
-        """Return those of the source."""
+        """Return the infos of the source."""
         return self.source.infos(progress)
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
-        """Return an episode, as it was read first."""
+        """Return an episode, read at the first call."""
         if (index, camera) not in self.episodes:
             self.episodes[index, camera] = self.source.read(index, camera, needed)
         return self.episodes[index, camera]
@@ -121,7 +121,7 @@ def _steps(shift: int) -> str:
 
 
 def _shifted(episode: Episode, *, late: int) -> Episode:
-    """Give each step the state, and the command, of so many steps before; beyond the ends, the first or the last."""
+    """Give each step the state, and the command, of `late` steps before; beyond the ends, the first or the last."""
     steps = np.clip(np.arange(len(episode.states)) - late, 0, len(episode.states) - 1)
     commands = None if episode.commands is None else episode.commands[steps]
     return replace(episode, states=episode.states[steps], commands=commands)

@@ -35,7 +35,7 @@ def calibrate_config(
         config: The data, the model, the device and the precision.
         model: Another model: what `model.base` takes, or the folder of a run.
         split: Episodes to measure on.
-        clips: At each stride.
+        clips: Number at each stride.
         frames: Of a clip; None: the config's, but 8 at most.
         indexing: Called with the progress of indexing.
         measuring: Called with the number of measured clips.
@@ -58,7 +58,7 @@ def load_named(config: Config, model: str | None) -> WorldModel:
     """Return the model of a run's folder, or of what `model.base` takes; None: the config's own.
 
     Raises:
-        InputError: There is none, it cannot be read, or it is drawn at random.
+        InputError: There is none, it cannot be read, or it is randomly initialized.
     """
     if model is not None and (Path(model) / CONFIG).is_file():
         return load_run(Path(model)).world_model

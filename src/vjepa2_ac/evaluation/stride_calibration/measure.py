@@ -30,7 +30,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 
 FRAMES = 8  # of a clip at most: as the released weights were trained, and short enough for the widest stride
 _EPISODES_NEEDED = 2  # for an interval
-_EPISODES_TO_BE_SURE = 10  # an interval that is drawn from fewer is too narrow
+_EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ class StrideResult:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was found at each stride, and which one is best."""
+    """The results at each stride, and the best one."""
 
     results: tuple[StrideResult, ...]
-    impossible: dict[int, str]  # stride -> why it could not be tried
+    impossible: dict[int, str]  # stride -> why it could not be measured
     frames: int
     split: Split
-    runner_up: int | None  # the stride that comes second
+    runner_up: int | None  # the second-best stride
     difference: Estimate | None  # of the two best ratios, the best's minus the other's, paired by clip
 
     @property
@@ -65,7 +65,7 @@ class Calibration:
 
     @property
     def is_certain(self) -> bool:
-        """Whether the best stride beats the next with its whole 95 % interval, over episodes enough."""
+        """Whether the best stride is better than the next with its whole 95 % interval, over enough episodes."""
         return (
             self.difference is not None
             and self.difference.has_interval
@@ -74,7 +74,7 @@ class Calibration:
         )
 
     def verdict(self) -> str:
-        """State as text which stride to take, and how sure that is."""
+        """Return as text the best stride, and how certain it is."""
         best = self.best
         words = (
             f"Best: stride {best.stride} ({best.seconds_per_step:.2f} s per model step), error/persistence {best.ratio}"
@@ -90,7 +90,7 @@ class Calibration:
         return words if words.endswith("?") else words + "."
 
     def lines(self) -> list[str]:
-        """Return what was found as lines of text, the verdict last."""
+        """Return the results as lines of text, the verdict last."""
         results = [
             f"  stride {one.stride} ({one.seconds_per_step:.2f} s): error/persistence {one.ratio},"
             f" {one.clips} clips of {one.episodes} episodes"
@@ -99,7 +99,7 @@ class Calibration:
         return [*results, *(f"  stride {n}: not possible: {why}" for n, why in self.impossible.items()), self.verdict()]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every figure as plain values, for `calibration.json`."""
+        """Return all metrics as plain values, for `calibration.json`."""
         strides = [
             {**{name: getattr(one, name) for name in _METRICS}, "error_over_persistence": one.ratio.as_dict()}
             for one in self.results
@@ -140,18 +140,18 @@ def calibrate(
     """Measure a model's one-step error over persistence at each stride.
 
     A stride is possible if clips of it fit into at least two episodes (one, if no stride fits into two). All possible
-    ones are tried on the starts from which a clip of the widest fits.
+    ones are measured on the starts from which a clip of the widest fits.
 
     Args:
-        model: What predicts.
+        model: The predictor.
         encode: Turns a batch of pixels into latents on the model's device.
-        dataset: Where clips come from; its own stride and number of frames do not matter.
+        dataset: The source of clips; its own stride and number of frames do not matter.
         split: Which episodes.
-        strides: To try; none: those of the config.
+        strides: The candidates; none: those of the config.
         frames: Of a clip; None: the config's, but 8 at most, so that wide strides fit.
-        clips: At each stride.
-        batch_size: Clips that are measured at once.
-        copies: How they get to the model's device.
+        clips: Number at each stride.
+        batch_size: Clips per batch.
+        copies: Copies them to the model's device.
         progress: Called with (clips done, clips in total).
 
     Raises:
@@ -177,11 +177,11 @@ def calibrate(
 
 @dataclass(frozen=True)
 class _Measured:
-    """Figures by clip; a clip is named by its episode and first step."""
+    """Metrics by clip; a clip is named by its episode and first step."""
 
     errors: Float[np.ndarray, " clips"]
     persistence: Float[np.ndarray, " clips"]
-    moved_cm: Float[np.ndarray, " steps"]  # none where the states are no poses
+    moved_cm: Float[np.ndarray, " steps"]  # none if the states are no poses
     clips: tuple[tuple[str, int], ...]
 
     @classmethod
@@ -241,7 +241,7 @@ def _with_progress(
 
 
 def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:
-    """Tell the strides whose clips fit into episodes enough from the others, and say why not."""
+    """Return the strides whose clips fit into enough episodes, and for the others the reason why not."""
     fitting, reasons = {}, {}
     for stride, dataset in views.items():
         try:
@@ -258,7 +258,7 @@ def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[
 
 
 def _compared(measured: dict[int, _Measured]) -> tuple[int | None, Estimate | None]:
-    """Return the stride that comes second, and how far the best ratio lies below its ratio."""
+    """Return the second-best stride, and how far the best ratio is below its ratio."""
     if len(measured) < 2:
         return None, None
     first, second = sorted(measured, key=lambda stride: measured[stride].value)[:2]
@@ -275,7 +275,7 @@ def _compared(measured: dict[int, _Measured]) -> tuple[int | None, Estimate | No
 
 
 def require_learned(model: ModelConfig) -> None:
-    """Refuse to ask a model that is drawn at random.
+    """Refuse a randomly initialized model.
 
     Raises:
         InputError: It is.
