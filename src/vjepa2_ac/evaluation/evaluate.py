@@ -50,9 +50,7 @@ class Contender:
     name: str
     role: Role
     model: Predictor
-    switched: Callable[[], contextlib.AbstractContextManager[object]] = (
-        contextlib.nullcontext
-    )  # while it predicts
+    switched: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext  # while it predicts
     to_plan: Callable[[], Predictor] | None = None  # returns the model that plans in its place, held only for that time
 
 

@@ -1,4 +1,4 @@
-"""Videos of closed-loop episodes: the cameran image beside the goal image, step by step."""
+"""Videos of closed-loop episodes: the camera image beside the goal image, step by step."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ from vjepa2_ac.reports.figures.caption import side_by_side
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult, EpisodeResult
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
 
-_HOLD = 4  # as many frames as this are the first and the last image of an episode shown
+_HOLD = 4  # number of repetitions of the first and the last image of an episode
 
 
 def write_film(path: str | Path, results: Sequence[ClosedLoopResult]) -> Path:
-    """Write the kept images of policies that did the same problems as a video, in the time that they took.
+    """Write the stored frames of policies that solved the same problems as a video, in real time.
 
     Args:
         path: Of an MP4.
-        results: A cameran image for each, side by side, the goal image last.
+        results: One camera image for each, side by side, the goal image last.
 
     Raises:
         InputError: PyAV is not installed.
-        ValueError: No images were kept.
+        ValueError: No frames were stored.
     """
     return write_video(path, film_frames(results), rate_hz=CONTROL_RATE_HZ / results[0].stride)
 
 
 def film_frames(results: Sequence[ClosedLoopResult]) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
-    """Yield the frames of the film, one for every model step, the first and last of an episode for longer."""
+    """Yield the frames of the video, one per model step, the first and last of an episode repeated."""
     for index, episodes in enumerate(zip(*(result.episodes for result in results), strict=True)):
         if any(episode.frames is None for episode in episodes):
             return

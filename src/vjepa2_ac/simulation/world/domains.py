@@ -21,7 +21,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """Where a camera stands and looks: around `look_at_m`; azimuth 0 is in front of the robot, 90 at its left."""
+    """Position and direction of a camera: around `look_at_m`; azimuth 0 is in front of the robot, 90 at its left."""
 
     azimuth_deg: float
     elevation_deg: float
@@ -42,7 +42,7 @@ class CameraPlace:
         return pose
 
     def turned(self, angle_deg: float) -> CameraPlace:
-        """Return the place further round the same circle."""
+        """Return the same position, rotated further on the circle."""
         return replace(self, azimuth_deg=self.azimuth_deg + angle_deg)
 
 
@@ -58,7 +58,7 @@ class Look:
     wall: Rgb
     light_azimuth_deg: float = 100.0
     light_elevation_deg: float = 55.0
-    ambient: float = 0.45  # share of the light that comes from everywhere
+    ambient: float = 0.45  # share of ambient light
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Domain:
     look: Look
     base_yaw_deg: float = 0.0  # mounting of the robot: the same action moves the arm in another direction in the image
     lag_s: float = 0.08  # time constant with which the measured pose follows the commanded one
-    clutter_seed: int = 0  # decides what lies on the table, and where
+    clutter_seed: int = 0  # selects the objects on the table, and their positions
 
     def base_pose(self) -> Float[np.ndarray, "4 4"]:
         """Return the robot base frame in the world."""
@@ -81,7 +81,7 @@ class Domain:
 
 @dataclass(frozen=True)
 class DomainRanges:
-    """From what `sample_domain` draws, uniformly."""
+    """The ranges of `sample_domain`, drawn uniformly."""
 
     azimuth_deg: Range = (25.0, 75.0)
     elevation_deg: Range = (18.0, 38.0)
@@ -145,7 +145,7 @@ def named_domain(name: str) -> Domain:
 def sample_domain(rng: np.random.Generator, ranges: DomainRanges = DomainRanges()) -> Domain:
     """Return a random world: camera, light, colours and mounting, for training a base over many of them.
 
-    The arm is always light before dark or dark before light, so that it can be seen.
+    The arm is always light before dark or dark before light, so that it is visible.
     """
 
     def draw(bounds: Range) -> float:

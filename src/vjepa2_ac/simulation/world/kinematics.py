@@ -19,7 +19,7 @@ FLANGE_OFFSET_M = 0.107
 
 @dataclass(frozen=True)
 class Joint:
-    """A revolute joint and how its frame stands in the one before it: Rx(twist) Tx(length) Rz(angle) Tz(offset)."""
+    """A revolute joint and its frame in that of the previous joint: Rx(twist) Tx(length) Rz(angle) Tz(offset)."""
 
     length_m: float
     twist_deg: float
@@ -56,7 +56,7 @@ def forward_kinematics(joints: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarra
 
 
 def flange_jacobian(joints: Float[np.ndarray, " 7"]) -> Float[np.ndarray, "6 7"]:
-    """Return how the flange moves (m, then rad, in the base frame) per radian of each joint."""
+    """Return the Jacobian of the flange (m, then rad, in the base frame) per radian of each joint."""
     return _jacobian(_frames(joints))
 
 
@@ -69,8 +69,8 @@ def inverse_kinematics(
 ) -> Float[np.ndarray, " 7"]:
     """Return joint angles that bring the flange to a pose: to 0.01 mm and 0.006 degrees, within the limits.
 
-    Damped least squares, the damping falling with the error; the spare degree of freedom is drawn to `rest`: a smooth
-    path of poses, each started at the solution before, gives a smooth path of joints.
+    Damped least squares, the damping falling with the error; the redundant degree of freedom is pulled to `rest`: a
+    smooth path of poses, each started at the previous solution, gives a smooth path of joints.
 
     Raises:
         UnreachableError: The pose was not reached from `start`, nor from `rest`.
@@ -93,7 +93,7 @@ def _limited_step(
     joints: Float[np.ndarray, " 7"],
     rest: Float[np.ndarray, " 7"],
 ) -> Float[np.ndarray, " 7"]:
-    """Return the joints one step further; one at its limit that pushes on stays, and the others make up for it."""
+    """Return the joints after one step; a joint pushed against its limit stays, and the others compensate."""
     free = np.ones(7)
     for _ in range(3):
         step = _step(jacobian * free, error, (rest - joints) * free)
@@ -109,7 +109,7 @@ def _step(
 ) -> Float[np.ndarray, " 7"]:
     """Return one damped step towards the pose, and in its null space towards rest.
 
-    The pull to rest fades with the error: near the pose nothing may disturb the convergence.
+    The pull to rest fades with the error: near the pose it must not disturb the convergence.
     """
     size = float(np.linalg.norm(error))
     damped = jacobian @ jacobian.T + (1e-7 + 0.05 * size**2) * np.eye(6)
