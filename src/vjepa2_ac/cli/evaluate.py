@@ -29,7 +29,7 @@ def add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def add_checkpoint(parser: argparse._ActionsContainer) -> None:
-    """Add the option by which a checkpoint of a run is named."""
+    """Add the option that selects a checkpoint of a run."""
     parser.add_argument(
         "--checkpoint",
         default="newest",
@@ -161,7 +161,7 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _require_planning(options: argparse.Namespace) -> None:
-    """Refuse settings of plans where none are asked for: they would do nothing."""
+    """Refuse planning settings if no plans are requested: they would have no effect."""
     require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
     if options.overrides and options.planning is None:
         raise InputError(

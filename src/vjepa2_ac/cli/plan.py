@@ -127,7 +127,7 @@ def _plan(options: argparse.Namespace) -> int:
 
 
 def _question(options: argparse.Namespace) -> PlanRequest:
-    """Read what was given and refuse what cannot be planned with, before a model is loaded."""
+    """Read the inputs and refuse invalid ones, before a model is loaded."""
     from vjepa2_ac.media.image_file import read_image
     from vjepa2_ac.planning.decision import PlanRequest
     from vjepa2_ac.planning.input_checks import require_image, require_mask, require_pose

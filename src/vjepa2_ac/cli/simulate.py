@@ -24,7 +24,7 @@ _STEERING = {
 
 
 def add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
-    """Add `simulate` to a parser: it records where its first word is `record`, and steers otherwise."""
+    """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
     parser = command(
         commands,
         "simulate",

@@ -23,7 +23,7 @@ def print_finding(finding: Finding) -> None:
 
 
 def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
-    """Return what `data index` says."""
+    """Return the output of `data index`."""
     lines = [f"{len(table):,} episodes, {int(table.num_steps.sum()):,} steps; opened in {seconds:.2f} s"]
     if table.problems:
         lines.append(f"{len(table.problems):,} broken episodes; the first: {table.problems[0].where}")
@@ -34,7 +34,7 @@ def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
 
 
 def inspection_lines(inspection: Inspection) -> list[str]:
-    """Return what `data inspect` says before its table."""
+    """Return the output of `data inspect` before its table."""
     success = inspection.success_share
     known = int((inspection.success >= 0).sum())
     shortest, low, median, high, longest = inspection.length_percentiles

@@ -18,18 +18,18 @@ from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscapes, PlanningStudy, Sensitivity
 from vjepa2_ac.reports.comparison import Comparison
 
-_MOST_HORIZONS = 8  # rows; of longer clips some are left out, and stand in metrics.json
+_MOST_HORIZONS = 8  # rows; of longer clips some are left out, but are in metrics.json
 _TOP = 5
 
 
 class Stages:
-    """Shows one part of the work after another, each with a bar of its own."""
+    """Shows the parts of the work one after another, each with a progress bar."""
 
     def __init__(self) -> None:
         self._bar: LateProgress | None = None
 
     def __call__(self, title: str) -> Progress:
-        """Begin another part; return what is told how far it is."""
+        """Begin another part; return the function that receives its progress."""
         self._close()
         self._bar = LateProgress(title)
         return self._bar
@@ -41,7 +41,7 @@ class Stages:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         self._close()
 
     def _close(self) -> None:
@@ -51,7 +51,7 @@ class Stages:
 
 
 def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Return the tables of `evaluate`: errors over persistence, then what the models make of their actions."""
+    """Return the tables of `evaluate`: errors over persistence, then the use of the actions."""
     probed = any(model.sensitivity or model.landscapes for model in evaluation.models.values())
     study = evaluation.planning
     return (

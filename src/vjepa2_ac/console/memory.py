@@ -60,9 +60,9 @@ def verdict(needed: int, available: int, gpu: str, knobs: list[str] | None) -> s
 
     Args:
         needed: Bytes at the peak.
-        available: Bytes that the GPU has.
-        gpu: What to call it.
-        knobs: What to turn so that it fits, or None where nothing helps.
+        available: Bytes of the GPU.
+        gpu: Its name.
+        knobs: Changes that make it fit, or None if none do.
     """
     room = f"{gpu}, {available / GIGABYTE:.1f} GB"
     if needed <= available:

@@ -10,7 +10,7 @@ from vjepa2_ac.planning.decision import PlanResult
 
 
 def plan_table(answer: PlanResult) -> Table:
-    """Return a row for each model step: its action, and where the flange is then."""
+    """Return a row for each model step: its action, and the position of the flange after it."""
     turns = bool(answer.actions[:, 3:6].any())
     table = MetricsTable(f"Plan: {answer.decision.why}")
     columns = ["step", "dx (cm)", "dy (cm)", "dz (cm)", *["turn (degrees)"] * turns, "gripper"]

@@ -24,7 +24,7 @@ _DIGITS = 6  # behind the point, of metres, centimetres and radians
 
 
 def study_as_dict(study: PlanningStudy) -> dict[str, Any]:
-    """Return from where was planned and how, what was demonstrated, and the figures of plans that take no model."""
+    """Return the starts and settings of the plans, the demonstrated actions, and the metrics of model-free plans."""
     references = {"zero": study.zero, "random": study.random, "within_limits": study.within_limits}
     return {
         "starts": len(study),
@@ -44,7 +44,7 @@ def study_as_dict(study: PlanningStudy) -> dict[str, Any]:
 
 
 def plans_as_dict(evaluation: Evaluation, name: str) -> dict[str, Any] | None:
-    """Return the figures of what a model planned; None: it did not."""
+    """Return the metrics of a model's plans; None: it did not plan."""
     study, plans = evaluation.planning, evaluation.models[name].plans
     if study is None or plans is None:
         return None

@@ -23,7 +23,7 @@ _SAME_LATENTS = 1e-3  # errors of persistence that differ by a larger share are 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs side by side: a table, and curves for a picture."""
+    """Runs side by side: a table, and curves for a figure."""
 
     title: str
     columns: tuple[str, ...]
@@ -34,7 +34,7 @@ class Comparison:
 
 
 def compare(folders: Sequence[Path]) -> Comparison:
-    """Put runs side by side; each is compared with the first one, paired by clip.
+    """Compare runs; each is compared with the first one, paired by clip.
 
     Raises:
         InputError: Fewer than two, one is named twice or was not evaluated, or they were measured on different clips.
@@ -120,7 +120,7 @@ def _row(metrics: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> 
 
 
 def _plans(metrics: dict[str, Any]) -> dict[str, Any] | None:
-    """Return what stands there of plans; nothing where none were asked for, or evaluate did not know them yet."""
+    """Return the metrics of its plans; None if none were requested, or evaluate did not know them yet."""
     plans: dict[str, Any] | None = metrics["models"][metrics["trained"]].get("planning")
     return plans
 
@@ -131,7 +131,7 @@ def _planned(metrics: dict[str, Any]) -> tuple[Cell, ...]:
 
 
 def _gain(metrics: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> Estimate:
-    """Return by which share the error over persistence is smaller than the first run's, at the last horizon, paired."""
+    """Return the share by which the error over persistence is below the first run's, at the last horizon, paired."""
     columns = [column for one in (metrics, first) for column in _last(one)]
     return bootstrapped(
         lambda sums: 1 - (sums[0] / sums[1]) / (sums[2] / sums[3]), np.stack(columns)[:, :, None], list(ids)

@@ -49,20 +49,20 @@ from vjepa2_ac.storage.structured import read_json_object, shown
 
 METRICS_FILE = "metrics.json"
 _MOST_BYTES = 1 << 28  # landscapes are long
-FORMAT = 1  # goes up when a reader of the file would have to change
+FORMAT = 1  # incremented when a reader of the file would have to change
 
 _NUMBERS = re.compile(r"\[\s+((?:(?:-?\d[\d.e+-]*|null|true|false),?\s+)+)\]")  # a list of plain values, over lines
 
 
 def write_metrics(evaluation: Evaluation, path: Path) -> Path:
-    """Write every figure of an evaluation; the file is written atomically."""
+    """Write all metrics of an evaluation; the file is written atomically."""
     text = json.dumps(metrics_as_dict(evaluation), indent=1, allow_nan=False)
     write_atomically(path, _NUMBERS.sub(lambda found: "[" + " ".join(found[1].split()) + "]", text) + "\n")
     return path
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:
-    """Return what `vjepa2-ac evaluate` wrote into a folder.
+    """Return the metrics that `vjepa2-ac evaluate` wrote into a folder.
 
     Raises:
         InputError: There is nothing, it is damaged, or of another format.
@@ -85,7 +85,7 @@ def read_metrics(folder: Path) -> dict[str, Any]:
 
 
 def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
-    """Return every figure as plain values; see docs/evaluation.md for what each is."""
+    """Return all metrics as plain values; see docs/evaluation.md for the meaning of each."""
     return {
         "format": FORMAT,
         "verdict": verdict(evaluation),
@@ -225,7 +225,7 @@ def _landscapes(landscapes: Landscapes) -> dict[str, Any]:
 
 
 def _by_clip(evaluation: Evaluation) -> dict[str, Any]:
-    """Return the rollout's L1 errors of every clip, from which `compare` pairs runs."""
+    """Return the rollout's L1 errors of every clip, which `compare` pairs between runs."""
     models = {name: _rounded(model.true.rollout.l1) for name, model in evaluation.models.items()}
     return {"persistence": _rounded(evaluation.persistence.rollout.l1), "models": models}
 
@@ -235,7 +235,7 @@ def _curve(curve: Curve) -> list[Mapping[str, float | None]]:
 
 
 def _rounded(values: np.ndarray) -> Any:
-    """Return numbers with 7 digits that count: more than a prediction in bfloat16 has."""
+    """Return numbers with 7 significant digits: more than a prediction in bfloat16 has."""
     return _each(values.tolist())
 
 

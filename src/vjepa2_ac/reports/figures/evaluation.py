@@ -28,7 +28,7 @@ _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
-    """Write the picture of an evaluation as PNG; it is written atomically."""
+    """Write the figure of an evaluation as PNG; it is written atomically."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(13, 6.2), layout="constrained")
         FigureCanvasAgg(figure)
@@ -103,14 +103,14 @@ def _colours(evaluation: Evaluation) -> dict[str, str]:
 
 
 def _reach(value: Estimate) -> tuple[float, float]:
-    """How far an error bar reaches down and up; never negative, which rounding could make it."""
+    """Return the length of an error bar downwards and upwards; never negative, which rounding could make it."""
     if not value.has_interval:
         return 0.0, 0.0
     return max(0.0, value.value - value.low), max(0.0, value.high - value.value)
 
 
 def _filmstrip(figure: Any, example: Example, seconds_per_step: float) -> None:
-    """Show one clip: the first frame and some later ones, and under each where a prediction of it is wrong."""
+    """Draw one clip: the first frame and some later ones, and below each the error map of a prediction."""
     horizons = np.unique(np.linspace(1, len(example.true_colours) - 1, num=4).round().astype(int))
     grid = figure.subplots(1 + len(example.errors), 1 + len(horizons), squeeze=False)
     figure.suptitle("One held-out clip, and the error of each patch (brighter is worse)", x=0.02, ha="left", fontsize=9)

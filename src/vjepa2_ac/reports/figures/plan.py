@@ -29,7 +29,7 @@ _STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": _RED, "edgecolors": "
 
 
 def plot_plan(answer: PlanResult, path: Path) -> Path:
-    """Write the picture of a decision as PNG; it is written atomically."""
+    """Write the figure of a decision as PNG; it is written atomically."""
     with mpl.rc_context(_STYLE):
         plan = answer.decision.plan
         rows = 1 if plan is None else 3 if answer.slices else 2

@@ -15,7 +15,7 @@ _POINTS = 51
 
 
 def rank_chart(rankings: Sequence[tuple[Series, Ranking]]) -> Markup:
-    """Return in which share of clips the true action's rank is at most so much, for each model and by chance."""
+    """Return the cumulative distribution of the true action's rank over clips, for each model and by chance."""
     reached = np.linspace(0, 1, _POINTS).tolist()
     by_chance = Line("chance", [0.0, 1.0], [0.0, 100.0], "s-persistence")
     lines = [by_chance, *(Line(one.label, reached, _shares(ranking, reached), one.style) for one, ranking in rankings)]

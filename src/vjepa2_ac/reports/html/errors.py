@@ -43,7 +43,7 @@ _HOW = {
     "rollout": (
         "The model sees the first frame and the actions, and feeds its own predictions back. The dashed line at 1 is"
         " persistence: copying the first frame. Lower is better; above 1, doing nothing would have been better. Bands:"
-        " 95 % intervals over episodes; those of wrong actions stand in the table."
+        " 95 % intervals over episodes; those of wrong actions are in the table."
     ),
     "teacher_forced": (
         "The model predicts each frame from all true frames before it: always one step ahead, later ones with more"
@@ -55,7 +55,7 @@ CurveOf = Callable[[Evaluation, Series, Mode, Metric], Sequence[Estimate]]
 
 
 def error_section(evaluation: Evaluation) -> ReportSection:
-    """Return the error by horizon of every model, as curves and as numbers."""
+    """Return the section on the error by horizon of every model, as curves and as numbers."""
     drawings = []
     for mode in reversed(MODES):
         lines = [_line(evaluation, one, _ratios(evaluation, one, mode, "l1")) for one in models_of(evaluation)]
@@ -85,7 +85,7 @@ def error_section(evaluation: Evaluation) -> ReportSection:
 
 
 def base_section(evaluation: Evaluation) -> ReportSection:
-    """Return how what was trained, and other runs, compare with the base: paired, clip by clip."""
+    """Return the section that compares the trained and other models with the base: paired, clip by clip."""
     title = "Compared with the base"
     if evaluation.base is None:
         why = "There is no base model in this evaluation to compare with."
@@ -109,7 +109,7 @@ def base_section(evaluation: Evaluation) -> ReportSection:
 
 
 def strata_section(evaluation: Evaluation) -> ReportSection:
-    """Return the one-step error of steps that have something in common."""
+    """Return the section on the one-step error of groups of steps."""
     title = "Where it helps: moving and idle, small and large actions"
     if not evaluation.strata:
         return ReportSection("strata", title, not_measured("Strata", "This result holds no strata."))
@@ -206,7 +206,7 @@ def _reached(lines: Sequence[Line]) -> list[float]:
 
 
 def _as_text(lines: Sequence[Line], digits: int = 2) -> str:
-    """Return where each curve begins and ends."""
+    """Return as text the first and last value of each curve."""
     return "; ".join(f"{line.name} from {line.y[0]:.{digits}f} to {line.y[-1]:.{digits}f}" for line in reversed(lines))
 
 

@@ -27,7 +27,7 @@ _MAPS = {
 
 
 def colours_of(values: Float[np.ndarray, "height width"], low: float, high: float, colours: str) -> np.ndarray:
-    """Return numbers as RGB by a map of colours, from `low` to `high`; what is not finite is grey."""
+    """Return numbers as RGB by a colour map, from `low` to `high`; values that are not finite are grey."""
     table = np.array([list(bytes.fromhex(code)) for code in _MAPS[colours].split()], np.float64)
     share = np.clip((values - low) / max(high - low, 1e-12), 0, 1)
     position = np.where(np.isfinite(values), share, 0) * (len(table) - 1)
@@ -37,7 +37,7 @@ def colours_of(values: Float[np.ndarray, "height width"], low: float, high: floa
 
 
 def css_gradient(colours: str) -> str:
-    """Return a map of colours as the CSS value of a bar from left (low) to right (high)."""
+    """Return a colour map as the CSS value of a bar from left (low) to right (high)."""
     return f"linear-gradient(to right, {', '.join('#' + code for code in _MAPS[colours].split())})"
 
 
@@ -54,11 +54,11 @@ def png_url(pixels: UInt8[np.ndarray, "height width channels"]) -> str:
 
 
 def jpeg_urls(clips: Sequence[Sequence[UInt8[np.ndarray, "height width 3"]]], *, at_most: int) -> list[list[str]]:
-    """Return photographs as JPEG in data: URLs, in the best quality in which all of them together fit.
+    """Return photographs as JPEG in data: URLs, in the best quality in which all of them fit together.
 
     Args:
         clips: Photographs, clip by clip.
-        at_most: Bytes of all URLs together; if the lowest quality takes more, the photographs are left out.
+        at_most: Bytes of all URLs together; if the lowest quality needs more, the photographs are left out.
     """
     small = [[_shrunk(frame) for frame in frames] for frames in clips]
     for quality in _JPEG_QUALITIES:
@@ -69,7 +69,7 @@ def jpeg_urls(clips: Sequence[Sequence[UInt8[np.ndarray, "height width 3"]]], *,
 
 
 def _shrunk(frame: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return a photograph that is at most so large, by averaging squares of pixels."""
+    """Return a photograph of at most this size, by averaging squares of pixels."""
     factor = -(-max(frame.shape[:2]) // _MOST_PIXELS)
     height, width = (size // factor for size in frame.shape[:2])
     squares = frame[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)

@@ -30,14 +30,14 @@ Row = tuple[str, Callable[[PlanMetrics], Estimate], int]
 
 
 def planning_section(evaluation: Evaluation) -> ReportSection:
-    """Return how close plans come to what was demonstrated."""
+    """Return the section on how close plans are to the demonstrations."""
     title, study = "Plans beside demonstrations", evaluation.planning
     if study is None:
         why = why_not(evaluation, "plans", "It takes a while, and was not asked for: vjepa2-ac evaluate --planning.")
         return ReportSection("planning", title, not_measured("Plans", why))
     how = paragraph(
         f"From one frame of each of {len(study)} clips the models plan towards frames that really came, and the plan is"
-        " held against what was demonstrated. People need not take the shortest way, so 0 cm is not to be expected,"
+        " compared with the demonstrated one. People need not take the shortest way, so 0 cm is not to be expected,"
         " but a model worth planning with is clearly nearer than doing nothing. Doing nothing, random plans (every"
         " number uniform within its limits) and the demonstration itself, cut to the limits, take no model: the last"
         " is the best that any plan could do.",
@@ -135,13 +135,13 @@ def _scatter(evaluation: Evaluation, study: PlanningStudy, axis: int) -> Markup:
 
 
 def _drawn(evaluation: Evaluation) -> Sequence[tuple[Series, Plans]]:
-    """Return the models with their plans, what was trained last, so that it lies above."""
+    """Return the models with their plans, the trained one last, so that it is drawn on top."""
     found = ways_of(evaluation)
     return [(one, found[one.model]) for one in models_of(evaluation) if one.model in found]
 
 
 def _ends(values: Float[np.ndarray, "starts steps"]) -> list[float]:
-    """Return where steps along one axis lead, in cm."""
+    """Return the displacements along one axis, in cm."""
     return [100 * float(each) for each in values.sum(axis=-1)]
 
 
