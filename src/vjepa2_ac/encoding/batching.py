@@ -96,13 +96,13 @@ class Chunks:
         """Fetch chunks until at most this many are in progress, and yield finished episodes."""
         while len(self._under_way) > under_way:
             fetched, owners = self._under_way.popleft()
-            self._hand_out(fetched().mapped(_unpinned), owners)
+            self._distribute(fetched().mapped(_unpinned), owners)
         while self._ends and self._is_whole(self._ends[0][0]):
             wanted, recording = self._ends.popleft()
             small_frames = np.concatenate(self._small_frames.pop(wanted))
             yield Encoded(wanted, recording, _joined(self._done.pop(wanted)), small_frames)
 
-    def _hand_out(self, latents: StoredLatents, owners: list[FramesToEncode]) -> None:
+    def _distribute(self, latents: StoredLatents, owners: list[FramesToEncode]) -> None:
         """Distribute the frames of a chunk to their owners."""
         values, scales = latents.values, latents.scales
         start = 0

@@ -118,9 +118,9 @@ class CacheWriter:
             column = self._sizes(len(dataset.table), camera)
             column[unread] = 0
             needed = dataset.starts.episodes
-            lacking = np.setdiff1d(needed[column[needed] == 0], unread)
-            if len(lacking):
-                raise ValueError(f"{len(lacking)} episodes are not written: {lacking[:10].tolist()}")
+            missing = np.setdiff1d(needed[column[needed] == 0], unread)
+            if len(missing):
+                raise ValueError(f"{len(missing)} episodes are not written: {missing[:10].tolist()}")
             sizes[size_column(place)] = column
         return sizes
 

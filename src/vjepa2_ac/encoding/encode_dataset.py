@@ -23,9 +23,9 @@ from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.cache_lookup import folder_of, key_for
 from vjepa2_ac.encoding.cache_writer import CacheWriter
 from vjepa2_ac.encoding.disk_space import GIGABYTE, free_bytes, require_space
-from vjepa2_ac.encoding.pipeline import EncoderAtWork, build
+from vjepa2_ac.encoding.pipeline import EncoderOnDevice, build
 from vjepa2_ac.encoding.repair import describe, missing_files, restart
-from vjepa2_ac.encoding.workload import Workload, WorkloadShare, take_folder
+from vjepa2_ac.encoding.workload import Workload, WorkloadShare, claim_folder
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -68,14 +68,14 @@ def encode_config(
     model = load_base(config.model, seed=config.seed)
     writer = writer_for(config, dataset, model, out)
     if is_whole(writer.folder):
-        take_folder(writer)
-        if not (lacking := missing_files(dataset, writer)):
+        claim_folder(writer)
+        if not (missing := missing_files(dataset, writer)):
             note(f"Everything is encoded already, in {writer.folder}")
             return EncodedSet(writer.folder, read_manifest(writer.folder))
-        note(f"{describe(lacking)}. It is encoded again.")
-        restart(writer, lacking)
+        note(f"{describe(missing)}. It is encoded again.")
+        restart(writer, missing)
     share = WorkloadShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
-    at_work = encoder_at_work(config, model, device)
+    at_work = encoder_on_device(config, model, device)
     return EncodedSet(writer.folder, encode_share(config, dataset, writer, at_work, share, note, progress))
 
 
@@ -111,17 +111,17 @@ def writer_for(config: Config, dataset: Dataset, model: WorldModel, out: Path | 
     return CacheWriter(folder_of(config.data, key) if out is None else out, key, encoding)
 
 
-def encoder_at_work(config: Config, model: WorldModel, device: torch.device) -> EncoderAtWork:
+def encoder_on_device(config: Config, model: WorldModel, device: torch.device) -> EncoderOnDevice:
     """Move the encoder of a model, and only the encoder, to a device."""
     model.present_encoder.to(device)
-    return EncoderAtWork(model, device, partial(autocast, config.training, device), config.model.encode_chunk)
+    return EncoderOnDevice(model, device, partial(autocast, config.training, device), config.model.encode_chunk)
 
 
 def encode_share(
     config: Config,
     dataset: Dataset,
     writer: CacheWriter,
-    encoder: EncoderAtWork,
+    encoder: EncoderOnDevice,
     share: WorkloadShare,
     note: Note,
     progress: Progress | None = None,
@@ -135,10 +135,10 @@ def encode_share(
     free = free_bytes(writer.folder) / GIGABYTE
     note(f"Encoding {config.data.path}: {work.room} as {config.data.cache_dtype}")
     note(f"The latents go into {writer.folder}, with {free:.4g} GB free on its disk")
-    if work.left_of_all < work.frames:
-        note(f"{work.frames - work.left_of_all:,} frames are there already; {work.left_of_all:,} are left")
-    require_space(work.room, writer.folder, smaller=smaller_caches(config))
-    take_folder(writer)
+    if work.left_in_total < work.frames:
+        note(f"{work.frames - work.left_in_total:,} frames are there already; {work.left_in_total:,} are left")
+    require_space(work.room, writer.folder, smaller=size_reducing_knobs(config))
+    claim_folder(writer)
     return build(work, encoder, threads=max(1, config.data.workers), progress=progress)
 
 
@@ -147,7 +147,7 @@ def duration(frames: int, per_second: float) -> str:
     return str(timedelta(seconds=round(frames / per_second)))
 
 
-def smaller_caches(config: Config) -> tuple[str, ...]:
+def size_reducing_knobs(config: Config) -> tuple[str, ...]:
     """Return the knobs that would reduce the size of a cache."""
     data = config.data
     knobs = [] if data.cache_dtype == "int8" else ["data.cache_dtype: int8"]

@@ -33,7 +33,7 @@ Autocast = Callable[[], contextlib.AbstractContextManager[object]]
 
 
 @dataclass(frozen=True, eq=False)
-class EncoderAtWork:
+class EncoderOnDevice:
     """The frozen encoder of a model on its device, and its settings."""
 
     world_model: WorldModel
@@ -48,7 +48,9 @@ class EncoderAtWork:
             return self.world_model.encode(inputs[None], chunk=self.chunk)[0]
 
 
-def build(work: Workload, encoder: EncoderAtWork, *, threads: int, progress: Progress | None = None) -> Manifest | None:
+def build(
+    work: Workload, encoder: EncoderOnDevice, *, threads: int, progress: Progress | None = None
+) -> Manifest | None:
     """Encode the share of this process, and finalize the cache if nothing is missing by then.
 
     Args:
@@ -70,7 +72,7 @@ def build(work: Workload, encoder: EncoderAtWork, *, threads: int, progress: Pro
     for frames in _written(work, encoder, threads) if work.left else ():
         if progress is not None:
             progress(frames, work.frames_left)
-    if work.lacks:
+    if work.is_incomplete:
         return None
     broken = broken_in(folder)
     for name, reason in broken.items():
@@ -78,7 +80,7 @@ def build(work: Workload, encoder: EncoderAtWork, *, threads: int, progress: Pro
     return work.writer.finish(dataset, broken=broken, frames=work.frames)
 
 
-def _written(work: Workload, encoder: EncoderAtWork, threads: int) -> Iterator[int]:
+def _written(work: Workload, encoder: EncoderOnDevice, threads: int) -> Iterator[int]:
     """Write episode after episode; yield the number of finished frames, first 0; those of unreadable ones count."""
     yield 0
     side = small_frame_side(encoder.world_model.image_size)
@@ -113,7 +115,7 @@ def _waited_for(under_way: deque[tuple[Future[int], int]]) -> int:
     return frames
 
 
-def _storing(work: Workload, encoder: EncoderAtWork) -> Encode:
+def _storing(work: Workload, encoder: EncoderOnDevice) -> Encode:
     def encode(inputs: Tensor) -> StoredLatents:
         return pack_latents(encoder.latents(inputs), work.writer.key.kind)
 
@@ -135,7 +137,7 @@ def _leave_out(work: Workload, one: Unreadable) -> None:
     note_broken(work.writer.folder, one.wanted.episode, name, str(one.error))
 
 
-def frames_per_second(encoder: EncoderAtWork) -> float:
+def frames_per_second(encoder: EncoderOnDevice) -> float:
     """Measure the encoding speed on a chunk of black frames, after a warm-up chunk where a device needs one."""
     size = encoder.world_model.image_size
     black = torch.zeros(encoder.chunk, 3, size, size, device=encoder.device)

@@ -57,7 +57,7 @@ def missing_files(dataset: Dataset, writer: CacheWriter) -> list[MissingFiles]:
     return found
 
 
-def restart(writer: CacheWriter, lacking: Sequence[MissingFiles]) -> None:
+def restart(writer: CacheWriter, missing: Sequence[MissingFiles]) -> None:
     """Turn a finished cache into an unfinished one that lacks these files, so that the next encoding writes them.
 
     Damaged files are deleted first, and cache.json, which marks a finished cache, last: a kill changes nothing.
@@ -66,13 +66,13 @@ def restart(writer: CacheWriter, lacking: Sequence[MissingFiles]) -> None:
         InputError: The folder cannot be written.
     """
     with storage.user_can_write(writer.folder):
-        for one in lacking:
+        for one in missing:
             if size_of(one.path) != one.size:  # or another process has written it meanwhile
                 one.path.unlink(missing_ok=True)
         (writer.folder / MANIFEST).unlink(missing_ok=True)
 
 
-def describe(lacking: Sequence[MissingFiles]) -> str:
+def describe(missing: Sequence[MissingFiles]) -> str:
     """Return as text which episodes are encoded again."""
-    more = f" and {len(lacking) - 1:,} more" if len(lacking) > 1 else ""
-    return f"Missing in the latent cache or damaged: {lacking[0]}{more}"
+    more = f" and {len(missing) - 1:,} more" if len(missing) > 1 else ""
+    return f"Missing in the latent cache or damaged: {missing[0]}{more}"

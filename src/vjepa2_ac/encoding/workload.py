@@ -40,21 +40,21 @@ class Workload:
     writer: CacheWriter
     frames: int  # of the whole cache, of all cameras
     left: tuple[FramesToEncode, ...]  # of this process
-    left_of_all: int  # frames, of all processes
+    left_in_total: int  # frames, of all processes
 
     @classmethod
     def of(cls, dataset: Dataset, writer: CacheWriter, share: WorkloadShare) -> Workload:
         """Compare with the existing files: written episodes are not encoded again; broken ones are retried."""
-        frames, left_of_all, left = 0, 0, []
+        frames, left_in_total, left = 0, 0, []
         for place, needed in enumerate(needed_frames(dataset)):
             for camera in dataset.config.cameras:
                 frames += len(needed.steps)
                 if writer.has(needed.episode, camera):
                     continue
-                left_of_all += len(needed.steps)
+                left_in_total += len(needed.steps)
                 if place % share.processes == share.rank:
                     left.append(FramesToEncode(needed.episode, camera, needed.steps))
-        return cls(dataset, writer, frames, tuple(left), left_of_all)
+        return cls(dataset, writer, frames, tuple(left), left_in_total)
 
     @property
     def frames_left(self) -> int:
@@ -68,10 +68,10 @@ class Workload:
         steps = int(table.num_steps[np.unique(self.dataset.starts.episode)].sum())
         per_frame = bytes_per_frame(writer.encoding.tokens, writer.encoding.dim, writer.key.kind)
         per_frame += small_frame_bytes(writer.encoding.image_size)
-        return CacheSize(self.frames, self.left_of_all, per_frame, steps / self.dataset.control_rate_hz / 3600)
+        return CacheSize(self.frames, self.left_in_total, per_frame, steps / self.dataset.control_rate_hz / 3600)
 
     @property
-    def lacks(self) -> bool:
+    def is_incomplete(self) -> bool:
         """Whether an episode is currently neither written nor recorded as broken, by any process."""
         cameras, broken = self.dataset.config.cameras, broken_in(self.writer.folder)
         return any(
@@ -82,7 +82,7 @@ class Workload:
         )
 
 
-def take_folder(writer: CacheWriter) -> None:
+def claim_folder(writer: CacheWriter) -> None:
     """Check that a folder belongs to this cache, finished or not, or is new.
 
     Raises:

@@ -63,16 +63,16 @@ def difference_to(
 
 def cost_of_actions(evaluation: Evaluation, name: str, actions: Actions, metric: Metric = "l1") -> Estimate:
     """Return the share by which the teacher-forced error grows with zero or shuffled actions, paired; 0: unused."""
-    tried, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
-    grown = ratio(tried.mean(axis=1), true.mean(axis=1), evaluation.clips.episode_ids)
+    given, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
+    grown = ratio(given.mean(axis=1), true.mean(axis=1), evaluation.clips.episode_ids)
     return Estimate(grown.value - 1, grown.low - 1, grown.high - 1)
 
 
 def gap_of_actions(evaluation: Evaluation, name: str, actions: Actions, metric: Metric = "l1") -> Estimate:
     """Return how much higher the teacher-forced error over persistence is with zero or shuffled actions, paired."""
-    tried, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
+    given, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
     nothing = evaluation.persistence.teacher_forced.of(metric)
-    return ratio((tried - true).mean(axis=1), nothing.mean(axis=1), evaluation.clips.episode_ids)
+    return ratio((given - true).mean(axis=1), nothing.mean(axis=1), evaluation.clips.episode_ids)
 
 
 def stratum_over_persistence(evaluation: Evaluation, stratum: Stratum, name: str, metric: Metric = "l1") -> Estimate:

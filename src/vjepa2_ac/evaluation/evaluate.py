@@ -98,7 +98,7 @@ def evaluate(
         ValueError: No clips; or too few frames for planning.
     """
     probes = probes or ProbeOptions()
-    seen = _see_all(contenders, clips, probes, about, _bar(stage, "measuring"))
+    seen = _collect(contenders, clips, probes, about, _bar(stage, "measuring"))
     ids, seconds = tuple(seen.ids), about.seconds_per_step
     known = clips_of(seen.actions, ids, tuple(seen.firsts), is_pose=about.is_pose, seconds_per_step=seconds)
     pool = ActionPool(
@@ -163,7 +163,7 @@ class _Seen:
     planned: list[PlanningStart] = field(default_factory=list)
 
 
-def _see_all(
+def _collect(
     contenders: Sequence[Contender],
     clips: RepeatableClips,
     probes: ProbeOptions,
@@ -178,8 +178,8 @@ def _see_all(
         kinds = {"true": batch.actions, "zero": torch.zeros_like(batch.actions), "shuffled": others}
         for contender in contenders:
             with contender.switched():
-                for kind, tried in kinds.items():
-                    seen.errors.setdefault((contender.name, kind), []).append(measured(contender.model, batch, tried))
+                for kind, given in kinds.items():
+                    seen.errors.setdefault((contender.name, kind), []).append(measured(contender.model, batch, given))
         seen.persistence.append(persistence_of(batch))
         first = len(seen.ids)
         for row in range(len(batch.starts)):

@@ -172,7 +172,7 @@ def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
     if asked.out is None:
         raise InputError(
             where="command line",
-            found="--data without --out: metrics.json of a run's own folder tells of its own data",
+            found="--data without --out: metrics.json of a run's own folder is for its own data",
             needed="a folder for what is found on these data",
             fix="Add --out FOLDER",
         )
@@ -181,7 +181,7 @@ def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
             where="data.stride",
             found="auto",
             needed="a number, to evaluate",
-            fix="`vjepa2-ac data calibrate CONFIG` tells which",
+            fix="`vjepa2-ac data calibrate CONFIG` finds one",
         )
     return config, asked.out
 

@@ -50,7 +50,7 @@ class Estimate:
 
 def bootstrapped(
     of_sums: Callable[[np.ndarray], np.ndarray],
-    columns: Float[np.ndarray, "columns clips figures"],
+    columns: Float[np.ndarray, "columns clips metrics"],
     episode_ids: Sequence[str],
     *,
     resamples: int = RESAMPLES,

@@ -132,9 +132,9 @@ def one_step_errors(
 ) -> tuple[Float[np.ndarray, " batch"], Float[np.ndarray, " batch"]]:
     """Return, for each clip, the teacher-forced L1 error with its own or other actions, and that of persistence."""
     latents, extrinsics = batch.latents, batch.extrinsics
-    tried = batch.actions if actions is None else actions
+    given = batch.actions if actions is None else actions
     before = None if extrinsics is None else extrinsics[:, :-1]
-    predicted = model.predict(latents[:, :-1], tried, batch.states[:, :-1], before)
+    predicted = model.predict(latents[:, :-1], given, batch.states[:, :-1], before)
     truth = latents[:, 1:]
     return _error(predicted, truth).mean(axis=1), _error(latents[:, :-1], truth).mean(axis=1)
 
@@ -150,12 +150,12 @@ def one_step_ratios(errors: PredictionErrors) -> dict[str, Estimate]:
 
     A model that uses its actions is much better with the true ones than with the others.
     """
-    tried = {
+    by_actions = {
         "true": errors.one_step,
         "zero": errors.one_step_zero_actions,
         "shuffled": errors.one_step_shuffled_actions,
     }
-    return {name: ratio(e, errors.one_step_persistence, errors.episode_ids) for name, e in tried.items()}
+    return {name: ratio(e, errors.one_step_persistence, errors.episode_ids) for name, e in by_actions.items()}
 
 
 def _batch_errors(model: Predictor, batch: LatentBatch, other_actions: Tensor) -> dict[str, np.ndarray]:

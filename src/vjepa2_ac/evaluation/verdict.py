@@ -22,7 +22,7 @@ def verdict(evaluation: Evaluation) -> str:
     error = over_persistence(evaluation, evaluation.trained, "rollout")[-1]
     ahead = f"{evaluation.seconds_ahead:.1f} s ahead"
     absolute = f"Its error {ahead} is {_over_nothing(error)}."
-    parts = [f"{_compared(evaluation, ahead)}.", absolute, *_denied(evaluation), _actions(evaluation)]
+    parts = [f"{_compared(evaluation, ahead)}.", absolute, *_disagreements(evaluation), _actions(evaluation)]
     return " ".join(part for part in (*parts, _planned(evaluation), *evaluation.notes) if part)
 
 
@@ -74,16 +74,16 @@ def _digits(gain: Estimate) -> str:
     return ".0%" if abs(gain.value) >= 0.01 else ".2%"
 
 
-def _denied(evaluation: Evaluation) -> tuple[str, ...]:
+def _disagreements(evaluation: Evaluation) -> tuple[str, ...]:
     """Return a sentence on how L2 or cosine differ from L1: better, worse, or uncertain."""
     found: dict[str, list[str]] = {}
     for metric in METRICS[1:]:
-        if words := _otherwise(evaluation, metric):
+        if words := _disagreement(evaluation, metric):
             found.setdefault(" and ".join(words), []).append(_WORDS[metric])
     return tuple(f"By {' and '.join(metrics)} it is another matter: {words}." for words, metrics in found.items())
 
 
-def _otherwise(evaluation: Evaluation, metric: Metric) -> list[str]:
+def _disagreement(evaluation: Evaluation, metric: Metric) -> list[str]:
     words = []
     if evaluation.base is not None:
         by_l1, by_other = (

@@ -52,7 +52,7 @@ class Controller:
     """Plans towards a goal, one model step at a time, and stores what was observed.
 
     The same seed, images and states give the same actions: the n-th decision after a reset (from 0) is drawn with
-    seed + n. Actions are within `planning.limits`, whatever the model says.
+    seed + n. Actions are within `planning.limits`, for any output of the model.
     """
 
     def __init__(

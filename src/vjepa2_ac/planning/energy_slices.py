@@ -47,10 +47,10 @@ def energy_slices(
 @torch.no_grad()
 def _slice(cost: Cost, actions: Tensor, space: ActionSpace, axes: tuple[int, int], nodes: int) -> EnergySlice:
     across, up = (_BEYOND * _half_width(space, axis) * torch.linspace(-1, 1, nodes) for axis in axes)
-    tried = actions.repeat(nodes * nodes, 1, 1)
-    tried[:, : space.repeat, axes[0]] = across.repeat(nodes)[:, None]
-    tried[:, : space.repeat, axes[1]] = up.repeat_interleave(nodes)[:, None]
-    energy = cost(tried).float().cpu().reshape(nodes, nodes)
+    evaluated = actions.repeat(nodes * nodes, 1, 1)
+    evaluated[:, : space.repeat, axes[0]] = across.repeat(nodes)[:, None]
+    evaluated[:, : space.repeat, axes[1]] = up.repeat_interleave(nodes)[:, None]
+    energy = cost(evaluated).float().cpu().reshape(nodes, nodes)
     return EnergySlice(axes, across.double().numpy(), up.double().numpy(), energy.double().numpy())
 
 

@@ -108,7 +108,9 @@ def _train(
             reporter.note(f"The config changes: {line}")
     if check_only:
         gradients(run, batches_from(run))
-        reporter.note("Everything is in place: data, model, validation and gradients were tried; nothing was written.")
+        reporter.note(
+            "Everything is in place: data, model, validation and gradients were checked; nothing was written."
+        )
         return folder
     if writes:
         lock.take()

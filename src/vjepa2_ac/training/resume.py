@@ -104,7 +104,7 @@ def refuse_if_overtaken(folder: Path, state: RunState) -> None:
             where=str(newest),
             found=f"a checkpoint of step {read_state(newest).step}, which another start wrote while this one stood at"
             f" {state.step}",
-            fix="Start again: the run goes on from there",
+            fix="Start again: the run continues from there",
         )
 
 
@@ -125,7 +125,7 @@ def restore_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
     scaler.load_state_dict(dict(state.loss_scale))
 
 
-def say_what_is_new(dataset: Dataset, state: RunState, note: Callable[[str], None]) -> None:
+def report_data_changes(dataset: Dataset, state: RunState, note: Callable[[str], None]) -> None:
     """Report if the data has changed since the checkpoint was written."""
     windows = len(dataset.windows("train"))
     if state.windows not in {None, windows}:

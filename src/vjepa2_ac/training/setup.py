@@ -47,7 +47,7 @@ from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.micro_step import CapturedMicroStep, MicroStep, captured_on_cuda
 from vjepa2_ac.training.new_embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
-from vjepa2_ac.training.resume import micro_batches_of, restore, restore_loss_scale, say_what_is_new
+from vjepa2_ac.training.resume import micro_batches_of, report_data_changes, restore, restore_loss_scale
 from vjepa2_ac.training.stride_choice import choose_stride
 
 _CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes
@@ -165,7 +165,7 @@ def set_up(
     optimizer = shard_predictor(world_model, optimizer, config, accelerator, note)
     restore_loss_scale(scaler, state)
     dataset.broken.recall(state.broken)
-    say_what_is_new(dataset, state, note)
+    report_data_changes(dataset, state, note)
     state = best_so_far(state, measured_on(config, dataset), note)
     micro_batches = micro_batches_of(config, state, accelerator.num_processes, note)
     objective = Objective(world_model, config.training)

@@ -99,7 +99,7 @@ def gradients(
     if not clips:
         return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(fetched_by_all))
     forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
-    norm = _settle(run, factor=expected / clips)
+    norm = _finish_gradients(run, factor=expected / clips)
     _refuse_not_finite(run, forced_loss + rollout_loss, norm, seen, look_back)
     return Gradients(forced_loss, rollout_loss, norm, int(clips), int(fetched_by_all))
 
@@ -123,7 +123,7 @@ def _accumulate(run: Run, batches: Iterator[Batch], look_back: ClipRecorder | No
     return totals, seen, fetched
 
 
-def _settle(run: Run, factor: float) -> float:
+def _finish_gradients(run: Run, factor: float) -> float:
     """Turn the scaled sums of all processes into the gradient of the mean, clip it, and return its norm before."""
     all_reduce_gradients(run.accelerator, run.trained)
     run.scaler.unscale_(run.optimizer)

@@ -75,5 +75,5 @@ def refuse_weak_base(run: Run, errors: PredictionErrors, reporter: Reporter) -> 
         found=f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame",
         needed="a base that is better than doing nothing (below 1)",
         fix="Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction;"
-        " to adapt it all the same, set training.allow_weak_base=true",
+        " to adapt it anyway, set training.allow_weak_base=true",
     )

@@ -148,7 +148,7 @@ def test_of_good_data_no_variant_fits_better_and_only_changed_pictures_are_encod
     assert probe.better is None
     assert probe.ratio.value < 0.02
     assert min(one.difference.value for one in probe.results) > 0.1
-    assert probe.verdict().endswith("on 16 clips of 8 episodes; no variant surely fits better")
+    assert probe.verdict().endswith("on 16 clips of 8 episodes; no variant certainly fits better")
     assert knowing.encoded == 2 * 3  # two batches; again with red and blue exchanged, and mirrored
     names = [name for name, *_ in rows_of(probe)]
     assert names[0] == "as they are"

@@ -24,7 +24,7 @@ from vjepa2_ac.evaluation.metrics import Predictor, distances
 
 FRAMES = 8  # of a clip, at most
 SHIFTS = (1, 2, 4, 8)  # control steps
-_TRIED_FOR_ONE = 8  # windows checked per clip, since shifts need room on both sides
+_CANDIDATES_PER_CLIP = 8  # windows checked per clip, since shifts need room on both sides
 _EPISODES_TO_BE_SURE = 5
 _MARGIN = 2.0  # half-widths of the 95 % interval: one of a dozen variants is easily better by chance
 _GAIN = 0.01  # of persistence: smaller gains are irrelevant
@@ -52,10 +52,10 @@ class VariantProbe:
     @property
     def better(self) -> VariantResult | None:
         """The variant that fits best, if it certainly fits better than the unchanged data."""
-        surely = [one for one in self.results if self._is_surely_better(one)]
-        return min(surely, key=lambda one: one.difference.value) if surely else None
+        certain = [one for one in self.results if self._is_certainly_better(one)]
+        return min(certain, key=lambda one: one.difference.value) if surely else None
 
-    def _is_surely_better(self, one: VariantResult) -> bool:
+    def _is_certainly_better(self, one: VariantResult) -> bool:
         difference = one.difference
         if not difference.has_interval or self.episodes < _EPISODES_TO_BE_SURE:
             return False
@@ -71,8 +71,8 @@ class VariantProbe:
         if self.episodes < _EPISODES_TO_BE_SURE:
             return f"{text}: too few episodes to compare, {_EPISODES_TO_BE_SURE} are needed"
         if self.ratio.value >= 1:
-            return f"{text}: the model predicts none of this better than persistence, and cannot tell"
-        return f"{text}; no variant surely fits better"
+            return f"{text}: the model predicts none of this better than persistence, so the result is unknown"
+        return f"{text}; no variant certainly fits better"
 
 
 def rows_of(probe: VariantProbe) -> Iterator[tuple[str, str, str]]:
@@ -106,7 +106,9 @@ def probe_variants(
     Raises:
         InputError: The split is empty, or a clip cannot be read.
     """
-    candidates = validation_windows(dataset, split, clips=clips * _TRIED_FOR_ONE)  # of whole clips, as a cache has them
+    candidates = validation_windows(
+        dataset, split, clips=clips * _CANDIDATES_PER_CLIP
+    )  # of whole clips, as a cache has them
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": min(dataset.config.frames, FRAMES)}))
     windows, shifts = _with_room(dataset, candidates, clips)
     variants = variants_of(dataset.config, shifts)

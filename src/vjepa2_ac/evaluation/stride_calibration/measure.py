@@ -167,8 +167,8 @@ def calibrate(
     for done, stride in enumerate(possible):
         batches = batches_of(views[stride], chosen, batch_size=batch_size, copies=copies)
         parts = _measure(model, encode, batches, is_pose=settings.states == "pose")
-        tell = _with_progress(progress, done * len(chosen), len(possible) * len(chosen))
-        measured[stride] = _Measured.joined(list(tell(parts)))
+        report = _with_progress(progress, done * len(chosen), len(possible) * len(chosen))
+        measured[stride] = _Measured.joined(list(report(parts)))
     runner_up, difference = _compared(measured)
     rate = dataset.control_rate_hz
     results = tuple(one.summary(stride, stride / rate) for stride, one in measured.items())
@@ -229,7 +229,7 @@ def _measure(
 def _with_progress(
     progress: Progress | None, before: int, total: int
 ) -> Callable[[Iterator[_Measured]], Iterator[_Measured]]:
-    def tell(parts: Iterator[_Measured]) -> Iterator[_Measured]:
+    def report(parts: Iterator[_Measured]) -> Iterator[_Measured]:
         done = before
         for part in parts:
             done += len(part.clips)
@@ -237,7 +237,7 @@ def _with_progress(
                 progress(done, total)
             yield part
 
-    return tell
+    return report
 
 
 def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:
@@ -310,7 +310,7 @@ def calibrate_model(
         raise InputError(
             where=f"data.path: {dataset.config.path}",
             found=f"latents that were encoded for clips at stride {dataset.config.stride}",
-            needed="frames at every stride that is tried",
+            needed="frames at every candidate stride",
             fix="Calibrate on the data set itself, with data.cache: off",
         )
     world_model.eval()

@@ -188,11 +188,11 @@ def _plane(model: str, landscapes: Landscapes, one: Landscape, first: int, secon
         MapAxis(landscapes.axis_names[axis] + unit, one.axes[axis], float(one.true[axis]), float(one.minimum[axis]))
         for axis in (first, second)
     )
-    says = (
+    description = (
         f"Energy of {model} over {across.label} and {up.label}: true action at {_point(one.true, first, second)},"
         f" lowest energy at {_point(one.minimum, first, second)}."
     )
-    return heat_map(says, energy, across, up, (float(one.energy.min()), float(one.energy.max())))
+    return heat_map(description, energy, across, up, (float(one.energy.min()), float(one.energy.max())))
 
 
 def _nearest(values: Float[np.ndarray, " grid"], wanted: float) -> int:

@@ -59,11 +59,13 @@ def axis_at(label: str, values: Sequence[float], shown: Sequence[str], *, most: 
     return Axis(label, values[0] - air, values[-1] + air, tuple(values[::every]), tuple(shown[::every]))
 
 
-def line_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis, *, level: float | None = None) -> Markup:
+def line_chart(
+    description: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis, *, level: float | None = None
+) -> Markup:
     """Return curves as SVG.
 
     Args:
-        says: Description of the chart, as alternative text.
+        description: Description of the chart, as alternative text.
         lines: Later ones are drawn on top.
         x_axis: The horizontal axis.
         y_axis: The vertical axis; values outside are clipped.
@@ -76,22 +78,22 @@ def line_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis, *, 
     ) if level is not None else Markup()  # fmt: skip
     return element(
         "svg",
-        element("title", says),
+        element("title", description),
         _grid(place),
         reference,
         *drawn,
         class_="chart",
         viewBox=f"0 0 {_WIDTH:g} {_HEIGHT:g}",
         role="img",
-        aria_label=says,
+        aria_label=description,
     )
 
 
-def dot_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis) -> Markup:
+def dot_chart(description: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis) -> Markup:
     """Return a scatter chart, with the diagonal of equal values, and zero lines.
 
     Args:
-        says: Description of the chart, as alternative text.
+        description: Description of the chart, as alternative text.
         lines: The points; later ones are drawn on top.
         x_axis: The horizontal axis.
         y_axis: The vertical axis, zero included.
@@ -102,7 +104,7 @@ def dot_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis) -> M
     zero = {"x1": _LEFT, "x2": _WIDTH - _RIGHT, "y1": place.down(0.0), "y2": place.down(0.0)}
     return element(
         "svg",
-        element("title", says),
+        element("title", description),
         _grid(place),
         element("line", class_="axis", **zero),
         element("line", class_="level", **ends),
@@ -110,7 +112,7 @@ def dot_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis) -> M
         class_="chart",
         viewBox=f"0 0 {_WIDTH:g} {_HEIGHT:g}",
         role="img",
-        aria_label=says,
+        aria_label=description,
     )
 
 

@@ -62,8 +62,8 @@ def error_section(evaluation: Evaluation) -> ReportSection:
         wrong = [_line(evaluation, one, _ratios(evaluation, one, mode, "l1")) for one in wrong_actions_of(evaluation)]
         lines = [*(replace(line, low=None, high=None) for line in wrong), *lines]
         y_axis = nice_axis("L1 error / persistence", [*_reached(lines), 1.0], from_zero=True)
-        says = f"Error over persistence by horizon, {_MODES[mode]}: {_as_text(lines)}."
-        chart = line_chart(says, lines, _time_axis(evaluation), y_axis, level=1.0)
+        description = f"Error over persistence by horizon, {_MODES[mode]}: {_as_text(lines)}."
+        chart = line_chart(description, lines, _time_axis(evaluation), y_axis, level=1.0)
         key = legend([Line("persistence (doing nothing)", (), (), "s-persistence"), *reversed(lines)])
         drawings.append(figure(f"Error by horizon, {_MODES[mode]}", joined(chart, key), _HOW[mode]))
     tables = [_table(evaluation, mode, "l1", _ratios, "over persistence") for mode in reversed(MODES)]
@@ -93,12 +93,12 @@ def base_section(evaluation: Evaluation) -> ReportSection:
     compared = [one for one in models_of(evaluation) if one.model != evaluation.base]
     lines = [_line(evaluation, one, gain_over(evaluation, one.model, evaluation.base)) for one in compared]
     in_percent = [
-        replace(line, y=[100 * y for y in line.y], low=_hundredfold(line.low), high=_hundredfold(line.high))
+        replace(line, y=[100 * y for y in line.y], low=_in_percent(line.low), high=_in_percent(line.high))
         for line in lines
     ]
     y_axis = nice_axis("gain over the base (%)", [*_reached(in_percent), 0.0])
-    says = f"Gain over the base in percent by horizon, open-loop rollout: {_as_text(in_percent, 1)}."
-    chart = joined(line_chart(says, in_percent, _time_axis(evaluation), y_axis, level=0.0), legend(in_percent))
+    description = f"Gain over the base in percent by horizon, open-loop rollout: {_as_text(in_percent, 1)}."
+    chart = joined(line_chart(description, in_percent, _time_axis(evaluation), y_axis, level=0.0), legend(in_percent))
     how = (
         "By which share of the base's error the model's is smaller. Both predict the same clips, so what makes a clip"
         " hard for both cancels out. Above 0 is better than the base; where the band includes 0, nothing is shown."
@@ -197,7 +197,7 @@ def _line(evaluation: Evaluation, one: Series, curve: Sequence[Estimate]) -> Lin
     )
 
 
-def _hundredfold(side: Sequence[float] | None) -> Sequence[float] | None:
+def _in_percent(side: Sequence[float] | None) -> Sequence[float] | None:
     return None if side is None else [100 * each for each in side]
 
 

@@ -92,7 +92,7 @@ def _how() -> Markup:
         paragraph(
             "Rollouts from the first frame of held-out clips. ",
             element("strong", "Errors"),
-            " lie over the frames in grey: ",
+            " are drawn over the frames in grey: ",
             bar,
             " from 0 to the largest L1 error of a patch in that clip, the same colours for all models of the clip. ",
             element("strong", "Latents"),
@@ -183,8 +183,8 @@ def _film(shown: _Shown, name: str) -> Markup:
     clock = [element("span", shown.when(time), class_=f"frame f{place}") for place, time in enumerate(times)]
     box = element("label", element("input", type="checkbox", class_="halt"), " pause")
     controls = element("div", box, element("span", *clock, class_="clock", aria_hidden="true"), class_="controls")
-    says = f"Animation of {name}: {count} frames, repeated. The same frames are shown below, side by side."
-    parts = element("div", *panels, class_="panels", role="img", aria_label=says)
+    description = f"Animation of {name}: {count} frames, repeated. The same frames are shown below, side by side."
+    parts = element("div", *panels, class_="panels", role="img", aria_label=description)
     return element("div", controls, parts, class_=f"film film-{count}")
 
 
@@ -199,8 +199,10 @@ def _photograph(shown: _Shown, time: int) -> Markup:
 
 def _error_image(shown: _Shown, of: str, time: int) -> Markup:
     mean = float(shown.example.errors[of][time - 1].mean())
-    says = f"Error of {of}, {shown.when(time)}: mean {decimal(mean)}"
-    return joined(_drawing(says, _error_inside(shown, of, time)), element("span", decimal(mean), class_="number"))
+    description = f"Error of {of}, {shown.when(time)}: mean {decimal(mean)}"
+    return joined(
+        _drawing(description, _error_inside(shown, of, time)), element("span", decimal(mean), class_="number")
+    )
 
 
 def _colour_image(shown: _Shown, of: str, time: int) -> Markup:
@@ -236,7 +238,7 @@ def _grid(pixels: UInt8[np.ndarray, "grid grid 3"], class_: str) -> Markup:
     return element("image", href=png_url(pixels), class_=f"grid {class_}", preserveAspectRatio="none", **size)
 
 
-def _drawing(says: str | None, *inside: Markup) -> Markup:
+def _drawing(description: str | None, *inside: Markup) -> Markup:
     """Return a square image; one without description is decorative."""
-    described = {"role": "img", "aria_label": says} if says else {"aria_hidden": "true"}
+    described = {"role": "img", "aria_label": description} if description else {"aria_hidden": "true"}
     return element("svg", *inside, class_="picture", viewBox=f"0 0 {_SIZE:g} {_SIZE:g}", **described)

@@ -45,7 +45,7 @@ class MapAxis:
 
 
 def heat_map(
-    says: str,
+    description: str,
     energy: Float[np.ndarray, "across up"],
     across: MapAxis,
     up: MapAxis,
@@ -56,7 +56,7 @@ def heat_map(
     frame = {"x": _LEFT, "y": _TOP, "width": _SIZE, "height": _SIZE}
     return element(
         "svg",
-        element("title", says),
+        element("title", description),
         element("image", href=png_url(np.ascontiguousarray(pixels)), preserveAspectRatio="none", **frame),
         *_axis_across(across),
         *_axis_up(up),
@@ -65,7 +65,7 @@ def heat_map(
         class_="map",
         viewBox=f"0 0 {_LEFT + _SIZE + _RIGHT:g} {_TOP + _SIZE + _BOTTOM:g}",
         role="img",
-        aria_label=says,
+        aria_label=description,
     )
 
 

@@ -83,10 +83,10 @@ def _step_table(evaluation: Evaluation, study: PlanningStudy) -> Markup:
     ways = {name: metrics_of(study, plans) for name, plans in _ways(evaluation, study).items()}
     shown = [[label, *(value(of(found), digits) for found in ways.values())] for label, of, digits in rows]
     settings = study.settings
-    tried = f"{settings.samples} samples" if settings.planner != "gradient" else f"{settings.gradient.starts} starts"
+    effort = f"{settings.samples} samples" if settings.planner != "gradient" else f"{settings.gradient.starts} starts"
     most = ", ".join(f"{100 * one:g}" for one in settings.limits.xyz)
     caption = (
-        f"Plans of one step ({settings.planner}, {tried}, {settings.iterations} iterations,"
+        f"Plans of one step ({settings.planner}, {effort}, {settings.iterations} iterations,"
         f" {settings.energy.distance.upper()} energy, at most {most} cm along x, y, z;"
         f" {percent(study.one_step_beyond)} of the demonstrated steps go beyond that) and the demonstrated step (value"
         f" [95 % interval]). Angle and signs are of steps of at least {LEAST_CM:g} cm; by chance 90 degrees and 0.5"
@@ -130,8 +130,10 @@ def _scatter(evaluation: Evaluation, study: PlanningStudy, axis: int) -> Markup:
     x_axis = nice_axis(f"demonstrated along {name} (cm)", [*demonstrated, 0.0])
     y_axis = nice_axis(f"planned along {name} (cm)", reached)
     off = "; ".join(f"{one.name} off by {_mean_off(one):.1f} cm on average" for one in dots)
-    says = f"Planned against demonstrated displacement along {name} of {len(study)} plans of {STEPS} steps: {off}"
-    return dot_chart(f"{says}.", dots, x_axis, y_axis)
+    description = (
+        f"Planned against demonstrated displacement along {name} of {len(study)} plans of {STEPS} steps: {off}"
+    )
+    return dot_chart(f"{description}.", dots, x_axis, y_axis)
 
 
 def _drawn(evaluation: Evaluation) -> Sequence[tuple[Series, Plans]]:

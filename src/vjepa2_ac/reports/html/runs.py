@@ -27,7 +27,7 @@ def episode_section(evaluation: Evaluation) -> ReportSection:
         return ReportSection("episodes", title, not_measured("Episodes", "This result holds no metrics by episode."))
     how = (
         f"The L1 error of a rollout {seconds(evaluation.seconds_ahead)} ahead over that of persistence, by episode:"
-        " whether a mean hides a few bad ones. Episodes with few clips lie at both ends by chance alone: look at them"
+        " whether a mean hides a few bad ones. Episodes with few clips are at both ends by chance alone: look at them"
         " before you explain them."
     )
     drawing = figure(f"Error of {evaluation.trained} on every episode", episode_chart(scores), how)
@@ -120,10 +120,10 @@ def _training_chart(kind: str, curves: Sequence[TrainingCurve]) -> Markup:
     lines = [_training_line(curve, style) for curve, style in zip(curves, _cycled(len(curves)), strict=True)]
     everything = [value for line in lines for value in line.y]
     x_axis = nice_axis("optimizer steps", [float(x) for line in lines for x in line.x], most=5)
-    says = f"{kind} over optimizer steps: " + "; ".join(
+    description = f"{kind} over optimizer steps: " + "; ".join(
         f"{curve.name} from {curve.values[0]:.4g} to {curve.values[-1]:.4g}" for curve in curves
     )
-    chart = line_chart(says, lines, x_axis, nice_axis("", everything, most=5))
+    chart = line_chart(description, lines, x_axis, nice_axis("", everything, most=5))
     return element("figure", element("figcaption", element("h3", kind)), chart, legend(lines))
 
 

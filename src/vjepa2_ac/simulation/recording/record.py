@@ -145,7 +145,7 @@ def record_episode(
 
 
 def episode_folder(index: int, seed: int, domain_name: str) -> str:
-    """Return the source folder stored in the episode; as in DROID, it alone says success or failure."""
+    """Return the source folder stored in the episode; as in DROID, the only record of success or failure."""
     succeeded = np.random.default_rng([seed, index, 2]).uniform() < SUCCESS_SHARE
     minute, hour, day = index % 60, index // 60 % 24, 1 + index // 1440 % 28
     place = f"{domain_name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"

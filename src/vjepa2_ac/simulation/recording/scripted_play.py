@@ -23,7 +23,7 @@ from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.kinematics import OutOfReachError, inverse_kinematics
 from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, rest_joints
 
-_UNSTEADY_M = 0.008  # standard deviation of the noise on each axis of an oracle's step
+_NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's step
 _LOWEST_M, _HIGHEST_M = 0.155, 0.34  # of the flange while playing
 _TO_BLOCK = 0.5  # probability that a step of play goes to the block, or through it
 _AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # of the flange while playing, in the world
@@ -65,9 +65,9 @@ def play(
     for step in range(steps):
         if step % recipe.stride == 0:
             if script:
-                action = _unsteady(oracle.act(np.zeros((1, 1, 3), dtype=np.uint8), arm.state), limits, rng)
+                action = _with_noise(oracle.act(np.zeros((1, 1, 3), dtype=np.uint8), arm.state), limits, rng)
             else:
-                action = _playful(arm, problem, limits, rng)
+                action = _play_action(arm, problem, limits, rng)
             joints, grip = _sent(arm, action)
         rows.append((joints, grip, arm.joints, arm.closedness))
         if look:
@@ -77,11 +77,11 @@ def play(
     return Motion(np.array(commanded), np.array(commanded_grip), np.array(measured), np.array(measured_grip))
 
 
-def _unsteady(action: Float[np.ndarray, " 7"], limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
-    return shortened(action + np.append(rng.normal(0.0, _UNSTEADY_M, size=3), np.zeros(4)), limits)
+def _with_noise(action: Float[np.ndarray, " 7"], limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
+    return shortened(action + np.append(rng.normal(0.0, _NOISE_M, size=3), np.zeros(4)), limits)
 
 
-def _playful(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
+def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
     """Return a step to or through the block, or anywhere; for `pick`, sometimes the gripper opens or closes."""
     state, block = arm.state, arm.block
     if block is None:

@@ -68,7 +68,7 @@ class Watch:
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
         self._at_start: dict[str, float] = {}
         self._losses: deque[float] = deque(maxlen=_LOSSES)
         self._lowest = math.inf
@@ -76,9 +76,9 @@ class Watch:
     def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> list[str]:
         """Return the warnings of a row: none if it is fine or the cause is known already."""
         found = {"validation": self._of_validation, "train": self._of_loss}.get(kind)
-        new = {cause: text for cause, text in found(step, metrics) if cause not in self._said} if found else {}
-        self._said |= set(new)
-        return [f"at step {step:,} {text}. {way_out(self._config)}" for text in new.values()]
+        new = {cause: text for cause, text in found(step, metrics) if cause not in self._reported} if found else {}
+        self._reported |= set(new)
+        return [f"at step {step:,} {text}. {advice(self._config)}" for text in new.values()]
 
     def _of_validation(self, step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         now = {name: _number(metrics.get(key)) for key, name in _MEASURES.items()}
@@ -91,11 +91,11 @@ class Watch:
         worse = [name for name, value in now.items() if value > _NOISE * starts[name]]
         if not worse:
             return
-        told = " and ".join(f"the {name} is {now[name]:.3f} (before training {starts[name]:.3f})" for name in worse)
+        errors = " and ".join(f"the {name} is {now[name]:.3f} (before training {starts[name]:.3f})" for name in worse)
         beyond = any(now[name] > 1.0 > starts[name] for name in worse)
         copying = "; copying the last frame would be better" if beyond else ""
         last = step == self._config.training.steps
-        yield f"{worse} {beyond} {last}", f"{told} of persistence's in the validation{copying}"
+        yield f"{worse} {beyond} {last}", f"{errors} of persistence's in the validation{copying}"
 
     def _of_loss(self, step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         del step
@@ -111,7 +111,7 @@ class Watch:
             yield "loss", f"the loss is {typical:.4g}, and was {self._lowest:.4g} (medians of {_LOSSES} rows)"
 
 
-def way_out(config: Config) -> str:
+def advice(config: Config) -> str:
     """Return the knobs to change in a config whose training has made the model worse."""
     training, adapter = config.training, config.adapter
     knobs = [f"lower training.learning_rate ({training.learning_rate:g})"]
