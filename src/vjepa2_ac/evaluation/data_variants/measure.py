@@ -53,7 +53,7 @@ class VariantProbe:
     def better(self) -> VariantResult | None:
         """The variant that fits best, if it certainly fits better than the unchanged data."""
         certain = [one for one in self.results if self._is_certainly_better(one)]
-        return min(certain, key=lambda one: one.difference.value) if surely else None
+        return min(certain, key=lambda one: one.difference.value) if certain else None
 
     def _is_certainly_better(self, one: VariantResult) -> bool:
         difference = one.difference
