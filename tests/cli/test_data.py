@@ -1,4 +1,4 @@
-"""The data commands: what they print, what they write, and their exit status."""
+"""The data commands: output, files and exit status."""
 
 import json
 from pathlib import Path

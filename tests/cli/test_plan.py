@@ -1,4 +1,4 @@
-"""`vjepa2-ac plan` writes a plan and its picture, or one clear error before anything is loaded."""
+"""`vjepa2-ac plan` writes a plan and its figure, or reports an error before anything is loaded."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A run shows how it goes: on a bar in a terminal, in lines elsewhere."""
+"""Progress of a run: a bar in a terminal, lines elsewhere."""
 
 import io
 import re

@@ -1,4 +1,4 @@
-"""Every figure of a table can be read, on a narrow terminal as on a wide one, and however long one cell is."""
+"""Every number of a table is readable, on narrow and wide terminals, whatever the length of a cell."""
 
 import re
 from collections.abc import Callable

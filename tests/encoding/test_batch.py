@@ -1,4 +1,4 @@
-"""What is drawn for a clip is applied before it is encoded."""
+"""Batches: augmentation is applied before encoding."""
 
 from dataclasses import replace
 

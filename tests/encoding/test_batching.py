@@ -1,4 +1,4 @@
-"""Every chunk has one shape, whatever episodes its frames are of; what cannot be read takes nothing else with it."""
+"""Encoder batching: all chunks have the same shape, and an unreadable episode does not affect others."""
 
 import weakref
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""Encoding is done once, whoever interrupts it; a run on cached latents is the run on pictures."""
+"""Encoding: done once, also after interruptions; a run on cached latents equals the run on frames."""
 
 import errno
 import re

@@ -1,4 +1,4 @@
-"""A data set opened through its latents has the same clips in the same order; a wrong or damaged cache is refused."""
+"""The latent cache: same clips in the same order; a wrong or damaged cache is refused."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Training on cached latents is training on the fly: bit for bit in fp32, within what is rounded off otherwise."""
+"""Training on cached latents equals training from frames: bit for bit in fp32, within rounding otherwise."""
 
 from pathlib import Path
 from typing import Any

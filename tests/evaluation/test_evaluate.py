@@ -1,4 +1,4 @@
-"""An oracle is found perfect, a copier as good as doing nothing and deaf to its actions, every time."""
+"""An oracle has error 0, a copier equals persistence and ignores its actions, reproducibly."""
 
 import json
 from collections.abc import Iterator

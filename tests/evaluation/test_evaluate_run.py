@@ -1,4 +1,4 @@
-"""Runs and models are measured on their own data or others, against what is named; what cannot be is said at once."""
+"""Runs and models are evaluated on their own or other data, against others; invalid input is refused early."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""What leaves the house predicts as the run does, and says what it is."""
+"""An exported model predicts like the run, and its card describes it."""
 
 import errno
 import json

@@ -1,4 +1,4 @@
-"""Plans with compiled blocks are the plain ones, and a second decision compiles nothing."""
+"""Plans with compiled blocks equal the plain ones, and a second decision compiles nothing."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A robot's loop: pictures and states in, actions within the limits out, with a reason."""
+"""The controller in a robot's loop: images and states in, actions within the limits and a reason out."""
 
 import numpy as np
 import pytest

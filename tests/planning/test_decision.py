@@ -1,4 +1,4 @@
-"""A decision is told as it is: in values, in a file, in words."""
+"""Decisions: their values, their file and their summary agree."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Plans in 8 bits are nearly the plain ones, and the model that was given stays as it was; they are for bfloat16."""
+"""Plans in 8 bits are close to the plain ones, and the given model stays unchanged; bfloat16 only."""
 
 import copy
 import importlib.util

@@ -1,4 +1,4 @@
-"""What was named is planned with, as its own config says; what cannot be planned with is refused."""
+"""The planning session uses the given run or model with its own config, and refuses unusable ones."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Every planner finds known optima, keeps to limits and time, and survives a cost that says nothing."""
+"""Solvers find known optima, respect limits and time, and handle a cost without finite values."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""A model that was trained is planned with as its base is: merged, in the type of its weights, and itself untouched."""
+"""A trained model plans like its base: merged, in the type of its weights, and without being changed."""
 
 import copy
 from collections.abc import Iterator

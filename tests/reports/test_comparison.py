@@ -1,4 +1,4 @@
-"""Runs that were measured on the same clips are compared pair by pair; others are not compared at all."""
+"""Runs that were measured on the same clips are compared pair by pair; others are refused."""
 
 import json
 from pathlib import Path

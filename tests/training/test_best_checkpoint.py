@@ -1,4 +1,4 @@
-"""Errors of other clips, over another time or of other latents are no better or worse."""
+"""Errors of other clips, another time span or other latents are not compared."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A run whose batches are copied ahead is the same run, and the next batch is on its way before the host waits."""
+"""Asynchronous copies do not change a run, and the next batch is copied before the host waits."""
 
 import itertools
 from collections.abc import Generator

@@ -1,4 +1,4 @@
-"""Processes that share a predictor (FSDP2) make the run that one makes, and what they cannot share is refused."""
+"""FSDP2: processes that share a predictor equal a single one, and unsupported settings are refused."""
 
 from pathlib import Path
 

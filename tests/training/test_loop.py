@@ -1,4 +1,4 @@
-"""Laws of the loop: exact, resumable, and nothing but the adapter moves."""
+"""Properties of the loop: exact, resumable, and only the adapter changes."""
 
 import importlib.util
 import json

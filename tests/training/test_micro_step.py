@@ -1,4 +1,4 @@
-"""A micro-step that is captured once and replayed learns what the plain one learns; so do matrices cast once a step."""
+"""A captured and replayed micro-step equals the plain one; so do matrices cast once per step."""
 
 import itertools
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""A robot of other states or actions than the base knows, from its recordings to a model of its own."""
+"""A robot with other states or actions than the base's: from its recordings to a trained model."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""A step counts every clip that could be read alike, and none that could not."""
+"""A step weights all readable clips equally, and ignores unreadable ones."""
 
 import itertools
 import math

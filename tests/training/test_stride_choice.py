@@ -1,4 +1,4 @@
-"""A stride that is auto is chosen once, by the base model, and belongs to the run from then on."""
+"""An automatic stride is chosen once, by the base model, and stored with the run."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""A model that knows the world plans what was demonstrated; one that is deaf to actions is no better than no plan."""
+"""An oracle plans the demonstrated actions; a model that ignores actions is no better than no plan."""
 
 from dataclasses import replace
 

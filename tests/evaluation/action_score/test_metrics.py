@@ -1,4 +1,4 @@
-"""Scores, errors, angles and signs are what is computed by hand."""
+"""Scores, errors, angles and signs equal those computed by hand."""
 
 import json
 import re

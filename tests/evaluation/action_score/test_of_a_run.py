@@ -1,4 +1,4 @@
-"""Plans are measured with the planning section of a config, and clips too short for them are refused at once."""
+"""Plans are measured with a config's planning section, and clips that are too short are refused at once."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Ranks are counted, ties are shared, and what is drawn is what it is said to be."""
+"""Ranks are counted, ties are shared, and samples come from the stated distribution."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""`data check --model` measures the data with a model, read as they are and otherwise, whatever form they are in."""
+"""`data check --model` measures the data with a model, unchanged and in variants, for every source."""
 
 from collections.abc import Callable
 from pathlib import Path

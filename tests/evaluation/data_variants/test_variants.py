@@ -1,4 +1,4 @@
-"""A model that knows its world names the variant in which the data really are, and of good data it names none."""
+"""An oracle finds the variant in which the data were written, and no variant for good data."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

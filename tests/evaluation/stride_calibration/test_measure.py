@@ -1,4 +1,4 @@
-"""A model that knows its step length is recognised; where that cannot be told, it is not claimed."""
+"""The stride of an oracle is found; an uncertain result is reported as uncertain."""
 
 from collections.abc import Sequence
 

@@ -1,4 +1,4 @@
-"""Pictures stand side by side, enlarged and unchanged, with words above."""
+"""Captioned frames: images side by side, enlarged and unchanged, with captions above."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The picture is written whole, whatever the episodes are like, and shows the pictures that it should."""
+"""The contact sheet is written completely for any kind of episodes, and shows the right frames."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Pictures are drawn whatever runs are called and however many there are."""
+"""Figures of evaluations are drawn for any names and any number of runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A decision's picture is drawn for every end that a decision has."""
+"""The figure of a plan is drawn for every outcome of a decision."""
 
 from pathlib import Path
 

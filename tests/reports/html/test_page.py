@@ -1,4 +1,4 @@
-"""The page says what was measured and nothing else, whatever things are called, and opens anywhere."""
+"""The report page contains all measurements, for any names, and needs no other file."""
 
 from __future__ import annotations
 

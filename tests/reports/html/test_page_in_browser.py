@@ -1,4 +1,4 @@
-"""A real browser shows the page from its file: no complaint, no request, no script; light and dark, wide and narrow."""
+"""The report page in a real browser: no errors, no requests, no scripts; light and dark, wide and narrow."""
 
 from __future__ import annotations
 

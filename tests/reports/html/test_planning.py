@@ -1,4 +1,4 @@
-"""The report shows what models planned beside plans that take no model, and says why where nobody planned."""
+"""The report compares a model's plans with model-free ones, or explains why there are none."""
 
 import re
 from dataclasses import replace

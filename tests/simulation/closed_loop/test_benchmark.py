@@ -1,4 +1,4 @@
-"""A model steers beside those it is compared with; table, figures and film tell the same."""
+"""The closed-loop benchmark: table, metrics and video agree."""
 
 import json
 import sys

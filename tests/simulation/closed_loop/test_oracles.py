@@ -1,4 +1,4 @@
-"""Who knows all solves push and pick; who does nothing or anything does not."""
+"""Oracles solve push and pick; doing nothing and random actions do not."""
 
 import numpy as np
 import pytest

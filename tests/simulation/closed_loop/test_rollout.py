@@ -1,4 +1,4 @@
-"""Episodes end where the actions lead, and the figures say so."""
+"""Episodes end where the actions lead, and the metrics agree."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is recorded reads back as DROID, is consistent with the kinematics, and is the same every time."""
+"""Recordings read back as DROID, are consistent with the kinematics, and are reproducible."""
 
 from dataclasses import replace
 from pathlib import Path

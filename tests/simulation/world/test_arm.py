@@ -1,4 +1,4 @@
-"""What the cameras see is the arm where it is, in the domain's colours."""
+"""Camera images show the arm at its pose, in the domain's colours."""
 
 import sys
 from dataclasses import replace

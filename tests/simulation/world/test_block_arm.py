@@ -1,4 +1,4 @@
-"""With contacts the arm goes where it went without them, stops where something is in the way, and moves the block."""
+"""With contacts the arm follows the same commands, stops at obstacles, and moves the block."""
 
 import numpy as np
 import pytest

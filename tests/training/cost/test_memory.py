@@ -1,4 +1,4 @@
-"""The estimate adds up what is there at once, knows every knob that changes it, and doctor tells it."""
+"""The memory estimate adds up what is allocated at once, depends on every relevant knob, and doctor prints it."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Training that makes the model worse says so, once for each cause, also when it goes on; other training does not."""
+"""A diverging run warns once per cause, also after resuming; other runs do not."""
 
 import json
 from collections.abc import Callable

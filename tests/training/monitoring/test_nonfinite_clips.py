@@ -1,4 +1,4 @@
-"""Clips that broke a step are there to be looked at, and saving them never hides the error."""
+"""Clips of a step that is not finite are saved for inspection, and saving never hides the error."""
 
 import errno
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Figures of health say what they say they do."""
+"""Throughput metrics equal their definitions."""
 
 import math
 import sys
