@@ -98,11 +98,11 @@ def test_a_cache_of_another_encoder_stops_a_run_before_the_first_step(make_confi
     base = WorldModel.from_pretrained(Path(make_config().model.base))
     sizes = ModelSizes.model_validate(base.sizes.model_dump())
     WorldModel.random(sizes, seed=99).save_pretrained(other)
-    for changes, said in (
+    for changes, reported in (
         ({"model__base": str(other)}, "encoder: "),
         ({"training__precision": "bf16"}, r"training\.precision: "),
     ):
-        with pytest.raises(InputError, match=f"made otherwise: {said}"):
+        with pytest.raises(InputError, match=f"made otherwise: {reported}"):
             train(make_config(**of_cache(folder, **changes)), reporter)
     assert reporter.steps == []
 
@@ -135,7 +135,7 @@ def test_a_run_is_evaluated_from_its_cache_as_from_its_data(make_config, reporte
     assert [examples.frames is not None for examples in from_cache.examples] == [True] * len(from_data.examples)
     for cached, original in zip(from_cache.examples, from_data.examples, strict=True):
         difference = cached.frames.astype(float) - original.frames
-        assert abs(difference).mean() < 12  # small and JPEG, but the same pictures
+        assert abs(difference).mean() < 12  # small and JPEG, but the same frames
     for one in found:
         one.pop("about")
     assert found[0] == found[1]

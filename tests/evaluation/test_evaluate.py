@@ -227,13 +227,13 @@ def test_each_model_is_measured_only_while_it_is_switched_on() -> None:
 
 
 def test_progress_names_each_part_of_the_work() -> None:
-    told: dict[str, tuple[int, int]] = {}
+    reported: dict[str, tuple[int, int]] = {}
 
     def stage(title: str):  # type: ignore[no-untyped-def]
-        return lambda done, total: told.__setitem__(title, (done, total))
+        return lambda done, total: reported.__setitem__(title, (done, total))
 
     evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=PROBES, stage=stage)
-    assert told == {"measuring": (12, 12), "other actions, model": (6, 6), "energy landscapes, model": (3, 3)}
+    assert reported == {"measuring": (12, 12), "other actions, model": (6, 6), "energy landscapes, model": (3, 3)}
 
 
 @pytest.mark.parametrize(

@@ -150,7 +150,7 @@ def test_another_encoder_cannot_be_measured_on_these_latents(run: str, tmp_path:
         evaluate_subject(run, asked(against=(str(tmp_path / "other"),)))
 
 
-def test_a_cache_gives_the_figures_of_the_pictures_and_pictures_of_its_own(
+def test_a_cache_gives_the_figures_of_the_frames_and_frames_of_its_own(
     config: Config, run: str, tmp_path: Path
 ) -> None:
     encode_for(

@@ -83,7 +83,7 @@ def test_a_run_that_was_not_evaluated_is_named_with_the_way_out(tmp_path: Path) 
         compare([tmp_path / "one"])
 
 
-def test_figures_of_other_shapes_are_named(tmp_path: Path) -> None:
+def test_metrics_of_other_shapes_are_named(tmp_path: Path) -> None:
     one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
     metrics = json.loads((other / METRICS_FILE).read_text())
     metrics["by_clip"]["persistence"] = 0.5
@@ -92,7 +92,7 @@ def test_figures_of_other_shapes_are_named(tmp_path: Path) -> None:
         compare([one, other])
 
 
-def test_damaged_figures_are_named(tmp_path: Path) -> None:
+def test_damaged_metrics_are_named(tmp_path: Path) -> None:
     one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
     metrics = json.loads((other / METRICS_FILE).read_text())
     del metrics["by_clip"]

@@ -1,4 +1,4 @@
-"""How does a test get a latent cache? Encoded with a tiny model, or of numbers that tell the step."""
+"""Latent caches for tests: encoded with a tiny model, or of numbers that encode the step."""
 
 from __future__ import annotations
 

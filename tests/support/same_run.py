@@ -1,4 +1,4 @@
-"""Are two runs the same, bit for bit? Weights, optimizer state and metrics but for timings."""
+"""Comparison of two runs, bit for bit: weights, optimizer state and metrics except timings."""
 
 from pathlib import Path
 

@@ -59,10 +59,10 @@ def test_two_processes_that_share_a_predictor_make_the_run_of_one(make_config, r
     train(config("handed_over", steps=4, accumulation=4), reporter)
     config("shared", steps=6, accumulation=2)
     script, port = ROOT / "tests/support/shards_together.py", free_port()
-    (said, errors), (_, other_errors) = finish(
+    (reported, errors), (_, other_errors) = finish(
         [start_rank([str(script), str(tmp_path)], rank, 2, port, **FSDP2) for rank in range(2)]
     )
-    assert "2 processes share the predictor's weights, gradients and moments" in said
+    assert "2 processes share the predictor's weights, gradients and moments" in reported
     assert "returned a view" not in errors + other_errors
     state = read_state(newest_checkpoint(tmp_path / "shared/checkpoints"))
     assert (state.step, state.processes) == (4, 2)

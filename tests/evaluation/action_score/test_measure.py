@@ -250,10 +250,10 @@ def test_plans_without_a_finite_energy_do_nothing_and_are_counted() -> None:
 
 @pytest.mark.usefixtures("quick")
 def test_progress_counts_every_plan_of_a_model() -> None:
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     quick = ONE_STEP.model_copy(update={"samples": 10, "iterations": 1})
-    measure_plans(Copier(), starts_of_a_world()[:2], quick, lambda done, total: told.append((done, total)))
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    measure_plans(Copier(), starts_of_a_world()[:2], quick, lambda done, total: reported.append((done, total)))
+    assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def test_of_vectors_no_plans_are_made_and_the_reason_is_said() -> None:

@@ -102,16 +102,16 @@ def test_vectors_are_probed_by_a_model_that_takes_them_and_others_are_refused(
     assert "data with states of 8 and actions of 8 numbers" in capsys.readouterr().err
 
 
-def test_a_latent_cache_is_probed_by_the_model_that_encoded_it_without_other_pictures(
+def test_a_latent_cache_is_probed_by_the_model_that_encoded_it_without_other_frames(
     make_config: MakeConfig, tmp_path: Path, capsys: Printed
 ) -> None:
-    of_pictures = make_config(data__frames=10, data__start_every=2)
-    base = str(of_pictures.model.base)
-    cache = encode_for(of_pictures, load_base(of_pictures.model, seed=0), open_dataset(of_pictures.data))
+    of_frames = make_config(data__frames=10, data__start_every=2)
+    base = str(of_frames.model.base)
+    cache = encode_for(of_frames, load_base(of_frames.model, seed=0), open_dataset(of_frames.data))
     config = make_config(
         data__source="latents", data__path=str(cache), data__camera=None, data__frames=10, data__start_every=2
     )
-    probe, expected = probed(config, base), probed(of_pictures, base)
+    probe, expected = probed(config, base), probed(of_frames, base)
     assert probe.ratio.value == pytest.approx(expected.ratio.value, rel=2e-3)  # kept in bfloat16
     assert names(probe) == names(expected) - {"red and blue exchanged", "frames mirrored"}
     differences = {one.name: one.difference.value for one in expected.results}

@@ -44,23 +44,23 @@ def with_inverted_gripper(states: np.ndarray) -> np.ndarray:
 
 
 class TwoSided(MemorySource):
-    """Its pictures hold at the right other steps than at the left, and another blue."""
+    """Its frames hold at the right other steps than at the left, and another blue."""
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
         """Return an episode."""
         episode = super().read(index, camera, needed)
 
         def frames(steps: Sequence[int]) -> np.ndarray:
-            pictures = episode.read_frames(steps)
-            pictures[:, :, 3:, 1] = (7 * pictures[:, :, 3:, 1] + 3) % STEPS
-            pictures[:, :, 3:, 2] = RIGHT
-            return pictures
+            frames = episode.read_frames(steps)
+            frames[:, :, 3:, 1] = (7 * frames[:, :, 3:, 1] + 3) % STEPS
+            frames[:, :, 3:, 2] = RIGHT
+            return frames
 
         return replace(episode, read_frames=frames)
 
 
 class Knowing:
-    """Knows where each picture was taken, and what an action does to a place, a rotation and a gripper."""
+    """Knows where each frame was taken, and what an action does to a place, a rotation and a gripper."""
 
     def __init__(self, steps: int = STEPS, *, sees_bgr: bool = False, sees_mirrored: bool = False) -> None:
         self._latents = [self._latent(at(0)(truth(number, steps))) for number in range(EPISODES)]
@@ -78,7 +78,7 @@ class Knowing:
         return latents[step % len(latents)]
 
     def encode(self, batch: Batch) -> LatentBatch:
-        """Look up what is to be seen: a picture holds its episode and its step as colours."""
+        """Look up what is to be seen: a frame holds its episode and its step as colours."""
         assert batch.frames is not None
         self.encoded += 1
         seen = batch.frames[:, :, 0, self._column][..., self._channels].numpy().astype(int)
@@ -135,14 +135,14 @@ def test_each_fault_is_named_and_mending_it_makes_the_model_fit(name: str) -> No
 
 
 @pytest.mark.parametrize("name", ["red and blue exchanged", "frames mirrored"])
-def test_pictures_that_are_otherwise_are_named(name: str) -> None:
+def test_frames_that_are_otherwise_are_named(name: str) -> None:
     knowing = Knowing(sees_bgr=name.startswith("red"), sees_mirrored=name.startswith("frames"))
     probe = probed(dataset_of(at(0)), knowing)
     assert probe.better is not None
     assert probe.better.name == name
 
 
-def test_of_good_data_no_variant_fits_better_and_only_changed_pictures_are_encoded_again() -> None:
+def test_of_good_data_no_variant_fits_better_and_only_changed_frames_are_encoded_again() -> None:
     knowing = Knowing()
     probe = probed(dataset_of(at(0)), knowing)
     assert probe.better is None
@@ -261,7 +261,7 @@ def test_exchanging_colours_leaves_the_rest() -> None:
     assert changed.states is episode.states
 
 
-def test_of_changed_pictures_persistence_is_another_one_too() -> None:
+def test_of_changed_frames_persistence_is_another_one_too() -> None:
     """Or what moves less in latents would fit better."""
     knowing = Knowing()
 

@@ -188,10 +188,10 @@ def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(mon
 
 
 def test_progress_counts_every_clip_of_every_stride() -> None:
-    told: list[tuple[int, int]] = []
-    calibrated(GoesOn(4), Tracks([80] * 4), clips=10, progress=lambda done, total: told.append((done, total)))
-    assert told[-1] == (30, 30)
-    assert [done for done, _ in told] == sorted({done for done, _ in told})
+    reported: list[tuple[int, int]] = []
+    calibrated(GoesOn(4), Tracks([80] * 4), clips=10, progress=lambda done, total: reported.append((done, total)))
+    assert reported[-1] == (30, 30)
+    assert [done for done, _ in reported] == sorted({done for done, _ in reported})
 
 
 def test_the_figures_are_plain_values() -> None:

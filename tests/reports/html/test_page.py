@@ -297,7 +297,7 @@ def test_better_than_the_base_but_not_than_doing_nothing_is_no_success() -> None
     assert 'class="verdict unclear"' in html
 
 
-def test_pictures_are_described_tables_have_captions_and_headings_do_not_jump() -> None:
+def test_images_are_described_tables_have_captions_and_headings_do_not_jump() -> None:
     _, html, page = usual()
     levels = [int(tag[1]) for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)]
     assert levels.count(1) == 1
@@ -314,7 +314,7 @@ def test_pictures_are_described_tables_have_captions_and_headings_do_not_jump() 
     assert 'lang="en"' in html
 
 
-def test_every_moving_picture_turns_through_its_frames_and_can_be_halted() -> None:
+def test_every_moving_image_turns_through_its_frames_and_can_be_halted() -> None:
     one = evaluation(frames=6)
     html = page_of(one)
     assert html.count('class="halt"') == len(one.examples)

@@ -44,20 +44,20 @@ def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     rows = {line.split("│")[1].strip(): line for line in shown.splitlines() if line.startswith("│")}
     assert list(rows) == ["tiny", "do nothing", "random", "oracle"]
     assert "reach in domain B: 2 problems of seed 0, 2 steps of 0.27 s" in shown
-    told = metrics(tmp_path)
-    assert list(told["policies"]) == list(rows)
-    assert told["about"]["planning"]["samples"] == 6
-    assert told["about"]["success_below_cm"] == 5
-    for name, one in told["policies"].items():
+    reported = metrics(tmp_path)
+    assert list(reported["policies"]) == list(rows)
+    assert reported["about"]["planning"]["samples"] == 6
+    assert reported["about"]["success_below_cm"] == 5
+    for name, one in reported["policies"].items():
         distances = np.array(one["by_episode"]["distance_cm"])
         assert distances.shape == (2, 3)
         assert one["final_distance_cm"]["value"] == pytest.approx(distances[:, -1].mean(), abs=1e-3)
         assert one["by_episode"]["success"] == (distances[:, -1] < 5).tolist()
         assert f"{one['final_distance_cm']['value']:.1f} [" in rows[name]
-    assert told["policies"]["tiny"]["why_counts"] == {"planned": 4}
-    starts = [one["by_episode"]["distance_cm"][0][0] for one in told["policies"].values()]
+    assert reported["policies"]["tiny"]["why_counts"] == {"planned": 4}
+    starts = [one["by_episode"]["distance_cm"][0][0] for one in reported["policies"].values()]
     assert starts == starts[:1] * 4  # the same problems for all
-    assert count_frames(tmp_path / FILM, where="film") == 4 + 1 + 4  # the first and the last picture are held
+    assert count_frames(tmp_path / FILM, where="film") == 4 + 1 + 4  # the first and the last image are held
 
 
 def test_the_same_call_gives_the_same_figures_and_another_seed_others(model: str, tmp_path: Path) -> None:

@@ -129,13 +129,13 @@ def test_what_is_no_action_is_refused(arm: SimulatedArm) -> None:
 def test_a_world_model_plans_within_its_limits_and_says_why(arm: SimulatedArm) -> None:
     config = PlanningConfig(samples=8, iterations=2, limits=SMALL, cem=CemConfig(elites=3))
     policy = Planning(Controller(tiny_model(), config), name="tiny")
-    told = []
+    reported = []
     result = run_task(
-        "reach", DOMAIN_B, policy, episodes=2, steps=2, keep_frames=1, arm=arm, progress=lambda *n: told.append(n)
+        "reach", DOMAIN_B, policy, episodes=2, steps=2, keep_frames=1, arm=arm, progress=lambda *n: reported.append(n)
     )
     assert result.policy == "tiny"
     assert result.why_counts == {"planned": 4}
-    assert told == [(1, 2), (2, 2)]
+    assert reported == [(1, 2), (2, 2)]
     assert all((np.abs(episode.actions[:, :3]) <= 0.03).all() for episode in result.episodes)
     assert np.abs(result.episodes[0].actions[:, :3]).max() > 0
     assert [episode.frames is not None for episode in result.episodes] == [True, False]

@@ -29,7 +29,7 @@ def arm() -> SimulatedArm:
 
 
 def hand_pixel(arm: SimulatedArm) -> tuple[int, int]:
-    """Project the middle of the hand into the picture by the extrinsics and the state that the arm reports."""
+    """Project the middle of the hand into the image by the extrinsics and the state that the arm reports."""
     camera, pose = arm.extrinsics(), arm.state
     middle = pose[:3] + 0.035 * matrices_from_euler(pose[3:6])[:, 2]
     x, y, z = matrices_from_euler(camera[3:]).T @ (middle - camera[:3])
@@ -49,21 +49,21 @@ def test_the_scene_and_the_arithmetic_agree_on_where_the_flange_is() -> None:
 
 
 @pytest.mark.parametrize("domain", [DOMAIN_A, DOMAIN_B], ids=["A", "B"])
-def test_the_hand_is_in_the_picture_where_the_reported_poses_say(domain: Domain) -> None:
+def test_the_hand_is_in_the_image_where_the_reported_poses_say(domain: Domain) -> None:
     arm = SimulatedArm(domain)
-    pictures = []
+    images = []
     for joints in REACHES:
         arm.set_joints(joints + rest_joints(domain) - HOME, 0.0)
         image = arm.image().astype(int)
         column, row = hand_pixel(arm)
         red, _, blue = image[row, column]
         assert red > 2 * blue  # the hand's colour, which nothing else has
-        pictures.append(image)
-    changed = (np.abs(pictures[0] - pictures[1]) > 40).any(axis=-1).mean()
+        images.append(image)
+    changed = (np.abs(images[0] - images[1]) > 40).any(axis=-1).mean()
     assert 0.03 < changed < 0.6
 
 
-def test_the_arm_is_large_in_the_picture(arm: SimulatedArm) -> None:
+def test_the_arm_is_large_in_the_image(arm: SimulatedArm) -> None:
     arm.set_joints(HOME, 0.0)
     image = arm.image()[:, 38:281].astype(int)  # what the model sees of it
     white, orange = image.min(axis=-1) > 130, image[..., 0] > 2 * image[..., 2]
@@ -89,7 +89,7 @@ def test_closing_the_gripper_is_seen(arm: SimulatedArm) -> None:
     assert (opened != arm.image()).any()
 
 
-def test_another_look_gives_another_picture_of_the_same_arm() -> None:
+def test_another_look_gives_another_image_of_the_same_arm() -> None:
     other = SimulatedArm(replace(DOMAIN_A, look=DOMAIN_B.look))
     first = SimulatedArm(DOMAIN_A)
     np.testing.assert_array_equal(first.state, other.state)
@@ -97,9 +97,9 @@ def test_another_look_gives_another_picture_of_the_same_arm() -> None:
 
 
 def test_the_three_cameras_see_different_things(arm: SimulatedArm) -> None:
-    pictures = [arm.image(name) for name in ("exterior_1", "exterior_2", "wrist")]
-    assert not (pictures[0] == pictures[1]).all()
-    assert not (pictures[1] == pictures[2]).all()
+    images = [arm.image(name) for name in ("exterior_1", "exterior_2", "wrist")]
+    assert not (images[0] == images[1]).all()
+    assert not (images[1] == images[2]).all()
     with pytest.raises(ValueError, match="no camera"):
         arm.image("elbow")
 
