@@ -28,7 +28,7 @@ class Robot:
     def state(self) -> np.ndarray:
         return np.array(START)
 
-    def picture(self) -> np.ndarray:
+    def image(self) -> np.ndarray:
         return read_image(ROOT / f"docs/plan_{'start' if len(self.targets) < 2 else 'goal'}.png")
 
     def move_to(self, target: np.ndarray) -> None:

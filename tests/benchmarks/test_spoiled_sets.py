@@ -13,7 +13,7 @@ import yaml
 
 from benches import imported
 from moving_arms import RATE_HZ, STEPS, spot_frames, spot_states, write_spots
-from vjepa2_ac.evaluation.data_variants.measure import TriedVariant, VariantProbe
+from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult
 from vjepa2_ac.evaluation.intervals import Estimate
 
 EPISODES = 10
@@ -82,9 +82,9 @@ def outcomes(printed: str) -> dict[str, tuple[str, str]]:
 def test_a_table_says_what_was_refused_warned_hinted_and_missed(
     spoiled_sets: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    better = TriedVariant("y negated", "negate y", Estimate(0.5, 0.4, 0.6), Estimate(-0.4, -0.5, -0.3))
+    better = VariantResult("y negated", "negate y", Estimate(0.5, 0.4, 0.6), Estimate(-0.4, -0.5, -0.3))
     probes = {False: VariantProbe(Estimate(0.5, 0.4, 0.6), (), 16, 8)}
-    probes[True] = replace(probes[False], tried=(better,))
+    probes[True] = replace(probes[False], results=(better,))
     calls: list[object] = []
 
     def probe(config: object, dataset: object, **_: object) -> VariantProbe:

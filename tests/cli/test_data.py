@@ -1,4 +1,4 @@
-"""The data commands: what they print, what they write, and their exit status."""
+"""The data commands: output, files and exit status."""
 
 import json
 from pathlib import Path
@@ -97,7 +97,7 @@ def test_index_shows_the_kept_one_without_reading_the_data(
     assert "looking through" not in capsys.readouterr().out.split("8 episodes")[-1]
 
 
-def test_inspect_prints_and_writes_figures_and_a_picture(config: str, tmp_path: Path, capsys: Printed) -> None:
+def test_inspect_prints_and_writes_statistics_and_a_figure(config: str, tmp_path: Path, capsys: Printed) -> None:
     out = tmp_path / "out"
     assert main(["data", "inspect", config, "--out", str(out), "--limit", "4", "--rows", "1"]) == 0
     printed = capsys.readouterr().out
@@ -114,7 +114,7 @@ def test_inspect_of_an_auto_stride_says_at_which_it_looked(config: str, tmp_path
     assert "smallest candidate, 4" in capsys.readouterr().out
 
 
-def test_calibrate_prints_a_table_and_writes_its_figures(config: str, tmp_path: Path, capsys: Printed) -> None:
+def test_calibrate_prints_a_table_and_writes_its_metrics(config: str, tmp_path: Path, capsys: Printed) -> None:
     out = tmp_path / "out"
     arguments = ["data", "calibrate", config, "data.stride=auto", "--out", str(out), "--limit", "4"]
     assert main(arguments) == 0

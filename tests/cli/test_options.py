@@ -1,4 +1,4 @@
-"""An option that is no number, or too small or large a one, is told what would do."""
+"""Options with invalid or out-of-range numbers are refused with the valid range."""
 
 import argparse
 import errno

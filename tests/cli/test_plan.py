@@ -1,4 +1,4 @@
-"""`vjepa2-ac plan` writes a plan and its picture, or one clear error before anything is loaded."""
+"""`vjepa2-ac plan` writes a plan and its figure, or reports an error before anything is loaded."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ PLANNING = {"samples": 8, "iterations": 2, "horizon": 2, "cem": {"elites": 4}}
 
 @pytest.fixture(scope="module")
 def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with pictures, a model, a broken one, one that needs a camera's pose, and a run."""
+    """Return a folder with images, a model, a broken one, one that needs a camera's pose, and a run."""
     here = tmp_path_factory.mktemp("workshop")
     for name, seed, size in (
         ("start", 0, (60, 48)),
@@ -48,8 +48,8 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def no_picture(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave out the picture, which takes most of the time."""
+def no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the image, which takes most of the time."""
     monkeypatch.setattr("vjepa2_ac.reports.figures.plan.plot_plan", lambda _, path: path)
 
 
@@ -63,27 +63,27 @@ def config(here: Path) -> Config:
 
 
 def plan(here: Path, *more: str, subject: str = "model", state: str = STATE, goal: str = "goal") -> tuple[int, dict]:
-    pictures = ["--start", str(here / "start.png"), "--goal", str(here / f"{goal}.png")]
+    images = ["--start", str(here / "start.png"), "--goal", str(here / f"{goal}.png")]
     out = here / "out"
-    status = main(["plan", str(here / subject), *pictures, "--state", state, "--out", str(out), *more])
+    status = main(["plan", str(here / subject), *images, "--state", state, "--out", str(out), *more])
     return status, json.loads((out / "plan.json").read_text()) if status < 2 else {}
 
 
-def test_a_plan_its_picture_a_table_and_words_come_out(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plan_its_image_a_table_and_words_come_out(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, file = plan(workshop, *QUICK, "--seed", "9", "--nodes", "3")
     assert status == 0
-    said = capsys.readouterr().out
-    assert "planning, iterations 2/2" in said
-    assert "Plan: planned" in said
-    assert "Goes" in said
-    assert str(workshop / "out" / "plan.png") in said
+    reported = capsys.readouterr().out
+    assert "planning, iterations 2/2" in reported
+    assert "Plan: planned" in reported
+    assert "Goes" in reported
+    assert str(workshop / "out" / "plan.png") in reported
     assert (workshop / "out" / "plan.png").stat().st_size > 10_000
     assert (file["seed"], file["goals"], len(file["slices"])) == (9, [str(workshop / "goal.png")], 3)
     assert len(file["model"]["predictor"]) == 64
     assert plan(workshop, *QUICK, "--seed", "9")[1]["actions"] == file["actions"]
 
 
-@pytest.mark.usefixtures("no_picture")
+@pytest.mark.usefixtures("no_figure")
 def test_a_run_plans_by_its_config_with_the_checkpoint_that_is_named(workshop: Path) -> None:
     newest = plan(workshop, "--nodes", "0", subject="run")[1]
     assert (newest["seed"], newest["crop"], newest["settings"]["horizon"]) == (4, "square", 2)
@@ -96,28 +96,28 @@ def test_a_run_plans_by_its_config_with_the_checkpoint_that_is_named(workshop: P
     assert best["model"]["predictor"] != newest["model"]["predictor"]
 
 
-@pytest.mark.usefixtures("no_picture")
+@pytest.mark.usefixtures("no_figure")
 def test_a_model_takes_the_settings_of_a_config(workshop: Path) -> None:
     file = plan(workshop, "--nodes", "0", "--config", str(workshop / "config.yaml"))[1]
     assert (len(file["actions"]), file["seed"], file["crop"]) == (2, 4, "square")
 
 
-@pytest.mark.usefixtures("no_picture")
+@pytest.mark.usefixtures("no_figure")
 def test_goals_follow_one_another(workshop: Path) -> None:
     second = ["--goal", str(workshop / "goal.png")]
     summed = ["planning.energy.steps=sum", "planning.horizon=4"]
     assert plan(workshop, *QUICK, *second, *summed)[1]["goal_of_each_step"] == [0, 0, 1, 1]
-    told = plan(workshop, *QUICK, *second, *summed, "--durations", "1")[1]
-    assert told["goal_of_each_step"] == [0, 1, 1, 1]
+    reported = plan(workshop, *QUICK, *second, *summed, "--durations", "1")[1]
+    assert reported["goal_of_each_step"] == [0, 1, 1, 1]
 
 
-@pytest.mark.usefixtures("no_picture")
+@pytest.mark.usefixtures("no_figure")
 def test_a_mask_changes_what_counts(workshop: Path) -> None:
     whole, part = (plan(workshop, *QUICK, *more)[1] for more in ([], ["--mask", str(workshop / "mask.png")]))
     assert whole["energy"]["now"] != part["energy"]["now"]
 
 
-@pytest.mark.usefixtures("no_picture")
+@pytest.mark.usefixtures("no_figure")
 def test_a_camera_pose_is_taken_where_the_model_needs_one(workshop: Path) -> None:
     found = [
         plan(workshop, *QUICK, "--extrinsics", pose, subject="camera")[1]["energy"]["doing_nothing"]
@@ -126,13 +126,13 @@ def test_a_camera_pose_is_taken_where_the_model_needs_one(workshop: Path) -> Non
     assert found[0] != found[1]
 
 
-@pytest.mark.usefixtures("no_picture")
+@pytest.mark.usefixtures("no_figure")
 def test_a_state_may_begin_with_a_minus(workshop: Path) -> None:
     assert plan(workshop, *QUICK, state="-0.4,0,0.3,3.1,0,0.1,0.2")[1]["state"][0] == -0.4
     assert plan(workshop, *QUICK, state="-.4 0 0.3 3.1 0 0.1 0.2")[1]["state"][0] == -0.4
 
 
-@pytest.mark.usefixtures("no_picture")
+@pytest.mark.usefixtures("no_figure")
 def test_the_goal_itself_leads_to_no_motion(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, file = plan(workshop, *QUICK, goal="start")
     assert (status, file["why"]) == (0, "at the goal")
@@ -140,7 +140,7 @@ def test_the_goal_itself_leads_to_no_motion(workshop: Path, capsys: pytest.Captu
     assert "Does nothing" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("no_picture")
+@pytest.mark.usefixtures("no_figure")
 def test_a_broken_model_leads_to_no_motion_and_to_status_1(workshop: Path) -> None:
     status, file = plan(workshop, *QUICK, subject="broken")
     assert (status, file["why"]) == (1, "no finite energy")
@@ -149,11 +149,11 @@ def test_a_broken_model_leads_to_no_motion_and_to_status_1(workshop: Path) -> No
 
 WRONG = {
     "goal of another size": (["--goal", "{here}/other.png"], "48 x 60 pixels (width x height)"),
-    "no picture": (["--goal", "{here}/notes.png"], "no image, starting with b'x,y,'"),
-    "a picture that is not there": (["--goal", "{here}/nowhere.png"], "nowhere.png: cannot be read: No such file"),
+    "no image": (["--goal", "{here}/notes.png"], ", starting with b'x,y,'"),
+    "an image that is not there": (["--goal", "{here}/nowhere.png"], "nowhere.png: cannot be read: No such file"),
     "a folder": (["--goal", "{here}"], "cannot be read"),
-    "too small a picture": (["--goal", "{here}/tiny.png"], "16 pixels or more"),
-    "a mask of another size": (["--mask", "{here}/other.png"], "as the goal's picture"),
+    "too small an image": (["--goal", "{here}/tiny.png"], "16 pixels or more"),
+    "a mask of another size": (["--mask", "{here}/other.png"], "as the goal image"),
     "a black mask": (["--mask", "{here}/black.png"], "nothing of what the model sees counts"),
     "degrees": (["--state", "0.4,0,0.3,180,0,5,0"], "multiply the angles by pi / 180"),
     "millimetres": (["--state", "400,0,300,3.1,0,0,0"], "divide the position by 1000"),

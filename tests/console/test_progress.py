@@ -1,4 +1,4 @@
-"""A run shows how it goes: on a bar in a terminal, in lines elsewhere."""
+"""Progress of a run: a bar in a terminal, lines elsewhere."""
 
 import io
 import re
@@ -58,13 +58,13 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
     assert lines == [f"training 12/100  {words}  0:08:48 left"], "a line every 10 seconds"
 
 
-@pytest.mark.parametrize(("share", "said"), [(0.2, False), (0.35, True)])
-def test_waiting_for_data_is_shown_where_it_is_much(monkeypatch, share: float, *, said: bool) -> None:
+@pytest.mark.parametrize(("share", "reported"), [(0.2, False), (0.35, True)])
+def test_waiting_for_data_is_shown_where_it_is_much(monkeypatch, share: float, *, reported: bool) -> None:
     written = shown_on(monkeypatch, terminal=False)
     reporter = ConsoleReporter()
     reporter.started(0, 1)
     reporter.stepped(1, {**FIGURES, "data_wait_share": share})
-    assert ("waits for data 35% of the time" in written.getvalue()) == said
+    assert ("waits for data 35% of the time" in written.getvalue()) == reported
     assert "left" not in written.getvalue(), "nothing is left"
 
 

@@ -1,4 +1,4 @@
-"""Every figure of a table can be read, on a narrow terminal as on a wide one, and however long one cell is."""
+"""Every number of a table is readable, on narrow and wide terminals, whatever the length of a cell."""
 
 import re
 from collections.abc import Callable
@@ -15,11 +15,11 @@ from vjepa2_ac.console.evaluation import comparison_table, evaluation_tables
 from vjepa2_ac.console.plan import plan_table
 from vjepa2_ac.console.progress import PlainConsole
 from vjepa2_ac.data.inspection.statistics import Inspection
-from vjepa2_ac.evaluation.data_variants.measure import TriedVariant, VariantProbe
+from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, TriedStride
+from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, StrideResult
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reports.comparison import Comparison
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
@@ -32,13 +32,15 @@ REASON = "no episode of the validation split has the 1,351 steps that a clip of 
 
 
 def calibrations() -> list[Table]:
-    tried = tuple(TriedStride(stride, stride / 15, SHARE, 0.4321, 0.5432, 12.3, 1024, 128) for stride in (4, 8, 15))
-    return [calibration_table(Calibration(tried, {90: REASON}, 16, "validation", 8, SURE))]
+    results = tuple(StrideResult(stride, stride / 15, SHARE, 0.4321, 0.5432, 12.3, 1024, 128) for stride in (4, 8, 15))
+    return [calibration_table(Calibration(results, {90: REASON}, 16, "validation", 8, SURE))]
 
 
 def probes() -> list[Table]:
-    tried = tuple(TriedVariant(f"{name} or some other thing", "mend it", SHARE, SURE) for name in ("late", "mirrored"))
-    return [probe_table(VariantProbe(SHARE, tried, 64, 12))]
+    results = tuple(
+        VariantResult(f"{name} or some other thing", "mend it", SHARE, SURE) for name in ("late", "mirrored")
+    )
+    return [probe_table(VariantProbe(SHARE, results, 64, 12))]
 
 
 def motions() -> list[Table]:

@@ -13,7 +13,7 @@ import torch
 
 from paths import ROOT
 from ranks import finish, free_port, start_rank
-from same_run import figures, trained_weights
+from same_run import metrics, trained_weights
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.clips.loader import training_loader
 from vjepa2_ac.distributed.preemption import EXIT_STATUS, StoppedError
@@ -39,7 +39,7 @@ def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
     first, second = trained_weights(one), trained_weights(other)
     for name, value in first.items():
         torch.testing.assert_close(second[name], value, rtol=1e-3, atol=1e-6, msg=name)
-    for row, same in zip(figures(one), figures(other), strict=True):
+    for row, same in zip(metrics(one), metrics(other), strict=True):
         assert row["step"] == same["step"]
         if row["kind"] == "train":
             assert same["loss"] == pytest.approx(row["loss"], rel=1e-5)

@@ -1,4 +1,4 @@
-"""What is drawn for a clip is applied before it is encoded."""
+"""Batches: augmentation is applied before encoding."""
 
 from dataclasses import replace
 
@@ -29,7 +29,7 @@ def batch(frames: torch.Tensor, *augmentations: Augmentation) -> Batch:
     )
 
 
-def test_an_augmented_batch_gives_the_latents_of_the_cropped_pictures() -> None:
+def test_an_augmented_batch_gives_the_latents_of_the_cropped_frames() -> None:
     model = WorldModel.random(ModelSizes.model_validate(TINY), seed=0)
     frames = torch.randint(0, 256, (2, 2, 40, 50, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
 

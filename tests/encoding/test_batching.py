@@ -1,4 +1,4 @@
-"""Every chunk has one shape, whatever episodes its frames are of; what cannot be read takes nothing else with it."""
+"""Encoder batching: all chunks have the same shape, and an unreadable episode does not affect others."""
 
 import weakref
 from collections.abc import Callable, Iterator
@@ -34,7 +34,7 @@ def part(wanted: FramesToEncode, first: int, last: int) -> Part:
 
 
 class Brightness:
-    """Encodes a frame as the grey of its picture, and remembers the shapes it was given."""
+    """Encodes a frame as the grey of its frame, and remembers the shapes it was given."""
 
     def __init__(self, *, scales: bool) -> None:
         self.given: list[tuple[int, ...]] = []
@@ -69,7 +69,7 @@ def test_each_episode_gets_its_own_frames_back_from_chunks_of_one_shape(scales: 
     for number, one in enumerate(done):
         expected = 10 * number + np.arange(lengths[number])
         assert one.latents.values[:, 2, 1].tolist() == expected.tolist()
-        assert one.pictures[:, 0, 0, 0].tolist() == expected.tolist()
+        assert one.small_frames[:, 0, 0, 0].tolist() == expected.tolist()
         assert one.recording.info.id == str(number)
         assert (one.latents.scales is not None) == scales
         if scales:
@@ -98,7 +98,7 @@ class Enqueued(Brightness):
         self._cuda = cuda
 
     def __call__(self, inputs: torch.Tensor) -> StoredLatents:
-        self._cuda.told.append("computing: encode")
+        self._cuda.calls.append("computing: encode")
         return super().__call__(inputs)
 
 
@@ -119,7 +119,7 @@ def test_the_next_chunk_is_encoded_while_the_one_before_it_comes() -> None:
             *["memory in use by side 2", "side 2: to pinned memory"] * 2, f"side 2: event {event + 2}",
         ]  # fmt: skip
 
-    assert cuda.told == [
+    assert cuda.calls == [
         *chunk(1), *chunk(4), "host: waits for event 3", *chunk(7), "host: waits for event 6",
         "host: waits for event 9",
     ]  # fmt: skip

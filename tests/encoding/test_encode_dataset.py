@@ -1,4 +1,4 @@
-"""Encoding is done once, whoever interrupts it; a run on cached latents is the run on pictures."""
+"""Encoding: done once, also after interruptions; a run on cached latents equals the run on frames."""
 
 import errno
 import re
@@ -85,13 +85,13 @@ def test_every_needed_frame_is_encoded_once_in_whole_chunks(
     make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
 ) -> None:
     config = make_config(model__encode_chunk=7, data__start_every=2)
-    told: list[tuple[int, int]] = []
-    notes = encode(config, tmp_path / "out", lambda *of: told.append(of))
+    reported: list[tuple[int, int]] = []
+    notes = encode(config, tmp_path / "out", lambda *of: reported.append(of))
     frames = needed(config)
     assert frames == 8 * 12  # of 24 steps every second one
     assert encoded_frames == [7] * chunks(frames, config)
-    assert told[0] == (0, frames)
-    assert told[-1] == (frames, frames)
+    assert reported[0] == (0, frames)
+    assert reported[-1] == (frames, frames)
     assert read_manifest(tmp_path / "out").frames == frames
     assert "GB per hour of robot data" in notes[0]
     assert "GB free on its disk" in notes[1]
@@ -165,9 +165,9 @@ def test_two_processes_share_the_episodes_and_the_last_one_makes_the_cache_whole
     config = make_config()
     (tmp_path / "config.yaml").write_text(as_yaml(config))
     words = ["-m", "vjepa2_ac.cli", "encode", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "out")]
-    said = finish([start_rank(words, rank, 2, free_port()) for rank in range(2)])
-    assert sum("This process has done its share" in out for out, _ in said) <= 1
-    assert is_whole(tmp_path / "out"), said
+    reported = finish([start_rank(words, rank, 2, free_port()) for rank in range(2)])
+    assert sum("This process has done its share" in out for out, _ in reported) <= 1
+    assert is_whole(tmp_path / "out"), reported
     encode(config, tmp_path / "whole")
     assert contents(tmp_path / "out") == contents(tmp_path / "whole")
 
@@ -301,7 +301,7 @@ def test_what_cannot_be_encoded_is_refused_before_the_data_is_opened(
 
 @pytest.fixture
 def mend(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
-    """Episode 3 has a picture that cannot be decoded; mended by a call."""
+    """Episode 3 has a frame that cannot be decoded; mended by a call."""
     from vjepa2_ac.data.filters import broken_episodes
     from vjepa2_ac.data.sources.rlds.source import RldsSource
 
@@ -368,8 +368,8 @@ def test_what_a_damaged_file_is_said_to_need_makes_the_cache_sound_again(
     with pytest.raises(InputError, match=r"Run `vjepa2-ac encode` again, as the cache was made"):
         open_dataset(alone)
     encoded_frames.clear()
-    said = encode(make_config(), out)
-    assert re.search(rf"episode.*{damaged.name}: 100 bytes instead of [\d,]+\)\. It is encoded again", said[0])
+    reported = encode(make_config(), out)
+    assert re.search(rf"episode.*{damaged.name}: 100 bytes instead of [\d,]+\)\. It is encoded again", reported[0])
     assert contents(out) == sound
     assert 0 < len(encoded_frames) < chunks(needed(make_config()), make_config())
     damaged.write_bytes(bytes(damaged.stat().st_size))
@@ -423,19 +423,19 @@ def cache(tmp_path: Path) -> Path:
     return tmp_path / "cache"
 
 
-def test_a_run_that_encodes_first_is_the_run_on_pictures_bit_for_bit(
+def test_a_run_that_encodes_first_is_the_run_on_frames_bit_for_bit(
     make_config: MakeConfig, tmp_path: Path, cache: Path, encoded_frames: list[int]
 ) -> None:
     reporter = SilentReporter()
-    pictures = train(make_config(run_dir=str(tmp_path / "pictures")), reporter)
+    from_frames = train(make_config(run_dir=str(tmp_path / "pictures")), reporter)
     encoded_frames.clear()
     cached = {"data__cache": "auto", "data__cache_dtype": "fp32", "data__cache_dir": str(cache)}
     config = make_config(run_dir=str(tmp_path / "latents"), **cached)
     latents = train(config, reporter)
     assert sum(encoded_frames) == needed(config)  # and not one in training
-    assert_same_run(pictures, latents)
+    assert_same_run(from_frames, latents)
     encoded_frames.clear()
-    assert_same_run(pictures, train(make_config(run_dir=str(tmp_path / "again"), **cached), reporter))
+    assert_same_run(from_frames, train(make_config(run_dir=str(tmp_path / "again"), **cached), reporter))
     assert not encoded_frames
     assert any("Latents come from" in note for note in reporter.notes)
 
@@ -455,8 +455,10 @@ def test_a_run_mends_the_cache_that_it_finds_damaged(
     encoded_frames.clear()
     again = make_config(run_dir=str(tmp_path / "again"), **knobs)
     train(again, reporter, check_only=True)
-    (said,) = [note for note in reporter.notes if "Missing in the latent cache" in note]
-    assert re.search(rf"damaged: .*{cut.name}: .* bytes instead of .* and 1 more\. A run would encode it again", said)
+    (reported,) = [note for note in reporter.notes if "Missing in the latent cache" in note]
+    assert re.search(
+        rf"damaged: .*{cut.name}: .* bytes instead of .* and 1 more\. A run would encode it again", reported
+    )
     assert not gone.exists(), "a check writes nothing"
     assert is_whole(folder)
     assert_same_run(first, train(again, reporter))
@@ -508,15 +510,15 @@ def test_a_required_cache_that_is_not_there_is_refused_with_the_command_that_mak
     assert not encoded_frames
 
 
-def test_check_says_what_would_be_encoded_and_tries_the_rest_on_pictures(
+def test_check_says_what_would_be_encoded_and_tries_the_rest_on_frames(
     make_config: MakeConfig, cache: Path, reporter: SilentReporter, encoded_frames: list[int]
 ) -> None:
     config = make_config(data__cache="auto", data__cache_dir=str(cache))
     train(config, reporter, check_only=True)
     assert not cache.exists()
-    (said,) = [note for note in reporter.notes if "would first encode" in note]
-    assert f"{needed(config)} of {needed(config)} frames" in said
-    assert "frames/s" in said
+    (reported,) = [note for note in reporter.notes if "would first encode" in note]
+    assert f"{needed(config)} of {needed(config)} frames" in reported
+    assert "frames/s" in reported
     assert "Everything is in place" in reporter.notes[-1]
     assert 16 < sum(encoded_frames) < needed(config)  # a timed chunk, and the clips that were tried
 
@@ -544,9 +546,9 @@ def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
     config = make_config(data__cache="auto", data__cache_dir=str(cache), training__steps=1, training__accumulation=1)
     (tmp_path / "config.yaml").write_text(as_yaml(config))
     words, port = ["-m", "vjepa2_ac.cli", "train", str(tmp_path / "config.yaml")], free_port()
-    said = finish([start_rank(words, rank, 2, port) for rank in range(2)])
+    reported = finish([start_rank(words, rank, 2, port) for rank in range(2)])
     (folder,) = cache.iterdir()
     assert read_manifest(folder).frames == needed(config)
-    assert "encoding frames 96/96" in said[0][0]
-    assert "Latents come from" in said[0][0]
-    assert not said[1][0]
+    assert "encoding frames 96/96" in reported[0][0]
+    assert "Latents come from" in reported[0][0]
+    assert not reported[1][0]

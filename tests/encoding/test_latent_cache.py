@@ -1,4 +1,4 @@
-"""A data set opened through its latents has the same clips in the same order; a wrong or damaged cache is refused."""
+"""The latent cache: same clips in the same order; a wrong or damaged cache is refused."""
 
 import json
 import os
@@ -45,7 +45,7 @@ STEPS, FRAMES, TOKENS, DIM = 12, (0, 2, 5, 11), 4, 24
 
 
 def episode(steps: int = STEPS) -> Episode:
-    """Return an episode with everything that one can have; its pictures must not be read."""
+    """Return an episode with everything that one can have; its frames must not be read."""
 
     def no_pictures(steps: Sequence[int]) -> np.ndarray:
         raise AssertionError(f"pictures of {steps}")
@@ -138,7 +138,7 @@ def test_a_flipped_bit_in_a_frame_is_found_when_that_frame_is_read_and_only_then
         flipped(path, place_of(path, name, byte=size + 1))
 
 
-def test_a_flipped_bit_in_a_picture_is_found_when_it_is_read(tmp_path: Path) -> None:
+def test_a_flipped_bit_in_a_frame_is_found_when_it_is_read(tmp_path: Path) -> None:
     path, layout = written(tmp_path)
     flipped(path, place_of(path, "pictures", byte=40))
     record = EpisodeFile(path, layout)
@@ -193,7 +193,7 @@ def test_a_file_of_another_cache_is_refused(tmp_path: Path) -> None:
             EpisodeFile(path, other)
 
 
-def test_pictures_of_another_type_are_damage(tmp_path: Path) -> None:
+def test_frames_of_another_type_are_damage(tmp_path: Path) -> None:
     path, layout = written(tmp_path)
     with safe_open(path, framework="pt") as file:
         tensors, about = {name: file.get_tensor(name) for name in file.keys()}, file.metadata()  # noqa: SIM118
@@ -287,7 +287,7 @@ def first_batches(dataset: Dataset, count: int = 6) -> list[Batch]:
 
 
 def assert_same_clips(original: list[Batch], cached: list[Batch]) -> None:
-    """The states, actions and pictures of each clip are those of the original."""
+    """The states, actions and frames of each clip are those of the original."""
     assert len(original) == len(cached)
     for one, other in zip(original, cached, strict=True):
         assert one.frames is not None
@@ -392,9 +392,7 @@ def test_workers_change_nothing(droid_with_rests: Path, tmp_path: Path) -> None:
         assert (one.episode_ids, one.starts) == (other.episode_ids, other.starts)
 
 
-def test_the_pictures_of_a_cached_clip_are_small_ones_of_the_same_frames(
-    droid_with_rests: Path, tmp_path: Path
-) -> None:
+def test_the_frames_of_a_cached_clip_are_small_ones_of_the_same_frames(droid_with_rests: Path, tmp_path: Path) -> None:
     original, through = cached(droid_with_rests, tmp_path, camera=("exterior_1_left", "wrist_left"))
     for one, other in zip(first_batches(original, 4), first_batches(through, 4), strict=True):
         for row in range(2):
@@ -441,7 +439,7 @@ def test_poses_in_the_frame_of_the_camera_go_through_a_cache(tmp_path: Path, is_
 
 @pytest.fixture
 def with_a_broken_one(tmp_path: Path) -> Dataset:
-    """A hundred episodes; the pictures of one cannot be read."""
+    """A hundred episodes; the frames of one cannot be read."""
     unreadable = frozenset({5})
     source = MemorySource([6] * 100, pictureless=unreadable)
     config = config_of(tmp_path, tmp_path, broken_episodes="skip", validation_share=0.1, test_share=0.1)
@@ -500,7 +498,7 @@ def a_cache(droid_with_rests: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.mark.parametrize(
-    ("knobs", "said"),
+    ("knobs", "reported"),
     [
         ({"stride": 3}, r"data\.stride: 2, not 3"),
         ({"frames": 4}, r"data\.frames: 3, not 4"),
@@ -514,18 +512,18 @@ def a_cache(droid_with_rests: Path, tmp_path_factory: pytest.TempPathFactory) ->
     ids=lambda value: str(value)[:20],
 )
 def test_a_cache_of_other_clips_is_refused_and_the_difference_named(
-    a_cache: tuple[Dataset, Dataset, Path], knobs: dict[str, Any], said: str
+    a_cache: tuple[Dataset, Dataset, Path], knobs: dict[str, Any], reported: str
 ) -> None:
     original, through, _ = a_cache
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=reported):
         alone(through, **knobs)
     config = DataConfig.model_validate(original.config.model_dump() | knobs)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=reported):
         through_cache(open_dataset(config), NUMBERS)
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "reported"),
     [
         ({"encoder": "another"}, "encoder: numbers, not another"),
         ({"image_size": 32}, "image_size: 16, not 32"),
@@ -535,13 +533,15 @@ def test_a_cache_of_other_clips_is_refused_and_the_difference_named(
     ids=str,
 )
 def test_a_cache_of_another_encoder_is_refused_and_the_difference_named(
-    a_cache: tuple[Dataset, Dataset, Path], change: dict[str, Any], said: str
+    a_cache: tuple[Dataset, Dataset, Path], change: dict[str, Any], reported: str
 ) -> None:
     original, through, _ = a_cache
     encoding = replace(NUMBERS, **change)
-    with pytest.raises(InputError, match=f"no whole latent cache.*Other caches there: 1; .*{said}.*vjepa2-ac encode"):
+    with pytest.raises(
+        InputError, match=f"no whole latent cache.*Other caches there: 1; .*{reported}.*vjepa2-ac encode"
+    ):
         through_cache(original, encoding)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=reported):
         require_encoding(alone(through), encoding)
     require_encoding(alone(through), NUMBERS)
     require_encoding(original, encoding)  # no cache
@@ -565,11 +565,11 @@ def test_an_unfinished_or_damaged_cache_is_refused(droid_with_rests: Path, tmp_p
         with pytest.raises(InputError, match=name):
             through_cache(original, NUMBERS)
         flipped(folder / name, place)
-    told = (folder / MANIFEST).read_text()
-    (folder / MANIFEST).write_text(told.replace(f'"{KEPT}"', '"kept.nqz"'))
+    reported = (folder / MANIFEST).read_text()
+    (folder / MANIFEST).write_text(reported.replace(f'"{KEPT}"', '"kept.nqz"'))
     with pytest.raises(InputError, match=r"cache\.json: damaged: no checksum of kept\.npz"):
         alone(through)
-    (folder / MANIFEST).write_text(told)
+    (folder / MANIFEST).write_text(reported)
     sound = (folder / EPISODES).read_bytes()
     table = EpisodeTable.from_bytes(sound)
     (folder / EPISODES).write_bytes(replace(table, num_steps=table.num_steps + 1).to_bytes())
@@ -592,7 +592,7 @@ def test_a_cache_has_one_stride(a_cache: tuple[Dataset, Dataset, Path]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("knobs", "said"),
+    ("knobs", "reported"),
     [
         ({"augment": {"brightness": 0.1}, "cache": "auto"}, "augment"),
         ({"augment": {"brightness": 0.1}, "source": "latents", "cache": "off"}, "augment"),
@@ -602,8 +602,8 @@ def test_a_cache_has_one_stride(a_cache: tuple[Dataset, Dataset, Path]) -> None:
     ],
     ids=str,
 )
-def test_knobs_that_contradict_a_cache_are_errors(tmp_path: Path, knobs: dict[str, Any], said: str) -> None:
-    with pytest.raises(ValidationError, match=said):
+def test_knobs_that_contradict_a_cache_are_errors(tmp_path: Path, knobs: dict[str, Any], reported: str) -> None:
+    with pytest.raises(ValidationError, match=reported):
         config_of(tmp_path, tmp_path, **knobs)
 
 

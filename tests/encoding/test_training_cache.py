@@ -1,4 +1,4 @@
-"""Training on cached latents is training on the fly: bit for bit in fp32, within what is rounded off otherwise."""
+"""Training on cached latents equals training from frames: bit for bit in fp32, within rounding otherwise."""
 
 from pathlib import Path
 from typing import Any
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from latent_sets import encode_for
-from same_run import assert_same_run, figures, trained_weights
+from same_run import assert_same_run, metrics, trained_weights
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.errors import InputError
@@ -65,7 +65,7 @@ def test_training_on_a_rounded_cache_differs_by_what_is_rounded_off(
     train(on_the_fly, reporter)
     folder = encoded(on_the_fly)
     train(make_config(run_dir=str(tmp_path / "cached"), **(changes | of_cache(folder))), reporter)
-    pairs = zip(figures(tmp_path / "fly"), figures(tmp_path / "cached"), strict=True)
+    pairs = zip(metrics(tmp_path / "fly"), metrics(tmp_path / "cached"), strict=True)
     losses = [(one["loss"], other["loss"]) for one, other in pairs if one["kind"] == "train"]
     assert losses
     assert all(0 < abs(one / other - 1) < most for one, other in losses)
@@ -97,11 +97,11 @@ def test_a_cache_of_another_encoder_stops_a_run_before_the_first_step(make_confi
     base = WorldModel.from_pretrained(Path(make_config().model.base))
     sizes = ModelSizes.model_validate(base.sizes.model_dump())
     WorldModel.random(sizes, seed=99).save_pretrained(other)
-    for changes, said in (
+    for changes, reported in (
         ({"model__base": str(other)}, "encoder: "),
         ({"training__precision": "bf16"}, r"training\.precision: "),
     ):
-        with pytest.raises(InputError, match=f"made otherwise: {said}"):
+        with pytest.raises(InputError, match=f"made otherwise: {reported}"):
             train(make_config(**of_cache(folder, **changes)), reporter)
     assert reporter.steps == []
 
@@ -134,7 +134,7 @@ def test_a_run_is_evaluated_from_its_cache_as_from_its_data(make_config, reporte
     assert [examples.frames is not None for examples in from_cache.examples] == [True] * len(from_data.examples)
     for cached, original in zip(from_cache.examples, from_data.examples, strict=True):
         difference = cached.frames.astype(float) - original.frames
-        assert abs(difference).mean() < 12  # small and JPEG, but the same pictures
+        assert abs(difference).mean() < 12  # small and JPEG, but the same frames
     for one in found:
         one.pop("about")
     assert found[0] == found[1]

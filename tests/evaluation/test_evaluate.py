@@ -1,4 +1,4 @@
-"""An oracle is found perfect, a copier as good as doing nothing and deaf to its actions, every time."""
+"""An oracle has error 0, a copier equals persistence and ignores its actions, reproducibly."""
 
 import json
 from collections.abc import Iterator
@@ -139,13 +139,13 @@ def test_the_same_evaluation_twice_gives_the_same_file_and_another_seed_other_ac
     assert not np.array_equal(first.change_by_clip, second.change_by_clip)
 
 
-def values(figures: object) -> list[float]:
+def values(metrics: object) -> list[float]:
     """Return every number in there, in order."""
-    if isinstance(figures, dict):
-        return [number for one in figures.values() for number in values(one)]
-    if isinstance(figures, list):
-        return [number for one in figures for number in values(one)]
-    return [float(figures)] if isinstance(figures, int | float) else []
+    if isinstance(metrics, dict):
+        return [number for one in metrics.values() for number in values(one)]
+    if isinstance(metrics, list):
+        return [number for one in metrics for number in values(one)]
+    return [float(metrics)] if isinstance(metrics, int | float) else []
 
 
 def test_episodes_are_ranked_by_how_well_they_are_predicted() -> None:
@@ -228,13 +228,13 @@ def test_each_model_is_measured_only_while_it_is_switched_on() -> None:
 
 
 def test_progress_names_each_part_of_the_work() -> None:
-    told: dict[str, tuple[int, int]] = {}
+    reported: dict[str, tuple[int, int]] = {}
 
     def stage(title: str):  # type: ignore[no-untyped-def]
-        return lambda done, total: told.__setitem__(title, (done, total))
+        return lambda done, total: reported.__setitem__(title, (done, total))
 
     evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=PROBES, stage=stage)
-    assert told == {"measuring": (12, 12), "other actions, model": (6, 6), "energy landscapes, model": (3, 3)}
+    assert reported == {"measuring": (12, 12), "other actions, model": (6, 6), "energy landscapes, model": (3, 3)}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Runs and models are measured on their own data or others, against what is named; what cannot be is said at once."""
+"""Runs and models are evaluated on their own or other data, against others; invalid input is refused early."""
 
 import json
 from collections.abc import Callable
@@ -29,7 +29,7 @@ class _Silent:
     def indexed(self, done: int, total: int) -> None: ...
     def encoded(self, done: int, total: int) -> None: ...
     def started(self, done: int, total: int) -> None: ...
-    def stepped(self, step: int, figures: object) -> None: ...
+    def stepped(self, step: int, metrics: object) -> None: ...
     def validated(self, step: int, errors: object) -> None: ...
 
 
@@ -75,8 +75,8 @@ def written(config: Config, folder: Path, **data: object) -> str:
     return str(path)
 
 
-def rollout(figures: dict[str, Any], name: str) -> list[float]:
-    return [one["value"] for one in figures["models"][name]["rollout"]["l1"]["error"]]
+def rollout(metrics: dict[str, Any], name: str) -> list[float]:
+    return [one["value"] for one in metrics["models"][name]["rollout"]["l1"]["error"]]
 
 
 def figures_of(folder: Path | str) -> dict[str, Any]:
@@ -112,7 +112,7 @@ def test_figures_depend_on_neither_the_batch_size_nor_the_workers(config: Config
     one, other = figures_of(tmp_path / "a"), figures_of(tmp_path / "b")
     for name in ("base", "adapter"):
         assert rollout(one, name) == pytest.approx(rollout(other, name), rel=1e-5)
-        ranks = [figures["models"][name]["sensitivity"]["rankings"][0]["rank_by_clip"] for figures in (one, other)]
+        ranks = [metrics["models"][name]["sensitivity"]["rankings"][0]["rank_by_clip"] for metrics in (one, other)]
         assert ranks[0] == ranks[1]
     assert one["clips"] == other["clips"]
 
@@ -135,10 +135,10 @@ def test_others_are_measured_on_the_same_latents(run: str, tmp_path: Path, base_
     found = evaluate_subject(run, asked(against=("base", run, str(base_folder)), out=tmp_path))
     assert list(found.evaluation.models) == ["base", "run", "model", "adapter"]
     assert [model.role for model in found.evaluation.models.values()] == ["base", "other", "other", "trained"]
-    figures = figures_of(tmp_path)
-    assert rollout(figures, "run") == pytest.approx(rollout(figures, "adapter"), rel=1e-6)
-    assert rollout(figures, "model") == pytest.approx(rollout(figures, "base"), rel=1e-6)
-    assert rollout(figures, "base") != rollout(figures, "adapter")
+    metrics = figures_of(tmp_path)
+    assert rollout(metrics, "run") == pytest.approx(rollout(metrics, "adapter"), rel=1e-6)
+    assert rollout(metrics, "model") == pytest.approx(rollout(metrics, "base"), rel=1e-6)
+    assert rollout(metrics, "base") != rollout(metrics, "adapter")
     assert evaluate_subject(run, asked(against=(str(base_folder),), out=tmp_path)).evaluation.base is None
 
 
@@ -149,7 +149,7 @@ def test_another_encoder_cannot_be_measured_on_these_latents(run: str, tmp_path:
         evaluate_subject(run, asked(against=(str(tmp_path / "other"),)))
 
 
-def test_a_cache_gives_the_figures_of_the_pictures_and_pictures_of_its_own(
+def test_a_cache_gives_the_figures_of_the_frames_and_frames_of_its_own(
     config: Config, run: str, tmp_path: Path
 ) -> None:
     encode_for(

@@ -1,4 +1,4 @@
-"""Intervals cover the truth as often as they say, and pairs share their luck."""
+"""Intervals have their stated coverage, and pairs are resampled together."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Errors equal what is computed by hand; shuffled actions are those of the clip before, however clips are batched."""
+"""Errors equal those computed by hand; shuffled actions are those of the clip before, for any batch size."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Shares of successes come with intervals that cover the truth."""
+"""Shares of successes have intervals with the stated coverage."""
 
 import pytest
 from scipy import stats

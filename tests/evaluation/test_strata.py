@@ -1,4 +1,4 @@
-"""A step moves if the hand goes, turns or grips enough; sizes are in centimetres."""
+"""A step is moving if the hand moves, turns or grips enough; sizes are in centimetres."""
 
 import numpy as np
 import pytest

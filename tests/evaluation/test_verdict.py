@@ -1,4 +1,4 @@
-"""The words say what the figures say."""
+"""The verdict agrees with the metrics."""
 
 import re
 from dataclasses import replace

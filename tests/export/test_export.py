@@ -1,4 +1,4 @@
-"""What leaves the house predicts as the run does, and says what it is."""
+"""An exported model predicts like the run, and its card describes it."""
 
 import errno
 import json
@@ -143,7 +143,7 @@ def poison(path: Path) -> str:
 
 @pytest.mark.parametrize("form", ["merged", "official", "hub"])
 @pytest.mark.parametrize(
-    ("alpha", "said"),
+    ("alpha", "reported"),
     [
         (float("nan"), r"adapter_config\.json: not JSON: NaN"),
         (float("inf"), r"adapter_config\.json: not JSON: Infinity"),
@@ -151,11 +151,11 @@ def poison(path: Path) -> str:
     ],
 )
 def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(
-    trained, tmp_path: Path, form: Any, alpha: float, said: str
+    trained, tmp_path: Path, form: Any, alpha: float, reported: str
 ) -> None:
     run = trained()
     rewrite_adapter(run, lora_alpha=alpha)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=reported):
         export_run(run, tmp_path / "out", form)
     assert not (tmp_path / "out").exists()
 

@@ -1,4 +1,4 @@
-"""What is allowed comes out as it went in; what is not comes out allowed."""
+"""The action space: allowed actions are unchanged; all others become allowed."""
 
 import math
 

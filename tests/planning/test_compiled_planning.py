@@ -1,4 +1,4 @@
-"""Plans with compiled blocks are the plain ones, and a second decision compiles nothing."""
+"""Plans with compiled blocks equal the plain ones, and a second decision compiles nothing."""
 
 import numpy as np
 import pytest
@@ -31,10 +31,10 @@ def _with_a_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def decisions(model: WorldModel, config: PlanningConfig, count: int = 2) -> list[np.ndarray]:
-    pictures = np.random.default_rng(0).integers(0, 256, (count + 1, 48, 48, 3), dtype=np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (count + 1, 48, 48, 3), dtype=np.uint8)
     run = Controller(model, config)
-    run.reset(pictures[0])
-    return [run.act(picture, STATE) for picture in pictures[1:]]
+    run.reset(images[0])
+    return [run.act(image, STATE) for image in images[1:]]
 
 
 @pytest.mark.usefixtures("traced")

@@ -1,4 +1,4 @@
-"""A robot's loop: pictures and states in, actions within the limits out, with a reason."""
+"""The controller in a robot's loop: images and states in, actions within the limits and a reason out."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 QUICK = PlanningConfig(samples=12, iterations=2, horizon=2, cem=CemConfig(elites=4))
 
 
-def picture(seed: int, height: int = 60, width: int = 48) -> np.ndarray:
+def image(seed: int, height: int = 60, width: int = 48) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (height, width, 3), dtype=np.uint8)
 
 
@@ -25,8 +25,8 @@ def controller(model: WorldModel | None = None, seed: int = 0, **changes: object
 
 
 def actions(run: Controller, frames: int = 3) -> np.ndarray:
-    run.reset(picture(100))
-    return np.stack([run.act(picture(seed), STATE) for seed in range(frames)])
+    run.reset(image(100))
+    return np.stack([run.act(image(seed), STATE) for seed in range(frames)])
 
 
 def test_actions_are_within_the_limits_and_lower_the_energy() -> None:
@@ -64,11 +64,11 @@ def test_a_decision_tells_where_its_plan_leads() -> None:
 
 
 def test_a_decision_begins_from_the_last_ones_plan() -> None:
-    frames = (picture(1), picture(1))
+    frames = (image(1), image(1))
     found = []
     for warm in (True, False):
         run = controller(warm_start=warm, iterations=6)
-        run.reset(picture(100))
+        run.reset(image(100))
         run.act(frames[0], STATE)
         before = run.decision
         run.act(frames[1], STATE)
@@ -83,17 +83,17 @@ def test_a_decision_begins_from_the_last_ones_plan() -> None:
 
 def test_earlier_frames_are_seen_with_the_actions_that_were_done() -> None:
     run, model = controller(context=3), tiny_model()
-    run.reset(picture(100))
+    run.reset(image(100))
     states = np.stack([STATE + 0.01 * step for step in range(5)])
     for step, state in enumerate(states):
-        run.act(picture(step), state)
+        run.act(image(step), state)
     scene = run._scene(run._seen)
     assert len(scene.latents) == 3
     np.testing.assert_allclose(scene.states, states[2:], atol=1e-6)
     np.testing.assert_allclose(scene.actions, actions_from_states(states[2:]), atol=1e-6)
     alone = controller(model=model)
-    alone.reset(picture(100))
-    alone.act(picture(4), states[4])
+    alone.reset(image(100))
+    alone.act(image(4), states[4])
     assert alone.decision is not None
     assert run.decision is not None
     tried = torch.full((1, 1, 7), 0.02)
@@ -103,21 +103,21 @@ def test_earlier_frames_are_seen_with_the_actions_that_were_done() -> None:
 
 def test_sub_goals_follow_one_another() -> None:
     run = controller()
-    run.reset(picture(100), picture(101), durations=(2,))
+    run.reset(image(100), image(101), durations=(2,))
     goals = []
     for seed in range(4):
-        run.act(picture(seed), STATE)
+        run.act(image(seed), STATE)
         goals.append(run.decision.goal)  # type: ignore[union-attr]
     assert goals == [0, 0, 1, 1]
 
 
 def test_at_the_goal_nothing_is_done() -> None:
     run = controller()
-    run.reset(picture(100))
-    assert not run.act(picture(100), STATE).any()
+    run.reset(image(100))
+    assert not run.act(image(100), STATE).any()
     assert run.decision is not None
     assert run.decision.why == "at the goal"
-    assert run.act(picture(1), STATE).any()
+    assert run.act(image(1), STATE).any()
 
 
 def test_a_broken_model_leads_to_no_motion_with_a_reason() -> None:
@@ -130,11 +130,11 @@ def test_a_broken_model_leads_to_no_motion_with_a_reason() -> None:
     assert run.decision.why == "no finite energy"
 
 
-def test_a_mask_decides_what_counts_of_the_picture() -> None:
+def test_a_mask_decides_what_counts_of_the_image() -> None:
     run = controller()
     mask = np.zeros((60, 48), bool)
     mask[:20, :16] = True
-    run.reset(picture(100), mask=mask)
+    run.reset(image(100), mask=mask)
     assert run._goal is not None
     assert run._goal.weights is not None
     assert run._goal.weights.nonzero().flatten().tolist() == [0]
@@ -144,10 +144,10 @@ def test_what_does_not_count_may_differ_at_the_goal() -> None:
     run = controller()
     mask = np.zeros((60, 48), bool)
     with pytest.raises(InputError, match="nothing of what the model sees"):
-        run.reset(picture(100), mask=mask)
+        run.reset(image(100), mask=mask)
     for other in (~mask.T, ~mask[:, :40], ~mask[:40]):
         with pytest.raises(InputError, match="mask"):
-            run.reset(picture(100), mask=other)
+            run.reset(image(100), mask=other)
 
 
 @torch.no_grad()
@@ -160,19 +160,19 @@ def test_a_model_in_bfloat16_plans_as_well(planner: str) -> None:
 @pytest.mark.parametrize(
     ("frame", "complaint"),
     [
-        (picture(0, 48, 60), "as the goal's picture"), (picture(0, 60, 60), "as the goal's picture"),
-        (picture(0, 50, 48), "as the goal's picture"), (picture(0)[..., 0], "RGB picture"),
-        (np.dstack([picture(0), picture(0)]), "RGB picture"),
-        (picture(0).astype(np.float32), "RGB picture"), (picture(0)[:4, :4], "RGB picture"),
+        (image(0, 48, 60), "as the goal image"), (image(0, 60, 60), "as the goal image"),
+        (image(0, 50, 48), "as the goal image"), (image(0)[..., 0], "RGB image"),
+        (np.dstack([image(0), image(0)]), "RGB image"),
+        (image(0).astype(np.float32), "RGB image"), (image(0)[:4, :4], "RGB image"),
     ],
 )  # fmt: skip
-def test_a_picture_that_cannot_be_used_is_refused(frame: np.ndarray, complaint: str) -> None:
+def test_an_image_that_cannot_be_used_is_refused(frame: np.ndarray, complaint: str) -> None:
     run = controller()
-    run.reset(picture(100))
+    run.reset(image(100))
     with pytest.raises(InputError, match=complaint):
         run.act(frame, STATE)
     with pytest.raises(InputError, match=r"goal 1.*" + complaint):
-        run.reset(picture(100), frame, durations=(1,))
+        run.reset(image(100), frame, durations=(1,))
 
 
 @pytest.mark.parametrize(
@@ -184,9 +184,9 @@ def test_a_picture_that_cannot_be_used_is_refused(frame: np.ndarray, complaint: 
 )  # fmt: skip
 def test_a_state_that_cannot_be_used_is_refused(state: np.ndarray, complaint: str) -> None:
     run = controller()
-    run.reset(picture(100))
+    run.reset(image(100))
     with pytest.raises(InputError, match=complaint):
-        run.act(picture(0), state)
+        run.act(image(0), state)
 
 
 def test_a_camera_pose_is_needed_exactly_where_the_model_uses_it() -> None:
@@ -198,16 +198,16 @@ def test_a_camera_pose_is_needed_exactly_where_the_model_uses_it() -> None:
 
 def test_acting_without_a_goal_is_an_error() -> None:
     with pytest.raises(ValueError, match="reset"):
-        controller().act(picture(0), STATE)
+        controller().act(image(0), STATE)
     with pytest.raises(ValueError, match="no goal"):
         controller().reset()
 
 
 @pytest.mark.parametrize("steps", ["last", "sum"])
-def test_the_present_energy_is_that_of_a_picture_that_stays(steps: str) -> None:
+def test_the_present_energy_is_that_of_an_image_that_stays(steps: str) -> None:
     run = controller(energy=EnergyConfig(steps=steps))
-    run.reset(picture(100), picture(101), durations=(1,))
-    run.act(picture(1), STATE)
+    run.reset(image(100), image(101), durations=(1,))
+    run.act(image(1), STATE)
     assert run._goal is not None
     assert run.decision is not None
     seen = run._seen[-1][0]
@@ -219,14 +219,14 @@ def test_the_present_energy_is_that_of_a_picture_that_stays(steps: str) -> None:
 def test_a_goal_that_is_reached_on_the_way_to_another_is_left() -> None:
     for steps in ("last", "sum"):
         run = controller(energy=EnergyConfig(steps=steps))
-        run.reset(picture(100), picture(101), durations=(1,))
-        assert run.act(picture(100), STATE).any()
+        run.reset(image(100), image(101), durations=(1,))
+        assert run.act(image(100), STATE).any()
 
 
 def test_goals_that_are_all_reached_are_reached() -> None:
     run = controller()
-    run.reset(picture(100), picture(100), durations=(1,))
-    assert not run.act(picture(100), STATE).any()
+    run.reset(image(100), image(100), durations=(1,))
+    assert not run.act(image(100), STATE).any()
 
 
 def test_a_new_goal_forgets_what_was_seen() -> None:
@@ -239,14 +239,14 @@ def test_a_new_goal_forgets_what_was_seen() -> None:
 
 def test_a_decision_that_failed_can_be_asked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
     undisturbed, run = actions(controller(context=3)), controller(context=3)
-    run.reset(picture(100))
-    run.act(picture(0), STATE)
+    run.reset(image(100))
+    run.act(image(0), STATE)
     for step in (1, 2):
         with monkeypatch.context() as patch:
             patch.setattr(run._planner, "plan", fail)
             with pytest.raises(RuntimeError, match="out of memory"):
-                run.act(picture(step), STATE)
-        np.testing.assert_array_equal(run.act(picture(step), STATE), undisturbed[step])
+                run.act(image(step), STATE)
+        np.testing.assert_array_equal(run.act(image(step), STATE), undisturbed[step])
 
 
 def fail(*_: object) -> None:
@@ -261,9 +261,9 @@ def test_a_model_that_was_in_training_is_put_into_eval_mode() -> None:
 @torch.no_grad()
 def test_energies_are_of_the_goal_that_counts_now() -> None:
     run = controller(horizon=1)
-    run.reset(picture(100), picture(101), durations=(1,))
+    run.reset(image(100), image(101), durations=(1,))
     for seed, wanted in enumerate((0, 1)):
-        run.act(picture(seed), STATE)
+        run.act(image(seed), STATE)
         assert run._goal is not None
         assert run.decision is not None
         assert run.decision.cost is not None
@@ -279,18 +279,18 @@ def test_one_model_step_of_the_last_plan_is_gone_when_the_next_begins(monkeypatc
     assert run.decision is not None
     before, starts, plan = run.decision.plan, [], run._planner.plan
     monkeypatch.setattr(run._planner, "plan", lambda *given: (starts.append(given[2]), plan(*given))[1])
-    run.act(picture(1), STATE)
+    run.act(image(1), STATE)
     assert before is not None
     assert torch.equal(starts[0].mean, before.mean[[1, 2, 2]])
     assert not torch.equal(before.mean[0], before.mean[1])
 
 
-def test_a_mask_is_cropped_as_the_picture_is() -> None:
+def test_a_mask_is_cropped_as_the_image_is() -> None:
     run = controller()
     mask = np.zeros((48, 120), bool)
     mask[:16, :20] = True  # outside what the model sees: columns 27 to 91
     mask[:16, 72:] = True
-    run.reset(picture(100, 48, 120), mask=mask)
+    run.reset(image(100, 48, 120), mask=mask)
     assert run._goal is not None
     assert run._goal.weights is not None
     assert run._goal.weights.nonzero().flatten().tolist() == [2]
@@ -298,22 +298,22 @@ def test_a_mask_is_cropped_as_the_picture_is() -> None:
 
 def test_every_decision_draws_with_a_seed_of_its_own() -> None:
     run = controller(seed=7)
-    run.reset(picture(100))
+    run.reset(image(100))
     seeds = []
     for seed in range(3):
-        run.act(picture(seed), STATE)
+        run.act(image(seed), STATE)
         seeds.append(run.decision.plan.seed)  # type: ignore[union-attr]
     assert seeds == [7, 8, 9]
 
 
-def test_pictures_are_cropped_as_in_training() -> None:
-    wide = [picture(seed, 48, 120) for seed in (100, 1)]
+def test_images_are_cropped_as_in_training() -> None:
+    wide = [image(seed, 48, 120) for seed in (100, 1)]
     narrow = [np.ascontiguousarray(one[:, 36:84]) for one in wide]  # the central square
     energies = []
-    for pictures, crop in ((wide, "square"), (narrow, "square"), (wide, "released")):
+    for images, crop in ((wide, "square"), (narrow, "square"), (wide, "released")):
         run = Controller(tiny_model(), QUICK, crop=crop)
-        run.reset(pictures[0])
-        run.act(pictures[1], STATE)
+        run.reset(images[0])
+        run.act(images[1], STATE)
         energies.append(run.decision.energy_now)  # type: ignore[union-attr]
     assert energies[0] == energies[1] != energies[2]
 

@@ -1,4 +1,4 @@
-"""A decision is told as it is: in values, in a file, in words."""
+"""Decisions: their values, their file and their summary agree."""
 
 import json
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from decisions import QUICK, STATE, asked, picture
+from decisions import QUICK, STATE, asked, image
 from tiny_models import tiny_model
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.planning.controller import Controller
@@ -27,8 +27,8 @@ def read(found: PlanResult, folder: Path) -> dict:
 def test_an_answer_is_what_the_controller_decides() -> None:
     found = asked()
     controller = Controller(tiny_model(), QUICK, seed=5)
-    controller.reset(picture(100))
-    np.testing.assert_array_equal(controller.act(picture(0), STATE), found.actions[0])
+    controller.reset(image(100))
+    np.testing.assert_array_equal(controller.act(image(0), STATE), found.actions[0])
     assert found.decision.cost is not None
     assert found.doing_nothing == pytest.approx(float(found.decision.cost(torch.zeros(1, 2, 7))[0]))
     assert found.states.shape == (3, 7)
@@ -106,7 +106,7 @@ def test_goals_without_a_part_in_the_plan_are_named() -> None:
 
 
 def test_goals_share_the_horizon_unless_told() -> None:
-    one = PlanRequest(picture(0), STATE, (picture(1), picture(2), picture(3)))
+    one = PlanRequest(image(0), STATE, (image(1), image(2), image(3)))
     assert one.with_equal_durations(6).durations == (2, 2)
     assert one.with_equal_durations(1).durations == (1, 1)
 
@@ -122,12 +122,12 @@ def test_a_plan_that_is_no_better_than_doing_nothing_is_said_to_be() -> None:
     found = asked()
     assert "better than doing nothing" not in summarize(found)
     object.__setattr__(found, "doing_nothing", -1.0)
-    assert "Nothing that was tried is predicted to be better than doing nothing." in summarize(found)
+    assert "None of the evaluated actions is predicted to be better than doing nothing." in summarize(found)
 
 
 def test_running_out_of_time_is_said() -> None:
     ticks = iter(range(1000))
     controller = Controller(tiny_model(), QUICK.model_copy(update={"budget_s": 4.0}), clock=lambda: float(next(ticks)))
-    found = decide(controller, PlanRequest(picture(0), STATE, (picture(100),)))
+    found = decide(controller, PlanRequest(image(0), STATE, (image(100),)))
     assert "Time was up after" in summarize(found)
     assert " of 3 iterations" in summarize(found)

@@ -1,4 +1,4 @@
-"""The energy of actions is what the plain computation says, however it is cut up and whatever is kept."""
+"""The energy of actions equals the plain computation, for any batch size and with cached keys and values."""
 
 import numpy as np
 import pytest
@@ -122,7 +122,7 @@ def test_a_mask_over_the_image_weighs_its_patches_row_by_row() -> None:
 
 
 @torch.no_grad()
-def test_the_goals_weights_are_heeded() -> None:
+def test_the_goals_weights_are_used() -> None:
     model, tried = tiny_model(), actions(3, 1)
     weights = torch.arange(float(TOKENS))
     measure = WorldModelCost(model, scene(), goal(weights=weights), EnergyConfig())

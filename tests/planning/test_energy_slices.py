@@ -1,4 +1,4 @@
-"""A slice is the energy of the plan with two numbers of its first action changed."""
+"""An energy slice is the energy of the plan with two components of its first action changed."""
 
 import numpy as np
 import pytest

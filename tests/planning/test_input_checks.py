@@ -1,4 +1,4 @@
-"""Each number of a state and of a camera's pose is looked at by itself, with room for what sensors give."""
+"""Input checks: each component of a state and of a camera pose is checked, with tolerance for sensor noise."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Poses on the device are those of the official code and of geometry.py, and gradients flow through them."""
+"""Pose integration equals the official code and geometry.py, and gradients flow through it."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Plans in 8 bits are nearly the plain ones, and the model that was given stays as it was; they are for bfloat16."""
+"""Plans in 8 bits are close to the plain ones, and the given model stays unchanged; bfloat16 only."""
 
 import copy
 import importlib.util
@@ -56,17 +56,17 @@ def test_energies_in_8_bits_are_nearly_the_plain_ones(adapted: bool) -> None:
 
 @with_torchao
 def test_a_controller_plans_in_8_bits() -> None:
-    pictures = np.random.default_rng(0).integers(0, 256, (3, 48, 48, 3), dtype=np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (3, 48, 48, 3), dtype=np.uint8)
     state, model = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2]), in_bfloat16(adapted=True)
     found: list[list[np.ndarray]] = []
     energies: list[list[float]] = []
     for config in (PLAIN, INT8, INT8):
         run = Controller(model, config)
-        run.reset(pictures[0])
+        run.reset(images[0])
         found.append([])
         energies.append([])
-        for picture in pictures[1:]:
-            found[-1].append(run.act(picture, state))
+        for image in images[1:]:
+            found[-1].append(run.act(image, state))
             energies[-1].append(run.decision.plan.energy)
     np.testing.assert_array_equal(found[1], found[2])
     np.testing.assert_allclose(energies[1], energies[0], rtol=0.01)  # as good; which of two is taken hangs by a digit
@@ -114,8 +114,8 @@ def test_8_bits_in_float32_are_refused(kind: str, adapter: str | None, monkeypat
     model = tiny_model()
     if adapter is not None:
         add_adapter(model, AdapterConfig(kind=adapter, rank=2), seed=0)
-    told = rf"planning\.quantize: {kind}, with weights in float32.*needed: bfloat16.*model\.dtype=bfloat16"
-    with pytest.raises(InputError, match=told):
+    reported = rf"planning\.quantize: {kind}, with weights in float32.*needed: bfloat16.*model\.dtype=bfloat16"
+    with pytest.raises(InputError, match=reported):
         Controller(model, PLAIN.model_copy(update={"quantize": kind}))
 
 

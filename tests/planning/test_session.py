@@ -1,4 +1,4 @@
-"""What was named is planned with, as its own config says; what cannot be planned with is refused."""
+"""The planning session uses the given run or model with its own config, and refuses unusable ones."""
 
 from pathlib import Path
 
@@ -40,9 +40,9 @@ def test_a_run_is_planned_with_as_its_own_config_says(run: Path) -> None:
     assert steering.checkpoint == "step-00000020 (the newest)"
     assert steering.config.planning.horizon == 2
     controller = steering.controller()
-    pictures = np.random.default_rng(0).integers(0, 256, (2, 40, 64, 3), dtype=np.uint8)
-    controller.reset(pictures[0])
-    controller.act(pictures[1], STATE)
+    images = np.random.default_rng(0).integers(0, 256, (2, 40, 64, 3), dtype=np.uint8)
+    controller.reset(images[0])
+    controller.act(images[1], STATE)
     assert controller.decision is not None
     assert controller.decision.plan is not None
     assert controller.decision.plan.seed == 7
@@ -71,9 +71,9 @@ def test_a_model_needs_no_config_and_takes_one(make_config, base_folder: Path, t
     assert (alone.config.planning.samples, alone.config.seed, alone.config.planning.horizon) == (20, 4, 1)
     path = tmp_path / "its.yaml"
     path.write_text(config_as_yaml(make_config(planning=PLANNING, model__dtype="bfloat16", training__precision="bf16")))
-    told = load_to_plan(str(base_folder), config=path, overrides=["planning.cem.elites=3"])
-    assert (told.config.planning.horizon, told.config.planning.cem.elites) == (2, 3)
-    assert next(told.world_model.parameters()).dtype == torch.bfloat16
+    reported = load_to_plan(str(base_folder), config=path, overrides=["planning.cem.elites=3"])
+    assert (reported.config.planning.horizon, reported.config.planning.cem.elites) == (2, 3)
+    assert next(reported.world_model.parameters()).dtype == torch.bfloat16
 
 
 def test_the_model_that_was_named_is_loaded_not_that_of_the_config(make_config, base_folder, tmp_path: Path) -> None:
@@ -144,19 +144,19 @@ def test_a_run_is_merged_in_its_bases_type_and_its_fingerprints_are_those_of_wha
     assert steering.world_model.adaptation is None
     assert {value.dtype for value in steering.world_model.parameters()} == {torch.bfloat16}
     torch.testing.assert_close(prediction(steering.world_model), prediction(trained.eval()), rtol=0, atol=0.1)
-    told = steering.as_dict()["model"]
-    assert told["encoder"] == trained.encoder_fingerprint()
-    assert told["base"] == load_base(config.model, seed=0).predictor_fingerprint()
-    assert told["predictor"] == fingerprint(trained.predictor.state_dict())
-    assert told["dtype"] == "bfloat16"
+    reported = steering.as_dict()["model"]
+    assert reported["encoder"] == trained.encoder_fingerprint()
+    assert reported["base"] == load_base(config.model, seed=0).predictor_fingerprint()
+    assert reported["predictor"] == fingerprint(trained.predictor.state_dict())
+    assert reported["dtype"] == "bfloat16"
 
 
 def test_a_base_is_known_by_its_own_weights(base_folder: Path) -> None:
     base = WorldModel.from_pretrained(base_folder)
-    told = load_to_plan(str(base_folder)).as_dict()["model"]
-    assert told["encoder"] == base.encoder_fingerprint()
-    assert told["base"] == base.predictor_fingerprint()
-    assert told["predictor"] == fingerprint(base.predictor.state_dict())
+    reported = load_to_plan(str(base_folder)).as_dict()["model"]
+    assert reported["encoder"] == base.encoder_fingerprint()
+    assert reported["base"] == base.predictor_fingerprint()
+    assert reported["predictor"] == fingerprint(base.predictor.state_dict())
 
 
 def test_a_run_in_float32_is_planned_with_in_bfloat16_if_that_is_asked_for(run: Path) -> None:
@@ -176,8 +176,8 @@ def test_how_a_run_was_trained_does_not_keep_it_from_planning_here(make_config) 
 def test_8_bits_in_float32_are_refused_before_a_model_is_loaded(make_config, kind: str, tmp_path: Path) -> None:
     path = tmp_path / "its.yaml"
     path.write_text(config_as_yaml(make_config(planning__quantize=kind)))
-    told = rf"planning\.quantize: {kind}, with weights in float32\. needed: bfloat16.*Set model\.dtype=bfloat16"
-    with pytest.raises(InputError, match=told):
+    reported = rf"planning\.quantize: {kind}, with weights in float32\. needed: bfloat16.*Set model\.dtype=bfloat16"
+    with pytest.raises(InputError, match=reported):
         load_to_plan("no such model", config=path)
 
 

@@ -1,4 +1,4 @@
-"""Every planner finds known optima, keeps to limits and time, and survives a cost that says nothing."""
+"""Solvers find known optima, respect limits and time, and handle a cost without finite values."""
 
 import json
 import math
@@ -200,10 +200,10 @@ def test_no_iteration_begins_that_would_end_after_the_time_budget(planner: str, 
 
 
 def test_how_far_it_is_is_told_after_every_iteration() -> None:
-    told: list[tuple[int, int]] = []
-    planner = Planner(config("cem", iterations=3), space(), progress=lambda done, total: told.append((done, total)))
+    reported: list[tuple[int, int]] = []
+    planner = Planner(config("cem", iterations=3), space(), progress=lambda done, total: reported.append((done, total)))
     planner.plan(parabola(torch.zeros(1, 2)), torch.Generator())
-    assert told == [(1, 3), (2, 3), (3, 3)]
+    assert reported == [(1, 3), (2, 3), (3, 3)]
 
 
 @pytest.mark.parametrize("planner", PLANNERS)

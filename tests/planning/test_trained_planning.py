@@ -1,4 +1,4 @@
-"""A model that was trained is planned with as its base is: merged, in the type of its weights, and itself untouched."""
+"""A trained model plans like its base: merged, in the type of its weights, and without being changed."""
 
 import copy
 from collections.abc import Iterator
@@ -47,10 +47,10 @@ def trained_model(adapter: AdapterConfig, dtype: torch.dtype = torch.float32) ->
 
 
 def decided(model: WorldModel, config: PlanningConfig = PLAIN) -> list[np.ndarray]:
-    pictures = np.random.default_rng(0).integers(0, 256, (3, 48, 48, 3), dtype=np.uint8)
+    images = np.random.default_rng(0).integers(0, 256, (3, 48, 48, 3), dtype=np.uint8)
     run = Controller(model, config)
-    run.reset(pictures[0])
-    return [run.act(picture, STATE) for picture in pictures[1:]]
+    run.reset(images[0])
+    return [run.act(image, STATE) for image in images[1:]]
 
 
 class Types(TorchDispatchMode):

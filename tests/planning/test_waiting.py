@@ -1,4 +1,4 @@
-"""A device that computes energies is not asked anything before they are done: asking would make the program wait."""
+"""Planning does not synchronize with the device before the energies are computed."""
 
 from collections.abc import Callable
 from typing import Any

@@ -1,4 +1,4 @@
-"""Runs that were measured on the same clips are compared pair by pair; others are not compared at all."""
+"""Runs that were measured on the same clips are compared pair by pair; others are refused."""
 
 import json
 from pathlib import Path
@@ -63,9 +63,9 @@ def test_a_run_beside_itself_is_refused(tmp_path: Path) -> None:
 def test_other_starts_are_different_clips(tmp_path: Path) -> None:
     one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
     text = (other / METRICS_FILE).read_text()
-    figures = json.loads(text)
-    figures["clips"]["fingerprint"] = "0"
-    (other / METRICS_FILE).write_text(json.dumps(figures))
+    metrics = json.loads(text)
+    metrics["clips"]["fingerprint"] = "0"
+    (other / METRICS_FILE).write_text(json.dumps(metrics))
     with pytest.raises(InputError, match="other episodes or starts"):
         compare([one, other])
 
@@ -84,21 +84,21 @@ def test_a_run_that_was_not_evaluated_is_named_with_the_way_out(tmp_path: Path) 
         compare([tmp_path / "one"])
 
 
-def test_figures_of_other_shapes_are_named(tmp_path: Path) -> None:
+def test_metrics_of_other_shapes_are_named(tmp_path: Path) -> None:
     one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
-    figures = json.loads((other / METRICS_FILE).read_text())
-    figures["by_clip"]["persistence"] = 0.5
-    (other / METRICS_FILE).write_text(json.dumps(figures))
-    with pytest.raises(InputError, match="figures that cannot be used"):
+    metrics = json.loads((other / METRICS_FILE).read_text())
+    metrics["by_clip"]["persistence"] = 0.5
+    (other / METRICS_FILE).write_text(json.dumps(metrics))
+    with pytest.raises(InputError, match="metrics that cannot be used"):
         compare([one, other])
 
 
-def test_damaged_figures_are_named(tmp_path: Path) -> None:
+def test_damaged_metrics_are_named(tmp_path: Path) -> None:
     one, other = written(tmp_path / "one", Oracle()), written(tmp_path / "other", Oracle())
-    figures = json.loads((other / METRICS_FILE).read_text())
-    del figures["by_clip"]
-    (other / METRICS_FILE).write_text(json.dumps(figures))
-    with pytest.raises(InputError, match="figures that cannot be used"):
+    metrics = json.loads((other / METRICS_FILE).read_text())
+    del metrics["by_clip"]
+    (other / METRICS_FILE).write_text(json.dumps(metrics))
+    with pytest.raises(InputError, match="metrics that cannot be used"):
         compare([one, other])
     (other / METRICS_FILE).write_text('{"format": 99}')
     with pytest.raises(InputError, match="format 99"):
@@ -107,13 +107,13 @@ def test_damaged_figures_are_named(tmp_path: Path) -> None:
 
 def test_what_is_written_is_what_is_read_and_lists_of_numbers_stand_on_a_line(tmp_path: Path) -> None:
     folder = written(tmp_path / "one", Halfway())
-    figures = read_metrics(folder)
-    rollout = figures["models"]["adapter"]["rollout"]
+    metrics = read_metrics(folder)
+    rollout = metrics["models"]["adapter"]["rollout"]
     assert [one["value"] for one in rollout["l1"]["over_persistence"]] == pytest.approx([0.5] * 4, rel=1e-4)
     assert [one["value"] for one in rollout["l2"]["over_persistence"]] == pytest.approx([0.25] * 4, rel=1e-4)
-    assert np.array(figures["by_clip"]["models"]["adapter"]).shape == (12, 4)
-    assert np.array(figures["models"]["adapter"]["landscapes"]["maps"][0]["energy"]).shape == (3, 3, 3)
-    assert "gain_over_base" not in figures["models"]["base"]["rollout"]["l1"]
+    assert np.array(metrics["by_clip"]["models"]["adapter"]).shape == (12, 4)
+    assert np.array(metrics["models"]["adapter"]["landscapes"]["maps"][0]["energy"]).shape == (3, 3, 3)
+    assert "gain_over_base" not in metrics["models"]["base"]["rollout"]["l1"]
     text = (folder / METRICS_FILE).read_text()
     assert max(map(len, text.splitlines())) > 40
     assert len(text.splitlines()) < 4000

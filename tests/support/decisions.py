@@ -1,4 +1,4 @@
-"""Decisions of a tiny model, for tests of what is told and drawn of them."""
+"""Decisions of a tiny model, for tests of their output and figures."""
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
 QUICK = PlanningConfig(samples=12, iterations=3, horizon=2, cem=CemConfig(elites=4))
 
 
-def picture(seed: int) -> np.ndarray:
+def image(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (60, 48, 3), dtype=np.uint8)
 
 
@@ -22,5 +22,5 @@ def asked(*goals: int, nodes: int = 3, broken: bool = False, start: int = 0, **c
         with torch.no_grad():
             model.base_predictor.predictor_proj.weight.fill_(float("nan"))
     config = QUICK.model_copy(update=changes)
-    question = PlanRequest(picture(start), STATE, tuple(picture(goal) for goal in goals or (100,)))
+    question = PlanRequest(image(start), STATE, tuple(image(goal) for goal in goals or (100,)))
     return decide(Controller(model, config, seed=5), question.with_equal_durations(config.horizon), nodes=nodes)

@@ -1,4 +1,4 @@
-"""An evaluation made up of numbers that are known, for tests of what is written and drawn of it."""
+"""A synthetic evaluation with known numbers, for tests of reports and figures."""
 
 from __future__ import annotations
 

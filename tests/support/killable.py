@@ -1,4 +1,4 @@
-"""How is a real run killed with SIGKILL, at moments of one's choice, twenty times in a minute or two?
+"""Runs killed with SIGKILL at chosen moments, twenty times in a minute or two.
 
 Starting Python with PyTorch takes seconds. A `Nursery` is a process that has imported everything, done nothing yet and
 has one thread; it forks a child per start, which runs the command line as any process does and dies as any does.

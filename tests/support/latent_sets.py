@@ -1,4 +1,4 @@
-"""How does a test get a latent cache? Encoded with a tiny model, or of numbers that tell the step."""
+"""Latent caches for tests: encoded with a tiny model, or of numbers that encode the step."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def write_cache(dataset: Dataset, encoding: Encoding = NUMBERS, encode: Encode =
             latents = pack_latents(encode(frames), key.kind)
             writer.write_episode(
                 needed.episode, camera, episode,
-                steps=needed.steps.tolist(), latents=latents, pictures=_squashed(frames, 16),
+                steps=needed.steps.tolist(), latents=latents, small_frames=_squashed(frames, 16),
             )  # fmt: skip
     writer.finish(dataset, broken=broken, frames=count)
     return writer.folder

@@ -1,4 +1,4 @@
-"""Evaluations of plans in the world of `worlds`, and plans that are made up."""
+"""Evaluations of plans in the world of `worlds`, and synthetic plans."""
 
 from __future__ import annotations
 

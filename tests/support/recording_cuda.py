@@ -1,4 +1,4 @@
-"""A CUDA device that is not there: copies are done at once, and what it was asked is recorded in order."""
+"""A fake CUDA device: copies are done at once, and calls are recorded in order."""
 
 import contextlib
 import threading
@@ -17,7 +17,7 @@ COMPUTING = "computing"
 class RecordingCuda(Cuda):
     """Takes the place of `vjepa2_ac.data.clips.streams.Cuda`: streams have names, and events numbers."""
 
-    told: list[str] = field(default_factory=list)
+    calls: list[str] = field(default_factory=list)
     streams: int = 0
     events: int = 0
     now: str = COMPUTING  # the stream that is enqueued on
@@ -36,16 +36,16 @@ class RecordingCuda(Cuda):
         self.now = before
 
     def to_device(self, pinned: torch.Tensor) -> torch.Tensor:
-        self.told.append(f"{self.now}: to device")
+        self.calls.append(f"{self.now}: to device")
         return pinned.clone()
 
     def pinned_copy(self, tensor: torch.Tensor) -> torch.Tensor:
-        self.told.append(f"{self.now}: to pinned memory")
+        self.calls.append(f"{self.now}: to pinned memory")
         return tensor.clone()
 
     def used_by(self, tensor: torch.Tensor, stream: "RecordedStream") -> None:
         del tensor
-        self.told.append(f"memory in use by {stream.name}")
+        self.calls.append(f"memory in use by {stream.name}")
 
 
 @dataclass
@@ -55,11 +55,11 @@ class RecordedStream:
 
     def record_event(self) -> "RecordedEvent":
         self.cuda.events += 1
-        self.cuda.told.append(f"{self.name}: event {self.cuda.events}")
+        self.cuda.calls.append(f"{self.name}: event {self.cuda.events}")
         return RecordedEvent(self.cuda, self.cuda.events)
 
     def wait_event(self, event: "RecordedEvent") -> None:
-        self.cuda.told.append(f"{self.name}: waits for event {event.number}")
+        self.cuda.calls.append(f"{self.name}: waits for event {event.number}")
 
 
 @dataclass
@@ -68,7 +68,7 @@ class RecordedEvent:
     number: int
 
     def synchronize(self) -> None:
-        self.cuda.told.append(f"host: waits for event {self.number}")
+        self.cuda.calls.append(f"host: waits for event {self.number}")
 
 
 def recorded_copies(cuda: RecordingCuda) -> Copies:

@@ -1,4 +1,4 @@
-"""Are two runs the same, bit for bit? Weights, optimizer state and figures but for timings."""
+"""Comparison of two runs, bit for bit: weights, optimizer state and metrics except timings."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from vjepa2_ac.runs.checkpoint import newest_checkpoint
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.monitoring.throughput import MEASURED
 
-TIMINGS = MEASURED  # figures of the machine
+TIMINGS = MEASURED  # metrics of the machine
 
 
 def trained_weights(run: Path) -> dict[str, torch.Tensor]:
@@ -27,7 +27,7 @@ def optimizer_state(run: Path) -> dict:
     return torch.load(newest_checkpoint(run / "checkpoints") / "optimizer.pt", weights_only=True)["state"]
 
 
-def figures(run: Path) -> list[dict]:
+def metrics(run: Path) -> list[dict]:
     """Return all rows of numbers; what warnings advise depends on what a run keeps."""
     rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] != "warning"]
     return [{k: v for k, v in row.items() if k not in TIMINGS} for row in rows]
@@ -49,4 +49,4 @@ def assert_same_run(one: Path, other: Path) -> None:
         assert first.keys() == second.keys()
         for name, value in first.items():
             assert torch.equal(value, second[name]), name
-    assert figures(one) == figures(other)
+    assert metrics(one) == metrics(other)

@@ -1,4 +1,4 @@
-"""What test_sharding.py starts twice: one process of a pair that shares a predictor, and checks what it has of it."""
+"""One process of the pair of test_sharding.py, which share a predictor; checks its own part."""
 
 import os
 import sys

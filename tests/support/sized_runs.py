@@ -1,4 +1,4 @@
-"""Runs of chosen sizes: their base and data are never opened."""
+"""Runs of given sizes: their base and data are never opened."""
 
 from typing import Any
 

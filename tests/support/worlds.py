@@ -1,4 +1,4 @@
-"""Worlds small enough to compute by hand, and predictors of which one knows how good they are."""
+"""Worlds small enough to compute by hand, and predictors with known errors."""
 
 from __future__ import annotations
 

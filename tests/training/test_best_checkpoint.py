@@ -1,4 +1,4 @@
-"""Errors of other clips, over another time or of other latents are no better or worse."""
+"""Errors of other clips, another time span or other latents are not compared."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -27,8 +27,8 @@ def test_the_best_of_other_frames_no_longer_counts_and_the_reason_is_named(make_
     folder = train(make_config(**every), reporter) / "checkpoints"
     assert read_state(newest_checkpoint(folder)).best_error == 0.2
     train(make_config(**{**every, "training__steps": 4}, data__frames=5), reporter, allow_config_change=True)
-    (said,) = [note for note in reporter.notes if "no longer counts" in note]
-    assert said.startswith(
+    (reported,) = [note for note in reporter.notes if "no longer counts" in note]
+    assert reported.startswith(
         "Validation measures something else than before (other: data.frames, its clips): the error 0.2 "
     )
     state = read_state(newest_checkpoint(folder))

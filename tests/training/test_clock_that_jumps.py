@@ -1,4 +1,4 @@
-"""A run whose clock jumps by a day is the run that it would have been, with the checkpoints that it would have had."""
+"""A run whose clock jumps by a day is unchanged, with the same checkpoints."""
 
 import itertools
 import time

@@ -1,4 +1,4 @@
-"""A run with compiled blocks is a run like others: same weights in its checkpoints, and refused where it cannot be."""
+"""A run with compiled blocks has the same checkpoints as others, and is refused where it is impossible."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A run whose batches are copied ahead is the same run, and the next batch is on its way before the host waits."""
+"""Asynchronous copies do not change a run, and the next batch is copied before the host waits."""
 
 import itertools
 from collections.abc import Generator
@@ -36,10 +36,10 @@ def cuda(monkeypatch: pytest.MonkeyPatch) -> RecordingCuda:
 
     def recorded(tensor: torch.Tensor) -> list[float]:
         if tensor.shape == (2,):
-            cuda.told.append("host: waits for the losses")
+            cuda.calls.append("host: waits for the losses")
         return tolist(tensor)
 
-    monkeypatch.setattr(torch.Tensor, "backward", lambda loss: (cuda.told.append("backward"), backward(loss))[1])
+    monkeypatch.setattr(torch.Tensor, "backward", lambda loss: (cuda.calls.append("backward"), backward(loss))[1])
     monkeypatch.setattr(torch.Tensor, "tolist", recorded)
     return cuda
 
@@ -63,7 +63,7 @@ def test_the_next_batch_is_on_its_way_before_the_host_waits_for_the_losses(make_
     for step in (1, 2):
         training_step(run, batches, step)
     event = "side 1: event "
-    assert cuda.told == [
+    assert cuda.calls == [
         *COPY, event + "1", *micro_batch(1), *COPY, event + "2", *micro_batch(2),
         *COPY, event + "3", "host: waits for the losses",
         *micro_batch(3), *COPY, event + "4", *micro_batch(4),
@@ -74,11 +74,11 @@ def test_the_next_batch_is_on_its_way_before_the_host_waits_for_the_losses(make_
 def test_after_the_last_step_and_in_a_trial_nothing_is_fetched_ahead(make_config, reporter, cuda) -> None:
     run = set_up(make_config(training__steps=1), reporter.note)
     training_step(run, copied(run, cuda), 1)
-    assert cuda.told[-1] == "host: waits for the losses"
-    assert cuda.told[-2] == "backward"
-    cuda.told.clear()
+    assert cuda.calls[-1] == "host: waits for the losses"
+    assert cuda.calls[-2] == "backward"
+    cuda.calls.clear()
     gradients(run, copied(run, cuda))
-    assert cuda.told[-2:] == ["backward", "host: waits for the losses"]
+    assert cuda.calls[-2:] == ["backward", "host: waits for the losses"]
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_a_run_that_copies_ahead_is_the_run_that_does_not(make_config, reporter,
     train(config, reporter)
     cuda = request.getfixturevalue("on_device")
     train(config.model_copy(update={"run_dir": str(tmp_path / "ahead")}), reporter)
-    assert "side 1: to device" in cuda.told
+    assert "side 1: to device" in cuda.calls
     assert_same_run(tmp_path / "ahead", tmp_path / "plain")
 
 

@@ -1,4 +1,4 @@
-"""Processes that share a predictor (FSDP2) make the run that one makes, and what they cannot share is refused."""
+"""FSDP2: processes that share a predictor equal a single one, and unsupported settings are refused."""
 
 from pathlib import Path
 
@@ -8,7 +8,7 @@ from safetensors.torch import load_file
 
 from paths import ROOT
 from ranks import finish, free_port, start_rank
-from same_run import figures, optimizer_state
+from same_run import metrics, optimizer_state
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.distributed.launch import check_launch
 from vjepa2_ac.errors import InputError
@@ -33,7 +33,7 @@ def assert_equal_up_to_rounding(one: Path, other: Path) -> None:
     for key, values in moments.items():
         for name, value in values.items():
             torch.testing.assert_close(same[key][name], value, rtol=1e-3, atol=1e-6, msg=f"{key} {name}")
-    for row, again in zip(figures(one), figures(other), strict=True):
+    for row, again in zip(metrics(one), metrics(other), strict=True):
         assert row.keys() == again.keys()
         assert row.pop("kind") == again.pop("kind")
         assert all(again[name] == pytest.approx(value, rel=1e-4) for name, value in row.items())
@@ -59,10 +59,10 @@ def test_two_processes_that_share_a_predictor_make_the_run_of_one(make_config, r
     train(config("handed_over", steps=4, accumulation=4), reporter)
     config("shared", steps=6, accumulation=2)
     script, port = ROOT / "tests/support/shards_together.py", free_port()
-    (said, errors), (_, other_errors) = finish(
+    (reported, errors), (_, other_errors) = finish(
         [start_rank([str(script), str(tmp_path)], rank, 2, port, **FSDP2) for rank in range(2)]
     )
-    assert "2 processes share the predictor's weights, gradients and moments" in said
+    assert "2 processes share the predictor's weights, gradients and moments" in reported
     assert "returned a view" not in errors + other_errors
     state = read_state(newest_checkpoint(tmp_path / "shared/checkpoints"))
     assert (state.step, state.processes) == (4, 2)

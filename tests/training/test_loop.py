@@ -1,4 +1,4 @@
-"""Laws of the loop: exact, resumable, and nothing but the adapter moves."""
+"""Properties of the loop: exact, resumable, and only the adapter changes."""
 
 import importlib.util
 import json
@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from copied_sets import write_rlds
-from same_run import assert_same_run, figures, trained_weights
+from same_run import assert_same_run, metrics, trained_weights
 from vjepa2_ac.config import CheckpointConfig, Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.clips import loader
@@ -90,8 +90,8 @@ def test_how_often_a_run_is_measured_and_saved_changes_nothing(make_config, repo
     assert len(list((tmp_path / "often/checkpoints").iterdir())) > len(
         list((tmp_path / "seldom/checkpoints").iterdir())
     )
-    rows = {(row["kind"], row["step"]): row for row in figures(tmp_path / "often")}
-    assert all(rows[row["kind"], row["step"]] == row for row in figures(tmp_path / "seldom"))
+    rows = {(row["kind"], row["step"]): row for row in metrics(tmp_path / "often")}
+    assert all(rows[row["kind"], row["step"]] == row for row in metrics(tmp_path / "seldom"))
     one, other = trained_weights(tmp_path / "seldom"), trained_weights(tmp_path / "often")
     assert all(torch.equal(one[key], other[key]) for key in one)
 
@@ -126,7 +126,7 @@ def test_the_best_by_validation_is_written_kept_and_remembered(make_config, repo
 def test_another_seed_is_another_run(make_config, reporter, tmp_path) -> None:
     train(make_config(run_dir=str(tmp_path / "a"), training__steps=2), reporter)
     train(make_config(run_dir=str(tmp_path / "b"), training__steps=2, seed=1), reporter)
-    assert figures(tmp_path / "a") != figures(tmp_path / "b")
+    assert metrics(tmp_path / "a") != metrics(tmp_path / "b")
 
 
 def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporter) -> None:
@@ -182,7 +182,7 @@ def test_training_lowers_the_loss(make_config, reporter) -> None:
         validation__every=60, checkpoint__every=60,
     )  # fmt: skip
     train(config, reporter)
-    validations = [row for row in figures(Path(config.run_dir)) if row["kind"] == "validation"]
+    validations = [row for row in metrics(Path(config.run_dir)) if row["kind"] == "validation"]
     assert [row["step"] for row in validations] == [0, 60]
     assert validations[-1]["error_over_persistence"] < 0.8 * validations[0]["error_over_persistence"]
 
@@ -232,8 +232,8 @@ def test_episodes_cannot_change_their_split_within_a_run(make_config, reporter) 
 def test_copies_in_other_splits_are_said_before_the_first_step(make_config, reporter, tmp_path) -> None:
     folder = write_rlds(tmp_path / "copied", [number // 2 for number in range(16)])
     train(make_config(data__path=str(folder), data__frames=3, training__steps=1), reporter, check_only=True)
-    (said,) = [note for note in reporter.notes if "copy in another split" in note]
-    assert said.startswith("Warning: 16 episodes have the states of another one: they are 8 different ones. ")
+    (reported,) = [note for note in reporter.notes if "copy in another split" in note]
+    assert reported.startswith("Warning: 16 episodes have the states of another one: they are 8 different ones. ")
     assert reporter.steps == []
     reporter.notes.clear()
     train(make_config(training__steps=1), reporter, check_only=True)
@@ -247,13 +247,13 @@ def test_another_config_on_purpose_is_written_and_what_changes_is_said(make_conf
     folder = Path(changed.run_dir)
     assert (folder / "config.yaml").read_text() != config_as_yaml(changed), "--check writes nothing"
     train(changed, reporter, allow_config_change=True)
-    said = ["training.learning_rate: 0.001 -> 0.002", "training.steps: 6 -> 8"]
+    reported = ["training.learning_rate: 0.001 -> 0.002", "training.steps: 6 -> 8"]
     assert [note for note in reporter.notes if "config changes" in note][-2:] == [
-        f"The config changes: {s}" for s in said
+        f"The config changes: {s}" for s in reported
     ]
     assert (folder / "config.yaml").read_text() == config_as_yaml(changed)
     starts = json.loads((folder / "environment.json").read_text())
-    assert [start.get("config_changes") for start in starts] == [None, said]
+    assert [start.get("config_changes") for start in starts] == [None, reported]
     assert reporter.steps == [*range(1, 7), 7, 8]
     train(changed, reporter)
 
@@ -339,5 +339,5 @@ def test_an_episode_may_be_left_out_within_a_run(make_config, reporter) -> None:
     broken = next(batches_from(set_up(config, reporter.note))).episode_ids[0]
     assert not any("data has changed" in note for note in reporter.notes)
     train(make_config(training__steps=2, data__exclude=[broken]), reporter)
-    said = "\n".join(reporter.notes)
-    assert re.search("Going on from .*\nThe data has changed: [0-9]+ training clips instead of [0-9]+", said)
+    reported = "\n".join(reporter.notes)
+    assert re.search("Going on from .*\nThe data has changed: [0-9]+ training clips instead of [0-9]+", reported)

@@ -1,4 +1,4 @@
-"""The loss is the official one, and the other distances and weights are what they say."""
+"""The loss equals the official one; other distances and weights equal their definitions."""
 
 import json
 

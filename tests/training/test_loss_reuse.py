@@ -1,4 +1,4 @@
-"""The rollout reuses what teacher forcing computed of the first step: cheaper, and the same losses and gradients."""
+"""The rollout reuses the first step of teacher forcing: cheaper, with the same losses and gradients."""
 
 from dataclasses import replace
 from typing import Any

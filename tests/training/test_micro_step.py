@@ -1,4 +1,4 @@
-"""A micro-step that is captured once and replayed learns what the plain one learns; so do matrices cast once a step."""
+"""A captured and replayed micro-step equals the plain one; so do matrices cast once per step."""
 
 import itertools
 from collections.abc import Callable, Iterator
@@ -56,8 +56,8 @@ def uneven(batches: Iterator[Batch]) -> Iterator[Batch]:
 
 
 def learned(run: Run, batches: Iterator[Batch]) -> list[Tensor]:
-    figures = [training_step(run, batches, step) for step in range(1, STEPS + 1)]
-    losses = torch.tensor([[row["loss"], row["grad_norm"]] for row in figures], dtype=torch.float64)
+    metrics = [training_step(run, batches, step) for step in range(1, STEPS + 1)]
+    losses = torch.tensor([[row["loss"], row["grad_norm"]] for row in metrics], dtype=torch.float64)
     return [losses, *(parameter.detach().clone() for parameter in run.trained)]
 
 

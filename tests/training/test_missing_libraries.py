@@ -1,4 +1,4 @@
-"""What is not installed is said in one line, with the way out, before anything is opened, fetched or computed."""
+"""A missing library is reported in one line, with a fix, before anything is opened, fetched or computed."""
 
 import sys
 

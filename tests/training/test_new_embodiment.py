@@ -1,4 +1,4 @@
-"""A robot of other states or actions than the base knows, from its recordings to a model of its own."""
+"""A robot with other states or actions than the base's: from its recordings to a trained model."""
 
 import json
 from collections.abc import Callable
@@ -67,9 +67,9 @@ def test_from_recordings_to_a_model_of_its_own(
 
     evaluation = evaluate_subject(str(folder), EvaluationOptions(split="validation", clips=4)).evaluation
     assert list(evaluation.models) == ["adapter" if kind == "lora" else "model"]
-    figures = metrics_as_dict(evaluation)
-    assert "no base to compare with" in figures["verdict"]
-    assert figures["base"] is None
+    metrics = metrics_as_dict(evaluation)
+    assert "no base to compare with" in metrics["verdict"]
+    assert metrics["base"] is None
 
     merged = export_run(folder, tmp_path / "merged").path
     base = load_base(ModelConfig(base=str(merged), dtype="float32"), seed=5)
@@ -95,8 +95,8 @@ def test_a_run_with_fresh_heads_that_was_stopped_goes_on_bit_for_bit(
     train(make_robot(**whole), type(reporter)())
 
     class Interrupts(type(reporter)):  # type: ignore[misc]
-        def stepped(self, step: int, figures: object) -> None:
-            super().stepped(step, figures)
+        def stepped(self, step: int, metrics: object) -> None:
+            super().stepped(step, metrics)
             if step == 3:
                 raise KeyboardInterrupt
 
@@ -130,8 +130,8 @@ def test_what_it_learnt_is_a_base_that_the_same_robot_trains_on(
     assert any("state encoder: the base's own" in note for note in again.notes)
     evaluation = evaluate_subject(str(folder), EvaluationOptions(split="validation", clips=4)).evaluation
     assert list(evaluation.models) == ["base", "adapter"]
-    tried = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), clips=4).tried
-    assert [one.moved_cm for one in tried] == [None, None]
+    results = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), clips=4).results
+    assert [one.moved_cm for one in results] == [None, None]
 
 
 def test_a_head_that_nothing_trains_is_refused_before_the_model_is_loaded(

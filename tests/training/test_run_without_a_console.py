@@ -1,4 +1,4 @@
-"""No reader, terminal or disk of a log stops a run, holds it up or changes it. With real processes."""
+"""A missing reader, terminal or a full log disk does not stop, delay or change a run. With real processes."""
 
 import fcntl
 import os

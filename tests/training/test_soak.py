@@ -1,4 +1,4 @@
-"""A run that is killed again and again, whenever it happens, is the run that was not.
+"""A run that is killed repeatedly, at any time, equals one that is not.
 
 A few kills here; many with `make soak` (VJEPA2_AC_SOAK=20: so many kills of each kind of run).
 """

@@ -1,4 +1,4 @@
-"""A step counts every clip that could be read alike, and none that could not."""
+"""A step weights all readable clips equally, and ignores unreadable ones."""
 
 import itertools
 import math
@@ -41,22 +41,22 @@ def prepared(make_config: Any, reporter: Any, batch_size: int, accumulation: int
 
 def taken(run: Run, batches: list[Batch]) -> tuple[Gradients, dict[str, torch.Tensor]]:
     run.optimizer.zero_grad(set_to_none=True)
-    figures = gradients(run, iter(batches))
-    return figures, {n: p.grad.clone() for n, p in run.world_model.named_parameters() if p.grad is not None}
+    metrics = gradients(run, iter(batches))
+    return metrics, {n: p.grad.clone() for n, p in run.world_model.named_parameters() if p.grad is not None}
 
 
 @pytest.mark.parametrize("read", [[[0, 1], [2]], [[], [1, 2, 3]], [[3], []]])
 def test_clips_left_out_leave_the_mean_over_the_others(make_config, reporter, read: list[list[int]]) -> None:
     run = prepared(make_config, reporter, 4, 2)
     whole = next(training_loader(run.dataset, seed=0, batch_size=4))
-    figures, gradient = taken(run, [some_clips(whole, chosen) for chosen in read])
+    metrics, gradient = taken(run, [some_clips(whole, chosen) for chosen in read])
     clips = [clip for chosen in read for clip in chosen]
     alone = prepared(make_config, reporter, len(clips), 1)
     expected, expected_gradient = taken(alone, [some_clips(whole, clips)])
-    assert figures.clips == len(clips)
-    assert figures.forced_loss == pytest.approx(expected.forced_loss, rel=1e-5)
-    assert figures.rollout_loss == pytest.approx(expected.rollout_loss, rel=1e-5)
-    assert figures.norm == pytest.approx(expected.norm, rel=1e-4)
+    assert metrics.clips == len(clips)
+    assert metrics.forced_loss == pytest.approx(expected.forced_loss, rel=1e-5)
+    assert metrics.rollout_loss == pytest.approx(expected.rollout_loss, rel=1e-5)
+    assert metrics.norm == pytest.approx(expected.norm, rel=1e-4)
     assert gradient
     for name, one in expected_gradient.items():
         torch.testing.assert_close(gradient[name], one, rtol=1e-4, atol=1e-7)
@@ -67,9 +67,9 @@ def test_a_step_without_a_clip_moves_nothing_and_says_so(make_config, reporter) 
     batches = training_loader(run.dataset, seed=0, batch_size=2)
     training_step(run, batches, 1)  # the optimizer has momentum now
     before = [parameter.detach().clone() for parameter in run.world_model.parameters()]
-    figures = training_step(run, iter([some_clips(batch, []) for batch in itertools.islice(batches, 2)]), 2)
-    assert math.isnan(figures["loss"])
-    assert figures["clips_left_out"] == 4
+    metrics = training_step(run, iter([some_clips(batch, []) for batch in itertools.islice(batches, 2)]), 2)
+    assert math.isnan(metrics["loss"])
+    assert metrics["clips_left_out"] == 4
     assert all(torch.equal(old, new) for old, new in zip(before, run.world_model.parameters(), strict=True))
 
 

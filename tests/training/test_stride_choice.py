@@ -1,4 +1,4 @@
-"""A stride that is auto is chosen once, by the base model, and belongs to the run from then on."""
+"""An automatic stride is chosen once, by the base model, and stored with the run."""
 
 import json
 from collections.abc import Callable
@@ -34,10 +34,10 @@ def test_a_run_chooses_keeps_and_never_chooses_again(
 def test_the_run_equals_one_that_was_told_the_stride(make_config: Make, reporter: Any, tmp_path: Path) -> None:
     same: dict[str, Any] = {"data__stride_candidates": [2], "training__steps": 2}
     chosen = train(make_config(run_dir=str(tmp_path / "a"), data__stride="auto", **same), reporter)
-    told = train(make_config(run_dir=str(tmp_path / "b"), data__stride=2, **same), reporter)
+    reported = train(make_config(run_dir=str(tmp_path / "b"), data__stride=2, **same), reporter)
     losses = [
         [json.loads(line).get("loss") for line in (folder / "metrics.jsonl").read_text().splitlines()]
-        for folder in (chosen, told)
+        for folder in (chosen, reported)
     ]
     assert losses[0] == losses[1]
 

@@ -1,4 +1,4 @@
-"""How is the program used from the command line? `program` parses; each command has a file of its own."""
+"""The command line: `program` parses the arguments, and each command has its own file."""
 
 from vjepa2_ac.cli.program import main
 

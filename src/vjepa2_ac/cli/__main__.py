@@ -1,4 +1,4 @@
-"""`python -m vjepa2_ac.cli`: the same as `vjepa2-ac`."""
+"""Entry point of `python -m vjepa2_ac.cli`, the same as `vjepa2-ac`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""What can be asked about data on the command line? check, index, inspect, calibrate."""
+"""The data commands: check, index, inspect and calibrate."""
 
 from __future__ import annotations
 
@@ -213,7 +213,7 @@ def _calibrate(options: argparse.Namespace) -> None:
 
 @contextlib.contextmanager
 def _progress(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Give a function that shows how far long work is; nothing is shown of work that is done at once."""
+    """Provide a function that shows the progress of long work; nothing is shown for work that is done at once."""
     from vjepa2_ac.console.progress import LateProgress
 
     bar = LateProgress(title)
@@ -224,7 +224,7 @@ def _progress(title: str) -> Iterator[Callable[[int, int], None]]:
 
 
 def _make_folder(folder: Path) -> None:
-    """Make the folder for results before anything long is begun."""
+    """Create the folder for results before any long work."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""What can be asked about a run and this machine on the command line? doctor: will it fit on the GPU?"""
+"""The doctor command: will the run fit on the GPU of this machine?"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can be asked about latents on the command line? encode: run the frozen encoder once, and keep what comes out."""
+"""The encode command: run the frozen encoder once over a data set and store its latents."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""How does a command end that is told to? It leaves nothing half-written behind, then dies of the signal as any other.
+"""Signal handling of commands: on SIGTERM or SIGHUP, remove partial files, then exit with that signal.
 
-For commands that have no way of their own: a training run finishes its step first (`distributed.preemption`).
+For commands without handling of their own: a training run finishes its step first (`distributed.preemption`).
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ _SAME_WITHIN_S = 0.5  # `timeout`, some launchers and terminals signal twice
 
 
 class EndedError(BaseException):
-    """Ends what is under way, as KeyboardInterrupt does, so that temporary files go.
+    """Ends the current work, as KeyboardInterrupt does, so that temporary files are removed.
 
     Args:
-        number: The signal that asked for it.
+        number: The signal.
     """
 
     def __init__(self, number: int) -> None:
@@ -31,9 +31,9 @@ class EndedError(BaseException):
 
 @contextlib.contextmanager
 def tidy_end() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the block in good order, and then the process; a second one ends it at once.
+    """Let SIGTERM and SIGHUP end the block cleanly, and then the process; a second one ends it at once.
 
-    Outside the main thread, and for signals that something else is done at already, nothing is changed.
+    Outside the main thread, and for signals that already have a handler, nothing is changed.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -1,4 +1,4 @@
-"""What can be asked about how good something is, on the command line? evaluate, compare."""
+"""The evaluate and compare commands: metrics of runs and models on held-out episodes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def add_checkpoint(parser: argparse._ActionsContainer) -> None:
-    """Add the option by which a checkpoint of a run is named."""
+    """Add the option that selects a checkpoint of a run."""
     parser.add_argument(
         "--checkpoint",
         default="newest",
@@ -180,7 +180,7 @@ def _asked(options: argparse.Namespace) -> dict[str, EvaluationOptions]:
 
 
 def _require_planning(options: argparse.Namespace) -> None:
-    """Refuse settings of plans where none are asked for: they would do nothing."""
+    """Refuse planning settings if no plans are requested: they would have no effect."""
     require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
     if options.overrides and options.planning is None:
         raise InputError(

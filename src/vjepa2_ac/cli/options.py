@@ -1,4 +1,4 @@
-"""What do the commands of the command line have in common? How one is added, and how numbers are read."""
+"""Shared parts of the commands: adding a subcommand, and parsing numbers."""
 
 from __future__ import annotations
 
@@ -25,24 +25,24 @@ _OVERRIDE = re.compile(r"[a-z_]+(\.\w+)+=")
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose messages cannot move a terminal's cursor, whatever was given."""
+    """A parser whose messages cannot move a terminal's cursor, whatever the arguments are."""
 
     def error(self, message: str) -> NoReturn:
-        """Print what is wrong, and end with status 2."""
+        """Print the error, and exit with status 2."""
         super().error(printable(message))
 
 
 def command(
     commands: Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
 ) -> argparse.ArgumentParser:
-    """Add a command that a handler does, and return its parser."""
+    """Add a command with its handler, and return its parser."""
     parser = commands.add_parser(name, help=text, description=text)
     parser.set_defaults(handler=handler)
     return parser
 
 
 def say_places_elsewhere(subject: str) -> None:
-    """Say which addresses the config of a run names, before any of them is contacted; nothing of a model."""
+    """Print the addresses that the config of a run names, before any of them is contacted; nothing for a model."""
     from vjepa2_ac.console.progress import console
     from vjepa2_ac.runs.folder import CONFIG, places_elsewhere, read_run_config
 
@@ -104,9 +104,9 @@ def require_subject(subject: str, checkpoint: str | None = None) -> None:
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Parse a command line; `key=value` may stand anywhere behind a command that takes it.
+    """Parse a command line; `key=value` may be anywhere after a command that takes it.
 
-    argparse gives up on such words behind an option, and takes them for what it was not told of.
+    argparse does not accept such words after an option, and treats them as unknown arguments.
     """
     options, rest = parser.parse_known_args(arguments)
     unknown = [word for word in rest if _OPTION.match(word)]
@@ -118,12 +118,12 @@ def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> 
 
 
 class SubjectsAndOverrides(argparse.Action):
-    """Takes names of runs or models, one or more, and among them the `key=value` that no folder is called."""
+    """Takes names of runs or models, one or more, and among them `key=value` words that are no folders."""
 
     def __call__(
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, _option: str | None = None
     ) -> None:
-        """Put each where it belongs."""
+        """Sort the words into both kinds."""
         overrides = [word for word in values if _is_override(word)]
         subjects = [word for word in values if word not in overrides]
         if not subjects:
@@ -133,7 +133,7 @@ class SubjectsAndOverrides(argparse.Action):
 
 
 def as_subject(text: str) -> str:
-    """Read likewise what names a run or a model, and leave a `key=value` for `SubjectsAndOverrides` as it is."""
+    """Parse the name of a run or a model, and leave a `key=value` unchanged for `SubjectsAndOverrides`."""
     return text if _is_override(text) else as_model(text)
 
 
@@ -158,22 +158,22 @@ def require_overrides(words: Sequence[str], *, fix: str = "") -> None:
 
 
 def as_path(text: str) -> Path:
-    """Read an option that is a path of this machine; `~` is the user's home, also behind `--out=`."""
+    """Parse an option that is a path of this machine; `~` is the user's home, also after `--out=`."""
     return Path(as_local(text))
 
 
 def as_local(text: str) -> str:
-    """Read a path of this machine, and keep it as it was written."""
+    """Parse a path of this machine, and keep its spelling."""
     return _meant(places.on_this_machine, text)
 
 
 def as_model(text: str) -> str:
-    """Read what names a run or a model: a path of this machine, or a model that comes with the package."""
+    """Parse the name of a run or a model: a path of this machine, or a model that comes with the package."""
     return _meant(places.of_a_model, text)
 
 
 def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
-    """Return what reads an option that is a whole number from `least` to `most`; None: as many as anybody can need."""
+    """Return a parser of whole numbers from `least` to `most`; None: a limit that no use reaches."""
     meant = f"a whole number from {least}" + ("" if most is None else f" to {most}")
 
     def read(text: str) -> int:
@@ -191,7 +191,7 @@ def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
 
 
 def number_between(least: float, most: float, unit: str) -> Callable[[str], float]:
-    """Return what reads an option that is a number of some unit; the bounds themselves are not among them."""
+    """Return a parser of numbers with a unit, strictly between the bounds."""
 
     def read(text: str) -> float:
         try:

@@ -1,4 +1,4 @@
-"""What can be asked about what a robot should do, on the command line? plan."""
+"""The plan command: the next action of a robot for given images and states."""
 
 from __future__ import annotations
 
@@ -153,13 +153,13 @@ class _Images(NamedTuple):
 def _images(options: argparse.Namespace) -> _Images:
     """Read what was given and refuse what cannot be planned with, before a model is loaded."""
     from vjepa2_ac.media.image_file import read_image
-    from vjepa2_ac.planning.input_checks import require_mask, require_picture
+    from vjepa2_ac.planning.input_checks import require_image, require_mask
 
     goals = tuple(read_image(path) for path in options.goal)
     for path, picture in zip(options.goal, goals, strict=True):
-        require_picture(picture, where=f"--goal {path}", like=goals[0])
+        require_image(picture, where=f"--goal {path}", like=goals[0])
     start = read_image(options.start)
-    require_picture(start, where=f"--start {options.start}", like=goals[0])
+    require_image(start, where=f"--start {options.start}", like=goals[0])
     mask = None if options.mask is None else read_image(options.mask).max(axis=-1)
     if mask is not None:
         require_mask(mask, where=f"--mask {options.mask}", like=goals[0])

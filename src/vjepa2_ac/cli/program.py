@@ -1,4 +1,4 @@
-"""What can be asked for on the command line? Parse, call one function, print."""
+"""The command-line program: parse the arguments, call one function, print its result."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from vjepa2_ac.errors import InputError, in_words, is_out_of_memory, printable
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return its status.
 
-    0 done, 1 a check failed, 2 something given cannot be used, 75 a training run was asked to stop and can go on,
-    130 broken off. A reader who leaves, as `head` does, changes nothing; text for which there is no room on its disk is
-    an error, but where it only tells of work.
+    0 done, 1 a check failed, 2 an input cannot be used, 75 a training run was asked to stop and can be resumed,
+    130 interrupted. A reader that closes early, as `head` does, changes nothing; a full disk for the output is an
+    error, except for progress messages.
     """
     with output.own_streams() as streams, _our_warnings(), tidy_end():
         status = _run(arguments)
@@ -66,7 +66,7 @@ def _run(arguments: Sequence[str] | None) -> int:
 
 
 def _require_working_directory() -> None:
-    """See that there is one: relative paths need it, and libraries of PyTorch end the process without."""
+    """Check that the working directory exists: relative paths and libraries of PyTorch need it."""
     try:
         Path.cwd()
     except OSError:
@@ -88,7 +88,7 @@ class _Warning(logging.Formatter):
 
 @contextlib.contextmanager
 def _our_warnings() -> Iterator[None]:
-    """Print warnings of this program, as long as the context lasts; those of libraries are theirs to show."""
+    """Print warnings of this program, as long as the context lasts; those of libraries are left to them."""
     ours, handler = logging.getLogger("vjepa2_ac"), logging.StreamHandler()
     handler.setFormatter(_Warning())
     ours.addHandler(handler)

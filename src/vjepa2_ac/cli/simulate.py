@@ -1,4 +1,4 @@
-"""What can be asked of the simulated arm on the command line? Demonstrations of it, or how well a model steers it."""
+"""The simulate commands: record demonstrations of the simulated arm, or test a model on it in closed loop."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _STEERING = {
 
 
 def add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
-    """Add `simulate` to a parser: it records where its first word is `record`, and steers otherwise."""
+    """Add `simulate` to a parser: it records if its first word is `record`, else it tests a model in closed loop."""
     parser = command(
         commands,
         "simulate",

@@ -1,1 +1,1 @@
-"""How does the program look in a terminal? Progress bars, tables and lines, for each command."""
+"""Console output: progress bars, tables and lines of each command."""

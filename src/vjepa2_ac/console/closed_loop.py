@@ -1,22 +1,22 @@
-"""How does a contest in closed loop look in a terminal?"""
+"""Console output of a closed-loop benchmark."""
 
 from __future__ import annotations
 
 from rich.table import Table
 
-from vjepa2_ac.console.progress import FigureTable
+from vjepa2_ac.console.progress import MetricsTable
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
 from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M
 
-_USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that need no word
+_USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that are not mentioned
 
 
 def contest_table(contest: ClosedLoopBenchmark) -> Table:
-    """Return a row for each who did the task; the intervals are 95 %, over episodes."""
+    """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
     asked, threshold = contest.asked, f"{100 * SUCCESS_M[contest.asked.task]:g} cm"
-    table = FigureTable(
+    table = MetricsTable(
         f"{asked.task} in domain {asked.domain}: {asked.episodes} problems of seed {asked.seed},"
         f" {contest.results[0].steps} steps of {contest.seconds_per_step:.2f} s (95 % interval over episodes)",
     )
@@ -30,13 +30,13 @@ def contest_table(contest: ClosedLoopBenchmark) -> Table:
 
 
 def contest_notes(contest: ClosedLoopBenchmark) -> tuple[str, ...]:
-    """Return what a reader should know of single decisions and commands: a line each, none where all was as usual."""
+    """Return notes on unusual decisions and commands: a line each, none if all was as usual."""
     notes = []
     for result in contest.results:
         unusual = {why: number for why, number in result.why_counts.items() if why not in _USUAL}
         if unusual:
-            told = ", ".join(f"{why} {number}" for why, number in unusual.items())
-            notes.append(f"{result.policy}: of {result.seconds.size} decisions {told}")
+            counts = ", ".join(f"{why} {number}" for why, number in unusual.items())
+            notes.append(f"{result.policy}: of {result.seconds.size} decisions {counts}")
         if result.unreachable.any():
             notes.append(f"{result.policy}: {result.unreachable.sum()} commands led out of the arm's reach")
     return tuple(notes)

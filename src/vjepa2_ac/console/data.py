@@ -1,11 +1,11 @@
-"""How does a data set look in a terminal? The lines and tables of check, index, inspect and calibrate."""
+"""Console output of the data commands: the lines and tables of check, index, inspect and calibrate."""
 
 from __future__ import annotations
 
 from rich.table import Table
 from rich.text import Text
 
-from vjepa2_ac.console.progress import FigureTable, console
+from vjepa2_ac.console.progress import MetricsTable, console
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import Usage
 from vjepa2_ac.data.inspection.finding import Finding
@@ -23,7 +23,7 @@ def print_finding(finding: Finding) -> None:
 
 
 def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
-    """Return what `data index` says."""
+    """Return the output of `data index`."""
     lines = [f"{len(table):,} episodes, {int(table.num_steps.sum()):,} steps; opened in {seconds:.2f} s"]
     if table.problems:
         lines.append(f"{len(table.problems):,} broken episodes; the first: {table.problems[0].where}")
@@ -34,7 +34,7 @@ def index_lines(table: EpisodeTable, watch: Usage, seconds: float) -> list[str]:
 
 
 def inspection_lines(inspection: Inspection) -> list[str]:
-    """Return what `data inspect` says before its table."""
+    """Return the output of `data inspect` before its table."""
     success = inspection.success_share
     known = int((inspection.success >= 0).sum())
     shortest, low, median, high, longest = inspection.length_percentiles
@@ -91,18 +91,18 @@ def motion_table(inspection: Inspection) -> Table:
     """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
     if not inspection.is_pose:
         return _change_table(inspection)
-    table = FigureTable("Motion per model step: 10 / 50 / 90 / 99 %")
+    table = MetricsTable("Motion per model step: 10 / 50 / 90 / 99 %")
     for name in ("stride", "seconds", "moves by (cm)", "turns by (degrees)"):
         table.add_column(name, justify="right")
     for one in inspection.motions:
-        figures = (one.percentiles("moved_cm"), one.percentiles("turned_deg"))
-        cells = (" / ".join(f"{value:.1f}" for value in values) or "no step fits" for values in figures)
+        metrics = (one.percentiles("moved_cm"), one.percentiles("turned_deg"))
+        cells = (" / ".join(f"{value:.1f}" for value in values) or "no step fits" for values in metrics)
         table.add_row(str(one.stride), f"{one.seconds:.2f}", *cells)
     return table
 
 
 def _change_table(inspection: Inspection) -> Table:
-    table = FigureTable("Change per model step: 10 / 50 / 90 / 99 %")
+    table = MetricsTable("Change per model step: 10 / 50 / 90 / 99 %")
     for name in ("stride", "seconds", "the number that changes most (% of its range)"):
         table.add_column(name, justify="right")
     for one in inspection.changes:
@@ -113,7 +113,7 @@ def _change_table(inspection: Inspection) -> Table:
 
 def probe_table(probe: VariantProbe) -> Table:
     """Return the table of `data check --model`."""
-    table = FigureTable("One-step error / persistence of the data, read otherwise")
+    table = MetricsTable("One-step error / persistence of the data, read otherwise")
     for name in ("variant", "error / persistence", "difference"):
         table.add_column(name, justify="left" if name == "variant" else "right")
     for row in rows_of(probe):
@@ -123,13 +123,13 @@ def probe_table(probe: VariantProbe) -> Table:
 
 def calibration_table(calibration: Calibration) -> Table:
     """Return the table of `data calibrate`."""
-    table = FigureTable(
+    table = MetricsTable(
         f"One-step error / persistence on {calibration.split} episodes, {calibration.frames} frames a clip"
         " (95 % interval over episodes)"
     )
     for name in ("stride", "seconds", "error / persistence", "error", "persistence", "moves by", "clips (episodes)"):
         table.add_column(name, justify="right")
-    for one in calibration.tried:
+    for one in calibration.results:
         mark = " <" if one is calibration.best else ""
         moved = "" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
         table.add_row(

@@ -1,4 +1,4 @@
-"""How do the figures of an evaluation look in a terminal?"""
+"""Console output of an evaluation: tables of its metrics."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Literal
 
 from rich.table import Table
 
-from vjepa2_ac.console.progress import FigureTable, LateProgress
+from vjepa2_ac.console.progress import LateProgress, MetricsTable
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.action_score.metrics import AXES, PlanMetrics, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
@@ -18,18 +18,18 @@ from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscapes, PlanningStudy, Sensitivity
 from vjepa2_ac.reports.comparison import Comparison
 
-_MOST_HORIZONS = 8  # rows; of longer clips some are left out, and stand in metrics.json
+_MOST_HORIZONS = 8  # rows; of longer clips some are left out, but are in metrics.json
 _TOP = 5
 
 
 class Stages:
-    """Shows one part of the work after another, each with a bar of its own."""
+    """Shows the parts of the work one after another, each with a progress bar."""
 
     def __init__(self) -> None:
         self._bar: LateProgress | None = None
 
     def __call__(self, title: str) -> Progress:
-        """Begin another part; return what is told how far it is."""
+        """Begin another part; return the function that receives its progress."""
         self._close()
         self._bar = LateProgress(title)
         return self._bar
@@ -41,7 +41,7 @@ class Stages:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         self._close()
 
     def _close(self) -> None:
@@ -51,7 +51,7 @@ class Stages:
 
 
 def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Return the tables of `evaluate`: errors over persistence, then what the models make of their actions."""
+    """Return the tables of `evaluate`: errors over persistence, then the use of the actions."""
     probed = any(model.sensitivity or model.landscapes for model in evaluation.models.values())
     study = evaluation.planning
     return (
@@ -63,7 +63,7 @@ def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 def comparison_table(comparison: Comparison) -> Table:
     """Return the table of `compare`, a row per run."""
-    table = FigureTable(comparison.title)
+    table = MetricsTable(comparison.title)
     table.add_column("run")
     for column in comparison.columns:
         table.add_column(column, justify="right")
@@ -153,10 +153,10 @@ def _plans(evaluation: Evaluation, study: PlanningStudy) -> Table:
     ways = {**found, **ways_of(evaluation)}
     for name in ways:
         table.add_column(name, justify="right")
-    figures = [metrics_of(study, plans) for plans in ways.values()]
+    metrics = [metrics_of(study, plans) for plans in ways.values()]
 
     def row(label: str, of: Callable[[PlanMetrics], Estimate], digits: int = 1) -> None:
-        cells = [_short(of(one), digits, interval=name not in found) for name, one in zip(ways, figures, strict=True)]
+        cells = [_short(of(one), digits, interval=name not in found) for name, one in zip(ways, metrics, strict=True)]
         table.add_row(label, *cells)
 
     row(f"Action Score (best {BEST_SCORE:.0f})", lambda one: one.score)
@@ -177,8 +177,8 @@ def _plans(evaluation: Evaluation, study: PlanningStudy) -> Table:
     return table
 
 
-def _on(name: Literal["axes_cm", "signs"], axis: int, figures: PlanMetrics) -> Estimate:
-    estimates = {"axes_cm": figures.axes_cm, "signs": figures.signs}
+def _on(name: Literal["axes_cm", "signs"], axis: int, metrics: PlanMetrics) -> Estimate:
+    estimates = {"axes_cm": metrics.axes_cm, "signs": metrics.signs}
     return estimates[name][axis]
 
 
@@ -192,7 +192,7 @@ def _clips(number: int) -> str:
 
 
 def _table(title: str, first: str) -> Table:
-    table = FigureTable(title)
+    table = MetricsTable(title)
     table.add_column(first)
     return table
 

@@ -1,4 +1,4 @@
-"""How does a run's memory look in a terminal? The lines of doctor."""
+"""Console output of doctor: the memory of a run, part by part."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ def verdict(needed: int, available: int, gpu: str, knobs: list[str] | None) -> s
 
     Args:
         needed: Bytes at the peak.
-        available: Bytes that the GPU has.
-        gpu: What to call it.
-        knobs: What to turn so that it fits, or None where nothing helps.
+        available: Bytes of the GPU.
+        gpu: Its name.
+        knobs: Changes that make it fit, or None if none do.
     """
     room = f"{gpu}, {available / GIGABYTE:.1f} GB"
     if needed <= available:

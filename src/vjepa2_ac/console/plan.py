@@ -1,18 +1,18 @@
-"""How does a plan look in a terminal?"""
+"""Console output of a plan."""
 
 from __future__ import annotations
 
 import numpy as np
 from rich.table import Table
 
-from vjepa2_ac.console.progress import FigureTable
+from vjepa2_ac.console.progress import MetricsTable
 from vjepa2_ac.planning.decision import PlanResult
 
 
 def plan_table(answer: PlanResult) -> Table:
-    """Return a row for each model step: its action, and where the flange is then."""
+    """Return a row for each model step: its action, and the position of the flange after it."""
     turns = bool(answer.actions[:, 3:6].any())
-    table = FigureTable(f"Plan: {answer.decision.why}")
+    table = MetricsTable(f"Plan: {answer.decision.why}")
     columns = ["step", "dx (cm)", "dy (cm)", "dz (cm)", *["turn (degrees)"] * turns, "gripper"]
     for name in [*columns, "then x, y, z (m)", "gripper"]:
         table.add_column(name, justify="right")

@@ -1,4 +1,4 @@
-"""How does a run look in a terminal? Progress, tables, numbers; plain lines where there is no terminal."""
+"""Console output of a run: progress, tables and numbers; plain lines where there is no terminal."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ _WHOLE = 16  # characters: a longer word of a table, such as a path, may be divi
 
 
 class PlainConsole(Console):
-    """Shows every text as it is: no brackets, colons or control characters of a name or path mean anything.
+    """Shows every text literally: brackets, colons or control characters of a name or path have no meaning.
 
-    Whatever is to have a colour is a `rich.text.Text`.
+    Coloured text is a `rich.text.Text`.
     """
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, soft_wrap=True, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
-        """Return what is printed of a text: of a line, a cell, a title."""
+        """Return the literal form of a text: of a line, a cell, a title."""
         return super().render_str(printable(text), **options)
 
 
-class FigureTable(Table):
-    """A table whose figures and words stay whole: where the terminal is narrow, cells go on below at their spaces.
+class MetricsTable(Table):
+    """A table that does not cut numbers and words: if the terminal is narrow, cells are wrapped at their spaces.
 
     A cell may not squeeze the others, however long it is.
     """
@@ -51,7 +51,7 @@ class FigureTable(Table):
         yield from super().__rich_console__(console, options)
 
     def _widths(self, room: int) -> list[int]:
-        """Return how wide columns are: as wide as they like, or else the widest give way, down to whole words."""
+        """Return the widths of columns: as requested, or else the widest are reduced, down to whole words."""
         texts = [[str(text) for text in (column.header, *column.cells)] for column in self.columns]
         widths = [max(map(cell_len, of_column), default=1) for of_column in texts]
         words = [[cell_len(word) for text in of_column for word in text.split()] for of_column in texts]
@@ -62,13 +62,13 @@ class FigureTable(Table):
 
 
 class _Words(TextColumn):
-    """A column of a bar, of text that is shown as it is."""
+    """A column of a progress bar, of literal text."""
 
     def __init__(self, text_format: str, table_column: Column | None = None) -> None:
         super().__init__(text_format, markup=False, table_column=table_column)
 
     def render(self, task: Task) -> Text:
-        """Return what is shown of a task."""
+        """Return the text of a task."""
         return Text(printable(self.text_format.format(task=task)))
 
 
@@ -78,7 +78,7 @@ if not console.is_terminal:
 
 
 class ProgressBar:
-    """A bar with a few words behind it in a terminal; a line every few seconds elsewhere."""
+    """A progress bar with a short text in a terminal; a line every few seconds elsewhere."""
 
     def __init__(self, title: str, total: int, done: int = 0, line_every_s: float = 10.0) -> None:
         self._title, self._total, self._done, self._line_every_s = title, total, done, line_every_s
@@ -92,7 +92,7 @@ class ProgressBar:
                 BarColumn(bar_width=40 if console.width >= _WIDE else 6, table_column=Column(no_wrap=True)),
                 MofNCompleteColumn(table_column=Column(no_wrap=True)),
                 TimeRemainingColumn(table_column=Column(no_wrap=True)),
-                _Words("{task.fields[words]}", table_column=Column()),  # goes on below where it does not fit
+                _Words("{task.fields[words]}", table_column=Column()),  # wraps if it does not fit
                 console=console,
             )
             self._task = self._bar.add_task(title, total=total, completed=done, words="")
@@ -110,13 +110,13 @@ class ProgressBar:
             self.close()
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
 
     def _left(self) -> str:
-        """Return the time left at the speed so far, in words."""
+        """Return as text the time left at the average speed so far."""
         advanced, remaining = self._done - self._first, self._total - self._done
         if advanced <= 0 or remaining <= 0:
             return ""
@@ -125,7 +125,7 @@ class ProgressBar:
 
 
 class LateProgress:
-    """A bar of work of which one learns how long it is when it begins; none is shown where there is nothing to do."""
+    """A progress bar whose total is known when the work begins; none is shown if there is nothing to do."""
 
     def __init__(self, title: str) -> None:
         self._title = title
@@ -141,14 +141,14 @@ class LateProgress:
             self._bar.advance_to(done)
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
 
 
 class EncodingBar:
-    """A bar of frames that are encoded, with their number per second; begins when it is first told of any."""
+    """A progress bar of encoded frames, with their number per second; begins at the first call."""
 
     def __init__(self) -> None:
         self._bar: ProgressBar | None = None
@@ -162,20 +162,20 @@ class EncodingBar:
         self._bar.advance_to(done, f"{speed:.{1 if speed < 100 else 0}f} frames/s" if done else "")
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         if self._bar is not None:
             self._bar.close()
 
 
 class DownloadProgress:
-    """Shows a download as it grows."""
+    """Shows the progress of a download."""
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._bar: ProgressBar | None = None
 
     def __call__(self, done: int, whole: int | None) -> None:
-        """Show that `done` of `whole` bytes are here; in megabytes."""
+        """Show that `done` of `whole` bytes are downloaded; in megabytes."""
         if self._bar is None:
             self._bar = ProgressBar(f"{self._name} (MB)", (whole or 0) // 10**6)
         self._bar.advance_to(done // 10**6)

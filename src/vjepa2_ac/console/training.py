@@ -20,34 +20,34 @@ class ConsoleReporter:
         self._validation = ""
 
     def note(self, text: str) -> None:
-        """Say something once."""
+        """Show a message."""
         console.print(text)
 
     def indexed(self, done: int, total: int) -> None:
-        """Show how far a data set is looked through."""
+        """Show the progress of indexing."""
         self._looking(done, total)
 
     def encoded(self, done: int, total: int) -> None:
-        """Show how far the latent cache is."""
+        """Show the progress of the latent cache."""
         self._encoding(done, total)
 
     def started(self, done: int, total: int) -> None:
         """Begin the bar."""
         self._bar = ProgressBar("training", total, done)
 
-    def stepped(self, step: int, figures: Mapping[str, float]) -> None:
+    def stepped(self, step: int, metrics: Mapping[str, float]) -> None:
         """Move the bar."""
         if self._bar is not None:
-            speed = figures["samples_per_second"]
-            words = [f"loss {figures['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
-            if "bytes_per_clip" in figures:
-                words.append(f"{figures['bytes_per_clip'] / 1e6:.2f} MB/clip")
-            if figures.get("data_wait_share", 0.0) > _MUCH_WAITING:
-                words.append(f"waits for data {figures['data_wait_share']:.0%} of the time")
+            speed = metrics["samples_per_second"]
+            words = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
+            if "bytes_per_clip" in metrics:
+                words.append(f"{metrics['bytes_per_clip'] / 1e6:.2f} MB/clip")
+            if metrics.get("data_wait_share", 0.0) > _MUCH_WAITING:
+                words.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
             self._bar.advance_to(step, "  ".join(word for word in words if word))
 
     def validated(self, step: int, errors: PredictionErrors) -> None:
-        """Print a line of the validation's figures."""
+        """Print a line of the validation's metrics."""
         one_step = one_step_ratios(errors)
         self._validation = f"error/persistence {one_step['true'].value:.3f}"
         horizons = "  ".join(f"{h}: {r.value:.3f}" for h, r in enumerate(ratios_by_horizon(errors), start=1))
@@ -58,7 +58,7 @@ class ConsoleReporter:
         )
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         self._looking.close()
         self._encoding.close()
         if self._bar is not None:

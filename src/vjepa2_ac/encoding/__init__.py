@@ -1,1 +1,1 @@
-"""How is a cache of latents built? Which frames, how much room, decoded ahead of the encoder, written whole."""
+"""Encoding: building a latent cache, from frame selection and disk space to prefetching, batching and writing."""

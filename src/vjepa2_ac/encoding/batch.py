@@ -1,6 +1,6 @@
-"""Pixels to latents: where is the frozen encoder run, or are the latents of a cache taken instead?
+"""Batches of latents: from the frozen encoder, or from a latent cache.
 
-Training, evaluation and planning see only what comes out of here.
+Training, evaluation and planning only see the result of this module.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from vjepa2_ac.model.network.world_model import WorldModel
 
 @torch.no_grad()
 def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device, chunk: int) -> LatentBatch:
-    """Encode the frames of a batch, each by itself, on the device; a training batch is augmented there, too.
+    """Encode the frames of a batch on the device, each independently; a training batch is also augmented there.
 
-    Of a batch from a latent cache, the latents are taken as they are: `require_encoding` has compared the encoders.
+    Latents of a batch from a cache are used unchanged: `require_encoding` has compared the encoders.
 
     Args:
         world_model: The model whose frozen encoder is used.
-        batch: Clips as the loader gives them: uint8 pixels, cropped, of any size; or latents. If they are on their way
-            to the device, what arrives there is taken.
-        device: Where the model is.
-        chunk: Frames that go through the encoder at once.
+        batch: Clips from the loader: uint8 pixels, cropped, of any size; or latents. If a copy to the device is in
+            progress, its result is used.
+        device: The model's device.
+        chunk: Frames per encoder call.
 
     Raises:
-        InputError: The model wants camera poses and a clip has none; or cached latents are of another width.
+        InputError: The model needs camera poses and a clip has none; or cached latents are of another width.
     """
     batch = _arrived(batch)
     extrinsics = extrinsics_for(world_model, batch)
@@ -50,7 +50,7 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
 
 
 def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
-    """Return what decides the latents that a model makes in a run: by this a cache is found, or refused.
+    """Return what determines the latents of a model in a run: the key by which a cache is found or refused.
 
     Takes as long as it takes to hash the encoder's weights.
     """
@@ -66,7 +66,7 @@ def encoding_of(world_model: WorldModel, config: Config) -> Encoding:
 
 
 def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Config) -> None:
-    """Refuse cached latents that another encoder made, or the same in another precision; other data sets pass.
+    """Refuse cached latents of another encoder or precision; other data sets pass.
 
     Raises:
         InputError: Names what differs.
@@ -76,7 +76,7 @@ def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Conf
 
 
 def _arrived(batch: Batch) -> Batch:
-    """Return the copy of a batch on the device; the batch itself where there is none, or it was taken before."""
+    """Return the copy of a batch on the device; the batch itself if there is none, or it was used before."""
     there = None if batch.on_device is None else batch.on_device()
     return batch if there is None else there
 
@@ -102,12 +102,12 @@ def _latents_of(
 
 
 def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> None:
-    """Refuse data whose states or actions are wider or narrower than what the model takes.
+    """Refuse data whose states or actions do not have the width that the model takes.
 
     Args:
         world_model: The model.
         widths: Of the data.
-        where: What named the model.
+        where: The source of the model's name.
 
     Raises:
         InputError: Names both.
@@ -123,7 +123,7 @@ def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> No
 
 
 def extrinsics_for(world_model: WorldModel, batch: Batch) -> Float32[Tensor, "batch time 6"] | None:
-    """Return the camera poses of a batch if the model wants them.
+    """Return the camera poses of a batch if the model needs them.
 
     Raises:
         InputError: It does, and a clip has none; names the episodes of the batch.

@@ -1,4 +1,4 @@
-"""How is the encoder kept full? Frames of neighbouring episodes share a chunk, and every chunk has one shape."""
+"""Encoder batching: frames of neighbouring episodes share a chunk, and all chunks have the same shape."""
 
 from __future__ import annotations
 
@@ -19,30 +19,29 @@ from vjepa2_ac.episode import Episode, StoredLatents
 
 _CHUNKS_UNDER_WAY = 2  # the device computes one while the one before it is fetched
 
-Encode = Callable[[Float[Tensor, "time 3 size size"]], StoredLatents]  # normalised frames to what is stored of them
+Encode = Callable[[Float[Tensor, "time 3 size size"]], StoredLatents]  # normalised frames to their stored form
 
 
 @dataclass(frozen=True, eq=False)
 class Encoded:
-    """Everything that was wanted of one camera of one episode."""
+    """All encoded frames of one camera of one episode."""
 
     wanted: FramesToEncode
     recording: Episode
     latents: StoredLatents  # of all its frames, on the CPU
-    pictures: UInt8[np.ndarray, "frames side side 3"]
+    small_frames: UInt8[np.ndarray, "frames side side 3"]
 
 
 class Chunks:
-    """Encodes frames a whole chunk at a time, whatever episode they are of.
+    """Encodes frames in whole chunks, across episodes.
 
-    The last chunk is filled up with copies of its last frame: a product of matrices of another shape may round
-    otherwise.
+    The last chunk is padded with copies of its last frame: a matrix product of another shape may round differently.
 
     Args:
-        encode: What is stored of normalised frames, on the device.
+        encode: Encodes normalised frames on the device, to their stored form.
         chunk: Frames of a chunk.
         image_size: Height and width of a frame, in pixels.
-        copies: How frames get to where they are encoded, and latents back.
+        copies: Copies frames to the device, and latents back.
     """
 
     def __init__(self, encode: Encode, *, chunk: int, image_size: int, copies: Copies) -> None:
@@ -52,16 +51,16 @@ class Chunks:
         self._owners: list[FramesToEncode] = []  # of each of these frames
         self._under_way: deque[tuple[Callable[[], StoredLatents], list[FramesToEncode]]] = deque()
         self._done: dict[FramesToEncode, list[StoredLatents]] = {}
-        self._pictures: dict[FramesToEncode, list[np.ndarray]] = {}
-        self._ends: deque[tuple[FramesToEncode, Episode]] = deque()  # all of whose frames are here, in order
+        self._small_frames: dict[FramesToEncode, list[np.ndarray]] = {}
+        self._ends: deque[tuple[FramesToEncode, Episode]] = deque()  # all of whose frames have arrived, in order
         self.frames = 0  # encoded so far
 
     def encoded(self, parts: Iterable[Part | Unreadable]) -> Generator[Encoded | Unreadable, None, None]:
-        """Yield what is complete, in order; of what cannot be read, the error."""
+        """Yield finished episodes in order; for an unreadable one, its error."""
         for part in parts:
             if isinstance(part, Unreadable):
                 self._done.pop(part.wanted, None)
-                self._pictures.pop(part.wanted, None)
+                self._small_frames.pop(part.wanted, None)
                 yield part
                 continue
             self._add(part)
@@ -78,12 +77,12 @@ class Chunks:
         self._inputs.append(pixels_to_input(arrived[None], self._image_size)[0])
         self._owners += [part.wanted] * len(frames)
         self._done.setdefault(part.wanted, [])
-        self._pictures.setdefault(part.wanted, []).append(part.pictures)
+        self._small_frames.setdefault(part.wanted, []).append(part.small_frames)
         if part.is_last:
             self._ends.append((part.wanted, part.recording))
 
     def _start(self) -> None:
-        """Encode one chunk, and let its latents come as soon as they are there."""
+        """Encode one chunk, and start copying its latents."""
         waiting = torch.cat(self._inputs)
         now, owners = waiting[: self._chunk], self._owners[: self._chunk]
         self._inputs, self._owners = [waiting[self._chunk :]], self._owners[self._chunk :]
@@ -94,22 +93,22 @@ class Chunks:
         self.frames += len(owners)
 
     def _complete(self, under_way: int) -> Generator[Encoded, None, None]:
-        """Fetch chunks until so many are under way, and yield what is whole by then."""
+        """Fetch chunks until at most this many are in progress, and yield finished episodes."""
         while len(self._under_way) > under_way:
             fetched, owners = self._under_way.popleft()
-            self._hand_out(fetched().mapped(_unpinned), owners)
+            self._distribute(fetched().mapped(_unpinned), owners)
         while self._ends and self._is_whole(self._ends[0][0]):
             wanted, recording = self._ends.popleft()
-            pictures = np.concatenate(self._pictures.pop(wanted))
-            yield Encoded(wanted, recording, _joined(self._done.pop(wanted)), pictures)
+            small_frames = np.concatenate(self._small_frames.pop(wanted))
+            yield Encoded(wanted, recording, _joined(self._done.pop(wanted)), small_frames)
 
-    def _hand_out(self, latents: StoredLatents, owners: list[FramesToEncode]) -> None:
-        """Give each its own frames of a chunk."""
+    def _distribute(self, latents: StoredLatents, owners: list[FramesToEncode]) -> None:
+        """Distribute the frames of a chunk to their owners."""
         values, scales = latents.values, latents.scales
         start = 0
         for owner, frames in itertools.groupby(owners):
             end = start + len(list(frames))
-            if owner in self._done:  # else it turned out to be unreadable
+            if owner in self._done:  # else it was found to be unreadable
                 own_scales = None if scales is None else scales[start:end]
                 self._done[owner].append(StoredLatents(values[start:end], own_scales))
             start = end
@@ -119,7 +118,7 @@ class Chunks:
 
 
 def _unpinned(tensor: Tensor) -> Tensor:
-    """Return a tensor in memory that may be held for as long as an episode takes: pinned memory is never given back."""
+    """Return a tensor in pageable memory, as it may be held for a whole episode: pinned memory is never given back."""
     return tensor.clone() if tensor.is_pinned() else tensor
 
 

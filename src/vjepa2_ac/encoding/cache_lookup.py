@@ -1,4 +1,4 @@
-"""Which frames of a data set need latents, where are they kept, and how is the data set opened through them?"""
+"""Latent cache lookup: the frames that need latents, the cache folder, and a data set read through it."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from vjepa2_ac.errors import InputError
 
 @dataclass(frozen=True, eq=False)
 class NeededFrames:
-    """The frames of an episode that clips of any split are made of; of every camera."""
+    """The frames of an episode that clips of any split use; of every camera."""
 
-    episode: int  # place in the data set
+    episode: int  # index in the data set
     steps: Int32[np.ndarray, " frames"]  # control steps, ascending
 
 
 def needed_frames(dataset: Dataset) -> Iterator[NeededFrames]:
-    """Yield, in the data set's order, every episode of which clips are made, and the frames that they need.
+    """Yield, in the data set's order, every episode with clips, and the frames that they need.
 
-    Splits do not matter: clips of train, validation and test are all among them. Episodes that are shorter than a clip,
-    left out or wholly idle are not.
+    All splits are included: clips of train, validation and test. Episodes that are shorter than a clip, left out or
+    wholly idle are not.
     """
     starts, config = dataset.starts, dataset.config
     within = np.arange(config.frames) * config.model_stride
@@ -45,21 +45,21 @@ def needed_frames(dataset: Dataset) -> Iterator[NeededFrames]:
 
 
 def key_for(dataset: Dataset, encoding: Encoding) -> CacheKey:
-    """Return the key of the cache of a data set that is open and not itself a cache."""
+    """Return the cache key of an open data set that is not itself a cache."""
     return key_of_cache(dataset.config, dataset.table, encoding)
 
 
 def folder_of(config: DataConfig, key: CacheKey) -> Path:
-    """Return the folder of a cache: in `data.cache_dir`, or with what else is kept on this machine."""
+    """Return the folder of a cache: in `data.cache_dir`, or with the other caches of this machine."""
     parent = cache_folder(config.disk_cache) / "latents" if config.cache_dir is None else Path(config.cache_dir)
     return parent / key.digest
 
 
 def through_cache(dataset: Dataset, encoding: Encoding) -> Dataset:
-    """Return the same data set, with the same clips in the same order, whose clips hold latents from its cache.
+    """Return the same data set, with the same clips in the same order, read as latents from its cache.
 
     Raises:
-        InputError: There is none that was made with this encoder and these settings; says what differs in the others.
+        InputError: There is no cache of this encoder and these settings; says how the others differ.
     """
     key = key_for(dataset, encoding)
     folder = folder_of(dataset.config, key)

@@ -1,4 +1,4 @@
-"""How is a latent cache written? An episode at a time, by any number of processes, and finished by one of them."""
+"""Latent cache writer: one file per episode, written by any number of processes and finalized by one of them."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class CacheWriter:
     """Writes one cache into a folder. Several processes may each have one for the same folder.
 
-    To go on after a kill: leave out the episodes that `has` knows; a file appears under its name when it is whole.
+    To resume after a kill, leave out the episodes that `has` knows: a file gets its final name when it is complete.
     """
 
     folder: Path
@@ -34,7 +34,7 @@ class CacheWriter:
     encoding: Encoding
 
     def has(self, number: int, camera: str) -> bool:
-        """Return whether an episode, by its place in the data set, has been written."""
+        """Return whether an episode, by its index in the data set, has been written."""
         return path_of(self.folder, number, camera).is_file()
 
     def write_episode(
@@ -45,35 +45,35 @@ class CacheWriter:
         *,
         steps: Sequence[int],
         latents: StoredLatents,
-        pictures: UInt8[np.ndarray, "frames height width 3"],
+        small_frames: UInt8[np.ndarray, "frames height width 3"],
     ) -> int:
         """Write an episode of one camera and return the size of its file.
 
         Args:
-            number: Place of the episode in the data set.
+            number: Index of the episode in the data set.
             camera: One of `data.camera`.
-            episode: What the source gave for this camera; no picture of it is read.
+            episode: From the source for this camera; none of its frames is read.
             steps: Control steps of the frames, as `latent_cache.needed_frames` names them.
-            latents: Of these frames, in the type that the key names (`precision.stored` makes them so).
-            pictures: Of these frames, square as the encoder sees them and small; for people to look at.
+            latents: Of these frames, in the type that the key names (`precision.stored` converts them).
+            small_frames: Of these frames, square as the encoder sees them and small; for display.
 
         Raises:
             InputError: The folder cannot be written, or the disk is full.
         """
         layout = EpisodeLayout(self.key.digest, self.key.kind, self.encoding.tokens, self.encoding.dim)
         path = path_of(self.folder, number, camera)
-        return write_episode_file(path, layout, episode, camera, steps=steps, latents=latents, pictures=pictures)
+        return write_episode_file(path, layout, episode, camera, steps=steps, latents=latents, pictures=small_frames)
 
     def finish(
         self, dataset: Dataset, *, broken: Mapping[str, str], frames: int, about: Mapping[str, Any] | None = None
     ) -> Manifest:
-        """Make the cache whole, when every episode of which clips are made is written: one process does this, once.
+        """Finalize the cache, when every episode with clips is written: one process does this, once.
 
         Args:
-            dataset: What was encoded, as it was opened: without a cache.
+            dataset: The encoded data set, opened without a cache.
             broken: Identities of the episodes that could not be read (`data.broken_episodes` is skip), and why.
-            frames: How many were encoded, of all cameras; for people to know.
-            about: Whatever else is worth knowing, as JSON.
+            frames: Number of encoded frames, of all cameras; for information.
+            about: Further information, as JSON.
 
         Raises:
             InputError: The folder cannot be written.
@@ -109,7 +109,7 @@ class CacheWriter:
         """Return the size of every file, a column for each camera.
 
         Raises:
-            ValueError: One that clips need is not there, and its episode is not broken.
+            ValueError: One that clips need is missing, and its episode is not broken.
         """
         found = [dataset.table.find(name) for name in broken]
         unread = np.array([place for place in found if place is not None], np.int64)
@@ -118,9 +118,9 @@ class CacheWriter:
             column = self._sizes(len(dataset.table), camera)
             column[unread] = 0
             needed = dataset.starts.episodes
-            lacking = np.setdiff1d(needed[column[needed] == 0], unread)
-            if len(lacking):
-                raise ValueError(f"{len(lacking)} episodes are not written: {lacking[:10].tolist()}")
+            missing = np.setdiff1d(needed[column[needed] == 0], unread)
+            if len(missing):
+                raise ValueError(f"{len(missing)} episodes are not written: {missing[:10].tolist()}")
             sizes[size_column(place)] = column
         return sizes
 

@@ -1,4 +1,4 @@
-"""How much room does a cache of latents take, and is it there? Asked before the first frame is encoded."""
+"""Disk space of a latent cache: how much is needed, and is it free? Checked before the first frame is encoded."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from pathlib import Path
 from vjepa2_ac.errors import InputError
 
 GIGABYTE = 10**9
-FRAMES_AT_ONCE = 64  # that are decoded in one go: a run of a video, and 180 MB of 720p at most
-PICTURE_SIDE = 192  # pixels, at most, of the small pictures for people to look at
+FRAMES_AT_ONCE = 64  # decoded in one go: a run of a video, and 180 MB of 720p at most
+SMALL_FRAME_SIDE = 192  # pixels, at most, of the small frames for display
 
 
 @dataclass(frozen=True)
 class CacheSize:
-    """The size of a cache, and of what of it is still to be written."""
+    """The size of a cache, and of its part that is not written yet."""
 
     frames: int  # of the whole cache
     frames_left: int
-    bytes_per_frame: int  # with its small picture
+    bytes_per_frame: int  # with its small frame
     hours: float  # of robot data that clips come from
 
     @property
@@ -29,7 +29,7 @@ class CacheSize:
 
     @property
     def bytes_left(self) -> int:
-        """That are still to be written."""
+        """Of the part that is not written yet."""
         return self.frames_left * self.bytes_per_frame
 
     @property
@@ -44,31 +44,31 @@ class CacheSize:
         )
 
 
-def picture_side(image_size: int) -> int:
-    """Return height and width of the small pictures of a model's frames."""
-    return min(PICTURE_SIDE, image_size)
+def small_frame_side(image_size: int) -> int:
+    """Return height and width of the small frames of a model's frames."""
+    return min(SMALL_FRAME_SIDE, image_size)
 
 
-def picture_bytes(image_size: int) -> int:
-    """Return what a small picture takes as JPEG, about, with a share of the states."""
-    return 1000 + picture_side(image_size) ** 2 // 3
+def small_frame_bytes(image_size: int) -> int:
+    """Return the approximate size of a small frame as JPEG, with a share of the states."""
+    return 1000 + small_frame_side(image_size) ** 2 // 3
 
 
 def free_bytes(folder: Path) -> int:
-    """Return how much room there is on the disk of a folder, which need not be there yet."""
+    """Return the free space on the disk of a folder, which need not exist yet."""
     return shutil.disk_usage(next(there for there in [folder, *folder.parents] if there.exists())).free
 
 
 def require_space(room: CacheSize, folder: Path, *, smaller: tuple[str, ...]) -> None:
-    """Refuse to begin what the disk cannot take.
+    """Refuse to start if the disk has too little space.
 
     Args:
         room: What is to be written.
-        folder: Where to.
-        smaller: Knobs that would make it smaller.
+        folder: The folder to write to.
+        smaller: Knobs that would reduce the size.
 
     Raises:
-        InputError: Says how much there is, how much is needed, and the ways out.
+        InputError: Says how much is free, how much is needed, and what to do.
     """
     free = free_bytes(folder)
     if room.bytes_left <= free:

@@ -1,6 +1,7 @@
-"""How is a data set encoded before it is trained on, by itself or at the start of a run?
+"""Encoding of a whole data set before training, as a command or at the start of a run.
 
-By itself it needs no word between processes: each has its share of the episodes, and a file says when one is done.
+As a command, processes do not communicate: each encodes its share of the episodes and marks each finished one by a
+file.
 """
 
 from __future__ import annotations
@@ -22,9 +23,9 @@ from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.cache_lookup import folder_of, key_for
 from vjepa2_ac.encoding.cache_writer import CacheWriter
 from vjepa2_ac.encoding.disk_space import GIGABYTE, free_bytes, require_space
-from vjepa2_ac.encoding.pipeline import EncoderAtWork, build
+from vjepa2_ac.encoding.pipeline import EncoderOnDevice, build
 from vjepa2_ac.encoding.repair import describe, missing_files, restart
-from vjepa2_ac.encoding.workload import Workload, WorkloadShare, take_folder
+from vjepa2_ac.encoding.workload import Workload, WorkloadShare, claim_folder
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -35,7 +36,7 @@ Note = Callable[[str], None]
 
 @dataclass(frozen=True)
 class EncodedSet:
-    """What became of a cache."""
+    """The result of encoding a cache."""
 
     folder: Path
     manifest: Manifest | None  # None: other processes are still at work
@@ -53,13 +54,13 @@ def encode_config(
 
     Args:
         config: The data, the model whose encoder is used, device and precision.
-        note: Told what a person should know.
-        out: The folder of the cache; None: where `data.cache` looks for it.
-        indexed: Told how far the data set is looked through.
-        progress: Told (done, total) in frames.
+        note: Receives messages for the user.
+        out: The folder of the cache; None: the one of `data.cache`.
+        indexed: Called with the progress of indexing.
+        progress: Called with (done, total) in frames.
 
     Raises:
-        InputError: Something cannot be used, or there is no room for it.
+        InputError: Some input cannot be used, or the disk space is too small.
     """
     require_encodable(config)
     device = computing_device(config.training)
@@ -67,28 +68,26 @@ def encode_config(
     model = load_base(config.model, seed=config.seed)
     writer = writer_for(config, dataset, model, out)
     if is_whole(writer.folder):
-        take_folder(writer)
-        if not (lacking := missing_files(dataset, writer)):
+        claim_folder(writer)
+        if not (missing := missing_files(dataset, writer)):
             note(f"Everything is encoded already, in {writer.folder}")
             return EncodedSet(writer.folder, read_manifest(writer.folder))
-        note(f"{describe(lacking)}. It is encoded again.")
-        restart(writer, lacking)
+        note(f"{describe(missing)}. It is encoded again.")
+        restart(writer, missing)
     share = WorkloadShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
-    at_work = encoder_at_work(config, model, device)
+    at_work = encoder_on_device(config, model, device)
     return EncodedSet(writer.folder, encode_share(config, dataset, writer, at_work, share, note, progress))
 
 
 def require_encodable(config: Config) -> None:
-    """Refuse a config of which no cache can be made, before anything is opened.
+    """Refuse a config that cannot have a cache, before anything is opened.
 
     Raises:
         InputError: The data are a cache, the stride is not known, or clips are augmented.
     """
     data = config.data
     if data.source == "latents":
-        raise InputError(
-            where="data.source", found="latents: they are encoded already", needed="a data set of pictures"
-        )
+        raise InputError(where="data.source", found="latents: they are encoded already", needed="a data set of frames")
     if data.stride == "auto":
         raise InputError(
             where="data.stride",
@@ -106,28 +105,28 @@ def require_encodable(config: Config) -> None:
 
 
 def writer_for(config: Config, dataset: Dataset, model: WorldModel, out: Path | None = None) -> CacheWriter:
-    """Return what writes the cache of a data set that is open, made with the encoder of this model."""
+    """Return the cache writer of an open data set, for the encoder of this model."""
     encoding = encoding_of(model, config)
     key = key_for(dataset, encoding)
     return CacheWriter(folder_of(config.data, key) if out is None else out, key, encoding)
 
 
-def encoder_at_work(config: Config, model: WorldModel, device: torch.device) -> EncoderAtWork:
-    """Put the encoder of a model on a device, and it alone."""
+def encoder_on_device(config: Config, model: WorldModel, device: torch.device) -> EncoderOnDevice:
+    """Move the encoder of a model, and only the encoder, to a device."""
     model.present_encoder.to(device)
-    return EncoderAtWork(model, device, partial(autocast, config.training, device), config.model.encode_chunk)
+    return EncoderOnDevice(model, device, partial(autocast, config.training, device), config.model.encode_chunk)
 
 
 def encode_share(
     config: Config,
     dataset: Dataset,
     writer: CacheWriter,
-    encoder: EncoderAtWork,
+    encoder: EncoderOnDevice,
     share: WorkloadShare,
     note: Note,
     progress: Progress | None = None,
 ) -> Manifest | None:
-    """Say what is to be done, see that there is room, and do the share of one process.
+    """Report the work, check the disk space, and encode the share of one process.
 
     Raises:
         InputError: As `encode_config`.
@@ -136,20 +135,20 @@ def encode_share(
     free = free_bytes(writer.folder) / GIGABYTE
     note(f"Encoding {config.data.path}: {work.room} as {config.data.cache_dtype}")
     note(f"The latents go into {writer.folder}, with {free:.4g} GB free on its disk")
-    if work.left_of_all < work.frames:
-        note(f"{work.frames - work.left_of_all:,} frames are there already; {work.left_of_all:,} are left")
-    require_space(work.room, writer.folder, smaller=smaller_caches(config))
-    take_folder(writer)
+    if work.left_in_total < work.frames:
+        note(f"{work.frames - work.left_in_total:,} frames are there already; {work.left_in_total:,} are left")
+    require_space(work.room, writer.folder, smaller=size_reducing_knobs(config))
+    claim_folder(writer)
     return build(work, encoder, threads=max(1, config.data.workers), progress=progress)
 
 
 def duration(frames: int, per_second: float) -> str:
-    """Return how long frames take, in words."""
+    """Return as text how long encoding takes."""
     return str(timedelta(seconds=round(frames / per_second)))
 
 
-def smaller_caches(config: Config) -> tuple[str, ...]:
-    """Return the knobs that would make a cache smaller."""
+def size_reducing_knobs(config: Config) -> tuple[str, ...]:
+    """Return the knobs that would reduce the size of a cache."""
     data = config.data
     knobs = [] if data.cache_dtype == "int8" else ["data.cache_dtype: int8"]
     if data.start_every % data.model_stride:

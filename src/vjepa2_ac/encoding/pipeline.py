@@ -1,7 +1,7 @@
-"""How are the latents of a data set written? Decoded ahead, encoded a chunk at a time, an episode to a file.
+"""The encoding pipeline: prefetched frames, encoded in chunks, written as one file per episode.
 
-An episode counts when its file has its name: whoever is killed loses the ones under way. The process that finds nothing
-lacking makes the cache whole.
+An episode is complete once its file has its final name: a process that is killed loses only the episodes in progress.
+The process that finds nothing missing finalizes the cache.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.data.sources.latents.dtypes import pack_latents
 from vjepa2_ac.data.sources.latents.manifest import Manifest
 from vjepa2_ac.encoding.batching import Chunks, Encode, Encoded
-from vjepa2_ac.encoding.disk_space import picture_side
+from vjepa2_ac.encoding.disk_space import small_frame_side
 from vjepa2_ac.encoding.prefetch import Unreadable, prefetched
 from vjepa2_ac.encoding.workload import Workload, broken_in, forget_broken, note_broken
 from vjepa2_ac.episode import Progress, StoredLatents
 from vjepa2_ac.model.network.world_model import WorldModel
 
-_WRITES_UNDER_WAY = 2  # files: bounds the memory
+_WRITES_UNDER_WAY = 2  # files: limits the memory
 
 Autocast = Callable[[], contextlib.AbstractContextManager[object]]
 
 
 @dataclass(frozen=True, eq=False)
-class EncoderAtWork:
-    """The frozen encoder of a model that is on its device, and how it computes."""
+class EncoderOnDevice:
+    """The frozen encoder of a model on its device, and its settings."""
 
     world_model: WorldModel
     device: torch.device
@@ -48,21 +48,23 @@ class EncoderAtWork:
             return self.world_model.encode(inputs[None], chunk=self.chunk)[0]
 
 
-def build(work: Workload, encoder: EncoderAtWork, *, threads: int, progress: Progress | None = None) -> Manifest | None:
-    """Encode what this process has to, and make the cache whole if nothing is lacking by then.
+def build(
+    work: Workload, encoder: EncoderOnDevice, *, threads: int, progress: Progress | None = None
+) -> Manifest | None:
+    """Encode the share of this process, and finalize the cache if nothing is missing by then.
 
     Args:
-        work: What is to be done.
-        encoder: What encodes.
-        threads: That decode pictures ahead of it.
-        progress: Told (done, total) in frames of this process.
+        work: The work.
+        encoder: The encoder.
+        threads: Number of threads that decode frames in advance.
+        progress: Called with (done, total) in frames of this process.
 
     Returns:
-        What the cache says of itself; None while other processes are at work.
+        The manifest of the cache; None while other processes are still encoding.
 
     Raises:
         InputError: An episode cannot be read and `data.broken_episodes` does not skip it, or too many are; or the
-            folder cannot be written. What was written stays.
+            folder cannot be written. Written files stay.
     """
     folder, dataset = work.writer.folder, work.dataset
     for episode in sorted({one.episode for one in work.left}):
@@ -70,7 +72,7 @@ def build(work: Workload, encoder: EncoderAtWork, *, threads: int, progress: Pro
     for frames in _written(work, encoder, threads) if work.left else ():
         if progress is not None:
             progress(frames, work.frames_left)
-    if work.lacks:
+    if work.is_incomplete:
         return None
     broken = broken_in(folder)
     for name, reason in broken.items():
@@ -78,10 +80,10 @@ def build(work: Workload, encoder: EncoderAtWork, *, threads: int, progress: Pro
     return work.writer.finish(dataset, broken=broken, frames=work.frames)
 
 
-def _written(work: Workload, encoder: EncoderAtWork, threads: int) -> Iterator[int]:
-    """Write episode after episode; yield how many frames are done, at first 0; those of unreadable ones count."""
+def _written(work: Workload, encoder: EncoderOnDevice, threads: int) -> Iterator[int]:
+    """Write episode after episode; yield the number of finished frames, first 0; those of unreadable ones count."""
     yield 0
-    side = picture_side(encoder.world_model.image_size)
+    side = small_frame_side(encoder.world_model.image_size)
     chunks = Chunks(
         _storing(work, encoder),
         chunk=encoder.chunk,
@@ -113,7 +115,7 @@ def _waited_for(under_way: deque[tuple[Future[int], int]]) -> int:
     return frames
 
 
-def _storing(work: Workload, encoder: EncoderAtWork) -> Encode:
+def _storing(work: Workload, encoder: EncoderOnDevice) -> Encode:
     def encode(inputs: Tensor) -> StoredLatents:
         return pack_latents(encoder.latents(inputs), work.writer.key.kind)
 
@@ -124,19 +126,19 @@ def _write(work: Workload, one: Encoded) -> int:
     wanted = one.wanted
     return work.writer.write_episode(
         wanted.episode, wanted.camera, one.recording,
-        steps=wanted.steps.tolist(), latents=one.latents, pictures=one.pictures,
+        steps=wanted.steps.tolist(), latents=one.latents, small_frames=one.small_frames,
     )  # fmt: skip
 
 
 def _leave_out(work: Workload, one: Unreadable) -> None:
-    """Do what `data.broken_episodes` says, and note it where the other processes see it."""
+    """Apply `data.broken_episodes`, and record the episode for the other processes."""
     work.dataset.leave_out(one.wanted.episode, one.error)
     name = work.dataset.table.identity(one.wanted.episode)
     note_broken(work.writer.folder, one.wanted.episode, name, str(one.error))
 
 
-def frames_per_second(encoder: EncoderAtWork) -> float:
-    """Return how fast a chunk of black frames is encoded; where a device warms up, by one that does not count."""
+def frames_per_second(encoder: EncoderOnDevice) -> float:
+    """Measure the encoding speed on a chunk of black frames, after a warm-up chunk where a device needs one."""
     size = encoder.world_model.image_size
     black = torch.zeros(encoder.chunk, 3, size, size, device=encoder.device)
     if encoder.device.type != "cpu":

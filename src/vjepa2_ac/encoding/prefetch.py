@@ -1,4 +1,4 @@
-"""How are pictures decoded before the encoder asks for them? By threads, a part of an episode at a time, in order."""
+"""Frame prefetching for the encoder: threads decode parts of episodes in order."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.remote import UnreachableError
 
-_PARTS_AHEAD = 2  # for each thread: one that is made, and one that is ready
+_PREFETCHED_PARTS = 2  # per thread: one in progress, and one ready
 
 
 @dataclass(frozen=True, eq=False)
 class FramesToEncode:
-    """Frames that are to be encoded, of one camera of one episode."""
+    """Frames to encode, of one camera of one episode."""
 
     episode: int  # index into the data set's table
     camera: str
@@ -34,18 +34,18 @@ class FramesToEncode:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Some neighbouring frames of what was wanted, cropped; the last one ends it."""
+    """Some neighbouring requested frames, cropped; the last part ends the request."""
 
     wanted: FramesToEncode
     recording: Episode
     frames: UInt8[np.ndarray, "frames height width 3"]
-    pictures: UInt8[np.ndarray, "frames side side 3"]  # the same, small, for people to look at
+    small_frames: UInt8[np.ndarray, "frames side side 3"]  # the same, small, for display
     is_last: bool
 
 
 @dataclass(frozen=True, eq=False)
 class Unreadable:
-    """Something that was wanted and cannot be read; there may have been parts of it before."""
+    """A request that cannot be read; parts of it may have come before."""
 
     wanted: FramesToEncode
     error: InputError
@@ -54,16 +54,16 @@ class Unreadable:
 def prefetched(
     dataset: Dataset, wanted: Iterable[FramesToEncode], *, threads: int, side: int
 ) -> Generator[Part | Unreadable, None, None]:
-    """Yield the frames in the order in which they are wanted, while threads decode what comes next.
+    """Yield frames in the requested order, while threads decode the next ones.
 
     Args:
-        dataset: Where they come from.
-        wanted: Which ones.
-        threads: How many decode at once.
-        side: Height and width of the small pictures, in pixels.
+        dataset: Their source.
+        wanted: The requests.
+        threads: Number of decoding threads.
+        side: Height and width of the small frames, in pixels.
 
     Raises:
-        UnreachableError: It is not the episode's fault.
+        UnreachableError: A failure of the connection, not of the episode.
     """
     pool = ThreadPoolExecutor(threads, thread_name_prefix="decode")
     waiting: deque[Future[Part | Unreadable]] = deque()
@@ -71,7 +71,7 @@ def prefetched(
     failed: FramesToEncode | None = None
     try:
         while True:
-            while len(waiting) < threads * _PARTS_AHEAD and (task := next(tasks, None)) is not None:
+            while len(waiting) < threads * _PREFETCHED_PARTS and (task := next(tasks, None)) is not None:
                 waiting.append(pool.submit(task))
             if not waiting:
                 return
@@ -86,7 +86,7 @@ def prefetched(
 
 @dataclass(frozen=True, eq=False)
 class _Task:
-    """One part that is to be read."""
+    """One part to read."""
 
     source: _Recording
     first: int
@@ -119,7 +119,7 @@ class _Recording:
         self._episode: Episode | InputError | None = None
 
     def opened(self) -> Episode:
-        """Return the episode; opening it fails for all parts alike."""
+        """Return the episode; a failure to open it applies to all parts."""
         with self._lock:
             if self._episode is None:
                 try:
@@ -140,7 +140,7 @@ class _Recording:
 
 
 def _small(frames: UInt8[np.ndarray, "frames height width 3"], side: int) -> UInt8[np.ndarray, "frames side side 3"]:
-    """Return pictures squashed to a square, as the encoder sees them."""
+    """Return frames resized to a square, as the encoder sees them."""
     pixels = torch.from_numpy(np.ascontiguousarray(frames)).permute(0, 3, 1, 2)
     small = torch.nn.functional.interpolate(
         pixels, size=(side, side), mode="bilinear", align_corners=False, antialias=True

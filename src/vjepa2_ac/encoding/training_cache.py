@@ -1,4 +1,4 @@
-"""Do the clips of a run come from a latent cache? It is encoded on first use, asked for, or taken where it is there."""
+"""The latent cache of a run: encoded on first use, required, or used if present, as the config requests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vjepa2_ac.encoding.batch import require_same_encoder
 from vjepa2_ac.encoding.cache_lookup import through_cache
 from vjepa2_ac.encoding.cache_writer import CacheWriter
 from vjepa2_ac.encoding.disk_space import require_space
-from vjepa2_ac.encoding.encode_dataset import duration, encode_share, encoder_at_work, smaller_caches, writer_for
+from vjepa2_ac.encoding.encode_dataset import duration, encode_share, encoder_on_device, size_reducing_knobs, writer_for
 from vjepa2_ac.encoding.pipeline import frames_per_second
 from vjepa2_ac.encoding.repair import MissingFiles, describe, missing_files, restart
 from vjepa2_ac.encoding.workload import Workload, WorkloadShare
@@ -33,35 +33,35 @@ def with_latents(
     encoding: Progress | None = None,
     check_only: bool = False,
 ) -> Dataset:
-    """Return the data set of a run, its clips from the latent cache where the config has one.
+    """Return the data set of a run, with its clips from the latent cache if the config has one.
 
     Args:
-        config: The run.
-        dataset: As it was opened, at its stride.
-        model: Whose encoder is asked.
+        config: The config of the run.
+        dataset: The open data set, at its stride.
+        model: The model whose encoder is used.
         accelerator: Its processes share the encoding.
-        note: Told what a person should know.
-        encoding: Told (done, total) in frames of this process.
-        check_only: Encode nothing: say what would be, and leave the clips as pictures.
+        note: Receives messages for the user.
+        encoding: Called with (done, total) in frames of this process.
+        check_only: Encode nothing: report what would be encoded, and leave the clips as frames.
 
     Raises:
-        InputError: The cache is another encoder's, is required and not there, or cannot be made.
+        InputError: The cache is another encoder's, is required and missing, or cannot be made.
     """
     if config.data.source == "latents" or config.data.cache == "off":
         require_same_encoder(model, dataset, config)
         return dataset
     writer = writer_for(config, dataset, model)
-    if lacking := _lacking(config, dataset, accelerator, writer):
-        note(f"{describe(lacking)}. " + ("A run would encode it again." if check_only else "It is encoded again."))
+    if missing := _missing(config, dataset, accelerator, writer):
+        note(f"{describe(missing)}. " + ("A run would encode it again." if check_only else "It is encoded again."))
         if check_only:
             return dataset
         if accelerator.is_main_process:
-            restart(writer, lacking)
+            restart(writer, missing)
     if not broadcast_object(accelerator, is_whole(writer.folder)):
         if config.data.cache == "require":
-            return through_cache(dataset, writer.encoding)  # which says what is there instead
+            return through_cache(dataset, writer.encoding)  # which reports what was found instead
         if check_only:
-            _say_what_would_be(config, dataset, model, accelerator, writer, note)
+            _report_encoding(config, dataset, model, accelerator, writer, note)
             return dataset
         _encode(config, dataset, model, accelerator, writer, note, encoding)
     note(f"Latents come from {writer.folder}: the encoder is not needed")
@@ -69,7 +69,7 @@ def with_latents(
 
 
 def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -> Dataset:
-    """Return a data set with its clips from the latent cache if there is a whole one of this encoder, else as it is.
+    """Return a data set with its clips from a finished latent cache of this encoder if there is one, else unchanged.
 
     Raises:
         InputError: The data set is itself a cache, of another encoder.
@@ -81,8 +81,8 @@ def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -
     return through_cache(dataset, writer.encoding) if is_whole(writer.folder) else dataset
 
 
-def _lacking(config: Config, dataset: Dataset, accelerator: Accelerator, writer: CacheWriter) -> list[MissingFiles]:
-    """Return what a cache lacks that is whole by its own account: the first process looks, for all of them."""
+def _missing(config: Config, dataset: Dataset, accelerator: Accelerator, writer: CacheWriter) -> list[MissingFiles]:
+    """Return what a finished cache lacks: the first process checks, for all of them."""
     looks = accelerator.is_main_process and config.data.cache == "auto" and is_whole(writer.folder)
     return broadcast_object(accelerator, missing_files(dataset, writer) if looks else [])
 
@@ -102,7 +102,7 @@ def _encode(
         InputError: They do not see the same folder; or as `encode_share`.
     """
     share = WorkloadShare(accelerator.process_index, accelerator.num_processes)
-    encoder = encoder_at_work(config, model, accelerator.device)
+    encoder = encoder_on_device(config, model, accelerator.device)
     encode_share(config, dataset, writer, encoder, share, note, encoding)
     accelerator.wait_for_everyone()
     if not is_whole(writer.folder):
@@ -114,7 +114,7 @@ def _encode(
         )
 
 
-def _say_what_would_be(
+def _report_encoding(
     config: Config,
     dataset: Dataset,
     model: WorldModel,
@@ -123,10 +123,10 @@ def _say_what_would_be(
     note: Callable[[str], None],
 ) -> None:
     work = Workload.of(dataset, writer, WorkloadShare())
-    require_space(work.room, writer.folder, smaller=smaller_caches(config))
-    speed = frames_per_second(encoder_at_work(config, model, accelerator.device)) * accelerator.num_processes
+    require_space(work.room, writer.folder, smaller=size_reducing_knobs(config))
+    speed = frames_per_second(encoder_on_device(config, model, accelerator.device)) * accelerator.num_processes
     note(
-        f"A run would first encode {work.left_of_all:,} of {work.room} as {config.data.cache_dtype}, into"
+        f"A run would first encode {work.left_in_total:,} of {work.room} as {config.data.cache_dtype}, into"
         f" {writer.folder}. At the {speed:.3g} frames/s of one chunk just timed that takes"
-        f" {duration(work.left_of_all, speed)}"
+        f" {duration(work.left_in_total, speed)}"
     )

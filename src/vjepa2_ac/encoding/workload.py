@@ -1,4 +1,4 @@
-"""What of a cache is still to be written, and by which process?"""
+"""The work left in a latent cache, and its division among processes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vjepa2_ac.data.sources.latents.dtypes import bytes_per_frame
 from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest
 from vjepa2_ac.encoding.cache_lookup import needed_frames
 from vjepa2_ac.encoding.cache_writer import CacheWriter
-from vjepa2_ac.encoding.disk_space import CacheSize, picture_bytes
+from vjepa2_ac.encoding.disk_space import CacheSize, small_frame_bytes
 from vjepa2_ac.encoding.prefetch import FramesToEncode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import read_json_object, record_of
@@ -26,7 +26,7 @@ _BROKEN, _KEY = "broken", "key.json"
 
 @dataclass(frozen=True)
 class WorkloadShare:
-    """The place of a process among those that encode."""
+    """The index of a process among those that encode."""
 
     rank: int = 0
     processes: int = 1
@@ -34,27 +34,27 @@ class WorkloadShare:
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """A cache that is to be written, and what of it this process does: every episode belongs to one process."""
+    """A cache to write, and the share of this process: every episode belongs to one process."""
 
     dataset: Dataset
     writer: CacheWriter
     frames: int  # of the whole cache, of all cameras
     left: tuple[FramesToEncode, ...]  # of this process
-    left_of_all: int  # frames, of all processes
+    left_in_total: int  # frames, of all processes
 
     @classmethod
     def of(cls, dataset: Dataset, writer: CacheWriter, share: WorkloadShare) -> Workload:
-        """Look at what is there: an episode whose file is there is not encoded again; a broken one is tried again."""
-        frames, left_of_all, left = 0, 0, []
+        """Compare with the existing files: written episodes are not encoded again; broken ones are retried."""
+        frames, left_in_total, left = 0, 0, []
         for place, needed in enumerate(needed_frames(dataset)):
             for camera in dataset.config.cameras:
                 frames += len(needed.steps)
                 if writer.has(needed.episode, camera):
                     continue
-                left_of_all += len(needed.steps)
+                left_in_total += len(needed.steps)
                 if place % share.processes == share.rank:
                     left.append(FramesToEncode(needed.episode, camera, needed.steps))
-        return cls(dataset, writer, frames, tuple(left), left_of_all)
+        return cls(dataset, writer, frames, tuple(left), left_in_total)
 
     @property
     def frames_left(self) -> int:
@@ -63,16 +63,16 @@ class Workload:
 
     @property
     def room(self) -> CacheSize:
-        """What the cache takes on the disk."""
+        """The size of the cache on disk."""
         writer, table = self.writer, self.dataset.table
         steps = int(table.num_steps[np.unique(self.dataset.starts.episode)].sum())
         per_frame = bytes_per_frame(writer.encoding.tokens, writer.encoding.dim, writer.key.kind)
-        per_frame += picture_bytes(writer.encoding.image_size)
-        return CacheSize(self.frames, self.left_of_all, per_frame, steps / self.dataset.control_rate_hz / 3600)
+        per_frame += small_frame_bytes(writer.encoding.image_size)
+        return CacheSize(self.frames, self.left_in_total, per_frame, steps / self.dataset.control_rate_hz / 3600)
 
     @property
-    def lacks(self) -> bool:
-        """Whether, by now, an episode is neither written nor noted as broken, by whatever process."""
+    def is_incomplete(self) -> bool:
+        """Whether an episode is currently neither written nor recorded as broken, by any process."""
         cameras, broken = self.dataset.config.cameras, broken_in(self.writer.folder)
         return any(
             not self.writer.has(needed.episode, camera)
@@ -82,11 +82,11 @@ class Workload:
         )
 
 
-def take_folder(writer: CacheWriter) -> None:
-    """See that a folder is for this cache and no other, whole or begun.
+def claim_folder(writer: CacheWriter) -> None:
+    """Check that a folder belongs to this cache, finished or not, or is new.
 
     Raises:
-        InputError: It holds another one, and what differs; or it cannot be written.
+        InputError: It holds another cache, and how it differs; or it cannot be written.
     """
     path = writer.folder / _KEY
     there = read_manifest(writer.folder).cache_key if is_whole(writer.folder) else _begun(path)
@@ -104,7 +104,7 @@ def take_folder(writer: CacheWriter) -> None:
 
 
 def _require_empty(folder: Path) -> None:
-    """Keep a cache out of a folder of other things, such as that of a run; `.` and what other processes begin pass."""
+    """Refuse a folder with other contents, such as that of a run; hidden files and this cache's own files pass."""
     others = sorted(path.name for path in folder.iterdir() if path.name[0] != ".") if folder.is_dir() else []
     ours = (_KEY, _BROKEN, "episodes")
     strange = [name for name in others if not name.startswith(ours)]
@@ -118,7 +118,7 @@ def _require_empty(folder: Path) -> None:
 
 
 def _begun(path: Path) -> CacheKey | None:
-    """Return the key of a cache that was begun."""
+    """Return the key of an unfinished cache."""
     try:
         return CacheKey(read_json_object(path, fix="Delete this folder"))
     except (FileNotFoundError, NotADirectoryError):
@@ -128,19 +128,19 @@ def _begun(path: Path) -> CacheKey | None:
 
 
 def note_broken(folder: Path, episode: int, name: str, reason: str) -> None:
-    """Note, for the process that finishes the cache, that an episode cannot be read."""
+    """Record, for the process that finalizes the cache, that an episode cannot be read."""
     with storage.user_can_write(folder):
         storage.write_atomically(_note_of(folder, episode), json.dumps({"name": name, "reason": reason}) + "\n")
 
 
 def forget_broken(folder: Path, episode: int) -> None:
-    """Take back what was noted of an episode: it is tried again."""
+    """Delete the record of a broken episode, so that it is retried."""
     with storage.user_can_write(folder):
         _note_of(folder, episode).unlink(missing_ok=True)
 
 
 def broken_in(folder: Path) -> Mapping[str, str]:
-    """Return the episodes that were noted, by whatever process, and why."""
+    """Return the recorded episodes of all processes, and the reasons."""
     paths = sorted((folder / _BROKEN).glob("*.json"))
     notes = [record_of(_Note, read_json_object(path), where=str(path), fix="Delete this file") for path in paths]
     return {note.name: note.reason for note in notes}

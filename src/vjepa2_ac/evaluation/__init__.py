@@ -1,1 +1,1 @@
-"""How good is it?"""
+"""Evaluation: how good is a model on held-out episodes?"""

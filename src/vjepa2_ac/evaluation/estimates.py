@@ -1,4 +1,4 @@
-"""What do the measured arrays say? Means and ratios with their intervals over episodes; the base's and ours paired."""
+"""Estimates from measured arrays: means and ratios with intervals over episodes, paired between base and run."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def one_step_over_persistence(
 
 
 def gain_over(evaluation: Evaluation, name: str, other: str, mode: Mode = "rollout", metric: Metric = "l1") -> Curve:
-    """Return by which share the error of a model is smaller than another's by horizon, paired: 0.18 is 18 % better."""
+    """Return the share by which a model's error is smaller than another's, by horizon, paired: 0.18 is 18 % better."""
     pair = [errors_of(evaluation, each, mode).of(metric) for each in (name, other)]
     return bootstrapped(lambda sums: 1 - sums[0] / sums[1], np.stack(pair), evaluation.clips.episode_ids)
 
@@ -62,17 +62,17 @@ def difference_to(
 
 
 def cost_of_actions(evaluation: Evaluation, name: str, actions: Actions, metric: Metric = "l1") -> Estimate:
-    """Return by which share the teacher-forced error grows with zero or shuffled actions, paired; 0: unused."""
-    tried, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
-    grown = ratio(tried.mean(axis=1), true.mean(axis=1), evaluation.clips.episode_ids)
+    """Return the share by which the teacher-forced error grows with zero or shuffled actions, paired; 0: unused."""
+    given, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
+    grown = ratio(given.mean(axis=1), true.mean(axis=1), evaluation.clips.episode_ids)
     return Estimate(grown.value - 1, grown.low - 1, grown.high - 1)
 
 
 def gap_of_actions(evaluation: Evaluation, name: str, actions: Actions, metric: Metric = "l1") -> Estimate:
     """Return how much higher the teacher-forced error over persistence is with zero or shuffled actions, paired."""
-    tried, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
+    given, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
     nothing = evaluation.persistence.teacher_forced.of(metric)
-    return ratio((tried - true).mean(axis=1), nothing.mean(axis=1), evaluation.clips.episode_ids)
+    return ratio((given - true).mean(axis=1), nothing.mean(axis=1), evaluation.clips.episode_ids)
 
 
 def stratum_over_persistence(evaluation: Evaluation, stratum: Stratum, name: str, metric: Metric = "l1") -> Estimate:
@@ -81,7 +81,7 @@ def stratum_over_persistence(evaluation: Evaluation, stratum: Stratum, name: str
 
 
 def stratum_gain(evaluation: Evaluation, stratum: Stratum, name: str, other: str, metric: Metric = "l1") -> Estimate:
-    """Return by which share the teacher-forced error is smaller than another model's in a stratum, paired."""
+    """Return the share by which the teacher-forced error is smaller than another model's in a stratum, paired."""
     kept = _of_steps(evaluation, stratum, name, other, metric)
     return Estimate(1 - kept.value, 1 - kept.high, 1 - kept.low)
 
@@ -92,7 +92,7 @@ def episode_scores(
     nothing: Float[np.ndarray, " clips"],
     base: Float[np.ndarray, " clips"] | None,
 ) -> tuple[EpisodeScore, ...]:
-    """Return how well a model does on each episode, best first by error over persistence."""
+    """Return the scores of each episode, best first by error over persistence."""
     names, episode_of = np.unique(np.array(evaluation_ids), return_inverse=True)
 
     def total(values: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Did training help? What was trained, its base and others side by side on clips of held-out episodes."""
+"""Evaluation of models: a trained model, its base and others on the same clips of held-out episodes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from vjepa2_ac.evaluation.result import (
 from vjepa2_ac.evaluation.strata import clips_of, strata_of
 
 ClipName = tuple[str, int]  # id of the episode, first control step
-Pictures = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the batch at hand
+FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the current batch
 _NOT_ASKED = "{} is 0: no {} were asked for."
 _NO_PLANS = "No plans: they are poses' displacements, and the states here are plain numbers."
 _NO_LANDSCAPES = "No energy landscapes: an action has {} numbers, and a landscape is over three."
@@ -45,21 +45,21 @@ _NO_LANDSCAPES = "No energy landscapes: an action has {} numbers, and a landscap
 
 @dataclass(frozen=True)
 class Contender:
-    """A model that is measured."""
+    """A model to measure."""
 
     name: str
     role: Role
     model: Predictor
-    switched: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext  # on while it predicts
-    to_plan: Callable[[], Predictor] | None = None  # gives what plans in its place, and is held only while it does
+    switched: Callable[[], contextlib.AbstractContextManager[object]] = contextlib.nullcontext  # while it predicts
+    to_plan: Callable[[], Predictor] | None = None  # returns the model that plans in its place, held only for that time
 
 
 @dataclass(frozen=True)
 class RepeatableClips:
-    """Clips that can be read more than once: all of them, or some by name; batches of latents with their pictures."""
+    """Clips that can be read repeatedly: all of them, or some by name; batches of latents with their frames."""
 
     count: int
-    read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, Pictures]]]
+    read: Callable[[Sequence[ClipName] | None], Iterable[tuple[LatentBatch, FramesOfRow]]]
 
 
 def evaluate(
@@ -75,15 +75,15 @@ def evaluate(
     Args:
         contenders: In the order of the table; one of them has the role trained.
         clips: What to measure on.
-        about: What this is.
-        probes: How much is done beyond the errors.
-        stage: Gives a bar for a part of the work, by its title.
+        about: Description of the evaluation.
+        probes: Options of the measurements beyond the errors.
+        stage: Returns a progress bar for a part of the work, by its title.
 
     Raises:
-        ValueError: No clips; or to plan they have too few frames.
+        ValueError: No clips; or too few frames for planning.
     """
     probes = probes or ProbeOptions()
-    seen = _see_all(contenders, clips, probes, about, _bar(stage, "measuring"))
+    seen = _collect(contenders, clips, probes, about, _bar(stage, "measuring"))
     ids, seconds = tuple(seen.ids), about.seconds_per_step
     known = clips_of(seen.actions, ids, tuple(seen.firsts), is_pose=about.is_pose, seconds_per_step=seconds)
     pool = ActionPool(
@@ -120,7 +120,7 @@ def evaluate(
 
 
 def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[str, ...]:
-    """Return what a reader must know of what was not measured: by an option, or as there is no such thing."""
+    """Return notes on what was not measured: by an option, or because it does not apply."""
     notes = []
     if not probes.sensitivity_clips:
         notes.append(_NOT_ASKED.format("--sensitivity-clips", "other actions and no energy landscapes"))
@@ -137,7 +137,7 @@ def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[s
 
 @dataclass
 class _Seen:
-    """What is kept of all clips: figures and actions, and one frame and the next of some."""
+    """Data of all clips: errors and actions, and one frame and the next of some."""
 
     ids: list[str]
     firsts: list[int]
@@ -148,7 +148,7 @@ class _Seen:
     planned: list[PlanningStart] = field(default_factory=list)
 
 
-def _see_all(
+def _collect(
     contenders: Sequence[Contender],
     clips: RepeatableClips,
     probes: ProbeOptions,
@@ -163,8 +163,8 @@ def _see_all(
         kinds = {"true": batch.actions, "zero": torch.zeros_like(batch.actions), "shuffled": others}
         for contender in contenders:
             with contender.switched():
-                for kind, tried in kinds.items():
-                    seen.errors.setdefault((contender.name, kind), []).append(measured(contender.model, batch, tried))
+                for kind, given in kinds.items():
+                    seen.errors.setdefault((contender.name, kind), []).append(measured(contender.model, batch, given))
         seen.persistence.append(persistence_of(batch))
         first = len(seen.ids)
         for row in range(len(batch.starts)):
@@ -184,7 +184,7 @@ def _see_all(
 
 
 def _largest_step(actions: Float[torch.Tensor, "time action_dim"], about: About) -> int:
-    """Return the step of a clip in which most is done: of poses the translation decides."""
+    """Return the step of a clip with the largest action: for poses, by the translation."""
     return int((actions[:, :3] if about.is_pose else actions).norm(dim=-1).argmax())
 
 
@@ -265,7 +265,7 @@ def _episodes(evaluation: Evaluation) -> tuple[EpisodeScore, ...]:
 def _examples(
     contenders: Sequence[Contender], clips: RepeatableClips, evaluation: Evaluation, probes: ProbeOptions
 ) -> tuple[Example, ...]:
-    """Read the clips again that are worth a look: which ones these are is known only now."""
+    """Read the clips of the examples again: which ones these are is known only now."""
     known = evaluation.clips
     trained = evaluation.models[evaluation.trained].true.rollout
     moved = known.action_size.sum(axis=1)
@@ -275,13 +275,13 @@ def _examples(
     names = [(known.episode_ids[clip], known.starts[clip]) for clip in chosen]
     reasons = dict(zip(names, chosen.values(), strict=True))
     found = {}
-    for batch, pictures in clips.read(names):
+    for batch, frames_of_row in clips.read(names):
         for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
             predicted = {}
             for contender in contenders:
                 with contender.switched():
                     predicted[contender.name] = predicted_rollout(contender.model, batch, row)
-            found[name] = make_example(reasons[name], batch, row, predicted, pictures(row))
+            found[name] = make_example(reasons[name], batch, row, predicted, frames_of_row(row))
     return tuple(found[name] for name in names if name in found)
 
 

@@ -1,4 +1,4 @@
-"""How good is a run, or a model, on held-out episodes? Load it and what it is compared with, measure, write it down."""
+"""Evaluation of a run or a model on held-out episodes: load it and its references, measure, write the results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.evaluate import ClipName, Contender, Pictures, RepeatableClips, evaluate
+from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.examples import seen_by_the_encoder
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import About, Evaluation, Role, TrainingCurve
@@ -45,11 +45,11 @@ _NO_BASE = "There is no base to compare with: it takes states or actions of othe
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured."""
+    """The result of an evaluation."""
 
     evaluation: Evaluation
-    checkpoint: str  # which one, in words; "" of a model
-    folder: Path  # for what is written of it
+    checkpoint: str  # which one, as text; "" of a model
+    folder: Path  # of the output
 
 
 def measure_subject(
@@ -58,12 +58,12 @@ def measure_subject(
     """Measure a run or a model on held-out episodes. Cheap failures first.
 
     Args:
-        subject: The folder of a run; or a model: what `model.base` takes.
-        asked: How.
-        stage: Gives a bar for a part of the work, by its title.
+        subject: The folder of a run; or a model, as in `model.base`.
+        asked: The options.
+        stage: Returns a progress bar for a part of the work, by its title.
 
     Raises:
-        InputError: The subject, the data, or what to compare with cannot be used; the split is empty.
+        InputError: The subject, the data, or a model to compare with cannot be used; the split is empty.
     """
     asked = asked or EvaluationOptions()
     config, planning, folder = settle(subject, asked)
@@ -119,12 +119,12 @@ def measure_subject(
 
 
 def _warnings(folder: Path) -> list[str]:
-    """Return what training warned of, as sentences."""
+    """Return the warnings of the training, as sentences."""
     return [f"In training, {text}." for text in warnings_of(folder / METRICS)]
 
 
 def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
-    """Return every figure of a run's metrics.jsonl that is one number, over optimizer steps."""
+    """Return all scalar metrics of a run's metrics.jsonl, over optimizer steps."""
     points: dict[str, list[tuple[int, float]]] = {}
     for row in read_metrics_log(folder / METRICS):
         for name, value in row.items():
@@ -143,7 +143,7 @@ def _load_model(name: str, config: Config) -> WorldModel:
 def _contenders(
     subject: str, config: Config, run: TrainedRun | None, world_model: WorldModel, asked: EvaluationOptions
 ) -> tuple[list[Contender], tuple[str, ...]]:
-    """Return the models to measure, the base first and the subject last; and what a reader must know of them."""
+    """Return the models to measure, the base first and the subject last; and notes on them."""
     against = asked.against if asked.against is not None else (BASE,) * (run is not None)
     found: list[Contender] = []
     notes: tuple[str, ...] = ()
@@ -170,7 +170,7 @@ def _contenders(
 def _contender(
     name: str, role: Role, model: WorldModel, switched: Callable[[], AbstractContextManager[object]] = nullcontext
 ) -> Contender:
-    """Return a model to measure as it is; a merged copy plans in its place (see `planning.model_setup`)."""
+    """Return a model to measure unmerged; a merged copy plans in its place (see `planning.model_setup`)."""
     adaptation = model.adaptation
     plans_as_it_is = adaptation is None or (role == "base" and adaptation.kind == "lora")  # whose adapter is off then
     return Contender(name, role, model, switched, None if plans_as_it_is else partial(unadapted_copy, model))
@@ -214,19 +214,19 @@ def _clips(
     encode: Callable[[Batch], LatentBatch],
     image_size: int,
 ) -> RepeatableClips:
-    """Return the clips at these windows, to be read as often as it takes."""
+    """Return the clips at these windows, which can be read repeatedly."""
     by_name = {(dataset.table.identity(episode), start): (episode, start) for episode, start in windows}
 
-    def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, Pictures]]:
+    def read(names: Sequence[ClipName] | None) -> Iterable[tuple[LatentBatch, FramesOfRow]]:
         wanted = windows if names is None else [by_name[name] for name in names]
         for batch in batches(dataset, wanted):
-            yield encode(batch), partial(_pictures, dataset, batch, image_size)
+            yield encode(batch), partial(_frames_of_row, dataset, batch, image_size)
 
     return RepeatableClips(len(windows), read)
 
 
-def _pictures(dataset: Dataset, batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"]:
-    """Return what the encoder sees of a clip; of cached latents, small pictures made large."""
+def _frames_of_row(dataset: Dataset, batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"]:
+    """Return the frames of a clip as the encoder sees them; of cached latents, enlarged small frames."""
     return seen_by_the_encoder(torch.from_numpy(frames_of(dataset, batch, row)), size)
 
 

@@ -1,4 +1,4 @@
-"""What do good and bad predictions look like? Clips in pictures: error of each patch, and latents as colours."""
+"""Example clips of good and bad predictions: error maps per patch, and latents as colours."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ def chosen_clips(trained: Errors, nothing: Errors, moved: Float[np.ndarray, " cl
 
     Args:
         trained: Rollout errors of the model.
-        nothing: Of persistence.
-        moved: How far the robot goes in each clip.
-        count: How many to show at most.
+        nothing: Those of persistence.
+        moved: Distance that the robot moves in each clip.
+        count: Number of clips, at most.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = trained.l1.mean(axis=1) / nothing.l1.mean(axis=1)
@@ -43,7 +43,7 @@ def chosen_clips(trained: Errors, nothing: Errors, moved: Float[np.ndarray, " cl
 
 @torch.no_grad()
 def predicted_rollout(model: Predictor, batch: LatentBatch, row: int) -> Float[Tensor, "horizon tokens dim"]:
-    """Return what a model predicts of one clip from its first frame, in float32 on the CPU."""
+    """Return a model's prediction of one clip from its first frame, in float32 on the CPU."""
     one = slice(row, row + 1)
     camera = None if batch.extrinsics is None else batch.extrinsics[one, :-1]
     rolled = model.rollout(batch.latents[one, :1], batch.actions[one], batch.states[one, :-1], camera)
@@ -57,14 +57,14 @@ def make_example(
     predicted: Mapping[str, Float[Tensor, "horizon tokens dim"]],
     frames: UInt8[np.ndarray, "time height width 3"] | None,
 ) -> Example:
-    """Return one clip in pictures.
+    """Return one clip as an example.
 
     Args:
-        why: It was chosen.
-        batch: Where it is.
-        row: Its place there.
-        predicted: What each model makes of it.
-        frames: Its pictures, if there are any.
+        why: The reason for its choice.
+        batch: The batch that holds it.
+        row: Its row in the batch.
+        predicted: Predictions of each model.
+        frames: Its frames, if there are any.
     """
     true = batch.latents[row].float().cpu()
     grid = math.isqrt(true.shape[1])
@@ -89,7 +89,7 @@ def make_example(
 def seen_by_the_encoder(
     frames: UInt8[Tensor, "time height width 3"], size: int
 ) -> UInt8[np.ndarray, "time size size 3"]:
-    """Return frames as the encoder sees them, as pictures."""
+    """Return frames as the encoder sees them, as uint8."""
     inputs = pixels_to_input(frames[None], size)[0]
     low, high = inputs.amin(), inputs.amax()
     shown = (inputs - low) / (high - low).clamp(min=1e-6) * 255
@@ -97,9 +97,9 @@ def seen_by_the_encoder(
 
 
 class Colours:
-    """Turns latents into colours by the three principal components of some true latents: alike looks alike.
+    """Turns latents into colours by the three principal components of some true latents: similar latents look similar.
 
-    A component's range, from the 1st to the 99th percentile of the true latents, is that of its colour.
+    The 1st to 99th percentile of a component in the true latents is mapped to the range of its colour.
     """
 
     def __init__(self, true: Float[Tensor, "time tokens dim"]) -> None:
@@ -109,7 +109,7 @@ class Colours:
         _, vectors = torch.linalg.eigh(centred.T @ centred)
         basis = vectors[:, -3:].flip(1)  # the largest first
         largest = basis.gather(0, basis.abs().argmax(dim=0, keepdim=True))
-        self._basis = basis * largest.sign()  # else the sign would be the library's choice
+        self._basis = basis * largest.sign()  # otherwise the sign would depend on the library
         seen = centred @ self._basis
         self._low, self._high = (torch.quantile(seen, share, dim=0) for share in (0.01, 0.99))
 

@@ -1,8 +1,8 @@
-"""How sure is a figure? An estimate with its 95 % interval, from drawing whole episodes again and again.
+"""Bootstrap intervals: an estimate with its 95 % interval, from resampling whole episodes.
 
-Clips of one episode resemble each other: drawing clips would make intervals too narrow. Plain percentiles of the drawn
-values are too narrow, too, where there are few episodes; they are taken as much farther out as Student's t lies beyond
-the normal distribution.
+Clips of one episode are correlated: resampling clips would make intervals too narrow. Plain percentiles of the
+resampled values are also too narrow with few episodes, so they are widened by the ratio of Student's t to the normal
+distribution.
 
 Source: Hesterberg (2015), What Teachers Should Know About the Bootstrap, the expanded percentile interval.
 """
@@ -18,12 +18,12 @@ import numpy as np
 from jaxtyping import Float
 
 RESAMPLES = 2000
-_SHARE = 0.95  # of what happens, that an interval is to cover
+_SHARE = 0.95  # probability that an interval covers the true value
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure with a 95 % bootstrap interval over episodes; NaN where there is one episode only."""
+    """A number with a 95 % bootstrap interval over episodes; NaN where there is one episode only."""
 
     value: float
     low: float
@@ -31,17 +31,17 @@ class Estimate:
 
     @property
     def has_interval(self) -> bool:
-        """Whether there were episodes enough to say how sure the value is."""
+        """Whether there were enough episodes for an interval."""
         return not math.isnan(self.low)
 
     def side(self, of: float) -> int:
-        """Return -1 or 1 where the whole interval lies below or above a number, else 0: not sure."""
+        """Return -1 or 1 if the whole interval is below or above a number, else 0: uncertain."""
         return -1 if self.high < of else 1 if self.low > of else 0
 
     def as_dict(self) -> dict[str, float | None]:
         """Return plain values, for JSON; None where there is no value or no interval."""
-        figures = {"value": self.value, "low": self.low, "high": self.high}
-        return {name: number if math.isfinite(number) else None for name, number in figures.items()}
+        metrics = {"value": self.value, "low": self.low, "high": self.high}
+        return {name: number if math.isfinite(number) else None for name, number in metrics.items()}
 
     def __str__(self) -> str:
         return f"{self.value:.3f} [{self.low:.3f}, {self.high:.3f}]" if self.has_interval else f"{self.value:.3f}"
@@ -49,20 +49,20 @@ class Estimate:
 
 def bootstrapped(
     of_sums: Callable[[np.ndarray], np.ndarray],
-    columns: Float[np.ndarray, "columns clips figures"],
+    columns: Float[np.ndarray, "columns clips metrics"],
     episode_ids: Sequence[str],
     *,
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> tuple[Estimate, ...]:
-    """Return an estimate of each figure, which is a function of sums over clips.
+    """Return an estimate of each metric, which is a function of sums over clips.
 
     Args:
-        of_sums: Turns sums [columns, ..., figures] into values [..., figures].
-        columns: What is summed. All columns are drawn together, so a comparison of two on the same clips is paired.
+        of_sums: Turns sums [columns, ..., metrics] into values [..., metrics].
+        columns: The summands. All columns are resampled together, so a comparison of two on the same clips is paired.
         episode_ids: Of each clip.
-        resamples: How often as many episodes as there are are drawn, with replacement.
-        seed: Decides which.
+        resamples: Number of bootstrap samples, each of as many episodes as there are, with replacement.
+        seed: Of the samples.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         values = of_sums(columns.sum(axis=1))
@@ -97,7 +97,7 @@ def ratio(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Estimate:
-    """Return mean error over mean other error, most often persistence: clips weigh by how much there is to predict."""
+    """Return mean error over mean other error, most often persistence: clips are weighted by the denominator."""
     columns = np.stack([errors, others])[:, :, None]
     return bootstrapped(lambda sums: sums[0] / sums[1], columns, episode_ids, resamples=resamples, seed=seed)[0]
 
@@ -112,7 +112,7 @@ def ratio_difference(
 ) -> Estimate:
     """Return the `ratio` of one pair of (errors, persistence) minus that of another on the same clips.
 
-    Both are drawn together, so what makes an episode hard for both does not widen the interval.
+    Both are resampled together, so what makes an episode hard for both does not widen the interval.
     """
     columns = np.stack([*one, *other])[:, :, None]
     return bootstrapped(
@@ -136,10 +136,10 @@ def _with_interval(value: float, drawn: np.ndarray, tail: float) -> Estimate:
 
 
 def share_of(successes: int, tries: int) -> Estimate:
-    """Return the share of tries that succeeded, with Wilson's 95 % interval: it stays within 0 .. 1.
+    """Return the share of successes with Wilson's 95 % interval, which stays within 0 .. 1.
 
     Raises:
-        ValueError: No tries, or more successes than tries.
+        ValueError: No trials, or more successes than trials.
     """
     from scipy import stats
 

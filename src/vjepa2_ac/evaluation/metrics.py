@@ -1,7 +1,7 @@
-"""How far are predicted latents from the true ones, and how far would doing nothing be?
+"""Prediction metrics: errors between predicted and true latents, beside the error of persistence.
 
-Every error compares layer-normalised latents, per clip and model step. Beside it stands *persistence*: the error of
-copying a frame that was seen. A ratio of 1 means: as good as doing nothing; 0: perfect.
+All errors compare layer-normalised latents, per clip and model step. *Persistence* is the error of copying a frame that
+was seen. A ratio of 1 means: as good as doing nothing; 0: perfect.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vjepa2_ac.evaluation.result import Errors, Predicted
 
 @runtime_checkable
 class Predictor(Protocol):
-    """What is measured: something that predicts latents. `WorldModel` is one; so is an oracle in a test."""
+    """A predictor of latents: `WorldModel`, or an oracle in a test."""
 
     def predict(
         self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None
@@ -63,7 +63,7 @@ def persistence_of(batch: LatentBatch) -> Predicted:
 def distances(
     predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"]
 ) -> Errors:
-    """Return how far predictions are from the truth, in each metric of `evaluation.result`, computed in float32."""
+    """Return the error of predictions in each metric of `evaluation.result`, computed in float32."""
     predicted, true = predicted.float(), true.float()
     difference = predicted - true
     similarity = cosine_similarity(predicted, true, dim=-1)
@@ -77,9 +77,9 @@ def distances(
 def with_other_actions(
     batches: Iterable[LatentBatch],
 ) -> Iterator[tuple[LatentBatch, Float[Tensor, "batch time action_dim"]]]:
-    """Yield each batch with other actions for its clips: those of the clip before, whatever the size of a batch.
+    """Yield each batch with other actions for its clips: those of the clip before, whatever the batch size.
 
-    The first clip gets those of the second; if it is alone, its own backwards.
+    The first clip gets those of the second; if it is alone, its own reversed.
     """
     rest = iter(batches)
     head = [batch for _, batch in zip(range(1), rest, strict=False)]
@@ -110,7 +110,7 @@ class PredictionErrors:
 
 @torch.no_grad()
 def prediction_errors(model: Predictor, batches: Iterable[LatentBatch]) -> PredictionErrors:
-    """Measure a model on clips of held-out episodes, batch after batch, so that no latents need be kept.
+    """Measure a model on clips of held-out episodes, batch after batch, so that no latents are stored.
 
     Raises:
         ValueError: No clips.
@@ -132,9 +132,9 @@ def one_step_errors(
 ) -> tuple[Float[np.ndarray, " batch"], Float[np.ndarray, " batch"]]:
     """Return, for each clip, the teacher-forced L1 error with its own or other actions, and that of persistence."""
     latents, extrinsics = batch.latents, batch.extrinsics
-    tried = batch.actions if actions is None else actions
+    given = batch.actions if actions is None else actions
     before = None if extrinsics is None else extrinsics[:, :-1]
-    predicted = model.predict(latents[:, :-1], tried, batch.states[:, :-1], before)
+    predicted = model.predict(latents[:, :-1], given, batch.states[:, :-1], before)
     truth = latents[:, 1:]
     return _error(predicted, truth).mean(axis=1), _error(latents[:, :-1], truth).mean(axis=1)
 
@@ -148,14 +148,14 @@ def ratios_by_horizon(errors: PredictionErrors) -> list[Estimate]:
 def one_step_ratios(errors: PredictionErrors) -> dict[str, Estimate]:
     """Return the teacher-forced error over persistence with the true, zero and shuffled actions.
 
-    A model that uses its actions is much better with the true ones than with the other two.
+    A model that uses its actions is much better with the true ones than with the others.
     """
-    tried = {
+    by_actions = {
         "true": errors.one_step,
         "zero": errors.one_step_zero_actions,
         "shuffled": errors.one_step_shuffled_actions,
     }
-    return {name: ratio(e, errors.one_step_persistence, errors.episode_ids) for name, e in tried.items()}
+    return {name: ratio(e, errors.one_step_persistence, errors.episode_ids) for name, e in by_actions.items()}
 
 
 def _batch_errors(model: Predictor, batch: LatentBatch, other_actions: Tensor) -> dict[str, np.ndarray]:

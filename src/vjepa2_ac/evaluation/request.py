@@ -17,7 +17,7 @@ from vjepa2_ac.runs.relative_paths import DATA, with_paths_from_start
 
 @dataclass(frozen=True)
 class ProbeOptions:
-    """How much is done beyond the errors; 0 clips: nothing."""
+    """Options of the measurements beyond the errors; 0 clips: none."""
 
     sensitivity_clips: int = 32
     samples: int = 64  # other actions per clip, drawn in each of two ways
@@ -25,23 +25,23 @@ class ProbeOptions:
     nodes: int = 9  # along each axis of a landscape
     reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
     examples: int = 4
-    at_once: int = 64  # samples that are computed together
-    planning_clips: int = 0  # of these, plans are held against the demonstration; of poses only
-    planning: PlanningConfig = field(default_factory=PlanningConfig)  # how one step is planned
+    at_once: int = 64  # samples per batch
+    planning_clips: int = 0  # number of clips whose plans are compared with the demonstration; of poses only
+    planning: PlanningConfig = field(default_factory=PlanningConfig)  # settings of one-step plans
 
 
 @dataclass(frozen=True)
 class EvaluationOptions:
-    """What is asked of an evaluation."""
+    """The options of an evaluation."""
 
     split: Split = "test"
     clips: int = 256  # at most, spread over the episodes
     checkpoint: str = NEWEST  # of a run: newest, best, or a number of optimizer steps
-    data: Config | None = None  # other data than the run's own; a model has none of its own
+    data: Config | None = None  # data other than the run's own; a model has none of its own
     against: tuple[str, ...] | None = None  # base, runs, models; None: the base of a run, nothing for a model
-    out: Path | None = None  # folder for what is written; None: the run's
+    out: Path | None = None  # output folder; None: the run's
     probes: ProbeOptions = field(default_factory=ProbeOptions)
-    calibrate: bool = False  # measure the error at other strides, too
+    calibrate: bool = False  # also measure the error at other strides
     planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
 
 
@@ -57,7 +57,7 @@ def settle(subject: str, asked: EvaluationOptions) -> tuple[Config, PlanningConf
 
 
 def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
-    """Return the config to measure with, and the folder for what is found."""
+    """Return the config to measure with, and the output folder."""
     if is_run(subject):
         config, needed = read_run_config(Path(subject)), [DATA] if asked.data is None else []
         config = with_paths_from_start(config, Path(subject), needed=needed)
@@ -72,7 +72,7 @@ def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
     if asked.out is None:
         raise InputError(
             where="--data without --out",
-            found="metrics.json of a run's own folder tells of its own data",
+            found="metrics.json of a run's own folder is for its own data",
             needed="a folder for what is found on these data",
             fix="Add --out FOLDER",
         )
@@ -81,7 +81,7 @@ def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
             where="data.stride",
             found="auto",
             needed="a number, to evaluate",
-            fix="`vjepa2-ac data calibrate CONFIG` tells which",
+            fix="`vjepa2-ac data calibrate CONFIG` finds one",
         )
     return config, asked.out
 
@@ -98,10 +98,10 @@ def _nothing_to_measure(subject: str) -> InputError:
 
 
 def _planning_of(config: Config, asked: EvaluationOptions) -> PlanningConfig:
-    """Return how one step is planned: the config's settings, some of them replaced.
+    """Return the settings of one-step plans: the config's, some of them replaced.
 
     Raises:
-        InputError: A setting is wrong, or is none of planning.
+        InputError: A setting is wrong, or does not belong to planning.
     """
     for setting in asked.planning:
         if not setting.startswith("planning."):

@@ -1,9 +1,9 @@
-"""What was measured on held-out episodes? Records of plain arrays, which estimates, tables and the report are made of.
+"""Evaluation results: records of plain arrays, the input of estimates, tables and the report.
 
-Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). Every error compares
+Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). All errors compare
 layer-normalised latents: L1 is the mean absolute difference, L2 the mean *squared* difference (no root), cosine one
-minus the cosine similarity of a token, mean over tokens: 0 is perfect for each. Figures with intervals are made of
-these by `evaluation.estimates`, words by `evaluation.verdict`.
+minus the cosine similarity of a token, mean over tokens: 0 is perfect for each. Metrics with intervals are computed
+from these by `evaluation.estimates`, the verdict as text by `evaluation.verdict`.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ ACTIONS: tuple[Actions, ...] = ("true", "zero", "shuffled")
 
 @dataclass(frozen=True)
 class About:
-    """What was measured, and on what."""
+    """The description of an evaluation: model, data and settings."""
 
-    subject: str  # the run or model, as it was named
-    checkpoint: str  # which one, in words; "" where the subject is a model
+    subject: str  # the run or model, as given
+    checkpoint: str  # which one, as text; "" for a model
     checkpoint_path: str  # likewise
     source: str  # data.source
     data: str  # data.path
@@ -50,33 +50,33 @@ class About:
 
 @dataclass(frozen=True)
 class Clips:
-    """The clips, and how large their actions are."""
+    """The clips, and the size of their actions."""
 
     episode_ids: tuple[str, ...]
     starts: tuple[int, ...]  # first control step of each
     action_size: Float[np.ndarray, "clips horizon"]  # |dx, dy, dz| in cm; of vectors: the norm of the action
-    moving: Bool[np.ndarray, "clips horizon"]  # of each step, as `moving_means` says
-    moving_means: str  # the rule, in words
+    moving: Bool[np.ndarray, "clips horizon"]  # of each step, by the rule in `moving_means`
+    moving_means: str  # the rule, as text
 
     def __len__(self) -> int:
         return len(self.episode_ids)
 
     @property
     def episodes(self) -> int:
-        """How many episodes the clips come from."""
+        """The number of episodes of the clips."""
         return len(set(self.episode_ids))
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one way of predicting; row i is clip i."""
+    """Errors of one kind of prediction; row i is clip i."""
 
     l1: Float[np.ndarray, "clips horizon"]
     l2: Float[np.ndarray, "clips horizon"]  # mean squared difference
     cosine: Float[np.ndarray, "clips horizon"]  # 1 - cosine similarity
 
     def of(self, metric: Metric) -> Float[np.ndarray, "clips horizon"]:
-        """Return those of one metric."""
+        """Return the errors of one metric."""
         return {"l1": self.l1, "l2": self.l2, "cosine": self.cosine}[metric]
 
 
@@ -91,21 +91,21 @@ class Predicted:
     rollout: Errors
 
     def of(self, mode: Mode) -> Errors:
-        """Return those of one mode."""
+        """Return the errors of one mode."""
         return self.teacher_forced if mode == "teacher_forced" else self.rollout
 
 
 @dataclass(frozen=True)
 class Ranking:
-    """Where the true action stands among others by the L1 energy of a one-step prediction from one frame.
+    """The rank of the true action among others by the L1 energy of a one-step prediction from one frame.
 
-    Equal energies share their places. Chance: `mean_rank` 0.5, `top[k]` chance_of_top(k).
+    Equal energies share their rank. Chance: `mean_rank` 0.5, `top[k]` chance_of_top(k).
     """
 
     drawn_from: Literal["clips", "box"]  # the others: actions of other episodes, or uniform in a box
-    words: str  # the same, in words, with the size of the box
+    words: str  # the same as text, with the size of the box
     samples: int  # others per clip
-    clips: tuple[int, ...]  # which ones were measured, as places in Clips
+    clips: tuple[int, ...]  # the measured ones, as indices into Clips
     rank: Float[np.ndarray, " ranked"]  # share of the others with lower energy: 0 best, 1 worst
     mean_rank: Estimate
     top: Mapping[int, Estimate]  # k -> how often the true action is among the k of lowest energy (of samples + 1)
@@ -117,7 +117,7 @@ class Ranking:
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Does the prediction depend on the action?"""
+    """The dependence of the prediction on the action."""
 
     change: Estimate  # mean L1 distance of the predictions with others' actions to the one with the true action,
     # over the error of persistence; 0: the action is ignored
@@ -135,16 +135,16 @@ class Landscape:
 
     episode_id: str
     start: int
-    axes: Float[np.ndarray, "3 grid"]  # the actions tried along each axis, ascending; cm, or plain numbers
+    axes: Float[np.ndarray, "3 grid"]  # the evaluated actions along each axis, ascending; cm, or plain numbers
     energy: Float[np.ndarray, "grid grid grid"]  # indices: first, second, third axis
     true: Float[np.ndarray, " 3"]
-    minimum: Float[np.ndarray, " 3"]  # where the energy is lowest (the mean place where several are)
-    distance: float  # of the two, in the units of the axes
+    minimum: Float[np.ndarray, " 3"]  # where the energy is lowest (the mean if there are several)
+    distance: float  # between the two, in the units of the axes
 
 
 @dataclass(frozen=True)
 class Landscapes:
-    """Landscapes of some clips of one model, and what they say together."""
+    """Landscapes of some clips of one model, and statistics over them."""
 
     axis_names: tuple[str, str, str]
     unit: str  # cm, or "" where the states are no poses
@@ -153,32 +153,32 @@ class Landscapes:
     chance_distance: float  # the same of a node drawn at random
     sign_agreement: tuple[Estimate, Estimate, Estimate]  # per axis: share of clips whose minimum has the true sign
     sign_chance: tuple[float, float, float]  # share of the nodes that have it
-    sign_clips: tuple[int, int, int]  # clips that count: those whose true action is sign_least or more along the axis
+    sign_clips: tuple[int, int, int]  # counted clips: those whose true action is sign_least or more along the axis
     sign_least: float  # in the units of the axes
 
 
 @dataclass(frozen=True)
 class Plans:
-    """What one way of planning does from each start; several draws of it, where it is random."""
+    """The plans of one method from each start; several draws of it, if it is random."""
 
     one_step: Float[np.ndarray, "draws starts 7"]  # towards the next frame; an action as in `vjepa2_ac.episode`
-    three_steps: Float[np.ndarray, "draws starts 3 7"]  # towards the frame three steps on
-    empty: int = 0  # plans that found no finite energy, so that nothing is done
-    seconds: float = 0.0  # for all of them
+    three_steps: Float[np.ndarray, "draws starts 3 7"]  # towards the frame three steps later
+    empty: int = 0  # plans without a finite energy, which do nothing
+    seconds: float = 0.0  # for all plans
 
 
 @dataclass(frozen=True)
 class PlanningStudy:
-    """From where models planned, what was demonstrated there, and plans that take no model. Of poses only."""
+    """The starts of the plans, the demonstrated actions, and model-free plans. Of poses only."""
 
-    clips: tuple[int, ...]  # places in Clips
+    clips: tuple[int, ...]  # indices into Clips
     places: tuple[int, ...]  # frame of each clip at which planning begins
     episode_ids: tuple[str, ...]
     demonstrated: Float[np.ndarray, "starts 3 7"]
     zero: Plans
     random: Plans  # every number uniform within its limits
-    within_limits: Plans  # what was demonstrated, cut to the limits: no plan can come closer
-    one_step_beyond: float  # share of the demonstrated steps that go beyond the limits along x, y or z
+    within_limits: Plans  # the demonstration clipped to the limits: no plan can be closer
+    one_step_beyond: float  # share of the demonstrated steps that exceed the limits along x, y or z
     three_steps_beyond: float
     settings: PlanningConfig  # of the one-step plans
 
@@ -188,9 +188,9 @@ class PlanningStudy:
 
 @dataclass(frozen=True)
 class ModelResult:
-    """What was measured of one model."""
+    """The results of one model."""
 
-    name: str  # base, adapter, model, or that of another run
+    name: str  # base, adapter, model, or the name of another run
     role: Role
     true: Predicted  # with the true actions
     zero: Predicted  # with actions of zero
@@ -200,13 +200,13 @@ class ModelResult:
     plans: Plans | None = None
 
     def with_actions(self, actions: Actions) -> Predicted:
-        """Return what was predicted with the true, zero or shuffled actions."""
+        """Return the predictions with the true, zero or shuffled actions."""
         return {"true": self.true, "zero": self.zero, "shuffled": self.shuffled}[actions]
 
 
 @dataclass(frozen=True)
 class Stratum:
-    """Steps that have something in common; `steps` picks [clip, horizon] of the *teacher-forced* errors."""
+    """A group of steps; `steps` selects [clip, horizon] of the *teacher-forced* errors."""
 
     name: str  # such as moving, idle, "0.0 to 1.2 cm"
     kind: Literal["motion", "action size"]
@@ -215,12 +215,12 @@ class Stratum:
 
 @dataclass(frozen=True)
 class Example:
-    """One clip in pictures, and how each model predicts it in a rollout from its first frame."""
+    """One clip with its frames, and each model's prediction of it in a rollout from its first frame."""
 
-    why: str  # it was chosen: best, worst, median, most motion
+    why: str  # reason of the choice: best, worst, median, most motion
     episode_id: str
     start: int
-    frames: UInt8[np.ndarray, "time height width 3"] | None  # as the encoder sees them; None: no pictures (a cache)
+    frames: UInt8[np.ndarray, "time height width 3"] | None  # as the encoder sees them; None: no frames (a cache)
     errors: Mapping[str, Float[np.ndarray, "horizon grid grid"]]  # model or persistence -> L1 error of each patch
     true_colours: UInt8[np.ndarray, "time grid grid 3"]  # three principal components of the true latents, as RGB
     predicted_colours: Mapping[str, UInt8[np.ndarray, "horizon grid grid 3"]]  # model -> in the same basis and scale
@@ -228,17 +228,17 @@ class Example:
 
 @dataclass(frozen=True)
 class EpisodeScore:
-    """How well the trained model does on one episode, at the last horizon of the rollout (L1)."""
+    """The score of the trained model on one episode, at the last horizon of the rollout (L1)."""
 
     episode_id: str
     clips: int
     over_persistence: float
-    gain_over_base: float | None  # share of the base's error that is gone; None: no base
+    gain_over_base: float | None  # relative reduction of the base's error; None: no base
 
 
 @dataclass(frozen=True)
 class TrainingCurve:
-    """One figure of a run's metrics.jsonl over optimizer steps."""
+    """One metric of a run's metrics.jsonl over optimizer steps."""
 
     name: str  # loss, learning_rate, validation/rollout_over_persistence ...
     steps: tuple[int, ...]
@@ -247,7 +247,7 @@ class TrainingCurve:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Everything that was measured; models are in the order of the table: base, others, and what was trained last."""
+    """All results; models are in the order of the table: base, others, and the trained one last."""
 
     about: About
     clips: Clips
@@ -258,22 +258,22 @@ class Evaluation:
     examples: tuple[Example, ...]
     training: tuple[TrainingCurve, ...] = ()
     calibration: Mapping[str, Any] | None = None  # what `Calibration.as_dict` gives
-    notes: tuple[str, ...] = ()  # what a reader must know: why there is no base, no landscape ...
+    notes: tuple[str, ...] = ()  # for the reader: why there is no base, no landscape ...
     planning: PlanningStudy | None = None
 
     @property
     def trained(self) -> str:
-        """The name of what was evaluated: adapter, or model."""
+        """The name of the evaluated model: adapter, or model."""
         return next(name for name, model in self.models.items() if model.role == "trained")
 
     @property
     def base(self) -> str | None:
-        """The name of what it is compared with; None: there is no base."""
+        """The name of the base in `models`; None: there is none."""
         return next((name for name, model in self.models.items() if model.role == "base"), None)
 
     @property
     def horizon(self) -> int:
-        """How many model steps ahead was measured."""
+        """The number of model steps of the longest horizon."""
         return self.about.frames - 1
 
     @property

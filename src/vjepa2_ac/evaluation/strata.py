@@ -1,4 +1,4 @@
-"""Which steps are hard? Those in which the robot moves, and how far: clips' steps by what the true action does."""
+"""Strata of steps by difficulty: steps grouped by how the robot moves and how far, from the true action."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def clips_of(
 
 
 def strata_of(clips: Clips, *, is_pose: bool) -> tuple[Stratum, ...]:
-    """Return moving and idle steps, then thirds by the size of the action; those without a step are left out."""
+    """Return moving and idle steps, then thirds by the size of the action; empty strata are left out."""
     found = [Stratum("moving", "motion", clips.moving), Stratum("idle", "motion", ~clips.moving)]
     edges = np.quantile(clips.action_size, np.arange(1, _PARTS) / _PARTS)
     part = np.searchsorted(edges, clips.action_size, side="right")
@@ -66,6 +66,6 @@ def _range_of(sizes: Float[np.ndarray, " steps"], *, is_pose: bool) -> str:
 
 
 def _angles(rotations: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch"]:
-    """Return by how many degrees each rotation turns."""
+    """Return the angle of each rotation in degrees."""
     traces = np.trace(matrices_from_euler(rotations), axis1=-2, axis2=-1)
     return np.asarray(np.degrees(np.arccos(np.clip((traces - 1) / 2, -1.0, 1.0))))

@@ -1,4 +1,4 @@
-"""What do the figures say, in words? Whether it helped, how sure that is, and whether actions are used."""
+"""The verdict as text: did training help, how certain is that, and are the actions used?"""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ _WORDS: dict[Metric, str] = {"l1": "L1", "l2": "L2", "cosine": "cosine"}
 
 
 def verdict(evaluation: Evaluation) -> str:
-    """Say whether what was trained helped, at the farthest horizon by L1, and what L2 and cosine deny."""
+    """Return whether training helped, at the longest horizon by L1, and where L2 and cosine disagree."""
     error = over_persistence(evaluation, evaluation.trained, "rollout")[-1]
     ahead = f"{evaluation.seconds_ahead:.1f} s ahead"
     absolute = f"Its error {ahead} is {_over_nothing(error)}."
-    parts = [f"{_compared(evaluation, ahead)}.", absolute, *_denied(evaluation), _actions(evaluation)]
+    parts = [f"{_compared(evaluation, ahead)}.", absolute, *_disagreements(evaluation), _actions(evaluation)]
     return " ".join(part for part in (*parts, _planned(evaluation), *evaluation.notes) if part)
 
 
 def improvement(evaluation: Evaluation, horizon: int) -> Estimate | None:
-    """Return by which share of the base's error the trained model's is smaller at a horizon, paired; None: no base."""
+    """Return the share by which the trained model's error is below the base's at a horizon, paired; None: no base."""
     if evaluation.base is None:
         return None
     return gain_over(evaluation, evaluation.trained, evaluation.base)[horizon - 1]
 
 
 def uses_actions(evaluation: Evaluation) -> bool:
-    """Return whether the true actions clearly beat another clip's, and clearly rank before others by their energy."""
+    """Return whether the true actions are clearly better than another clip's, and clearly rank first by energy."""
     model = evaluation.models[evaluation.trained]
     rankings = () if model.sensitivity is None else model.sensitivity.rankings
     gap = gap_of_actions(evaluation, evaluation.trained, "shuffled")
@@ -42,7 +42,7 @@ def uses_actions(evaluation: Evaluation) -> bool:
 
 
 def spread(evaluations: Sequence[Evaluation]) -> str:
-    """Say how much the results of several runs differ, at the farthest horizon."""
+    """Return as text how much the results of several runs differ, at the longest horizon."""
     errors = [over_persistence(one, one.trained, "rollout")[-1].value for one in evaluations]
     gains = [gain.value for one in evaluations if (gain := improvement(one, one.horizon)) is not None]
     words = f"{len(evaluations)} runs: error over persistence {_mean_and_range(errors, '.3f')}"
@@ -50,7 +50,7 @@ def spread(evaluations: Sequence[Evaluation]) -> str:
 
 
 def interval(value: Estimate, form: str) -> str:
-    """Say between which numbers a figure lies."""
+    """Return the interval of an estimate as text."""
     if not value.has_interval:
         return "one episode: no interval"
     return f"95 % interval {value.low:{form}} to {value.high:{form}}"
@@ -70,20 +70,20 @@ def _compared(evaluation: Evaluation, ahead: str) -> str:
 
 
 def _digits(gain: Estimate) -> str:
-    """Return how a gain is written: 0 % better or worse would say nothing."""
+    """Return the number format of a gain: 0 % better or worse would say nothing."""
     return ".0%" if abs(gain.value) >= 0.01 else ".2%"
 
 
-def _denied(evaluation: Evaluation) -> tuple[str, ...]:
-    """Return a sentence for what L2 or cosine say otherwise than L1: better, worse, or not sure."""
+def _disagreements(evaluation: Evaluation) -> tuple[str, ...]:
+    """Return a sentence on how L2 or cosine differ from L1: better, worse, or uncertain."""
     found: dict[str, list[str]] = {}
     for metric in METRICS[1:]:
-        if words := _otherwise(evaluation, metric):
+        if words := _disagreement(evaluation, metric):
             found.setdefault(" and ".join(words), []).append(_WORDS[metric])
     return tuple(f"By {' and '.join(metrics)} it is another matter: {words}." for words, metrics in found.items())
 
 
-def _otherwise(evaluation: Evaluation, metric: Metric) -> list[str]:
+def _disagreement(evaluation: Evaluation, metric: Metric) -> list[str]:
     words = []
     if evaluation.base is not None:
         by_l1, by_other = (

@@ -1,1 +1,1 @@
-"""Export: how does a trained run leave the project? Merged, official, or as an adapter for the Hub."""
+"""Export of a trained run: merged, in the official format, or as an adapter for the Hub."""

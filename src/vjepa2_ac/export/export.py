@@ -1,4 +1,4 @@
-"""How does a trained run leave the house? As one merged model, as Meta's checkpoint, or as an adapter for the Hub."""
+"""Export of a trained run: as one merged model, as Meta's checkpoint, or as an adapter for the Hub."""
 
 from __future__ import annotations
 
@@ -35,26 +35,26 @@ Form = Literal["merged", "official", "hub"]
 
 OFFICIAL_NAME = "vjepa2-ac.pt"  # in a folder; a destination that ends in .pt is the file itself
 CARD = "README.md"
-_FILES = frozenset({".bin", ".ckpt", ".h5", ".onnx", ".pt", ".pth", ".safetensors"})  # no names of folders
+_FILES = frozenset({".bin", ".ckpt", ".h5", ".onnx", ".pt", ".pth", ".safetensors"})  # not names of folders
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What was written."""
+    """The result of an export."""
 
     path: Path  # the file or folder
-    checkpoint: str  # which one it was made of, in words
+    checkpoint: str  # the one it was made from, as text
 
 
 def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoint: str = NEWEST) -> Exported:
-    """Write what a run has learnt for others to use, whole or not at all.
+    """Export a trained run, atomically.
 
     An adapter is merged in float32, then cast to the type of the base's weights (`model.dtype`).
 
     Args:
         folder: The run.
-        destination: A new or empty folder; for official also a file ending in `.pt`, which must not be there.
-        form: merged: the model as a folder, which `model.base` takes. official: one `.pt` by Meta's own names, q, k
+        destination: A new or empty folder; for official also a file ending in `.pt`, which must not exist.
+        form: merged: the model as a folder, which `model.base` takes. official: one `.pt` with Meta's names, q, k
             and v fused, for the official code. hub: the adapter in PEFT's format with a model card, ready to upload.
         checkpoint: newest, best (by validation), or a number of optimizer steps.
 
@@ -85,7 +85,7 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
 
 
 def _merge(run: TrainedRun) -> None:
-    """Make what was trained part of the model, and see that every weight is then a finite number."""
+    """Merge the trained weights into the model, and check that every weight is then finite."""
     merge_adapter(run.world_model)
     require_finite(
         run.world_model.predictor.state_dict(),
@@ -95,7 +95,7 @@ def _merge(run: TrainedRun) -> None:
 
 
 def _check_free(destination: Path, form: Form) -> None:
-    """See that nothing is at a destination, and that it can be written. Changes nothing."""
+    """Check that a destination is free and can be written. Changes nothing."""
     is_own = form == "official" and destination.suffix == ".pt"
     if destination.suffix in _FILES and not is_own and not destination.is_dir():
         file = f"a file that ends in .pt, or a folder for {OFFICIAL_NAME}"
@@ -128,14 +128,14 @@ def _check_widths(folder: Path, widths: Widths) -> None:
 
 
 def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dict[str, Any] | None) -> None:
-    """Copy the adapter of a checkpoint, which load_run has seen to be whole, and put the card beside it."""
+    """Copy the adapter of a checkpoint, which load_run has verified, and put the card beside it."""
     plot = folder / PLOT if evaluation is not None and (folder / PLOT).is_file() else None
     adapter = run.checkpoint / ADAPTER
     try:
         card = model_card(run.config, _facts(run, folder, evaluation, plot))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise _damaged(folder, f"figures that cannot be used ({error!r})") from None
-    _merge(run)  # nothing of the merged model is written, but an adapter that spoils it is of no use
+        raise _damaged(folder, f"metrics that cannot be used ({error!r})") from None
+    _merge(run)  # the merged model is not written, but an adapter that makes it not finite is of no use
     with folder_writer(destination, ADAPTER_FILE) as fresh:
         for path in (*sorted(adapter.iterdir()), *([plot] if plot else [])):
             shutil.copyfile(path, fresh / path.name)
@@ -166,15 +166,15 @@ def _facts(run: TrainedRun, folder: Path, evaluation: dict[str, Any] | None, plo
 
 
 def _read_evaluation(folder: Path) -> dict[str, Any] | None:
-    """Return what `evaluate` wrote of a run, without paths of this machine; None where it was never run."""
+    """Return the result of `evaluate` for a run, without paths of this machine; None if there is none."""
     if not (folder / METRICS_FILE).exists():
         return None
-    figures = read_metrics(folder)
+    metrics = read_metrics(folder)
     try:
-        about = {**figures["about"], "subject": folder.resolve().name}
-        return {**figures, "about": {**about, "checkpoint_path": Path(about["checkpoint_path"]).name}}
+        about = {**metrics["about"], "subject": folder.resolve().name}
+        return {**metrics, "about": {**about, "checkpoint_path": Path(about["checkpoint_path"]).name}}
     except (TypeError, KeyError) as error:
-        raise _damaged(folder, f"figures that cannot be used ({error!r})") from None
+        raise _damaged(folder, f"metrics that cannot be used ({error!r})") from None
 
 
 def _damaged(folder: Path, found: str) -> InputError:

@@ -1,4 +1,4 @@
-"""What should one read who finds an adapter on the Hub? A model card: base, data, training, figures, how to use it."""
+"""The model card of an exported adapter: base, data, training, metrics and usage."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ _NOT_EVALUATED = (
 
 @dataclass(frozen=True)
 class AdapterFacts:
-    """What a card tells of an adapter besides the settings of its run."""
+    """The content of a card besides the settings of its run."""
 
     name: str
     steps: int  # optimizer steps done
     checkpoint: str  # name of the checkpoint that is exported
     chosen: str  # the same, and whether it is the newest or the best
-    trained: str  # how many parameters, in words
+    trained: str  # number of trained parameters, as text
     base_predictor: str  # fingerprints
     base_encoder: str
     evaluation: Mapping[str, Any] | None  # what `vjepa2-ac evaluate` wrote
     plot: str | None  # name of the file beside the card
-    fresh_heads: Widths | None = None  # of states and actions, where the base's input heads were replaced
+    fresh_heads: Widths | None = None  # of states and actions, if the base's input heads were replaced
 
 
 def model_card(config: Config, facts: AdapterFacts) -> str:
     """Return the README.md of an adapter, in Markdown, with the Hub's front matter.
 
     Raises:
-        KeyError: The evaluation lacks a figure; likewise TypeError where one is of another kind.
+        KeyError: The evaluation lacks a metric; likewise TypeError if one is of another type.
     """
     parts = [
         f"---\n{_front(config, facts)}\n---\n\n# {facts.name}: a LoRA adapter for V-JEPA 2-AC",

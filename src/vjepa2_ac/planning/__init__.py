@@ -1,1 +1,1 @@
-"""Which action next? Planners (which know no model), and the energy of actions in a world model."""
+"""Planning: solvers that know no model, and the energy of actions in a world model."""

@@ -1,4 +1,4 @@
-"""Which actions are allowed? Limits per axis, a ball, axes that are held, and how a finished plan is rounded."""
+"""The action space: limits per axis, a norm ball, fixed axes, and rounding of a finished plan."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class Ball:
 
 @dataclass(frozen=True)
 class ActionSpace:
-    """Limits of each number of each decision; where both are the same, it is held there.
+    """Limits of each component of each decision; where both limits are equal, it is fixed.
 
     Raises:
-        ValueError: Limits cross or are not finite, or a ball is asked for and no motion is not allowed.
+        ValueError: Limits cross or are not finite, or there is a ball and zero motion is not allowed.
     """
 
     lower: Float[Tensor, "decisions dim"]
@@ -39,7 +39,7 @@ class ActionSpace:
     repeat: int = 1  # model steps of a decision
     ball: Ball | None = None
     gripper: int | None = None  # which number, where one is
-    gripper_rounding: float = 0.0  # changes below this become none in a finished plan
+    gripper_rounding: float = 0.0  # changes below this are set to zero in a finished plan
 
     def __post_init__(self) -> None:
         if not (torch.isfinite(self.lower) & torch.isfinite(self.upper) & (self.lower <= self.upper)).all():
@@ -51,12 +51,12 @@ class ActionSpace:
 
     @property
     def decisions(self) -> int:
-        """How many actions are chosen."""
+        """Number of chosen actions."""
         return int(self.lower.shape[0])
 
     @property
     def dim(self) -> int:
-        """Numbers of an action."""
+        """Components of an action."""
         return int(self.lower.shape[1])
 
     @property
@@ -66,18 +66,18 @@ class ActionSpace:
 
     @property
     def free(self) -> Tensor:
-        """Which numbers are not held, at one decision at least: the places along dim."""
+        """Components that are not fixed, in at least one decision: indices along dim."""
         return (self.lower < self.upper).any(dim=0).nonzero()[:, 0]
 
     @property
     def first_std(self) -> Float[Tensor, "decisions dim"]:
-        """The standard deviation of first samples, nothing where a number is held."""
+        """The standard deviation of the first samples, zero where a component is fixed."""
         return torch.where(self.lower < self.upper, self.std, 0.0)
 
     def allowed(self, decisions: Float[Tensor, "*batch decisions dim"]) -> Float[Tensor, "*batch decisions dim"]:
-        """Return each decision, or the allowed one it is cut back to; nothing else comes out, not even for NaN.
+        """Return each decision, or its projection onto the allowed set; the result is always allowed, even for NaN.
 
-        First to the limits of each axis, then towards no motion until it is in the ball.
+        First to the limits of each axis, then scaled towards zero motion until it is within the ball.
         """
         cut = torch.nan_to_num(decisions, nan=0.0).clamp(self.lower, self.upper)
         if self.ball is None:
@@ -88,7 +88,7 @@ class ActionSpace:
         return torch.cat([torch.where(share < 1, inner * share, inner), outer], dim=-1)
 
     def finished(self, decisions: Float[Tensor, "decisions dim"]) -> Float[Tensor, "decisions dim"]:
-        """Return decisions as a robot gets them: allowed, small changes of the gripper rounded to none.
+        """Return decisions as a robot receives them: allowed, with small changes of the gripper rounded to zero.
 
         Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, round_small_elements.
         """
@@ -131,7 +131,7 @@ def _rounding(limits: LimitsConfig) -> float:
 
 
 def _towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
-    """Return values in float32, none larger than it was: float32's 0.05 is above 0.05."""
+    """Return values in float32, rounded towards smaller ones: float32's 0.05 is above 0.05."""
     if len(values) != ACTION_DIM:
         raise ValueError(f"{len(values)} limits for an action of {ACTION_DIM} numbers")
     exact = torch.tensor(values, dtype=torch.float64)

@@ -1,4 +1,4 @@
-"""What should the robot do now? A goal picture once, then an action for every picture and state."""
+"""The controller: set a goal image once, then get one action for each image and state."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.action_space import ActionSpace
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goal import Goal, patch_weights
-from vjepa2_ac.planning.input_checks import require_extrinsics, require_mask, require_picture, require_pose
+from vjepa2_ac.planning.input_checks import require_extrinsics, require_image, require_mask, require_pose
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Clock, Planner
 from vjepa2_ac.planning.pose_integration import states_along
 
-Seen = tuple[Tensor, np.ndarray]  # latents of a picture, and the state
+Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
 Why = Literal["planned", "out of time", "at the goal", "no finite energy"]
 
-_REACHED = 1e-6  # the energy of a picture that is the goal's, to rounding
+_REACHED = 1e-6  # the energy of an image equal to the goal image, up to rounding
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What was decided, and why."""
+    """The decision, and its reason."""
 
-    action: Float[np.ndarray, " 7"]  # for the next model step; zero where `why` says so
+    action: Float[np.ndarray, " 7"]  # for the next model step; zero for some values of `why`
     why: Why  # out of time: the best plan so far. at the goal, no finite energy: do nothing
-    energy_now: float  # of the present picture, if it stayed: to compare with the plan's
-    goal: int  # which of several goals counts now
+    energy_now: float  # of the current image, if nothing changed: to compare with the plan's
+    goal: int  # index of the goal that applies now
     goals: tuple[int, ...]  # and after each model step of a plan
-    plan: Plan | None  # None at the goal
-    states: Float[np.ndarray, "time 7"] | None  # where the plan leads, the present state first
-    cost: WorldModelCost | None  # to look at other actions
+    plan: Plan | None  # None if the goal is reached
+    states: Float[np.ndarray, "time 7"] | None  # states predicted along the plan, the current state first
+    cost: WorldModelCost | None  # to evaluate other actions
 
 
 class Controller:
-    """Plans towards a goal, one model step at a time, and remembers what was seen.
+    """Plans towards a goal, one model step at a time, and stores what was observed.
 
-    The same seed, pictures and states give the same actions: the n-th decision after a reset (from 0) is drawn with
-    seed + n. Actions are within `planning.limits`, whatever the model says.
+    The same seed, images and states give the same actions: the n-th decision after a reset (from 0) is drawn with
+    seed + n. Actions are within `planning.limits`, for any output of the model.
     """
 
     def __init__(
@@ -66,21 +66,21 @@ class Controller:
         clock: Clock = time.perf_counter,
         progress: Progress | None = None,
     ) -> None:
-        """Prepare to control.
+        """Create a controller.
 
         Args:
-            world_model: A base or merged, which is put into eval mode; or one that was trained, of which a merged copy
+            world_model: A base or merged model, which is put into eval mode; or a trained one, of which a merged copy
                 plans (see `planning.model_setup`).
-            config: How to plan.
+            config: Planning settings.
             seed: Of all decisions.
             crop: As in training (`data.crop`).
-            extrinsics: Pose of the camera, where the model uses it.
-            clock: What the time budget is measured by.
-            progress: Is told how many iterations of a decision are done.
+            extrinsics: Pose of the camera, if the model uses it.
+            clock: Measures the time budget.
+            progress: Called with the number of finished iterations of a decision.
 
         Raises:
-            InputError: The model's states and actions are no poses, or it needs a camera pose and there is none, or
-                none that can be; or its blocks cannot be compiled or in 8 bits.
+            InputError: The model's states and actions are no poses, or it needs a camera pose and none is given, or
+                the other way round; or its blocks cannot be compiled or quantized to 8 bits.
         """
         if widths_of_model(world_model.sizes) != POSE_WIDTHS:
             raise InputError(
@@ -105,26 +105,26 @@ class Controller:
 
     @property
     def space(self) -> ActionSpace:
-        """What is allowed."""
+        """The allowed actions."""
         return self._planner.space
 
     def reset(self, *goals: np.ndarray, durations: tuple[int, ...] = (), mask: np.ndarray | None = None) -> None:
-        """Set a goal, or several in order, and forget what was seen.
+        """Set a goal, or several in order, and forget all observations.
 
         Args:
-            goals: RGB pictures, height x width x 3, uint8, all of one size.
-            durations: Model steps for which each goal but the last counts.
-            mask: What of the picture counts: height x width, true or 1 where it does; None: all.
+            goals: RGB images, height x width x 3, uint8, all of one size.
+            durations: Model steps for which each goal but the last applies.
+            mask: Region of the image that counts: height x width, true or 1 where it does; None: all.
 
         Raises:
-            InputError: A picture is none, sizes differ, or the mask leaves nothing.
-            ValueError: There is not one duration for each goal but the last.
+            InputError: An image is invalid, sizes differ, or the mask is empty.
+            ValueError: The number of durations is not the number of goals minus one.
         """
-        for place, picture in enumerate(goals):
-            require_picture(picture, where=f"goal {place}", like=goals[0] if place else None)
+        for place, image in enumerate(goals):
+            require_image(image, where=f"goal {place}", like=goals[0] if place else None)
         if not goals:
             raise ValueError("no goal")
-        latents = torch.stack([self._encoded(picture) for picture in goals])
+        latents = torch.stack([self._encoded(image) for image in goals])
         self._goal = Goal(latents, durations, self._weights(mask, goals[0]))
         self._like, self._done, self.decision = goals[0], 0, None
         self._seen = []
@@ -132,25 +132,25 @@ class Controller:
     def act(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " 7"]:
         """Return the action of the next model step: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`).
 
-        Call it once every model step. `decision` then says why.
+        Call it once per model step. `decision` then holds the reason.
 
         Args:
-            frame: What the camera sees, of the goal picture's size.
+            frame: What the camera sees, of the goal image's size.
             state: Measured pose and gripper.
 
         Raises:
-            InputError: The picture or the state cannot be used.
+            InputError: The image or the state cannot be used.
             ValueError: No goal was set.
         """
         if self._goal is None:
             raise ValueError("no goal: call reset first")
-        require_picture(frame, where="frame", like=self._like)
+        require_image(frame, where="frame", like=self._like)
         state = np.asarray(state, dtype=np.float64)
         require_pose(state, where="state")
         seen = [*self._seen, (self._encoded(frame), state)][-self.config.context :]
         before = self.decision
         decision = self._decided(self._goal, seen, None if before is None else before.plan)
-        self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error all is as it was
+        self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
         return decision.action
 
     def _decided(self, goal: Goal, seen: Sequence[Seen], before: Plan | None) -> Decision:
@@ -179,8 +179,8 @@ class Controller:
             extrinsics=self._camera,
         )
 
-    def _encoded(self, picture: np.ndarray) -> Float[Tensor, "tokens dim"]:
-        frames = torch.from_numpy(np.ascontiguousarray(view(picture[None], self.crop)))[None]
+    def _encoded(self, image: np.ndarray) -> Float[Tensor, "tokens dim"]:
+        frames = torch.from_numpy(np.ascontiguousarray(view(image[None], self.crop)))[None]
         frames = frames.to(self._model.device)
         return self._model.encode(pixels_to_input(frames, self._model.image_size))[0, 0]
 
@@ -189,8 +189,8 @@ class Controller:
             return None
         require_mask(mask, where="mask", like=like)
         grid = self._model.image_size // self._model.sizes.patch_size
-        picture = np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1)
-        seen = torch.from_numpy(np.ascontiguousarray(view(picture, self.crop)[0, ..., 0]))
+        image = np.repeat((mask > 0).astype(np.uint8)[None, ..., None], 3, axis=-1)
+        seen = torch.from_numpy(np.ascontiguousarray(view(image, self.crop)[0, ..., 0]))
         try:
             return patch_weights(seen > 0, grid).to(self._model.device)
         except ValueError:

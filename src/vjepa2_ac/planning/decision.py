@@ -1,4 +1,4 @@
-"""What would the robot do here, and why? One decision, with all that is needed to judge it."""
+"""A planning decision: one planned action, with all data needed to judge it."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from vjepa2_ac.planning.energy_slices import EnergySlice, energy_slices
 
 @dataclass(frozen=True, eq=False)
 class PlanRequest:
-    """What is seen, and what is wanted."""
+    """The observation and the goal."""
 
     start: UInt8[np.ndarray, "height width 3"]
     state: Float[np.ndarray, " numbers"]  # measured; a pose is refused or taken by the controller
     goals: tuple[np.ndarray, ...]
     durations: tuple[int, ...] = ()  # model steps of each goal but the last
-    mask: np.ndarray | None = None  # what of the picture counts: height x width
+    mask: np.ndarray | None = None  # region of the image that counts: height x width
 
     def with_equal_durations(self, horizon: int) -> PlanRequest:
-        """Return the same, every goal counting for an equal share of so many model steps, the last for the rest."""
+        """Return the same request with the steps divided equally among the goals, the last one taking the rest."""
         return replace(self, durations=(max(1, horizon // len(self.goals)),) * (len(self.goals) - 1))
 
 
 @dataclass(frozen=True)
 class Seconds:
-    """What took how long."""
+    """Durations in seconds."""
 
     goals: float  # encoding them
     decision: float  # encoding the start, and planning
@@ -40,41 +40,41 @@ class Seconds:
 
 @dataclass(frozen=True, eq=False)
 class PlanResult:
-    """A decision, and what else could have been decided."""
+    """A decision, with its alternatives."""
 
     question: PlanRequest
     controller: Controller
     decision: Decision
     actions: Float[np.ndarray, "steps 7"]  # zero where the decision is to do nothing
-    states: Float[np.ndarray, "steps+1 7"]  # where they lead, as far as poses tell
-    doing_nothing: float  # energy that the model predicts for no motion; not a number where it was not asked
-    slices: tuple[EnergySlice, ...]  # empty where there is no plan, or none were asked for
+    states: Float[np.ndarray, "steps+1 7"]  # predicted states along them, if the states are poses
+    doing_nothing: float  # predicted energy of no motion; NaN if it was not computed
+    slices: tuple[EnergySlice, ...]  # empty if there is no plan, or none were requested
     seconds: Seconds
 
     @property
     def space(self) -> ActionSpace:
-        """What was allowed."""
+        """The allowed actions."""
         return self.controller.space
 
     @property
     def unused_goals(self) -> tuple[int, ...]:
-        """Goals that have no part in the plan: their time comes after its end, or only its last step counts."""
+        """Goals that do not affect the plan: they begin after its end, or only its last step counts."""
         ahead = self.decision.goals
         counted = set(ahead[-1:] if self.controller.config.energy.steps == "last" else ahead)
         return tuple(place for place in range(len(self.question.goals)) if place not in counted)
 
 
 def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0) -> PlanResult:
-    """Decide once, and look around the decision.
+    """Make one decision, and evaluate its alternatives.
 
     Args:
-        controller: Which plans; it is reset.
-        question: What is seen, and what is wanted.
+        controller: The planner; it is reset.
+        question: The observation and the goal.
         nodes: Of an energy slice along each axis; below 3: no slices.
 
     Raises:
-        InputError: A picture, the state or the mask cannot be used.
-        ValueError: There is not one duration for each goal but the last.
+        InputError: An image, the state or the mask is invalid.
+        ValueError: The number of durations is not the number of goals minus one.
     """
     began = time.perf_counter()
     controller.reset(*question.goals, durations=question.durations, mask=question.mask)

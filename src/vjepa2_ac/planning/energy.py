@@ -1,4 +1,4 @@
-"""How far from the goal would these actions lead? The energy of action sequences in a world model."""
+"""The planning energy: distance to the goal after an action sequence, predicted by the world model."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ Motion = Callable[[Float[Tensor, " state_dim"], Float[Tensor, "samples steps act
 
 @dataclass(frozen=True)
 class Scene:
-    """What is known when a decision is made: the last frames, up to the present one."""
+    """The input of a decision: the last frames, up to the current one."""
 
     latents: Float[Tensor, "context tokens dim"]
     states: Float[Tensor, "context state_dim"]
     actions: Float[Tensor, "context-1 action_dim"]
-    extrinsics: Float[Tensor, " 6"] | None = None  # of the camera, which stays where it is
+    extrinsics: Float[Tensor, " 6"] | None = None  # of the camera, which does not move
 
 
 class WorldModelCost:
     """The energy of action sequences from a scene towards a goal.
 
-    Keys and values of frames before the present one are computed here, once. Those of the present frame depend on the
-    action that is tried beside it, and are computed for every sample.
+    Keys and values of frames before the current one are computed here, once. Those of the current frame depend on the
+    evaluated action, and are computed for every sample.
     """
 
     def __init__(
@@ -52,11 +52,11 @@ class WorldModelCost:
 
         Args:
             world_model: In eval mode: dropout would make energies differ from call to call.
-            scene: Where the actions begin.
-            goal: Where they are to lead.
-            config: What far means, and how many samples are computed at once.
-            done: Model steps since the goal was set: which of several goals counts.
-            motion: Which states actions lead to, the first one included; for poses, or what a vector is.
+            scene: The start of the actions.
+            goal: Their target.
+            config: The distance, and the number of samples per batch.
+            done: Model steps since the goal was set: selects the goal that applies.
+            motion: Returns the states after actions, the first one included; for poses, or for the kind of vector.
 
         Raises:
             ValueError: The model is in training mode.
@@ -73,10 +73,10 @@ class WorldModelCost:
         self._cache = self._past(scene)
 
     def __call__(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
-        """Return energies on the device of the actions; gradients flow to them if they are asked for.
+        """Return energies on the device of the actions; gradients flow to the actions if requested.
 
-        With gradients, predictions of each part but the only one are computed again in the backward pass: memory stays
-        bounded then, too.
+        With gradients, predictions of each part but the only one are recomputed in the backward pass, so that memory is
+        bounded as well.
         """
         parts = actions.to(self._model.device).split(self._config.samples_at_once)  # type: ignore[no-untyped-call]  # torch
         again = torch.is_grad_enabled() and len(parts) > 1
@@ -126,7 +126,7 @@ def distance(
     kind: Literal["l1", "l2", "cosine"],
     weights: Float[Tensor, " tokens"] | None = None,
 ) -> Float[Tensor, "*batch"]:
-    """Return how far latents are from others, over patches by weight (all the same: None).
+    """Return the distance between latents, over patches by weight (None: equal weights).
 
     l1: mean absolute difference. l2: mean square. cosine: 1 - cosine of each token.
 

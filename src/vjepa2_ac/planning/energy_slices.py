@@ -1,4 +1,4 @@
-"""What would it cost to do something else? Energies around the first action of a plan, two axes at a time."""
+"""Energy slices: energies around the first action of a plan, over two axes at a time."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _LEAST_M = 0.05  # half the width of a slice along an axis that is held
 
 @dataclass(frozen=True)
 class EnergySlice:
-    """Energies over two axes of the first action in metres, all other numbers of the plan as they were chosen."""
+    """Energies over two axes of the first action in metres, all other components of the plan unchanged."""
 
     axes: tuple[int, int]  # of dx, dy, dz
     across: Float[np.ndarray, " nodes"]  # values along the first of them
     up: Float[np.ndarray, " nodes"]
-    energy: Float[np.ndarray, "nodes nodes"]  # [up, across]; not a number where the model has none
+    energy: Float[np.ndarray, "nodes nodes"]  # [up, across]; NaN where the model gives none
 
 
 def energy_slices(
@@ -34,7 +34,7 @@ def energy_slices(
 ) -> tuple[EnergySlice, ...]:
     """Return the energy around a plan's first action: over dx and dy, dx and dz, dy and dz.
 
-    Limits are not heeded, so that one sees what lies beyond them. A first action that is repeated changes as one.
+    Limits are ignored, to show what is beyond them. A first action that is repeated changes as one.
 
     Raises:
         ValueError: Fewer than three nodes.
@@ -47,10 +47,10 @@ def energy_slices(
 @torch.no_grad()
 def _slice(cost: Cost, actions: Tensor, space: ActionSpace, axes: tuple[int, int], nodes: int) -> EnergySlice:
     across, up = (_BEYOND * _half_width(space, axis) * torch.linspace(-1, 1, nodes) for axis in axes)
-    tried = actions.repeat(nodes * nodes, 1, 1)
-    tried[:, : space.repeat, axes[0]] = across.repeat(nodes)[:, None]
-    tried[:, : space.repeat, axes[1]] = up.repeat_interleave(nodes)[:, None]
-    energy = cost(tried).float().cpu().reshape(nodes, nodes)
+    evaluated = actions.repeat(nodes * nodes, 1, 1)
+    evaluated[:, : space.repeat, axes[0]] = across.repeat(nodes)[:, None]
+    evaluated[:, : space.repeat, axes[1]] = up.repeat_interleave(nodes)[:, None]
+    energy = cost(evaluated).float().cpu().reshape(nodes, nodes)
     return EnergySlice(axes, across.double().numpy(), up.double().numpy(), energy.double().numpy())
 
 

@@ -1,4 +1,4 @@
-"""What is wanted, and when? One goal picture or a sequence of them, perhaps only in a part of the image."""
+"""Goals: one goal image or a sequence of them, optionally limited to a region of the image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _EVERYWHERE = 1e-12
 
 @dataclass(frozen=True)
 class Goal:
-    """Latents to reach, one after the other: each for so many model steps, the last one for good.
+    """Goal latents in order: each applies for its number of model steps, the last one without end.
 
     Raises:
         ValueError: No goals, another number of durations than there are goals before the last, a duration below 1, or
@@ -23,7 +23,7 @@ class Goal:
 
     latents: Float[Tensor, "goals tokens dim"]
     durations: tuple[int, ...] = ()  # model steps of each goal but the last
-    weights: Float[Tensor, " tokens"] | None = None  # how much each patch counts; None: all the same
+    weights: Float[Tensor, " tokens"] | None = None  # weight of each patch; None: equal weights
 
     def __post_init__(self) -> None:
         if not len(self.latents) or len(self.durations) != len(self.latents) - 1 or min(self.durations, default=1) < 1:
@@ -34,7 +34,7 @@ class Goal:
                 raise ValueError("one weight for each patch, none negative, and not all zero")
 
     def place(self, step: int) -> int:
-        """Return which goal counts after this many model steps since the start."""
+        """Return the index of the goal that applies after this many model steps since the start."""
         for place, duration in enumerate(self.durations):
             step -= duration
             if step < 0:
@@ -42,9 +42,9 @@ class Goal:
         return len(self.latents) - 1
 
     def ahead(self, done: int, steps: int) -> Float[Tensor, "steps tokens dim"]:
-        """Return what is wanted after each of the next steps, when some are done.
+        """Return the goal latents after each of the next steps, when some are done.
 
-        The frame that a goal's last step leads to is still to be that goal.
+        The frame after a goal's last step is still compared with that goal.
         """
         places = [self.place(done + step) for step in range(steps)]
         return torch.stack([self.latents[place] for place in places])  # a list as an index would wait for the device
@@ -53,14 +53,14 @@ class Goal:
 def patch_weights(
     mask: Bool[Tensor, "height width"] | Float[Tensor, "height width"], grid: int
 ) -> Float[Tensor, " tokens"]:
-    """Return how much each patch counts: the mean of a mask over what it covers, patches row by row.
+    """Return the weight of each patch: the mean of a mask over the patch, patches row by row.
 
     Args:
-        mask: Over the picture as the model sees it (cropped), of any resolution; 1 counts, 0 does not.
+        mask: Over the image as the model sees it (cropped), of any resolution; 1 counts, 0 does not.
         grid: Patches along one side.
 
     Raises:
-        ValueError: Nothing counts.
+        ValueError: The mask is empty.
     """
     weights = adaptive_avg_pool2d(mask.float()[None], grid).flatten()
     if weights.sum() <= _EVERYWHERE:

@@ -1,4 +1,4 @@
-"""Can this be planned from? Pictures and states as a robot gives them, refused before they do harm."""
+"""Input checks of planning: images and states of a robot are refused if they are invalid."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.errors import InputError
 
 _LEAST_SIDE = 16  # pixels
-_REACH_M = 5.0  # beyond this it is no arm's reach in metres
+_REACH_M = 5.0  # larger positions are not in metres
 _ANGLE = 2 * math.pi + 0.01
-_GRIPPER_SLACK = 0.1  # what a measured closedness may be beyond 0 .. 1
+_GRIPPER_SLACK = 0.1  # a measured closedness may exceed 0 .. 1 by this
 
 
-def require_picture(picture: np.ndarray, *, where: str, like: np.ndarray | None = None) -> None:
-    """Refuse what is no RGB picture, or not of another's size.
+def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = None) -> None:
+    """Refuse an array that is no RGB image, or of another size than a given one.
 
     Args:
-        picture: As given.
-        where: What it is called.
-        like: A picture that it is compared with later, and that the same camera should have made.
+        image: The array.
+        where: Its name in errors.
+        like: An image of the same camera, of the required size.
 
     Raises:
         InputError: Says what was found.
     """
-    found = f"an array of shape {picture.shape} and type {picture.dtype}"
-    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8 or min(picture.shape[:2]) < _LEAST_SIDE:
+    found = f"an array of shape {image.shape} and type {image.dtype}"
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or min(image.shape[:2]) < _LEAST_SIDE:
         raise InputError(
-            where=where, found=found, needed=f"an RGB picture: height x width x 3, uint8, {_LEAST_SIDE} pixels or more"
+            where=where, found=found, needed=f"an RGB image: height x width x 3, uint8, {_LEAST_SIDE} pixels or more"
         )
-    if like is not None and picture.shape != like.shape:
+    if like is not None and image.shape != like.shape:
         raise InputError(
             where=where,
-            found=f"{picture.shape[1]} x {picture.shape[0]} pixels (width x height)",
-            needed=f"{like.shape[1]} x {like.shape[0]}, as the goal's picture",
+            found=f"{image.shape[1]} x {image.shape[0]} pixels (width x height)",
+            needed=f"{like.shape[1]} x {like.shape[0]}, as the goal image",
             fix="Take both with the same camera, at the same place and resolution",
         )
 
 
 def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
-    """Refuse a mask that is not of a picture's size.
+    """Refuse a mask that is not of an image's size.
 
     Raises:
         InputError: Says what was found.
@@ -50,7 +50,7 @@ def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
         raise InputError(
             where=where,
             found=f"shape {mask.shape} (height, width)",
-            needed=f"{like.shape[:2]}, as the goal's picture",
+            needed=f"{like.shape[:2]}, as the goal image",
         )
 
 
@@ -69,7 +69,7 @@ def require_pose(state: np.ndarray, *, where: str) -> None:
 
 
 def require_extrinsics(extrinsics: np.ndarray, *, where: str) -> None:
-    """Refuse what is not a camera's pose in the robot base frame.
+    """Refuse an array that is no camera pose in the robot base frame.
 
     Raises:
         InputError: Says what was found.

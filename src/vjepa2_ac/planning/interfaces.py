@@ -1,7 +1,7 @@
-"""What is asked of a planner, and what does it answer? A cost in, a plan out.
+"""Interfaces of planners: a cost function in, a plan out.
 
-Axes: samples (action sequences), decisions (actions that are chosen), steps (of the model; a decision is repeated for
-`ActionSpace.repeat` of them), dim (numbers of an action). All on the CPU.
+Axes: samples (action sequences), decisions (chosen actions), steps (of the model; a decision is repeated for
+`ActionSpace.repeat` of them), dim (components of an action). All on the CPU.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Stopped = Literal["finished", "out of time", "no finite energy"]
 
 @runtime_checkable
 class Cost(Protocol):
-    """All that a planner knows of a model: what action sequences cost. Lower is better; not a number is not allowed."""
+    """A planner's only view of a model: the cost of action sequences. Lower is better; NaN is not allowed."""
 
     def __call__(self, actions: Float[Tensor, "samples steps dim"]) -> Float[Tensor, " samples"]:
         """Return the energy of each action sequence; for `gradient`, as a differentiable function of it."""
@@ -28,7 +28,7 @@ class Cost(Protocol):
 
 @dataclass(frozen=True)
 class PlanStart:
-    """Where a search begins, if not from nothing: at what the last decision left."""
+    """The start of a search: what the last decision left."""
 
     mean: Float[Tensor, "decisions dim"]
     elites: Float[Tensor, "elites decisions dim"]
@@ -36,7 +36,7 @@ class PlanStart:
 
 @dataclass(frozen=True)
 class Iteration:
-    """One round of trying and learning, for a picture of it later."""
+    """The record of one iteration, for figures."""
 
     samples: int
     finite: int  # of these, how many have an energy
@@ -51,25 +51,25 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Plan:
-    """What to do, and how it was found."""
+    """The planned actions, and how they were found."""
 
     actions: Float[Tensor, "steps dim"]  # within the limits, always
-    energy: float  # of these actions; not a number where the plan is to do nothing
+    energy: float  # of these actions; NaN where the plan is to do nothing
     stopped: Stopped  # with "no finite energy" the actions are zero
     iterations: tuple[Iteration, ...]
     mean: Float[Tensor, "decisions dim"]  # where the search ended, before the gripper is rounded
     repeat: int  # model steps of a decision
     planner: str
     seed: int
-    evaluations: int  # action sequences that were tried
+    evaluations: int  # number of evaluated action sequences
     seconds: float
 
     def start_after(self, done: int) -> PlanStart:
-        """Return where the next decision begins when some model steps of this plan were done.
+        """Return the start of the next search after some model steps of this plan were done.
 
-        A decision of the next plan begins at the mean of what this one would have done in its model steps: within an
-        action that is repeated, a decision begins between two of this plan's. The last decision is repeated for what
-        the plan did not reach.
+        A decision of the next plan begins at the mean of what this plan would have done in its model steps: if an
+        action is repeated, a decision begins between two of this plan's. The last decision is repeated for the steps
+        that this plan did not reach.
 
         Raises:
             ValueError: A negative number of steps.

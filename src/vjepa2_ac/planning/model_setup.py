@@ -1,4 +1,4 @@
-"""What is done to a model before it is planned with? Merged, in eval mode; compiled or in 8 bits if asked for."""
+"""Model setup for planning: merged, in eval mode; on request compiled or quantized to 8 bits."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from vjepa2_ac.model.quantization import quantized_copy
 
 
 def prepare_for_planning(world_model: WorldModel, config: PlanningConfig) -> WorldModel:
-    """Return the model to plan with: the same, or a copy that shares its encoder, for an adapted or quantized one.
+    """Return the model for planning: the same, or a copy that shares its encoder, for an adapted or quantized one.
 
-    What was trained is float32, and nothing casts in planning as autocast does in training: as it is, PEFT computes an
+    Trained weights are float32, and planning does not use autocast as training does: unmerged, PEFT computes an
     adapter in float32, and a predictor that was trained whole takes float32 throughout. So it is merged and computes in
-    the base's type. On a fake GPU a decision at the released sizes in bfloat16 takes 7.5 s as it is, 3.7 s with
+    the base's type. On a fake GPU a decision at the released sizes in bfloat16 takes 7.5 s unmerged, 3.7 s with
     adapters in bfloat16 beside their layers, and 3.0 s merged. Merging costs no accuracy: after 200 steps of the demo
-    predictions are off by 2.5 % of what the adapter changes, by 2.7 % without merging, and the base's by 2.4 %. What
-    rounding takes away (updates below 0.2 % of a weight) is below bfloat16's noise in what a layer returns.
+    predictions are off by 2.5 % of the adapter's effect, by 2.7 % without merging, and the base's by 2.4 %. The updates
+    lost to rounding (below 0.2 % of a weight) are below bfloat16's noise in the output of a layer.
 
     Raises:
-        InputError: Its blocks shall be compiled or quantized and cannot be: a library or the device's ability is
-            missing, or its weights are not of the type.
+        InputError: Its blocks are to be compiled or quantized and cannot be: a library or a feature of the device is
+            missing, or its weights are of another type.
     """
     if config.quantize != "off":
         world_model = quantized_copy(world_model, config.quantize, where="planning.quantize")

@@ -1,4 +1,4 @@
-"""What stands in plan.json? A decision as plain values, by a schema that docs/planning.md explains."""
+"""The content of plan.json: a decision as plain values, by the schema in docs/planning.md."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ FORMAT = 1  # goes up when a reader of the file would have to change
 
 
 def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path:
-    """Write a decision as JSON; the file appears whole or not at all.
+    """Write a decision as JSON; the file is written atomically.
 
     Args:
         answer: The decision.
-        about: What answered, and where the pictures came from: plain values.
+        about: What answered, and where the images came from: plain values.
         path: The file.
     """
     write_atomically(path, json_text(plan_as_dict(answer, about)))

@@ -1,4 +1,4 @@
-"""Which actions cost least? The loop around every search: a time budget, bad energies, limits, a record of it all."""
+"""The planner: the loop around each solver, with a time budget, limits, bad energies and a record of all steps."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ Clock = Callable[[], float]  # seconds, from anywhere
 
 
 class Planner:
-    """Searches the action sequence of least cost, and knows nothing else of what it plans for.
+    """Searches the action sequence of lowest cost, and knows nothing else about the model.
 
-    Whatever the cost says, the actions of a plan are within the limits; where it says nothing finite, they are zero.
+    Whatever the cost returns, the actions of a plan are within the limits; if no cost is finite, they are zero.
     """
 
     def __init__(
@@ -37,28 +37,28 @@ class Planner:
         clock: Clock = time.perf_counter,
         progress: Progress | None = None,
     ) -> None:
-        """Choose a planner.
+        """Select a planner.
 
         Args:
-            config: Which one, and how long it searches.
-            space: What is allowed; None: an arm's actions within `planning.limits`.
-            clock: What the time budget is measured by.
-            progress: Is told how many iterations of a plan are done.
+            config: The solver, and how long it searches.
+            space: The allowed actions; None: an arm's actions within `planning.limits`.
+            clock: Measures the time budget.
+            progress: Called with the number of finished iterations of a plan.
         """
         self.config = config
         self.space = pose_space(config) if space is None else space
         self._clock, self._progress = clock, progress
 
     def plan(self, cost: Cost, generator: Generator, start: PlanStart | None = None) -> Plan:
-        """Return the best plan that was found.
+        """Return the best plan found.
 
         Args:
-            cost: What an action sequence costs. Called without gradients but for planner gradient.
-            generator: On the CPU; the same seed gives the same plan. Its first seed is recorded.
-            start: What an earlier plan left (`Plan.start_after`).
+            cost: The cost of action sequences. Called without gradients except by planner gradient.
+            generator: On the CPU; the same seed gives the same plan. Its initial seed is recorded.
+            start: Left by an earlier plan (`Plan.start_after`).
 
         Raises:
-            ValueError: The cost gives other than one number a sample, or `start` is of another shape.
+            ValueError: The cost does not return one number per sample, or `start` is of another shape.
         """
         began = self._clock()
         if start is not None and start.mean.shape != self.space.lower.shape:
@@ -71,7 +71,7 @@ class Planner:
             if self._progress is not None:
                 self._progress(len(record), self.config.iterations)
         stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"
-        actions, energy, tried = self._chosen(search.result(), best, cost, lowest=stopped == "out of time")
+        actions, energy, evaluated = self._chosen(search.result(), best, cost, lowest=stopped == "out of time")
         if actions is None:
             actions, stopped = torch.zeros(self.space.steps, self.space.dim), "no finite energy"
         return Plan(
@@ -83,7 +83,7 @@ class Planner:
             repeat=self.space.repeat,
             planner=self.config.planner,
             seed=generator.initial_seed(),
-            evaluations=sum(one.samples for one in record) + tried,
+            evaluations=sum(one.samples for one in record) + evaluated,
             seconds=self._clock() - began,
         )
 
@@ -98,7 +98,7 @@ class Planner:
         return GradientSolver(space, config.gradient, config.iterations, generator, start)
 
     def _has_time(self, began: float, record: list[Iteration]) -> bool:
-        """Say whether an iteration as long as the longest so far would end within the budget."""
+        """Return whether an iteration as long as the longest so far would end within the budget."""
         if self.config.budget_s is None or not record:
             return True
         return self._clock() - began + max(one.seconds for one in record) <= self.config.budget_s
@@ -106,15 +106,15 @@ class Planner:
     def _iterate(self, search: Solver, cost: Cost, best: _Best) -> Iteration:
         began = self._clock()
         decisions = search.sample()
-        tried = self._try(cost, decisions, gradients=search.uses_gradients)
-        elites = tried.best(search.elites)
+        evaluated = self._try(cost, decisions, gradients=search.uses_gradients)
+        elites = evaluated.best(search.elites)
         if len(elites.energies) and float(elites.energies[0]) < best.energy:
             best.decisions, best.energy = elites.decisions[0], float(elites.energies[0])
-        search.update(tried)
+        search.update(evaluated)
         found = bool(len(elites.energies))
         return Iteration(
             samples=len(decisions),
-            finite=len(tried.energies),
+            finite=len(evaluated.energies),
             lowest=float(elites.energies[0]) if found else math.inf,
             elite_energy=float(elites.energies.mean()) if found else math.inf,
             elites=elites.decisions,
@@ -141,26 +141,26 @@ class Planner:
     def _chosen(
         self, answer: Tensor | None, best: _Best, cost: Cost, *, lowest: bool
     ) -> tuple[Float[Tensor, "steps dim"] | None, float, int]:
-        """Return actions, their energy, and how many more were tried: the answer, or else the best that was tried.
+        """Return actions, their energy, and the number of extra evaluations: the result, or else the best sample.
 
-        With `lowest`, whichever of the two costs less: a mean that has hardly been moved may lead nowhere.
+        With `lowest`, the one of lower cost: a mean that has hardly moved may lead nowhere.
         """
-        chosen, lowest_energy, tried = None, math.nan, 0
+        chosen, lowest_energy, evaluated = None, math.nan, 0
         for decisions in (answer, best.decisions):
             if decisions is None or (chosen is not None and not lowest):
                 continue
             done, energies = self.space.finished(decisions), [best.energy]
             if decisions is not best.decisions or not torch.equal(done, decisions):
                 energies = self._try(cost, done[None], gradients=False).energies.tolist()
-                tried += 1
+                evaluated += 1
             if energies and not energies[0] >= lowest_energy:
                 chosen, lowest_energy = self.space.over_steps(done), energies[0]
-        return chosen, lowest_energy, tried
+        return chosen, lowest_energy, evaluated
 
 
 @dataclass
 class _Best:
-    """The best decisions that were tried so far."""
+    """The best decisions evaluated so far."""
 
     decisions: Tensor | None = None
     energy: float = math.inf

@@ -1,6 +1,6 @@
-"""Where does an arm get to? Poses integrated with actions, batched, on any device, and differentiable.
+"""Pose integration: poses after a sequence of actions, batched, on any device, and differentiable.
 
-The same as `geometry.apply_action` (NumPy, SciPy), but that the gripper stays between open and closed.
+The same as `geometry.apply_action` (NumPy, SciPy), except that the gripper is limited to between open and closed.
 """
 
 from __future__ import annotations
@@ -9,13 +9,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw can be told
+_LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
 
 
 def apply_actions(states: Float[Tensor, "*batch 7"], actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
-    """Return the states that actions lead to: xyz and gripper add, R' = R_delta @ R, the gripper is cut to 0 .. 1.
+    """Return the states after actions: xyz and gripper add, R' = R_delta @ R, the gripper is clipped to 0 .. 1.
 
-    Autocast does not touch it: bfloat16 has too few digits for rotations.
+    Autocast is disabled here: bfloat16 has too few digits for rotations.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.
     """
@@ -28,7 +28,7 @@ def apply_actions(states: Float[Tensor, "*batch 7"], actions: Float[Tensor, "*ba
 def states_along(
     state: Float[Tensor, " 7"], actions: Float[Tensor, "samples steps 7"]
 ) -> Float[Tensor, "samples steps+1 7"]:
-    """Return the states before and after every action, from one state on."""
+    """Return the states before and after every action, starting from one state."""
     states = [state.expand(len(actions), -1)]
     for step in range(actions.shape[1]):
         states.append(apply_actions(states[-1], actions[:, step]))

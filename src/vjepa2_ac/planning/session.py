@@ -1,4 +1,4 @@
-"""What is planned with? A model of its own or what a run has learned, and the settings that go with it."""
+"""The planning session: a model or a run's adapter, loaded with its settings."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class Fingerprints(NamedTuple):
 
     encoder: str
     base: str  # of the predictor before it was adapted
-    predictor: str  # with what was trained
+    predictor: str  # with the trained weights
 
     @classmethod
     def of(cls, model: WorldModel) -> Fingerprints:
-        """Hash a model, an adapter apart from its base."""
+        """Hash a model, with its adapter separate from its base."""
         known, whole = model.adaptation, fingerprint(model.predictor.state_dict())
         if known is not None:
             return cls(known.encoder, known.base, whole)
@@ -46,12 +46,12 @@ class Fingerprints(NamedTuple):
 
 @dataclass(frozen=True)
 class PlanningSession:
-    """A world model on its device, in eval mode, what was trained merged into it; and how to plan with it."""
+    """A world model on its device, in eval mode, with trained weights merged; and its planning settings."""
 
     world_model: WorldModel
-    config: Config  # of it: planning, seed, data.crop and data.stride count
-    subject: str  # what was named
-    checkpoint: str  # which one, in words; "" of a model
+    config: Config  # of it: planning, seed, data.crop and data.stride are used
+    subject: str  # the run or model as given
+    checkpoint: str  # which one, as text; "" of a model
     fingerprints: Fingerprints | None = None  # of a run's weights before they were merged; None: of the world model
 
     def controller(
@@ -65,8 +65,8 @@ class PlanningSession:
 
         Args:
             seed: Of all decisions; None: the config's.
-            extrinsics: Pose of the camera, where the model uses it.
-            progress: Is told how many iterations of a decision are done.
+            extrinsics: Pose of the camera, if the model uses it.
+            progress: Called with the number of finished iterations of a decision.
 
         Raises:
             InputError: The model's states are no poses, or it needs a camera pose and there is none.
@@ -81,7 +81,7 @@ class PlanningSession:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return which model this is, as plain values: what was named, and hashes of the weights."""
+        """Return the identity of the model as plain values: its name, and hashes of the weights."""
         model = self.world_model
         dtype = next(model.parameters()).dtype
         return {
@@ -103,20 +103,20 @@ class PlanningSession:
 def load_to_plan(
     subject: str, *, checkpoint: str = NEWEST, config: str | Path | None = None, overrides: Sequence[str] = ()
 ) -> PlanningSession:
-    """Load what to plan with.
+    """Load a run or a model for planning.
 
     The settings of a run are those of its config: planning, seed, crop, stride, type of the weights. Those of a model
-    are the given config's; without one the defaults, and float32 weights where the device has no bfloat16, or is a CPU.
-    What a run has trained is merged before it is on the device (see `planning.model_setup`): it is there once.
+    are the given config's; without one the defaults, and float32 weights if the device has no bfloat16, or is a CPU.
+    Trained weights are merged before the model moves to the device (see `planning.model_setup`): it is there once.
 
     Args:
-        subject: The folder of a run; or a model: what `model.base` takes.
+        subject: The folder of a run; or a model, as in `model.base`.
         checkpoint: Of a run: newest, best, or a number of optimizer steps.
         config: A config file, for a model.
         overrides: Such as planning.horizon=2.
 
     Raises:
-        InputError: There is no such thing, it cannot be planned with, or a setting is wrong or does not matter.
+        InputError: It does not exist, cannot be used for planning, or a setting is invalid or has no effect.
     """
     dtype = "bfloat16" if torch.cuda.is_available() and has_bf16() else "float32"
     its = planning_settings(subject, config=config, overrides=overrides, dtype=dtype)
@@ -136,10 +136,10 @@ def load_to_plan(
 
 
 def _device_to_plan_on(config: Config) -> torch.device:
-    """Return the device, once it is certain that it computes in the type that planning does: without autocast.
+    """Return the device, after checking that it supports the type used in planning, without autocast.
 
     Raises:
-        InputError: It does not, or not in the 8 bits that are asked for.
+        InputError: It does not, or it does not support the requested 8 bits.
     """
     device = torch.device("cpu" if is_on_cpu(config.training) else "cuda")
     require_type_of_weights(config.model, device)

@@ -1,4 +1,4 @@
-"""How is a decision said in a few sentences? How far it goes, what it is worth, and what a reader should beware of."""
+"""The summary of a decision as text: distance, expected gain, and warnings."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ _AT_LIMIT = 0.98  # share of a limit from which an action is said to be at it
 
 
 def summarize(answer: PlanResult) -> str:
-    """Return what was decided, in a sentence or more."""
+    """Return the decision as one or more sentences."""
     plan, why = answer.decision.plan, answer.decision.why
     if why == "at the goal" or plan is None:
-        return "Does nothing: what the model sees now is what it sees in the goal's picture."
+        return "Does nothing: what the model sees now is what it sees in the goal image."
     if why == "no finite energy":
         return (
             "Does nothing: the model gives no finite energy for any of"
@@ -56,7 +56,7 @@ def _warnings(answer: PlanResult, plan: Plan) -> list[str]:
         most = answer.controller.config.iterations
         found.append(f"Time was up after {len(plan.iterations)} of {most} iterations: the best so far.")
     if not plan.energy < answer.doing_nothing:
-        found.append("Nothing that was tried is predicted to be better than doing nothing.")
+        found.append("None of the evaluated actions is predicted to be better than doing nothing.")
     if at_limit := axes_at_limit(answer):
         found.append(f"The first action is at its limit along {', '.join(at_limit)} (planning.limits.xyz).")
     if answer.unused_goals:
@@ -66,7 +66,7 @@ def _warnings(answer: PlanResult, plan: Plan) -> list[str]:
 
 
 def axes_at_limit(answer: PlanResult) -> list[str]:
-    """Return along which of dx, dy, dz the first action goes as far as it may."""
+    """Return the axes among dx, dy, dz along which the first action is at its limit."""
     upper = answer.space.upper[0].numpy()
     return [
         axis for number, axis in enumerate(AXES)

@@ -1,1 +1,1 @@
-"""Reports: how are results written down? metrics.json, HTML, figures, comparisons."""
+"""Reports: results as metrics.json, HTML, figures and comparisons."""

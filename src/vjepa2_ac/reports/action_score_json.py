@@ -1,4 +1,4 @@
-"""What stands in metrics.json of plans? Every figure as plain values, by the schema of docs/evaluation.md."""
+"""The planning part of metrics.json: all metrics as plain values, by the schema in docs/evaluation.md."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DIGITS = 6  # behind the point, of metres, centimetres and radians
 
 
 def study_as_dict(study: PlanningStudy) -> dict[str, Any]:
-    """Return from where was planned and how, what was demonstrated, and the figures of plans that take no model."""
+    """Return the starts and settings of the plans, the demonstrated actions, and the metrics of model-free plans."""
     references = {"zero": study.zero, "random": study.random, "within_limits": study.within_limits}
     return {
         "starts": len(study),
@@ -36,7 +36,7 @@ def study_as_dict(study: PlanningStudy) -> dict[str, Any]:
         "best_score": BEST_SCORE,
         "one_step_beyond": study.one_step_beyond,
         "three_steps_beyond": study.three_steps_beyond,
-        "references": {name: _figures(study, plans) for name, plans in references.items()},
+        "references": {name: _metrics(study, plans) for name, plans in references.items()},
         "demonstrated": _rounded(study.demonstrated),
         "one_step_settings": study.settings.model_dump(mode="json"),
         "three_steps_settings": SCORED.model_dump(mode="json"),
@@ -44,11 +44,11 @@ def study_as_dict(study: PlanningStudy) -> dict[str, Any]:
 
 
 def plans_as_dict(evaluation: Evaluation, name: str) -> dict[str, Any] | None:
-    """Return the figures of what a model planned; None: it did not."""
+    """Return the metrics of a model's plans; None: it did not plan."""
     study, plans = evaluation.planning, evaluation.models[name].plans
     if study is None or plans is None:
         return None
-    found = _figures(study, plans)
+    found = _metrics(study, plans)
     found["difference_to_zero"] = _differences(differences_of(study, plans, study.zero))
     base = None if evaluation.base in {None, name} else evaluation.models[str(evaluation.base)].plans
     if base is not None:
@@ -62,18 +62,18 @@ def plans_as_dict(evaluation: Evaluation, name: str) -> dict[str, Any] | None:
     return found
 
 
-def _figures(study: PlanningStudy, plans: Plans) -> dict[str, Any]:
-    figures = metrics_of(study, plans)
+def _metrics(study: PlanningStudy, plans: Plans) -> dict[str, Any]:
+    metrics = metrics_of(study, plans)
     return {
-        "score": figures.score.as_dict(),
-        "missed_cm": figures.missed_cm.as_dict(),
-        "missed_over_zero": figures.missed_over_zero.as_dict(),
-        "step_cm": figures.step_cm.as_dict(),
-        "step_over_zero": figures.step_over_zero.as_dict(),
-        "axes_cm": _by_axis(figures.axes_cm),
-        "angle_degrees": figures.angle_degrees.as_dict(),
-        "signs": _by_axis(figures.signs),
-        "gripper": figures.gripper.as_dict(),
+        "score": metrics.score.as_dict(),
+        "missed_cm": metrics.missed_cm.as_dict(),
+        "missed_over_zero": metrics.missed_over_zero.as_dict(),
+        "step_cm": metrics.step_cm.as_dict(),
+        "step_over_zero": metrics.step_over_zero.as_dict(),
+        "axes_cm": _by_axis(metrics.axes_cm),
+        "angle_degrees": metrics.angle_degrees.as_dict(),
+        "signs": _by_axis(metrics.signs),
+        "gripper": metrics.gripper.as_dict(),
     }
 
 

@@ -1,6 +1,6 @@
-"""Which run is best? Runs side by side that were measured on the same clips, from their metrics.json alone.
+"""Comparison of runs that were measured on the same clips, from their metrics.json alone.
 
-Nothing is measured here: what `vjepa2-ac evaluate` has not written yet is asked for.
+Nothing is measured here: missing results have to be written by `vjepa2-ac evaluate` first.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _SAME_LATENTS = 1e-3  # errors of persistence that differ by a larger share are 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Runs side by side: a table, and curves for a picture."""
+    """Runs side by side: a table, and curves for a figure."""
 
     title: str
     columns: tuple[str, ...]
@@ -34,7 +34,7 @@ class Comparison:
 
 
 def compare(folders: Sequence[Path]) -> Comparison:
-    """Put runs side by side; each is compared with the first one, paired by clip.
+    """Compare runs; each is compared with the first one, paired by clip.
 
     Raises:
         InputError: Fewer than two, one is named twice or was not evaluated, or they were measured on different clips.
@@ -50,7 +50,7 @@ def compare(folders: Sequence[Path]) -> Comparison:
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InputError(
             where=", ".join(str(folder / METRICS_FILE) for folder in folders),
-            found=f"figures that cannot be used ({error!r})",
+            found=f"metrics that cannot be used ({error!r})",
             fix="Write them again with `vjepa2-ac evaluate`",
         ) from None
 
@@ -76,11 +76,11 @@ def _compared(measured: Mapping[str, dict[str, Any]], folders: Mapping[str, Path
             *(("Action Score", "plans end off, cm") if any(map(_plans, measured.values())) else ()),
         ),
         rows={
-            name: _row(figures, first, ids) + (_planned(figures) if any(map(_plans, measured.values())) else ())
-            for name, figures in measured.items()
+            name: _row(metrics, first, ids) + (_planned(metrics) if any(map(_plans, measured.values())) else ())
+            for name, metrics in measured.items()
         },
         seconds=about["seconds_per_step"] * np.arange(1, about["frames"]),
-        curves={name: _curve(figures) for name, figures in measured.items()},
+        curves={name: _curve(metrics) for name, metrics in measured.items()},
         notes=_notes(measured, names),
     )
 
@@ -105,13 +105,13 @@ def _check_same_clips(one: dict[str, Any], other: dict[str, Any], first: Path, s
         )
 
 
-def _row(figures: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> tuple[Cell, ...]:
-    model = figures["models"][figures["trained"]]
+def _row(metrics: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> tuple[Cell, ...]:
+    model = metrics["models"][metrics["trained"]]
     base_gain = model["rollout"]["l1"].get("gain_over_base")
     sensitivity = model["sensitivity"]
     return (
         _estimate(model["rollout"]["l1"]["over_persistence"][-1]),
-        "" if figures is first else _gain(figures, first, ids),
+        "" if metrics is first else _gain(metrics, first, ids),
         "no base" if base_gain is None else _estimate(base_gain[-1]),
         _estimate(model["one_step_by_actions"]["true"]),
         f"{model['one_step_by_actions']['shuffled']['value']:.3f}",
@@ -119,38 +119,38 @@ def _row(figures: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> 
     )
 
 
-def _plans(figures: dict[str, Any]) -> dict[str, Any] | None:
-    """Return what stands there of plans; nothing where none were asked for, or evaluate did not know them yet."""
-    plans: dict[str, Any] | None = figures["models"][figures["trained"]].get("planning")
+def _plans(metrics: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the metrics of its plans; None if none were requested, or evaluate did not know them yet."""
+    plans: dict[str, Any] | None = metrics["models"][metrics["trained"]].get("planning")
     return plans
 
 
-def _planned(figures: dict[str, Any]) -> tuple[Cell, ...]:
-    plans = _plans(figures)
+def _planned(metrics: dict[str, Any]) -> tuple[Cell, ...]:
+    plans = _plans(metrics)
     return ("", "") if plans is None else (_estimate(plans["score"]), _estimate(plans["missed_cm"]))
 
 
-def _gain(figures: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> Estimate:
-    """Return by which share the error over persistence is smaller than the first run's, at the last horizon, paired."""
-    columns = [column for one in (figures, first) for column in _last(one)]
+def _gain(metrics: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> Estimate:
+    """Return the share by which the error over persistence is below the first run's, at the last horizon, paired."""
+    columns = [column for one in (metrics, first) for column in _last(one)]
     return bootstrapped(
         lambda sums: 1 - (sums[0] / sums[1]) / (sums[2] / sums[3]), np.stack(columns)[:, :, None], list(ids)
     )[0]
 
 
-def _last(figures: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    by_clip = figures["by_clip"]
-    trained = np.array(by_clip["models"][figures["trained"]], dtype=np.float64)
+def _last(metrics: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    by_clip = metrics["by_clip"]
+    trained = np.array(by_clip["models"][metrics["trained"]], dtype=np.float64)
     return trained[:, -1], np.array(by_clip["persistence"], dtype=np.float64)[:, -1]
 
 
-def _curve(figures: dict[str, Any]) -> tuple[Estimate, ...]:
-    return tuple(map(_estimate, figures["models"][figures["trained"]]["rollout"]["l1"]["over_persistence"]))
+def _curve(metrics: dict[str, Any]) -> tuple[Estimate, ...]:
+    return tuple(map(_estimate, metrics["models"][metrics["trained"]]["rollout"]["l1"]["over_persistence"]))
 
 
 def _notes(measured: Mapping[str, dict[str, Any]], names: Sequence[str]) -> tuple[str, ...]:
     nothing = {
-        name: np.array(figures["by_clip"]["persistence"], dtype=np.float64).mean() for name, figures in measured.items()
+        name: np.array(metrics["by_clip"]["persistence"], dtype=np.float64).mean() for name, metrics in measured.items()
     }
     others = [name for name in names[1:] if abs(nothing[name] / nothing[names[0]] - 1) > _SAME_LATENTS]
     notes = []
@@ -158,17 +158,17 @@ def _notes(measured: Mapping[str, dict[str, Any]], names: Sequence[str]) -> tupl
         notes.append(
             f"Other latents than those of {names[0]} (another encoder or crop): {', '.join(others)}; ratios compare."
         )
-    starts = {name: _starts(figures) for name, figures in measured.items() if _plans(figures)}
+    starts = {name: _starts(metrics) for name, metrics in measured.items() if _plans(metrics)}
     if len(set(starts.values())) > 1:
         notes.append("Plans began at other frames (another --planning-clips or seed): Action Scores do not compare.")
     return tuple(notes)
 
 
-def _starts(figures: dict[str, Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    return tuple(figures["planning"]["clips"]), tuple(figures["planning"]["places"])
+def _starts(metrics: dict[str, Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    return tuple(metrics["planning"]["clips"]), tuple(metrics["planning"]["places"])
 
 
-def _estimate(figures: Mapping[str, float | None]) -> Estimate:
+def _estimate(metrics: Mapping[str, float | None]) -> Estimate:
     return Estimate(
-        *(float("nan") if figures[key] is None else float(figures[key] or 0) for key in ("value", "low", "high"))
+        *(float("nan") if metrics[key] is None else float(metrics[key] or 0) for key in ("value", "low", "high"))
     )

@@ -1,6 +1,6 @@
-"""What stands in metrics.json? Every figure as plain values, by a schema that docs/evaluation.md explains.
+"""The content of metrics.json: all metrics as plain values, by the schema in docs/evaluation.md.
 
-Pictures are not in it: they are in the report.
+It holds no images: these are in the report.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ from vjepa2_ac.storage.structured import finite_or_none, json_text, read_json_ob
 
 METRICS_FILE = "metrics.json"
 _MOST_BYTES = 1 << 28  # landscapes are long
-FORMAT = 1  # goes up when a reader of the file would have to change
+FORMAT = 1  # incremented when a reader of the file would have to change
 
 
 def write_metrics(evaluation: Evaluation, path: Path) -> Path:
-    """Write every figure of an evaluation; the file appears whole or not at all."""
+    """Write all metrics of an evaluation; the file is written atomically."""
     write_atomically(path, json_text(metrics_as_dict(evaluation)))
     return path
 
 
 def read_metrics(folder: Path) -> dict[str, Any]:
-    """Return what `vjepa2-ac evaluate` wrote into a folder.
+    """Return the metrics that `vjepa2-ac evaluate` wrote into a folder.
 
     Raises:
         InputError: There is nothing, it is damaged, or of another format.
@@ -65,22 +65,22 @@ def read_metrics(folder: Path) -> dict[str, Any]:
     path = folder / METRICS_FILE
     fix = f"Write it with `vjepa2-ac evaluate {folder}`"
     try:
-        figures = read_json_object(path, most_bytes=_MOST_BYTES, fix=fix)
+        metrics = read_json_object(path, most_bytes=_MOST_BYTES, fix=fix)
     except FileNotFoundError:
         raise InputError(
             where=str(folder), found=f"no {METRICS_FILE}" if folder.is_dir() else "no such folder", fix=fix
         ) from None
     except OSError as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", fix=fix) from None
-    if figures.get("format") != FORMAT:
+    if metrics.get("format") != FORMAT:
         raise InputError(
-            where=str(path), found=f"format {shown(figures.get('format'))}", needed=f"format {FORMAT}", fix=fix
+            where=str(path), found=f"format {shown(metrics.get('format'))}", needed=f"format {FORMAT}", fix=fix
         )
-    return figures
+    return metrics
 
 
 def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
-    """Return every figure as plain values; see docs/evaluation.md for what each is."""
+    """Return all metrics as plain values; see docs/evaluation.md for the meaning of each."""
     return {
         "format": FORMAT,
         "verdict": verdict(evaluation),
@@ -132,16 +132,16 @@ def _model(evaluation: Evaluation, model: ModelResult) -> dict[str, Any]:
 
 
 def _errors(evaluation: Evaluation, name: str, mode: Mode, metric: Metric) -> dict[str, Any]:
-    figures = {
+    metrics = {
         "error": _curve(mean_error(evaluation, name, mode, metric)),
         "over_persistence": _curve(over_persistence(evaluation, name, mode, metric)),
         "over_persistence_zero_actions": _curve(over_persistence(evaluation, name, mode, metric, "zero")),
         "over_persistence_shuffled_actions": _curve(over_persistence(evaluation, name, mode, metric, "shuffled")),
     }
     if evaluation.base is not None and name != evaluation.base:
-        figures["gain_over_base"] = _curve(gain_over(evaluation, name, evaluation.base, mode, metric))
-        figures["difference_to_base"] = _curve(difference_to(evaluation, name, evaluation.base, mode, metric))
-    return figures
+        metrics["gain_over_base"] = _curve(gain_over(evaluation, name, evaluation.base, mode, metric))
+        metrics["difference_to_base"] = _curve(difference_to(evaluation, name, evaluation.base, mode, metric))
+    return metrics
 
 
 def _stratum(evaluation: Evaluation, stratum: Stratum) -> dict[str, Any]:
@@ -220,7 +220,7 @@ def _landscapes(landscapes: Landscapes) -> dict[str, Any]:
 
 
 def _by_clip(evaluation: Evaluation) -> dict[str, Any]:
-    """Return the rollout's L1 errors of every clip, from which `compare` pairs runs."""
+    """Return the rollout's L1 errors of every clip, which `compare` pairs between runs."""
     models = {name: _rounded(model.true.rollout.l1) for name, model in evaluation.models.items()}
     return {"persistence": _rounded(evaluation.persistence.rollout.l1), "models": models}
 
@@ -230,7 +230,7 @@ def _curve(curve: Curve) -> list[Mapping[str, float | None]]:
 
 
 def _rounded(values: np.ndarray) -> Any:
-    """Return numbers with 7 digits that count: more than a prediction in bfloat16 has."""
+    """Return numbers with 7 significant digits: more than a prediction in bfloat16 has."""
     return _each(values.tolist())
 
 

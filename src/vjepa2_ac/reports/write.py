@@ -20,11 +20,11 @@ PLOT, REPORT = "evaluation.png", "report.html"
 
 @dataclass(frozen=True)
 class Evaluated:
-    """What was measured."""
+    """The result of an evaluation, and its files."""
 
     evaluation: Evaluation
-    checkpoint: str  # which one, in words; "" of a model
-    files: tuple[Path, ...]  # that were written
+    checkpoint: str  # which one, as text; "" of a model
+    files: tuple[Path, ...]  # written files
 
 
 def evaluate_subject(
@@ -33,12 +33,12 @@ def evaluate_subject(
     """Measure a run or a model on held-out episodes; write metrics.json, report and figure. Cheap failures first.
 
     Args:
-        subject: The folder of a run; or a model: what `model.base` takes.
-        asked: How.
-        stage: Gives a bar for a part of the work, by its title.
+        subject: The folder of a run; or a model, as in `model.base`.
+        asked: The options.
+        stage: Returns a progress bar for a part of the work, by its title.
 
     Raises:
-        InputError: The subject, the data, or what to compare with cannot be used; the split is empty.
+        InputError: The subject, the data, or a model to compare with cannot be used; the split is empty.
     """
     measured = measure_subject(subject, asked, stage=stage)
     return Evaluated(measured.evaluation, measured.checkpoint, _written(measured.evaluation, measured.folder))

@@ -1,1 +1,1 @@
-"""Where does robot data come from when there is no robot? A Franka-like arm in MuJoCo (extra `sim`)."""
+"""Simulation: robot data and a test without a robot, from a Franka-like arm in MuJoCo (extra `sim`)."""

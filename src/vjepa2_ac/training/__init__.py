@@ -1,1 +1,1 @@
-"""How do the weights change?"""
+"""Training: how do the weights change?"""

@@ -1,4 +1,4 @@
-"""Which validation went best? Only errors of the same clips, over the same time, of the same latents compare."""
+"""The best validation of a run. Only errors of the same clips, time span and latents are compared."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import validation_windows
 from vjepa2_ac.runs.checkpoint import RunState
 
-# Where the data lie does not matter, nor what decides which clips are held out: the clips themselves are looked at.
+# The location of the data is ignored, and so are the settings that select held-out clips: the clips are compared.
 _DECIDE = (
     *("frames", "stride", "camera", "states", "actions", "join_actions", "pose_frame", "crop"),
     *("fields.", "lerobot.", "droid_raw."),
@@ -21,7 +21,7 @@ _DECIDE = (
 
 
 def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
-    """Return what decides what a validation measures, by names that a person knows."""
+    """Return what determines the measurements of a validation, by readable names."""
     decide = tuple(f"data.{key}" for key in _DECIDE)
     settings = {key: json.dumps(value) for key, value in config_as_flat_dict(config).items() if key.startswith(decide)}
     windows = validation_windows(dataset, "validation", clips=config.validation.clips)
@@ -30,9 +30,9 @@ def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
 
 
 def best_so_far(state: RunState, now: Mapping[str, str], note: Callable[[str], None]) -> RunState:
-    """Return the state that a run goes on from: a best error of other measurements is none, which is said.
+    """Return the state to resume from: a best error of other measurements is dropped, with a message.
 
-    States of earlier versions do not tell what they were measured on, and are taken at their word.
+    States of earlier versions do not record what they were measured on, and are accepted.
     """
     before = state.measured_on
     differing = [] if before is None else sorted(key for key in {*before, *now} if before.get(key) != now.get(key))

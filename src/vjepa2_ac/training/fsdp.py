@@ -1,9 +1,10 @@
-"""How do processes share the weights that they train, and not only the clips? FSDP2, for a predictor trained whole.
+"""FSDP2: processes share the trained weights and not only the clips, for a predictor trained whole.
 
-`accelerate launch --use_fsdp --fsdp_version 2` asks for it: it sets ACCELERATE_USE_FSDP and FSDP_VERSION for each
-process. A process then keeps a part of each weight, gradient and moment; a block's weights are put together where it
+`accelerate launch --use_fsdp --fsdp_version 2` requests it: it sets ACCELERATE_USE_FSDP and FSDP_VERSION for each
+process. A process then holds a part of each weight, gradient and moment; a block's weights are gathered where it
 computes. Gradients are summed over the processes after every micro-batch, so no process may be without a clip. The
-frozen encoder stays whole, and a checkpoint is what one process alone writes: it goes on shared or not.
+frozen encoder stays whole. A checkpoint has the format that one process alone writes: a run resumes from it with or
+without FSDP2.
 """
 
 from __future__ import annotations
@@ -32,24 +33,24 @@ def shard_predictor(
     accelerator: Accelerator,
     note: Callable[[str], None],
 ) -> torch.optim.Optimizer:
-    """Leave each process its part of the predictor's weights and of the moments, where the launch asks for that.
+    """Give each process its part of the predictor's weights and moments, if the launch requests it.
 
     All processes have to bring the same weights and moments.
 
     Returns:
-        The optimizer of this process's part; the given one where nothing is shared.
+        The optimizer of this process's part; the given one if nothing is shared.
     """
     if not shares_weights() or accelerator.num_processes == 1:
         return optimizer
-    # The predictor ends in a view, which nobody changes in place.
+    # The predictor ends in a view, which is never changed in place.
     warnings.filterwarnings("ignore", message="FSDP2-wrapped module .* returned a view tensor", category=UserWarning)
     mesh = init_device_mesh(accelerator.device.type, (accelerator.num_processes,))
     predictor = world_model.base_predictor
     for module in (*predictor.blocks, predictor):
-        # The outermost, too, or its weights would be whole after a validation, when the optimizer looks for its parts.
+        # The outermost, too, or its weights would be whole after a validation, when the optimizer needs its parts.
         part = fully_shard(module, mesh=mesh, reshard_after_forward=True)
-        part.set_gradient_divide_factor(1.0)  # a sum, as without shards: `step` makes means
-        part.set_force_sum_reduction_for_comms(True)  # or it is scaled on the way, which gloo cannot do
+        part.set_gradient_divide_factor(1.0)  # a sum, as without shards: `step` divides
+        part.set_force_sum_reduction_for_comms(True)  # otherwise it is scaled on the way, which gloo cannot do
     of_part = make_optimizer(world_model, config.training)
     of_part.load_state_dict(_parted(optimizer.state_dict(), of_part))
     note(
@@ -60,13 +61,13 @@ def shard_predictor(
 
 
 def full_state_dict(world_model: WorldModel, *, keep: bool) -> dict[str, Tensor] | None:
-    """Return the predictor's weights, put together on the CPU; None where they are not shared.
+    """Return the predictor's weights, gathered on the CPU; None if they are not shared.
 
-    All processes have to call.
+    All processes have to call this.
 
     Args:
         world_model: The model.
-        keep: Whether this process wants them: the others help to put them together, and get empty ones.
+        keep: Whether this process needs them: the others take part in gathering, and get empty ones.
     """
     if not isinstance(world_model.predictor, FSDPModule):
         return None
@@ -75,7 +76,7 @@ def full_state_dict(world_model: WorldModel, *, keep: bool) -> dict[str, Tensor]
 
 
 def full_optimizer_state_dict(optimizer: torch.optim.Optimizer, *, keep: bool) -> dict[str, Any]:
-    """Return the state of an optimizer, what is shared of it put together on the CPU. All processes have to call.
+    """Return the state of an optimizer, its shared parts gathered on the CPU. All processes have to call this.
 
     Args:
         optimizer: The optimizer.
@@ -90,7 +91,7 @@ def _own_numbers(predictor: nn.Module) -> int:
 
 
 def _parted(state: dict[str, Any], optimizer: torch.optim.Optimizer) -> dict[str, Any]:
-    """Return the state of an optimizer over whole weights as that of one over parts; nothing is sent."""
+    """Convert the state of an optimizer over whole weights into that of one over parts; nothing is sent."""
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     parted = {
         index: {name: _like(parameters[index], value) for name, value in values.items()}
@@ -100,13 +101,13 @@ def _parted(state: dict[str, Any], optimizer: torch.optim.Optimizer) -> dict[str
 
 
 def _like(parameter: DTensor, value: Tensor) -> Tensor:
-    if value.shape != parameter.shape:  # the count of steps
+    if value.shape != parameter.shape:  # the step count
         return value
     return distribute_tensor(value, parameter.device_mesh, parameter.placements, src_data_rank=None)
 
 
 def _whole(value: Any, keep: bool) -> Any:
-    """Put together every tensor in nested dicts and lists, one after the other, in the same order in all processes."""
+    """Gather every tensor in nested dicts and lists, one after the other, in the same order in all processes."""
     if isinstance(value, DTensor):
         together = value.full_tensor()
         return together.cpu() if keep else together.new_empty(0)

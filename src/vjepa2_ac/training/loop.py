@@ -1,7 +1,7 @@
 """The training loop: what happens before, during and after the steps.
 
-What makes a run exact: the clips of a step, its learning rate and its random numbers are pure functions of (config,
-step). A run that was killed continues from its newest checkpoint as if nothing had happened.
+A run is reproducible because the clips of a step, its learning rate and its random numbers are pure functions of
+(config, step). A run that was killed continues from its newest checkpoint as if it had not been interrupted.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ from vjepa2_ac.training.validation import refuse_weak_base, validate, validate_i
 
 
 def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
-    """Train as the config says, from the newest checkpoint of its run folder if there is one.
+    """Train by a config, from the newest checkpoint of its run folder if there is one.
 
     Args:
         config: The run.
         reporter: Shows progress.
         check_only: Do everything that can fail, and stop before the first step and before anything is written.
-        allow_config_change: Go on with this config where the run folder has another one, and say what changes.
+        allow_config_change: Continue with this config if the run folder has another one, and report the changes.
 
     Returns:
         The folder of the run.
 
     Raises:
-        InputError: Something the user gave cannot be used; raised before the first step wherever that can be known.
+        InputError: An input cannot be used; raised before the first step wherever possible.
         StoppedError: A signal asked the run to stop between its first and last step; see `distributed.preemption`.
     """
     accelerator = make_accelerator(config)
@@ -71,11 +71,11 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             config = with_settled_stride(config)
             check_run_folder(config, allow_config_change=allow_config_change)
             require_start_folder(config, Path(config.run_dir))
-            if not check_only and Path(config.run_dir).is_dir():  # a new one is made, and locked, when all else is well
+            if not check_only and Path(config.run_dir).is_dir():  # a new one is created, and locked, after all checks
                 lock.take()
-            # What is checked only is fetched to where it does not last.
+            # A check downloads into a temporary folder.
             trial = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run") if check_only else None
-            # Taken before anything is fetched into the run's folder: whoever else came to it would still be writing.
+            # Locked before anything is downloaded into the run's folder: another process could still be writing there.
             remote = open_remote(
                 config,
                 reporter.note,
@@ -108,7 +108,9 @@ def _train(
             reporter.note(f"The config changes: {line}")
     if check_only:
         gradients(run, batches_from(run))
-        reporter.note("Everything is in place: data, model, validation and gradients were tried; nothing was written.")
+        reporter.note(
+            "Everything is in place: data, model, validation and gradients were checked; nothing was written."
+        )
         return folder
     if writes:
         lock.take()
@@ -116,16 +118,16 @@ def _train(
         open_run_folder(config, run.state.run_id, allow_config_change=allow_config_change)
     if run.calibration is not None and writes:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
-    with _open_journal(run, folder, reporter) as journal:
+    with _open_metrics_log(run, folder, reporter) as metrics_log:
         if first is not None:
-            journal.write("validation", 0, validation_metrics(first))
+            metrics_log.write("validation", 0, validation_metrics(first))
         with remote.mirror(run.state.run_id) if remote else NoMirror() as mirror:
-            _loop(run, folder, journal, mirror, reporter)
+            _loop(run, folder, metrics_log, mirror, reporter)
     run.accelerator.end_training()
     return folder
 
 
-def _open_journal(run: Run, folder: Path, reporter: Reporter) -> MetricsLog | NullMetricsLog:
+def _open_metrics_log(run: Run, folder: Path, reporter: Reporter) -> MetricsLog | NullMetricsLog:
     if not run.accelerator.is_main_process:
         return NullMetricsLog()
     done = run.state.step
@@ -134,7 +136,7 @@ def _open_journal(run: Run, folder: Path, reporter: Reporter) -> MetricsLog | Nu
 
 
 def _loop(
-    run: Run, folder: Path, journal: MetricsLog | NullMetricsLog, mirror: Mirror | NoMirror, reporter: Reporter
+    run: Run, folder: Path, metrics_log: MetricsLog | NullMetricsLog, mirror: Mirror | NoMirror, reporter: Reporter
 ) -> None:
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes
@@ -147,23 +149,23 @@ def _loop(
         for step in range(run.state.step + 1, training.steps + 1):
             last = step == training.steps
             is_logged = step % training.log_every == 0 or last
-            figures = _timed_step(run, timed, step, throughput, measure_update=is_logged)
-            reporter.stepped(step, figures)
+            metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
+            reporter.stepped(step, metrics)
             if is_logged:
-                journal.write("train", step, figures)
+                metrics_log.write("train", step, metrics)
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
-            is_best = validate_if_due(run, journal, reporter)
-            # Agreed among all processes, and read once: a signal after this waits for the next step.
-            is_due = clock.is_due(step) or is_best or last or journal.is_behind
+            is_best = validate_if_due(run, metrics_log, reporter)
+            # Agreed among all processes, and read once: a signal after this takes effect at the next step.
+            is_due = clock.is_due(step) or is_best or last or metrics_log.is_behind
             stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
             if due or stopped_by:
-                with journal.before_a_checkpoint():
+                with metrics_log.before_a_checkpoint():
                     save_checkpoint(run, folder)
                 clock.restart()
             mirror.tick()
             if stopped_by and not last:
                 mirror.finish(lambda: True)
-                run.accelerator.wait_for_everyone()  # whoever ended first would have the others ended by the launcher
+                run.accelerator.wait_for_everyone()  # the launcher ends all processes once one has ended
                 raise StoppedError(folder, step, signal.Signals(stopped_by).name)
         mirror.finish(lambda: stop.reason is not None)
     run.accelerator.wait_for_everyone()
@@ -173,9 +175,9 @@ def _timed_step(
     run: Run, batches: TimedBatches, step: int, throughput: Throughput, *, measure_update: bool
 ) -> dict[str, float]:
     started, waited_s = time.perf_counter(), batches.waited_s
-    figures = training_step(run, batches, step, measure_update=measure_update)
-    clips = run.clips_per_step - figures.get("clips_left_out", 0.0)
-    return figures | throughput.figures(clips, time.perf_counter() - started, batches.waited_s - waited_s)
+    metrics = training_step(run, batches, step, measure_update=measure_update)
+    clips = run.clips_per_step - metrics.get("clips_left_out", 0.0)
+    return metrics | throughput.metrics(clips, time.perf_counter() - started, batches.waited_s - waited_s)
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""How wrong are the predictions? Teacher forcing plus a short rollout, on normalised latents."""
+"""The training loss: teacher forcing plus a short rollout, on normalised latents."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Losses:
 
 
 class Objective(nn.Module):
-    """The loss of a world model on latents, as a module: one forward pass a step, which is what DDP wants.
+    """The loss of a world model on latents, as a module: one forward pass per step, as DDP requires.
 
     Teacher forcing predicts frames 2..T from the true frames 1..T-1. The rollout starts at frame 1; its first
     prediction is the teacher-forced one, each further one sees the predictions before it. States and actions are the
@@ -46,7 +46,7 @@ class Objective(nn.Module):
         super().__init__()
         self.world_model = world_model
         self.weights = (training.teacher_forcing_weight, training.rollout_weight)
-        self.rollout_steps = training.rollout_steps if training.rollout_weight else 1  # what counts for nothing: free
+        self.rollout_steps = training.rollout_steps if training.rollout_weight else 1  # weight 0: no cost
         self.distance = distance_of(training)
 
     def forward(self, batch: LatentBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
@@ -73,8 +73,8 @@ def prediction_losses(
 ) -> Losses:
     """Return both parts of the loss of one batch, without weights; the distance is L1 unless given.
 
-    Both parts begin with the first step: the rollout reuses the keys and values that teacher forcing computed of it,
-    and computes one new step for each further prediction. Loss and gradients are those of computing all of it again.
+    Both parts begin with the first step: the rollout reuses the keys and values that teacher forcing computed for it,
+    and computes one new step for each further prediction. Loss and gradient equal those of recomputing everything.
     With dropout both parts share the masks of the first step, which changes the expectation of neither.
 
     Raises:

@@ -1,8 +1,8 @@
-"""What is one micro-step? Losses of some clips and their gradients, added to those that are there; perhaps as a graph.
+"""The micro-step: losses of some clips, and their gradients added to the existing ones; optionally as a CUDA graph.
 
-At one or two clips a GPU has computed a micro-step before Python has asked for its 6,000 kernels. A CUDA graph
-(`training.cuda_graph`) asks for all of them at once: it is captured from the first batch, with the shapes and addresses
-that it had then, and replayed on every batch of the same size. Others take the plain way.
+At one or two clips a GPU finishes a micro-step faster than Python launches its 6,000 kernels. A CUDA graph
+(`training.cuda_graph`) launches all of them at once: it is captured from the first batch, with its shapes and
+addresses, and replayed on each batch of the same size. Other batches run without a graph.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.training.loss import Objective
 
 Body = Callable[[], None]
-Capture = Callable[[Body], Body]  # what is to be done, to what does it again
+Capture = Callable[[Body], Body]  # turns a body into one that repeats it
 
 _WARM_UPS = 3  # before a capture, in which nothing may be allocated for the first time: PyTorch's own advice
 
 
 class MicroStep:
-    """Computes losses and adds gradients, as PyTorch is asked for it."""
+    """Computes losses and adds gradients in plain PyTorch."""
 
     def __init__(self, objective: Objective, accelerator: Accelerator, scaler: torch.amp.GradScaler) -> None:
         self._objective, self._accelerator, self._scaler = objective, accelerator, scaler
 
     def __call__(self, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:
-        """Return (teacher forcing, rollout), each a mean over these clips; add the gradient of their sum to the others.
+        """Return (teacher forcing, rollout), each a mean over these clips; add the gradient of their sum.
 
         Args:
             latents: The clips, on the device.
-            parts: Of how many like this one the step is made: the gradient is divided by it.
+            parts: Number of micro-steps of this size in the step: the gradient is divided by it.
         """
         with self._accelerator.autocast():
             forced, rollout = self._objective(latents)
@@ -45,24 +45,24 @@ class MicroStep:
 
 
 class CapturedMicroStep:
-    """The same, captured once and replayed where a batch has the sizes of the first one, and the same part of a step.
+    """The same, captured once and replayed if a batch has the sizes and the share of the first one.
 
-    Gradients must stay where they are: they are zeroed between steps, never let go.
+    Gradients must keep their addresses: they are zeroed between steps, never freed.
 
     Args:
-        plain: What is captured, and done where the graph does not fit.
-        trained: The parameters whose gradients are added to.
-        capture: Records a body without doing it, and returns what does it.
+        plain: The micro-step to capture, and the fallback if the graph does not fit.
+        trained: The parameters that receive gradients.
+        capture: Records a body without running it, and returns its replay.
     """
 
     def __init__(self, plain: MicroStep, trained: Sequence[nn.Parameter], capture: Capture) -> None:
         self._plain, self._trained, self._capture = plain, trained, capture
-        self._given: tuple[LatentBatch, float] | None = None  # what the graph reads
-        self._losses: Tensor | None = None  # what it writes
+        self._given: tuple[LatentBatch, float] | None = None  # input of the graph
+        self._losses: Tensor | None = None  # output of the graph
         self._replay: Body | None = None
 
     def __call__(self, latents: LatentBatch, parts: float) -> Float[Tensor, 2]:
-        """Return what `MicroStep` does."""
+        """Do the same as `MicroStep`."""
         if self._replay is None or self._losses is None or self._given is None:
             self._record(latents, parts)
             return self(latents, parts)
@@ -72,10 +72,10 @@ class CapturedMicroStep:
         for name, own in _tensors(self._given[0]).items():
             own.copy_(new[name])
         self._replay()
-        return self._losses.clone()  # the next replay writes over it
+        return self._losses.clone()  # the next replay overwrites it
 
     def _record(self, latents: LatentBatch, parts: float) -> None:
-        """Capture a micro-step on copies of these clips; gradients are afterwards as they were."""
+        """Capture a micro-step on copies of these clips; gradients are restored afterwards."""
         copies: dict[str, Any] = {name: one.clone() for name, one in _tensors(latents).items()}
         given = replace(latents, **copies)
         losses = torch.zeros(2, device=latents.latents.device)
@@ -86,13 +86,13 @@ class CapturedMicroStep:
         before = [None if one.grad is None else one.grad.clone() for one in self._trained]
         self._replay = self._capture(body)
         for parameter, gradient in zip(self._trained, before, strict=True):
-            if parameter.grad is not None:  # one that no clip reaches has none
+            if parameter.grad is not None:  # a parameter that no clip reaches has none
                 parameter.grad.zero_() if gradient is None else parameter.grad.copy_(gradient)
         self._given, self._losses = (given, parts), losses
 
 
 def captured_on_cuda(body: Body) -> Body:
-    """Record what a body asks the device for, after doing it a few times, and return what asks for all of it at once.
+    """Record the kernels of a body, after running it a few times, and return their replay.
 
     Source: PyTorch's notes on CUDA graphs, "Whole-network capture": warm-up and capture on a side stream.
     """

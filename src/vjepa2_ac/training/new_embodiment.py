@@ -1,4 +1,4 @@
-"""Does the model take this robot's states and actions, and if not, who learns to? Asked before the first step."""
+"""Checks for a new robot: does the model accept its states and actions, and which layers learn them?"""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from vjepa2_ac.model.network.world_model import WorldModel
 
 
 def check_heads(config: Config, dataset: Dataset) -> None:
-    """Refuse, before the model is loaded, data of other widths than the base's where nothing would learn them.
+    """Refuse, before the model is loaded, data of other widths than the base's if no layer would learn them.
 
     Raises:
-        InputError: A fresh head would not be trained; or the base, which cannot predict from this data, is to choose
-            the stride.
+        InputError: A new head would not be trained; or the stride is to be chosen by the base, which cannot predict
+            from this data.
     """
     heads = heads_to_replace(base_sizes(config.model), dataset.widths)
     if heads and config.data.stride == "auto":
@@ -32,16 +32,16 @@ def check_heads(config: Config, dataset: Dataset) -> None:
 
 
 def fit_to_data(world_model: WorldModel, config: Config, dataset: Dataset, note: Callable[[str], None]) -> None:
-    """Give a base fresh input heads where the data's states or actions have other widths, and say so.
+    """Give a base new input heads if the data's states or actions have other widths, and report them.
 
     Args:
-        world_model: The base, not adapted.
-        config: The run; its seed decides the heads.
+        world_model: The base, without an adapter.
+        config: The config of the run; its seed initializes the heads.
         dataset: The data.
-        note: Told of each head that is new, and of each that takes vectors and stays.
+        note: Receives a message for each new head, and for each head that takes vectors and stays.
 
     Raises:
-        InputError: A fresh head would not be trained.
+        InputError: A new head would not be trained.
     """
     heads = heads_to_replace(world_model.sizes, dataset.widths)
     require_trained(heads, config.adapter)

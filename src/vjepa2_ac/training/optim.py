@@ -1,4 +1,4 @@
-"""Which parameters move, by which rule, and how fast at which step?"""
+"""The optimizer: trained parameters, update rule, and learning rate schedule."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.model.finite import first_not_finite
 
-_MOST_STEPS = 2**53  # a float64 counts no further
+_MOST_STEPS = 2**53  # larger counts are not exact in float64
 
 
 def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, object]]:
-    """Split what is trained into matrices, which decay, and biases and norms, which do not.
+    """Split the trained parameters into matrices, which decay, and biases and norms, which do not.
 
     Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/utils.py, init_opt.
     """
@@ -29,10 +29,10 @@ def parameter_groups(module: nn.Module, weight_decay: float) -> list[dict[str, o
 
 
 def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.Optimizer:
-    """Return the optimizer over what is trained. The learning rate is set anew before every step.
+    """Return the optimizer of the trained parameters. The learning rate is set before every step.
 
-    AdamW on CUDA is fused: one kernel moves many tensors, and where fp16 has overflowed it moves none without the
-    host's asking. It rounds otherwise than on a CPU.
+    AdamW on CUDA is fused: one kernel updates many tensors, and after an overflow in fp16 it updates none without
+    involving the host. It rounds differently than on a CPU.
 
     Raises:
         InputError: It needs a library that is not installed.
@@ -45,7 +45,7 @@ def make_optimizer(module: nn.Module, training: TrainingConfig) -> torch.optim.O
 
 
 def require_optimizer(training: TrainingConfig) -> None:
-    """See that the optimizer is there.
+    """Check that the optimizer is installed.
 
     Raises:
         InputError: It needs a library that is not installed.
@@ -71,14 +71,14 @@ def _adamw_8bit() -> Any:
 
 
 def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> None:
-    """Take up the state of an optimizer of the same kind; weight decay and betas stay those that it was made with.
+    """Restore the state of an optimizer of the same kind; weight decay and betas keep their current values.
 
-    So does whether it is fused, by which PyTorch decides where the counts of steps have to be.
+    The same holds for `fused`, by which PyTorch decides on the device of the step counts.
 
     Raises:
         ValueError: The state is of another kind of optimizer, or of other parameters, or not finite.
     """
-    # PyTorch's names and those of bitsandbytes.
+    # Names of PyTorch and of bitsandbytes.
     first, second = ("exp_avg", "exp_avg_sq") if isinstance(optimizer, torch.optim.AdamW) else ("state1", "state2")
     known = (
         isinstance(state, dict) and isinstance(state.get("state"), dict) and isinstance(state.get("param_groups"), list)
@@ -104,20 +104,20 @@ def load_moments(optimizer: torch.optim.Optimizer, state: dict[str, Any]) -> Non
 
 
 def _is_count(step: object) -> bool:
-    """Return whether this can be the number of steps that an optimizer has made: powers of its betas have to exist."""
+    """Return whether this is a possible step count of an optimizer: powers of its betas have to exist."""
     if isinstance(step, Tensor):
         return step.numel() == 1 and 1 <= float(step) <= _MOST_STEPS
     return isinstance(step, int | float) and 1 <= step <= _MOST_STEPS
 
 
 def _flat(moments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the moments of a parameter by their names: bitsandbytes puts its own into a dict among them."""
+    """Return the moments of a parameter by name: bitsandbytes stores its own in a nested dict."""
     groups = [value for value in moments.values() if isinstance(value, Mapping)]
     return {name: value for group in (moments, *groups) for name, value in group.items()}
 
 
 def _require_shapes(optimizer: torch.optim.Optimizer, moments: Mapping[Any, Any], first: str) -> None:
-    """Refuse moments of other shapes than their parameters': nothing else would, before the first step."""
+    """Refuse moments of other shapes than their parameters, which nothing else checks before the first step."""
     parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
     for place, of_one in moments.items():
         if type(place) is not int or not 0 <= place < len(parameters):
@@ -154,11 +154,11 @@ def learning_rate_at(step: int, training: TrainingConfig) -> float:
 
 
 def set_learning_rate(optimizer: torch.optim.Optimizer, learning_rate: float) -> None:
-    """Give every group this learning rate."""
+    """Set the learning rate of every group."""
     for group in optimizer.param_groups:
         group["lr"] = learning_rate
 
 
 def trained_parameters(module: nn.Module) -> Iterable[nn.Parameter]:
-    """Return the parameters that the optimizer moves."""
+    """Return the parameters of the optimizer."""
     return (parameter for parameter in module.parameters() if parameter.requires_grad)

@@ -1,4 +1,4 @@
-"""The reporter of a run: what is a person shown while it trains, and what do processes use that show nothing?"""
+"""The reporter of a run: what is shown while it trains; silent in all other processes."""
 
 from __future__ import annotations
 
@@ -11,25 +11,25 @@ from vjepa2_ac.evaluation.metrics import PredictionErrors
 
 @runtime_checkable
 class Reporter(Protocol):
-    """Shows a run to a person."""
+    """Shows the progress of a run."""
 
     def note(self, text: str) -> None:
-        """Say something once."""
+        """Show a message."""
         ...
 
     def indexed(self, done: int, total: int) -> None:
-        """So much of a data set that was not known before is looked through."""
+        """Show the progress of indexing a data set."""
         ...
 
     def encoded(self, done: int, total: int) -> None:
-        """So many frames are encoded into the latent cache."""
+        """Show the progress of encoding frames into the latent cache."""
         ...
 
     def started(self, done: int, total: int) -> None:
         """The loop begins after `done` of `total` optimizer steps."""
         ...
 
-    def stepped(self, step: int, figures: dict[str, float]) -> None:
+    def stepped(self, step: int, metrics: dict[str, float]) -> None:
         """An optimizer step is done."""
         ...
 
@@ -42,7 +42,7 @@ class NullReporter:
     """Shows nothing."""
 
     def note(self, text: str) -> None:
-        """Say nothing."""
+        """Show nothing."""
 
     def indexed(self, done: int, total: int) -> None:
         """Show nothing."""
@@ -53,7 +53,7 @@ class NullReporter:
     def started(self, done: int, total: int) -> None:
         """Show nothing."""
 
-    def stepped(self, step: int, figures: dict[str, float]) -> None:
+    def stepped(self, step: int, metrics: dict[str, float]) -> None:
         """Show nothing."""
 
     def validated(self, step: int, errors: PredictionErrors) -> None:
@@ -63,7 +63,7 @@ class NullReporter:
 class NullMetricsLog:
     """Writes nothing."""
 
-    def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
+    def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Write nothing."""
 
     is_behind = False
@@ -74,7 +74,7 @@ class NullMetricsLog:
         yield
 
     def __enter__(self) -> NullMetricsLog:
-        """Return the journal."""
+        """Return this metrics log."""
         return self
 
     def __exit__(self, *_: object) -> None:

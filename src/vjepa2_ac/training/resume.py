@@ -1,4 +1,4 @@
-"""How does a run go on where it stood? Its newest checkpoint, on whatever number of processes."""
+"""Resuming a run: from its newest checkpoint, on any number of processes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def restore(
     optimizer: torch.optim.Optimizer,
     note: Callable[[str], None],
 ) -> RunState:
-    """Bring every process to where the run stands: the first one reads its newest checkpoint, the others get it there.
+    """Restore the run in every process: the first one reads the newest checkpoint and sends it to the others.
 
     Raises:
         InputError: The processes have different bases, or the checkpoint is not of this run.
@@ -60,13 +60,13 @@ def restore(
 
 
 def micro_batches_of(config: Config, state: RunState, processes: int, note: Callable[[str], None]) -> int:
-    """Return how many micro-batches a process does per step.
+    """Return the number of micro-batches of a process per step.
 
-    They are the config's, at the first start and where batch_size * accumulation was changed on purpose; else so many
-    that a step has the clips it had, on whatever number of processes, however often the run goes on.
+    It is the config's, at the first start and if batch_size * accumulation was changed on purpose; else the number that
+    keeps the clips per step, on any number of processes and after any number of restarts.
 
     Raises:
-        InputError: So many processes cannot share a step's clips evenly.
+        InputError: This number of processes cannot share a step's clips evenly.
     """
     batch_size, accumulation = config.training.batch_size, config.training.accumulation
     if state.clips_per_step is None:
@@ -91,12 +91,12 @@ def micro_batches_of(config: Config, state: RunState, processes: int, note: Call
 
 
 def refuse_if_overtaken(folder: Path, state: RunState) -> None:
-    """See that nobody trained in a new run's folder between its first look at it and its lock.
+    """Check that no other process trained in a new run's folder between its first inspection and its lock.
 
     Raises:
-        InputError: Somebody did.
+        InputError: Another process did.
     """
-    # Those up to its own step were looked at when the run was taken up.
+    # Checkpoints up to its own step were inspected when the run was resumed.
     further = [path for path in listed(folder / CHECKPOINTS) if (step_of(path.name) or 0) > state.step]
     newest = next((path for path in reversed(further) if find_damage(path) is None), None)
     if newest is not None:
@@ -104,15 +104,15 @@ def refuse_if_overtaken(folder: Path, state: RunState) -> None:
             where=str(newest),
             found=f"a checkpoint of step {read_state(newest).step}, which another start wrote while this one stood at"
             f" {state.step}",
-            fix="Start again: the run goes on from there",
+            fix="Start again: the run continues from there",
         )
 
 
 def restore_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
-    """Let losses be scaled as they were when the checkpoint was written.
+    """Restore the loss scale of the checkpoint.
 
     Raises:
-        InputError: What was written is no such scale.
+        InputError: The stored value is no loss scale.
     """
     if state.loss_scale is None or not scaler.is_enabled():
         return
@@ -125,8 +125,8 @@ def restore_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
     scaler.load_state_dict(dict(state.loss_scale))
 
 
-def say_what_is_new(dataset: Dataset, state: RunState, note: Callable[[str], None]) -> None:
-    """Note where the data is not what it was when the checkpoint was written."""
+def report_data_changes(dataset: Dataset, state: RunState, note: Callable[[str], None]) -> None:
+    """Report if the data has changed since the checkpoint was written."""
     windows = len(dataset.windows("train"))
     if state.windows not in {None, windows}:
         note(

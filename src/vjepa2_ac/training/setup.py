@@ -1,4 +1,4 @@
-"""What must stand before the first step? Device, data, model, adapter, optimizer and the newest checkpoint, checked."""
+"""Setup of a run before the first step: device, data, model, adapter, optimizer and newest checkpoint, with checks."""
 
 from __future__ import annotations
 
@@ -47,50 +47,50 @@ from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.micro_step import CapturedMicroStep, MicroStep, captured_on_cuda
 from vjepa2_ac.training.new_embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
-from vjepa2_ac.training.resume import micro_batches_of, restore, restore_loss_scale, say_what_is_new
+from vjepa2_ac.training.resume import micro_batches_of, report_data_changes, restore, restore_loss_scale
 from vjepa2_ac.training.stride_choice import choose_stride
 
-_CLIPS_TRIED = 8  # one is read; the others are for where data.broken_episodes passes over it
+_CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes
 
 
 @dataclass
 class Run:
-    """Everything the loop needs, assembled and checked."""
+    """All parts of a run, assembled and checked."""
 
     config: Config  # its stride is a number
     accelerator: Accelerator  # device, precision, and the place among processes
     world_model: WorldModel
     objective: Objective
     optimizer: torch.optim.Optimizer
-    scaler: torch.amp.GradScaler  # does nothing but with fp16
+    scaler: torch.amp.GradScaler  # has no effect except with fp16
     dataset: Dataset
     state: RunState
     micro_batches: int  # of this process, per optimizer step
-    calibration: Calibration | None = None  # where data.stride was auto and is now chosen
+    calibration: Calibration | None = None  # if data.stride was auto and is now chosen
 
     @property
     def encodes(self) -> bool:
-        """Whether clips are pictures that go through the encoder, not latents of a cache."""
+        """Whether clips are frames that go through the encoder, not latents of a cache."""
         return self.dataset.config.source != "latents"
 
     @cached_property
     def trained(self) -> list[nn.Parameter]:
-        """What the optimizer moves."""
+        """The parameters of the optimizer."""
         return list(trained_parameters(self.objective))
 
     @cached_property
     def cast_matrices(self) -> CastMatrices:
-        """The adapter in the type that a step computes in."""
+        """The adapter in the type of the computation."""
         return CastMatrices(self.world_model.predictor, PRECISIONS[self.config.training.precision])
 
     @property
     def micro_step(self) -> MicroStep | CapturedMicroStep:
-        """What adds the gradients of some clips."""
+        """The micro-step."""
         return self.captured or self._plain_micro_step
 
     @cached_property
     def captured(self) -> CapturedMicroStep | None:
-        """The same as a graph, where that is asked for."""
+        """The micro-step as a graph, if requested."""
         if not self.config.training.cuda_graph:
             return None
         return CapturedMicroStep(self._plain_micro_step, self.trained, captured_on_cuda)
@@ -101,7 +101,7 @@ class Run:
 
     @property
     def copies(self) -> Copies:
-        """How batches get to the run's device."""
+        """The copies of batches to the run's device."""
         return copies_for(self.accelerator.device)
 
     @property
@@ -119,15 +119,15 @@ def set_up(
     *,
     check_only: bool = False,
 ) -> Run:
-    """Open the data, load the model, attach the adapter, and take up the newest checkpoint. Cheap failures first.
+    """Open the data, load the model, attach the adapter, and restore the newest checkpoint. Cheap failures first.
 
     Args:
         config: The run.
-        note: Told what a person should know.
-        indexed: Told how far the data set is looked through, where that was not done before.
-        accelerator: What `make_accelerator` gave for this config; None: it is made here.
-        encoding: Told how many frames are encoded, where `data.cache` is auto and they are not there yet.
-        check_only: Leave such a cache alone, and say how large it would be.
+        note: Receives messages for the user.
+        indexed: Called with the progress of indexing, if the data set is not indexed yet.
+        accelerator: The result of `make_accelerator` for this config; None: it is created here.
+        encoding: Called with the number of encoded frames, if `data.cache` is auto and they are missing.
+        check_only: Do not write such a cache, and report its size.
 
     Raises:
         InputError: Something cannot be used.
@@ -165,7 +165,7 @@ def set_up(
     optimizer = shard_predictor(world_model, optimizer, config, accelerator, note)
     restore_loss_scale(scaler, state)
     dataset.broken.recall(state.broken)
-    say_what_is_new(dataset, state, note)
+    report_data_changes(dataset, state, note)
     state = best_so_far(state, measured_on(config, dataset), note)
     micro_batches = micro_batches_of(config, state, accelerator.num_processes, note)
     objective = Objective(world_model, config.training)
@@ -175,7 +175,7 @@ def set_up(
 
 
 def batches_from(run: Run) -> Batches:
-    """Yield the micro-batches of this process from where the run stands."""
+    """Yield the micro-batches of this process from the current step on."""
     return training_loader(
         run.dataset,
         seed=run.config.seed,
@@ -194,7 +194,7 @@ def encode(run: Run, batch: Batch) -> LatentBatch:
 
 
 def save_checkpoint(run: Run, folder: Path) -> None:
-    """Write where the run stands into its folder (see `runs.checkpoint`): all processes call, the first writes."""
+    """Write the state of the run into its folder (see `runs.checkpoint`): all processes call, the first writes."""
     writes = run.accelerator.is_main_process
     weights, moments = (
         full_state_dict(run.world_model, keep=writes),
@@ -226,7 +226,7 @@ def save_checkpoint(run: Run, folder: Path) -> None:
 
 
 def _started(config: Config) -> Path | None:
-    """Return the adapter that the run goes on with, where knowing it saves minutes: PiSSA starts where that one did."""
+    """Return the adapter of the checkpoint, if knowing it saves minutes: PiSSA starts from its initial weights."""
     if config.adapter.init != "pissa":
         return None
     checkpoint = newest_checkpoint(Path(config.run_dir) / CHECKPOINTS)
@@ -234,7 +234,7 @@ def _started(config: Config) -> Path | None:
 
 
 def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:
-    """Fail early: an empty split, a broken clip. A test split of share 0 is nobody's mistake."""
+    """Fail early: an empty split, a broken clip. A test split of share 0 is no error."""
     splits: tuple[Split, ...] = ("train", "validation", "test")
     splits = splits if dataset.config.test_share else splits[:2]
     firsts = [next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1)) for split in splits]

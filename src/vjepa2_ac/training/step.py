@@ -1,4 +1,4 @@
-"""What is one optimizer step? Micro-batches in, gradients accumulated and clipped, weights moved, or a refusal."""
+"""The optimizer step: gradients of micro-batches accumulated and clipped, weights updated, or the step refused."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ from vjepa2_ac.training.monitoring.throughput import Update
 from vjepa2_ac.training.optim import learning_rate_at, set_learning_rate
 from vjepa2_ac.training.setup import Run, encode
 
-SMALLEST_LOSS_SCALE = 1.0  # fp16: where gradients overflow even so, they are not finite for another reason
+SMALLEST_LOSS_SCALE = 1.0  # fp16: if gradients still overflow, they are not finite for another reason
 
 
 @dataclass(frozen=True)
 class Gradients:
-    """What the gradients of one optimizer step were taken from, by all processes together."""
+    """The gradients of one optimizer step, over all processes."""
 
     forced_loss: float  # mean over the clips; NaN where there is none
     rollout_loss: float
-    norm: float  # before clipping; not finite where fp16 has overflowed, which the loss scale answers
-    clips: int  # that could be read
+    norm: float  # before clipping; not finite after an overflow in fp16, which the loss scale handles
+    clips: int  # that were read
     bytes_fetched: int
 
 
@@ -43,9 +43,9 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
 
     Args:
         run: The run.
-        batches: Where its micro-batches come from.
+        batches: Source of its micro-batches.
         step: From 1.
-        measure_update: Tell how far the weights have moved, too, for which they are copied.
+        measure_update: Also return how far the weights have moved, which needs a copy of them.
 
     Raises:
         InputError: The loss or a gradient is not finite; names the clips and saves them. The weights have not moved.
@@ -58,7 +58,7 @@ def training_step(run: Run, batches: Iterator[Batch], step: int, *, measure_upda
     if taken.clips:  # without a clip there are no gradients, and nothing moves
         run.scaler.step(run.optimizer)  # with fp16 and an overflow nothing moves either
         run.scaler.update()
-    run.optimizer.zero_grad(set_to_none=not run.config.training.cuda_graph)  # a graph adds to those that it knows
+    run.optimizer.zero_grad(set_to_none=not run.config.training.cuda_graph)  # a graph adds to the same tensors
     return {
         "loss": taken.forced_loss + taken.rollout_loss,
         "loss_teacher_forcing": taken.forced_loss,
@@ -81,9 +81,9 @@ def gradients(
 
     Args:
         run: The run.
-        batches: Where its micro-batches come from.
-        look_back: Saves clips into the run's folder where a loss or gradient is not finite; None: nothing is written.
-        more: Whether another step follows, whose first micro-batch is fetched while the device is still at work.
+        batches: Source of its micro-batches.
+        look_back: Saves clips into the run's folder if a loss or gradient is not finite; None: nothing is written.
+        more: Whether another step follows, whose first micro-batch is fetched while the device is computing.
 
     Raises:
         InputError: A loss or gradient is not finite; names the clips of this process.
@@ -99,7 +99,7 @@ def gradients(
     if not clips:
         return Gradients(math.nan, math.nan, 0.0, clips=0, bytes_fetched=int(fetched_by_all))
     forced_loss, rollout_loss = (loss * (expected / clips) for loss in losses)
-    norm = _settle(run, factor=expected / clips)
+    norm = _finish_gradients(run, factor=expected / clips)
     _refuse_not_finite(run, forced_loss + rollout_loss, norm, seen, look_back)
     return Gradients(forced_loss, rollout_loss, norm, int(clips), int(fetched_by_all))
 
@@ -123,8 +123,8 @@ def _accumulate(run: Run, batches: Iterator[Batch], look_back: ClipRecorder | No
     return totals, seen, fetched
 
 
-def _settle(run: Run, factor: float) -> float:
-    """Make the sums of scaled parts of all processes the gradient of the mean, clip it, and return its norm before."""
+def _finish_gradients(run: Run, factor: float) -> float:
+    """Turn the scaled sums of all processes into the gradient of the mean, clip it, and return its norm before."""
     all_reduce_gradients(run.accelerator, run.trained)
     run.scaler.unscale_(run.optimizer)
     if factor != 1:
@@ -138,12 +138,12 @@ def _settle(run: Run, factor: float) -> float:
 
 def _about_the_data(run: Run, taken: Gradients) -> dict[str, float]:
     data = run.config.data
-    figures: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     if data.broken_episodes == "skip":
-        figures["clips_left_out"] = float(run.clips_per_step - taken.clips)
+        metrics["clips_left_out"] = float(run.clips_per_step - taken.clips)
     if is_url(data.path):
-        figures["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
-    return figures
+        metrics["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
+    return metrics
 
 
 def step_seed(seed: int, step: int, rank: int) -> int:

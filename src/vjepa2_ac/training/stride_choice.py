@@ -1,4 +1,4 @@
-"""Which stride does a run take where `data.stride` is auto? The one that its model chose before the first step."""
+"""Stride choice of a run with `data.stride: auto`: the stride that its model chose before the first step."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 def choose_stride(
     world_model: WorldModel, dataset: Dataset, config: Config, accelerator: Accelerator, note: Callable[[str], None]
 ) -> Calibration:
-    """Let the model of a run, before it is changed, choose among the candidates on the validation episodes.
+    """Let the model of a run, before training, choose among the candidates on the validation episodes.
 
     Raises:
         InputError: As `calibrate`.
@@ -34,7 +34,7 @@ def choose_stride(
 
 
 def strides_that_fit(dataset: Dataset) -> list[int]:
-    """Return the candidates at which a run's own clips, which may be longer than a calibration's, fit into episodes.
+    """Return the candidates at which the run's clips, which may be longer than a calibration's, fit into episodes.
 
     Raises:
         InputError: There is none.

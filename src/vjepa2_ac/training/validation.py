@@ -1,4 +1,4 @@
-"""Validation: how does the run do on held-out clips, and is its base worth adapting?"""
+"""Validation of a run on held-out clips, and the check that its base is worth adapting."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from vjepa2_ac.training.new_embodiment import NOT_ASKED
 from vjepa2_ac.training.reporter import NullMetricsLog, Reporter
 from vjepa2_ac.training.setup import Run, encode
 
-BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: the longest look ahead is what planning leans on
+BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: planning depends on the longest horizon
 
 
-def validate_if_due(run: Run, journal: MetricsLog | NullMetricsLog, reporter: Reporter) -> bool:
-    """Measure and note, where it is time to; return whether no earlier measurement was as good."""
+def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter: Reporter) -> bool:
+    """Measure and log the validation, if it is due; return whether it is the best so far."""
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
         return False
-    figures = validation_metrics(validate(run, reporter))
-    journal.write("validation", step, figures)
+    metrics = validation_metrics(validate(run, reporter))
+    metrics_log.write("validation", step, metrics)
     if not config.checkpoint.keep_best:
         return False
     before = run.state
-    run.state = before.measured(figures[BEST_BY])
+    run.state = before.measured(metrics[BEST_BY])
     return run.state != before
 
 
 def validation_metrics(errors: PredictionErrors) -> dict[str, Any]:
-    """Return what a validation writes into the journal."""
+    """Return what a validation writes into the metrics log."""
     by_horizon, one_step = ratios_by_horizon(errors), one_step_ratios(errors)
     return {
         "error_over_persistence": one_step["true"].value,
@@ -75,5 +75,5 @@ def refuse_weak_base(run: Run, errors: PredictionErrors, reporter: Reporter) -> 
         found=f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame",
         needed="a base that is better than doing nothing (below 1)",
         fix="Check the checkpoint, data.stride, data.camera, the order of the state and the gripper's direction;"
-        " to adapt it all the same, set training.allow_weak_base=true",
+        " to adapt it anyway, set training.allow_weak_base=true",
     )

@@ -1,4 +1,4 @@
-"""A model that knows the world plans what was demonstrated; one that is deaf to actions is no better than no plan."""
+"""An oracle plans the demonstrated actions; a model that ignores actions is no better than no plan."""
 
 from dataclasses import replace
 
@@ -250,10 +250,10 @@ def test_plans_without_a_finite_energy_do_nothing_and_are_counted() -> None:
 
 @pytest.mark.usefixtures("quick")
 def test_progress_counts_every_plan_of_a_model() -> None:
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     quick = ONE_STEP.model_copy(update={"samples": 10, "iterations": 1})
-    measure_plans(Copier(), starts_of_a_world()[:2], quick, lambda done, total: told.append((done, total)))
-    assert told == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    measure_plans(Copier(), starts_of_a_world()[:2], quick, lambda done, total: reported.append((done, total)))
+    assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
 def test_of_vectors_no_plans_are_made_and_the_reason_is_said() -> None:
@@ -266,11 +266,11 @@ def test_of_vectors_no_plans_are_made_and_the_reason_is_said() -> None:
 @pytest.mark.usefixtures("quick")
 def test_without_planning_the_file_holds_nothing_new_but_nulls() -> None:
     quiet = ProbeOptions(sensitivity_clips=0, examples=0)
-    figures = metrics_as_dict(planned(Copier(), probes=quiet))
-    assert figures.pop("planning") is None
-    assert figures["models"]["adapter"].pop("planning") is None
-    assert "planning" not in str(figures)
+    metrics = metrics_as_dict(planned(Copier(), probes=quiet))
+    assert metrics.pop("planning") is None
+    assert metrics["models"]["adapter"].pop("planning") is None
+    assert "planning" not in str(metrics)
     with_plans = metrics_as_dict(planned(Copier(), probes=QUICK))
     assert with_plans["planning"]["three_steps_settings"] == SCORED.model_dump(mode="json")
-    del with_plans["planning"], with_plans["models"]["adapter"]["planning"], with_plans["verdict"], figures["verdict"]
-    assert with_plans == figures
+    del with_plans["planning"], with_plans["models"]["adapter"]["planning"], with_plans["verdict"], metrics["verdict"]
+    assert with_plans == metrics

@@ -1,4 +1,4 @@
-"""Scores, errors, angles and signs are what is computed by hand."""
+"""Scores, errors, angles and signs equal those computed by hand."""
 
 import json
 import re
@@ -151,9 +151,9 @@ def test_the_table_shows_models_beside_what_takes_none(found: Evaluation) -> Non
     study, plans = found.planning, found.models["adapter"].plans
     assert study is not None
     assert plans is not None
-    figures = metrics_of(study, plans)
+    metrics = metrics_of(study, plans)
     for axis, place in enumerate((3, 4, 5)):
-        assert str(cells[place]).startswith(f"{figures.axes_cm[axis].value:.1f} ")
+        assert str(cells[place]).startswith(f"{metrics.axes_cm[axis].value:.1f} ")
 
 
 def test_compare_shows_the_score_where_there_is_one(found: Evaluation, tmp_path: Path) -> None:

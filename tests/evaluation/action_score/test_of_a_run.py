@@ -1,4 +1,4 @@
-"""Plans are measured with the planning section of a config, and clips too short for them are refused at once."""
+"""Plans are measured with a config's planning section, and clips that are too short are refused at once."""
 
 import json
 from dataclasses import replace
@@ -69,19 +69,19 @@ def test_plans_are_measured_on_held_out_clips_with_the_configs_settings(
 
     evaluation = evaluate_subject(str(base_folder), several, stage=stage).evaluation
     assert {"planning, base", "planning, model"} <= set(stages)
-    figures = json.loads((tmp_path / "out/metrics.json").read_text())
-    assert figures["planning"]["starts"] == 3
-    settings = figures["planning"]["one_step_settings"]
+    metrics = json.loads((tmp_path / "out/metrics.json").read_text())
+    assert metrics["planning"]["starts"] == 3
+    settings = metrics["planning"]["one_step_settings"]
     assert (settings["samples"], settings["iterations"], settings["cem"]["elites"]) == (12, 2, 3)
-    assert set(figures["planning"]["places"]) <= {0, 1}
-    assert "Its plans of 3 steps end" in figures["verdict"]
+    assert set(metrics["planning"]["places"]) <= {0, 1}
+    assert "Its plans of 3 steps end" in metrics["verdict"]
     one, other = (evaluation.models[name].plans for name in ("base", "model"))
     assert one is not None
     assert other is not None
     assert not one.one_step[..., 0].any(), "planning.limits.xyz holds x"
     assert one.one_step[..., 1].any()
     assert (one.three_steps == other.three_steps).all(), "the same weights plan the same"
-    difference = figures["models"]["model"]["planning"]["difference_to_base"]
+    difference = metrics["models"]["model"]["planning"]["difference_to_base"]
     assert difference["missed_cm"] == {"value": 0.0, "low": 0.0, "high": 0.0}
 
 

@@ -1,4 +1,4 @@
-"""The energy of a world that is known is lowest at the true action; a flat one tells of no direction."""
+"""The energy of a known world is lowest at the true action; a flat one has no direction."""
 
 import numpy as np
 import pytest

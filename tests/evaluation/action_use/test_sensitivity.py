@@ -1,10 +1,10 @@
-"""Ranks are counted, ties are shared, and what is drawn is what it is said to be."""
+"""Ranks are counted, ties are shared, and samples come from the stated distribution."""
 
 import numpy as np
 import pytest
 import torch
 
-from vjepa2_ac.evaluation.action_use.one_step import start_of, try_actions
+from vjepa2_ac.evaluation.action_use.one_step import evaluate_actions, start_of
 from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sensitivity
 from worlds import DIM, TIME, Copier, Halfway, Oracle, clips_batch
 
@@ -26,10 +26,10 @@ def test_energy_and_change_are_the_distances_of_the_world() -> None:
     start = starts()[0]
     true = start.action.double().numpy()
     other = true + np.array([0.03, 0, 0, 0, 0, 0, 0])
-    tried = try_actions(Oracle(), start, np.stack([true, other]), at_once=1)
+    tried = evaluate_actions(Oracle(), start, np.stack([true, other]), at_once=1)
     assert tried.energy == pytest.approx([0.0, 3.0 / DIM], abs=1e-5), "3 cm in one of the numbers"
     assert tried.change == pytest.approx([0.0, 3.0 / DIM], abs=1e-5)
-    half = try_actions(Halfway(), start, np.stack([2 * true, other]), at_once=7)
+    half = evaluate_actions(Halfway(), start, np.stack([2 * true, other]), at_once=7)
     assert half.energy[0] == pytest.approx(0.0, abs=1e-5)
     assert half.change[1] == pytest.approx(1.5 / DIM, abs=1e-5)
 

@@ -1,4 +1,4 @@
-"""`data check --model` measures the data with a model, read as they are and otherwise, whatever form they are in."""
+"""`data check --model` measures the data with a model, unchanged and in variants, for every source."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +13,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.evaluation.data_variants.from_config import probe_config
-from vjepa2_ac.evaluation.data_variants.measure import TriedVariant, VariantProbe
+from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.model.checkpoints.loading import load_base
 
@@ -36,7 +36,7 @@ def probed(config: Config, model: str, clips: int = 4) -> VariantProbe:
 
 
 def names(probe: VariantProbe) -> set[str]:
-    return {one.name for one in probe.tried}
+    return {one.name for one in probe.results}
 
 
 def test_the_probe_prints_a_table_and_a_verdict_after_the_findings(
@@ -46,7 +46,7 @@ def test_the_probe_prints_a_table_and_a_verdict_after_the_findings(
     printed = capsys.readouterr().out
     findings, table = printed.split("One-step error / persistence of the data, read otherwise")
     assert "\nok       agreement" in findings
-    for variant in ("as they are", "pictures 1 step late", "the states backwards", "y negated", "red and blue"):
+    for variant in ("as they are", "frames 1 step late", "the states backwards", "y negated", "red and blue"):
         assert variant in table
     assert table.splitlines()[-1].split()[1] == "probe"
     assert "on 8 clips of 5 episodes: the model predicts none of this" in table.splitlines()[-1]  # it knows no drawings
@@ -55,7 +55,7 @@ def test_the_probe_prints_a_table_and_a_verdict_after_the_findings(
 def test_a_variant_that_fits_better_is_a_warning_with_what_to_do_and_no_error(
     make_config: MakeConfig, tmp_path: Path, capsys: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    better = TriedVariant("y negated", "negate y", Estimate(0.5, 0.4, 0.6), Estimate(-0.4, -0.45, -0.35))
+    better = VariantResult("y negated", "negate y", Estimate(0.5, 0.4, 0.6), Estimate(-0.4, -0.45, -0.35))
     probe = VariantProbe(Estimate(0.9, 0.8, 1.0), (better,), clips=64, episodes=12)
     monkeypatch.setattr("vjepa2_ac.evaluation.data_variants.from_config.probe_config", lambda *_, **__: probe)
     assert check(make_config(), tmp_path, "builtin:sim-tiny") == 0
@@ -95,27 +95,27 @@ def test_vectors_are_probed_by_a_model_that_takes_them_and_others_are_refused(
 
     config = of_width(7)
     assert names(probed(config, str(config.model.base))) == {
-        *(f"pictures {n} {when}" for n in ("1 step", "2 steps", "4 steps") for when in ("late", "early")),
-        "the states backwards", "red and blue exchanged", "pictures mirrored",
+        *(f"frames {n} {when}" for n in ("1 step", "2 steps", "4 steps") for when in ("late", "early")),
+        "the states backwards", "red and blue exchanged", "frames mirrored",
     }  # fmt: skip
     assert check(of_width(8), tmp_path, str(config.model.base)) == 2
     assert "data with states of 8 and actions of 8 numbers" in capsys.readouterr().err
 
 
-def test_a_latent_cache_is_probed_by_the_model_that_encoded_it_without_other_pictures(
+def test_a_latent_cache_is_probed_by_the_model_that_encoded_it_without_other_frames(
     make_config: MakeConfig, tmp_path: Path, capsys: Printed
 ) -> None:
-    of_pictures = make_config(data__frames=10, data__start_every=2)
-    base = str(of_pictures.model.base)
-    cache = encode_for(of_pictures, load_base(of_pictures.model, seed=0), open_dataset(of_pictures.data))
+    of_frames = make_config(data__frames=10, data__start_every=2)
+    base = str(of_frames.model.base)
+    cache = encode_for(of_frames, load_base(of_frames.model, seed=0), open_dataset(of_frames.data))
     config = make_config(
         data__source="latents", data__path=str(cache), data__camera=None, data__frames=10, data__start_every=2
     )
-    probe, expected = probed(config, base), probed(of_pictures, base)
+    probe, expected = probed(config, base), probed(of_frames, base)
     assert probe.ratio.value == pytest.approx(expected.ratio.value, rel=2e-3)  # kept in bfloat16
-    assert names(probe) == names(expected) - {"red and blue exchanged", "pictures mirrored"}
-    differences = {one.name: one.difference.value for one in expected.tried}
-    for one in probe.tried:
+    assert names(probe) == names(expected) - {"red and blue exchanged", "frames mirrored"}
+    differences = {one.name: one.difference.value for one in expected.results}
+    for one in probe.results:
         assert one.difference.value == pytest.approx(differences[one.name], rel=0.02, abs=0.02)
     assert check(config, tmp_path, "builtin:sim-tiny") == 2
     assert "encoder" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""A model that knows its world names the variant in which the data really are, and of good data it names none."""
+"""An oracle finds the variant in which the data were written, and no variant for good data."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.step_ranges import StepSelection
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, StepRanges
-from vjepa2_ac.evaluation.data_variants.measure import TriedVariant, VariantProbe, probe_variants, rows_of
+from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult, probe_variants, rows_of
 from vjepa2_ac.evaluation.data_variants.variants import mirrored, variants_of
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.geometry import actions_from_states, matrices_from_euler
@@ -44,23 +44,23 @@ def with_inverted_gripper(states: np.ndarray) -> np.ndarray:
 
 
 class TwoSided(MemorySource):
-    """Its pictures hold at the right other steps than at the left, and another blue."""
+    """Its frames hold at the right other steps than at the left, and another blue."""
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
         """Return an episode."""
         episode = super().read(index, camera, needed)
 
         def frames(steps: Sequence[int]) -> np.ndarray:
-            pictures = episode.read_frames(steps)
-            pictures[:, :, 3:, 1] = (7 * pictures[:, :, 3:, 1] + 3) % STEPS
-            pictures[:, :, 3:, 2] = RIGHT
-            return pictures
+            frames = episode.read_frames(steps)
+            frames[:, :, 3:, 1] = (7 * frames[:, :, 3:, 1] + 3) % STEPS
+            frames[:, :, 3:, 2] = RIGHT
+            return frames
 
         return replace(episode, read_frames=frames)
 
 
 class Knowing:
-    """Knows where each picture was taken, and what an action does to a place, a rotation and a gripper."""
+    """Knows where each frame was taken, and what an action does to a place, a rotation and a gripper."""
 
     def __init__(self, steps: int = STEPS, *, sees_bgr: bool = False, sees_mirrored: bool = False) -> None:
         self._latents = [self._latent(at(0)(truth(number, steps))) for number in range(EPISODES)]
@@ -78,7 +78,7 @@ class Knowing:
         return latents[step % len(latents)]
 
     def encode(self, batch: Batch) -> LatentBatch:
-        """Look up what is to be seen: a picture holds its episode and its step as colours."""
+        """Look up what is to be seen: a frame holds its episode and its step as colours."""
         assert batch.frames is not None
         self.encoded += 1
         seen = batch.frames[:, :, 0, self._column][..., self._channels].numpy().astype(int)
@@ -116,8 +116,8 @@ def probed(dataset: Dataset, model: Knowing | Copier | None = None) -> VariantPr
 
 
 FAULTS: dict[str, Fault] = {
-    **{f"pictures {n} step{'s' * (n > 1)} late": at(n) for n in (1, 8)},
-    **{f"pictures {n} step{'s' * (n > 1)} early": at(-n) for n in (2, 4)},
+    **{f"frames {n} step{'s' * (n > 1)} late": at(n) for n in (1, 8)},
+    **{f"frames {n} step{'s' * (n > 1)} early": at(-n) for n in (2, 4)},
     "the states backwards": lambda states: at(0)(states)[::-1].copy(),
     "x negated": lambda states: mirrored(at(0)(states), 0),
     "y negated": lambda states: mirrored(at(0)(states), 1),
@@ -131,24 +131,24 @@ def test_each_fault_is_named_and_mending_it_makes_the_model_fit(name: str) -> No
     assert probe.better is not None
     assert probe.better.name == name
     assert probe.better.ratio.value < 0.02 < 0.1 < probe.ratio.value
-    assert probe.verdict().endswith(f"less with {name}: {probe.better.mend}")
+    assert probe.verdict().endswith(f"less with {name}: {probe.better.repair}")
 
 
-@pytest.mark.parametrize("name", ["red and blue exchanged", "pictures mirrored"])
-def test_pictures_that_are_otherwise_are_named(name: str) -> None:
-    knowing = Knowing(sees_bgr=name.startswith("red"), sees_mirrored=name.startswith("pictures"))
+@pytest.mark.parametrize("name", ["red and blue exchanged", "frames mirrored"])
+def test_frames_that_are_otherwise_are_named(name: str) -> None:
+    knowing = Knowing(sees_bgr=name.startswith("red"), sees_mirrored=name.startswith("frames"))
     probe = probed(dataset_of(at(0)), knowing)
     assert probe.better is not None
     assert probe.better.name == name
 
 
-def test_of_good_data_no_variant_fits_better_and_only_changed_pictures_are_encoded_again() -> None:
+def test_of_good_data_no_variant_fits_better_and_only_changed_frames_are_encoded_again() -> None:
     knowing = Knowing()
     probe = probed(dataset_of(at(0)), knowing)
     assert probe.better is None
     assert probe.ratio.value < 0.02
-    assert min(one.difference.value for one in probe.tried) > 0.1
-    assert probe.verdict().endswith("on 16 clips of 8 episodes; no variant surely fits better")
+    assert min(one.difference.value for one in probe.results) > 0.1
+    assert probe.verdict().endswith("on 16 clips of 8 episodes; no variant certainly fits better")
     assert knowing.encoded == 2 * 3  # two batches; again with red and blue exchanged, and mirrored
     names = [name for name, *_ in rows_of(probe)]
     assert names[0] == "as they are"
@@ -157,15 +157,15 @@ def test_of_good_data_no_variant_fits_better_and_only_changed_pictures_are_encod
 
 def test_of_few_episodes_nothing_is_claimed() -> None:
     probe = probed(dataset_of(FAULTS["the states backwards"], episodes=4))
-    assert min(one.difference.value for one in probe.tried) < -0.1
+    assert min(one.difference.value for one in probe.results) < -0.1
     assert probe.better is None
     assert "too few episodes to compare, 5 are needed" in probe.verdict()
 
 
 def test_what_is_worse_than_persistence_is_no_better_reading() -> None:
-    def found(ratio: Estimate) -> TriedVariant | None:
-        tried = TriedVariant("y negated", "negate y", ratio, Estimate(-0.2, -0.25, -0.15))
-        return VariantProbe(Estimate(1.3, 1.2, 1.4), (tried,), clips=64, episodes=12).better
+    def found(ratio: Estimate) -> VariantResult | None:
+        results = VariantResult("y negated", "negate y", ratio, Estimate(-0.2, -0.25, -0.15))
+        return VariantProbe(Estimate(1.3, 1.2, 1.4), (results,), clips=64, episodes=12).better
 
     assert found(Estimate(1.1, 1.05, 1.15)) is None
     assert found(Estimate(0.95, 0.85, 1.05)) is None
@@ -199,9 +199,9 @@ def test_shifts_are_tried_as_far_as_states_reach_on_both_sides(steps: int, wides
         return knowing.encode(batch)
 
     probe = probe_variants(knowing, encode, dataset, split="train", clips=16)
-    tried = {one.name for one in probe.tried}
+    results = {one.name for one in probe.results}
     for shift in (1, 2, 4, 8):
-        assert (f"pictures {shift} step{'s' * (shift > 1)} late" in tried) == (shift <= widest)
+        assert (f"frames {shift} step{'s' * (shift > 1)} late" in results) == (shift <= widest)
     assert asked
     assert all(widest <= start <= steps - 9 - widest for _, start in asked)
     assert probe.better is None
@@ -226,8 +226,8 @@ def test_vectors_are_shifted_and_turned_only_and_latents_keep_their_colours() ->
     def names(**changes: object) -> set[str]:
         return {one.name for one in variants_of(DataConfig.model_validate({"path": "set"} | changes), [1])}
 
-    shifted = {"pictures 1 step late", "pictures 1 step early"}
-    colours = {"red and blue exchanged", "pictures mirrored"}
+    shifted = {"frames 1 step late", "frames 1 step early"}
+    colours = {"red and blue exchanged", "frames mirrored"}
     poses = {"x negated", "y negated", "the gripper inverted"}
     assert names() == shifted | colours | poses | {"the states backwards"}
     assert names(source="latents") == shifted | poses | {"the states backwards"}
@@ -254,14 +254,14 @@ def test_commands_are_shifted_with_the_states() -> None:
 
 def test_exchanging_colours_leaves_the_rest() -> None:
     variants = variants_of(DataConfig.model_validate({"path": "set"}), [])
-    variant, _ = [one for one in variants if one.changes_pictures]
+    variant, _ = [one for one in variants if one.changes_frames]
     episode = an_episode(np.zeros((3, 7)))
     changed = variant.change(episode)
     assert changed.read_frames([2, 1]).tolist() == [[[[9, 0, 2]]], [[[9, 0, 1]]]]
     assert changed.states is episode.states
 
 
-def test_of_changed_pictures_persistence_is_another_one_too() -> None:
+def test_of_changed_frames_persistence_is_another_one_too() -> None:
     """Or what moves less in latents would fit better."""
     knowing = Knowing()
 
@@ -273,7 +273,7 @@ def test_of_changed_pictures_persistence_is_another_one_too() -> None:
 
     dataset = dataset_of(at(0))
     probe = probe_variants(Copier(), encode, dataset, split="train", clips=16)
-    (mirrored_ones,) = [one for one in probe.tried if one.name == "pictures mirrored"]
+    (mirrored_ones,) = [one for one in probe.results if one.name == "frames mirrored"]
     assert mirrored_ones.ratio.value == pytest.approx(1)
     assert probe.better is None
 

@@ -1,4 +1,4 @@
-"""A model that knows its step length is recognised; where that cannot be told, it is not claimed."""
+"""The stride of an oracle is found; an uncertain result is reported as uncertain."""
 
 from collections.abc import Sequence
 
@@ -87,12 +87,12 @@ def test_the_stride_that_a_model_has_learned_is_found(learned: int) -> None:
 
 def test_ratios_are_those_computed_by_hand() -> None:
     found = calibrated(GoesOn(8), Tracks([80] * 5), clips=10)
-    assert [one.stride for one in found.tried] == [4, 8, 15]
-    assert [one.ratio.value for one in found.tried] == [
+    assert [one.stride for one in found.results] == [4, 8, 15]
+    assert [one.ratio.value for one in found.results] == [
         pytest.approx(4 / 4, abs=1e-3), pytest.approx(0.0, abs=1e-3), pytest.approx(7 / 15, abs=1e-3),
     ]  # fmt: skip
-    assert [one.moved_cm for one in found.tried] == [pytest.approx(stride / 10, rel=1e-3) for stride in (4, 8, 15)]
-    assert found.tried[0].seconds_per_step == pytest.approx(4 / 15)
+    assert [one.moved_cm for one in found.results] == [pytest.approx(stride / 10, rel=1e-3) for stride in (4, 8, 15)]
+    assert found.results[0].seconds_per_step == pytest.approx(4 / 15)
     assert found.runner_up == 15
     assert found.difference is not None
     assert found.difference.value == pytest.approx(-7 / 15, abs=1e-3)
@@ -115,7 +115,7 @@ def test_every_stride_is_tried_on_the_same_starts() -> None:
 
 def test_a_model_that_does_nothing_is_certain_of_nothing() -> None:
     found = calibrated(GoesOn(0), Tracks([80] * 6, noise=0.2))
-    assert [one.ratio.value for one in found.tried] == [1.0, 1.0, 1.0]
+    assert [one.ratio.value for one in found.results] == [1.0, 1.0, 1.0]
     assert not found.is_certain
     assert "not certain" in found.verdict()
     assert "does it fit this data at all?" in found.verdict()
@@ -144,16 +144,16 @@ def split_is_train() -> bool:
 
 def test_a_stride_that_fits_no_episode_is_named_and_the_others_are_tried() -> None:
     found = calibrated(GoesOn(4), Tracks([30] * 6))
-    assert [one.stride for one in found.tried] == [4, 8]
+    assert [one.stride for one in found.results] == [4, 8]
     assert list(found.impossible) == [15]
     assert "46 steps for a clip of 4 frames at stride 15" in found.impossible[15]
 
 
 def test_one_long_episode_does_not_decide_for_all() -> None:
     found = calibrated(GoesOn(4), Tracks([30] * 6 + [80] * 1))
-    assert [one.stride for one in found.tried] == [4, 8]
+    assert [one.stride for one in found.results] == [4, 8]
     assert "1 episode only" in found.impossible[15]
-    assert found.tried[0].episodes >= 5
+    assert found.results[0].episodes >= 5
 
 
 def test_where_no_stride_fits_the_first_reason_is_the_error() -> None:
@@ -181,17 +181,17 @@ def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(mon
     damaged = {int(dataset.windows("validation").episodes[0])}
     found = calibrate(GoesOn(8), encode, dataset, clips=200, batch_size=1)
     assert found.best.episodes == len(dataset.windows("validation").episodes) - 1
-    assert [one.clips for one in found.tried] == [found.tried[0].clips] * 3
+    assert [one.clips for one in found.results] == [found.results[0].clips] * 3
     damaged = set(range(20))
     with pytest.raises(InputError, match="no clip that was tried can be read; broken episodes: track"):
         calibrate(GoesOn(8), encode, dataset, batch_size=4)
 
 
 def test_progress_counts_every_clip_of_every_stride() -> None:
-    told: list[tuple[int, int]] = []
-    calibrated(GoesOn(4), Tracks([80] * 4), clips=10, progress=lambda done, total: told.append((done, total)))
-    assert told[-1] == (30, 30)
-    assert [done for done, _ in told] == sorted({done for done, _ in told})
+    reported: list[tuple[int, int]] = []
+    calibrated(GoesOn(4), Tracks([80] * 4), clips=10, progress=lambda done, total: reported.append((done, total)))
+    assert reported[-1] == (30, 30)
+    assert [done for done, _ in reported] == sorted({done for done, _ in reported})
 
 
 def test_the_figures_are_plain_values() -> None:

@@ -1,4 +1,4 @@
-"""Pictures stand side by side, enlarged and unchanged, with words above."""
+"""Captioned frames: images side by side, enlarged and unchanged, with captions above."""
 
 import numpy as np
 import pytest
@@ -6,23 +6,23 @@ import pytest
 from vjepa2_ac.reports.figures.caption import side_by_side
 
 
-def test_pictures_stand_side_by_side_below_their_words() -> None:
-    pictures = [np.full((20, 60, 3), shade, dtype=np.uint8) for shade in (50, 120)]
-    frame = side_by_side(pictures, ["a", "b"], "both")
+def test_images_stand_side_by_side_below_their_words() -> None:
+    images = [np.full((20, 60, 3), shade, dtype=np.uint8) for shade in (50, 120)]
+    frame = side_by_side(images, ["a", "b"], "both")
     body = frame[-40:]
     assert (body[:, :120] == 50).all()
     assert (body[:, -120:] == 120).all()
     head = frame[:-40]
     assert head.min() < 80 < head.max() == 255  # ink on white
-    assert (side_by_side(pictures, ["a", "c"], "both") != frame).any()
-    assert (side_by_side(pictures, ["a", "b"], "other") != frame).any()
+    assert (side_by_side(images, ["a", "c"], "both") != frame).any()
+    assert (side_by_side(images, ["a", "b"], "other") != frame).any()
 
 
 def test_dollars_are_words_not_formulas() -> None:
-    picture = np.zeros((20, 200, 3), dtype=np.uint8)
-    side_by_side([picture], ["$x_{"], "costs $5")
+    image = np.zeros((20, 200, 3), dtype=np.uint8)
+    side_by_side([image], ["$x_{"], "costs $5")
 
 
-def test_every_picture_needs_a_caption() -> None:
+def test_every_image_needs_a_caption() -> None:
     with pytest.raises(ValueError, match="1 captions for 2 pictures"):
         side_by_side([np.zeros((20, 20, 3), dtype=np.uint8)] * 2, ["one"], "title")

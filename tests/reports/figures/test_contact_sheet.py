@@ -1,4 +1,4 @@
-"""The picture is written whole, whatever the episodes are like, and shows the pictures that it should."""
+"""The contact sheet is written completely for any kind of episodes, and shows the right frames."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def pixels(path: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("rows", "steps", "size"), [(1, 1, (18, 32)), (12, 9, (64, 64)), (2, 40, (48, 20))])
-def test_any_number_of_rows_and_any_shape_of_picture_fit(
+def test_any_number_of_rows_and_any_shape_of_image_fit(
     tmp_path: Path, rows: int, steps: int, size: tuple[int, int]
 ) -> None:
     strips = [strip(steps=steps, size=size) for _ in range(rows)]

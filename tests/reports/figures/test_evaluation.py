@@ -1,4 +1,4 @@
-"""Pictures are drawn whatever runs are called and however many there are."""
+"""Figures of evaluations are drawn for any names and any number of runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vjepa2_ac.reports.figures.evaluation import plot_comparison, plot_evaluatio
 NAMES = ("runs/lora", "_hidden", r"$\frac$", *(f"run {number}" for number in range(10)))
 
 
-def test_every_run_stands_in_the_picture_under_its_own_name_with_a_look_of_its_own(tmp_path, monkeypatch) -> None:
+def test_every_run_stands_in_the_image_under_its_own_name_with_a_look_of_its_own(tmp_path, monkeypatch) -> None:
     drawn: list[Figure] = []
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), save(self, *a, **k))[1])
@@ -28,7 +28,7 @@ def test_every_run_stands_in_the_picture_under_its_own_name_with_a_look_of_its_o
     assert len({(line.get_color(), line.get_linestyle()) for line in lines}) == len(NAMES)
 
 
-def test_names_that_look_like_formulas_and_missing_pictures_do_not_stop_the_picture_of_an_evaluation(tmp_path) -> None:
+def test_names_that_look_like_formulas_and_missing_images_do_not_stop_the_image_of_an_evaluation(tmp_path) -> None:
     one = evaluation(others=(r"$\frac$",))
     assert plot_evaluation(one, tmp_path / "plot.png").stat().st_size > 1000
     bare = replace(one, examples=tuple(replace(example, frames=None) for example in one.examples))

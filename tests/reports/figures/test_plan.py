@@ -1,11 +1,11 @@
-"""A decision's picture is drawn for every end that a decision has."""
+"""The figure of a plan is drawn for every outcome of a decision."""
 
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from decisions import asked, picture
+from decisions import asked, image
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reports.figures.plan import plot_plan
 
@@ -27,7 +27,7 @@ def test_a_plan_without_energies_is_drawn_as_well(tmp_path: Path) -> None:
 def test_many_goals_and_a_mask_are_shown(tmp_path: Path) -> None:
     found = asked(100, 101, 102, 103, nodes=0)
     plain = drawn(found, tmp_path)
-    mask = np.zeros(picture(0).shape[:2], bool)
+    mask = np.zeros(image(0).shape[:2], bool)
     mask[:30] = True
     object.__setattr__(found.question, "mask", mask)
     masked = drawn(found, tmp_path)

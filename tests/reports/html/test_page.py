@@ -1,4 +1,4 @@
-"""The page says what was measured and nothing else, whatever things are called, and opens anywhere."""
+"""The report page contains all measurements, for any names, and needs no other file."""
 
 from __future__ import annotations
 
@@ -160,20 +160,20 @@ def test_strata_ranks_landscapes_and_episodes_are_those_of_the_result() -> None:
 
 def test_strides_are_shown_with_their_errors_and_those_that_could_not_be_tried_with_the_reason() -> None:
     error = {"value": 0.9, "low": 0.8, "high": 1.0}
-    tried = {"stride": 4, "seconds_per_step": 0.25, "error_over_persistence": error, "clips": 7, "episodes": 3}
-    found = {"verdict": "Best: stride 4.", "strides": [tried], "impossible": {"15": "episodes are too short"}}
+    measured = {"stride": 4, "seconds_per_step": 0.25, "error_over_persistence": error, "clips": 7, "episodes": 3}
+    found = {"verdict": "Best: stride 4.", "strides": [measured], "impossible": {"15": "episodes are too short"}}
     page = Page(page_of(replace(usual()[0], calibration=found)))
     assert table_of(page, "One-step, teacher-forced error at each stride")[1] == (
         ["4", "0.25", "0.900 [0.800, 1.000]", "7", "3"]
     )
     assert "Best: stride 4." in page.shown
-    assert "Stride 15 could not be tried: episodes are too short." in page.shown
+    assert "Stride 15 could not be measured: episodes are too short." in page.shown
 
 
 def test_curves_of_training_stand_in_charts_by_what_they_show_speed_folded_away() -> None:
     _, html, page = usual()
     assert "training loss over optimizer steps: train/loss from 0.7 to 0.4" in html
-    main, _, folded = html.partition("Speed, memory and other figures")
+    main, _, folded = html.partition("Speed, memory and other metrics")
     assert "<h3>validation: error / persistence</h3>" in main
     assert "<h3>learning rate</h3>" in main
     assert "<h3>data wait share</h3>" in folded
@@ -275,7 +275,7 @@ def test_of_a_long_clip_the_first_the_last_and_frames_between_are_shown() -> Non
 def test_clips_without_photographs_show_their_latents_and_errors() -> None:
     one, _, _ = usual()
     html = page_of(replace(one, examples=tuple(replace(example, frames=None) for example in one.examples)))
-    assert "a cache that holds no pictures" in html
+    assert "a cache that holds no frames" in html
     assert "image/jpeg" not in html
     assert "True latents as colours, now" in html
     assert "<use" not in html
@@ -297,7 +297,7 @@ def test_better_than_the_base_but_not_than_doing_nothing_is_no_success() -> None
     assert 'class="verdict unclear"' in html
 
 
-def test_pictures_are_described_tables_have_captions_and_headings_do_not_jump() -> None:
+def test_images_are_described_tables_have_captions_and_headings_do_not_jump() -> None:
     _, html, page = usual()
     levels = [int(tag[1]) for tag, _ in page.elements if re.fullmatch("h[1-6]", tag)]
     assert levels.count(1) == 1
@@ -314,7 +314,7 @@ def test_pictures_are_described_tables_have_captions_and_headings_do_not_jump() 
     assert 'lang="en"' in html
 
 
-def test_every_moving_picture_turns_through_its_frames_and_can_be_halted() -> None:
+def test_every_moving_image_turns_through_its_frames_and_can_be_halted() -> None:
     one = evaluation(frames=6)
     html = page_of(one)
     assert html.count('class="halt"') == len(one.examples)

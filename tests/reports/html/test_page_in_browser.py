@@ -1,4 +1,4 @@
-"""A real browser shows the page from its file: no complaint, no request, no script; light and dark, wide and narrow."""
+"""The report page in a real browser: no errors, no requests, no scripts; light and dark, wide and narrow."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_what_a_name_smuggles_in_is_not_run_even_if_it_were_not_escaped(tmp_path
 
 
 @pytest.mark.parametrize(("dark", "width"), [(True, 1400), (False, 400)])
-def test_the_page_fits_the_window_in_its_colours_and_its_pictures_move_until_halted(tmp_path, dark, width) -> None:
+def test_the_page_fits_the_window_in_its_colours_and_its_images_move_until_halted(tmp_path, dark, width) -> None:
     found = probed(tmp_path, dark=dark, width=width)
     assert found["dark"] == str(dark).lower()
     assert found["paper"] == ("rgb(20, 23, 27)" if dark else "rgb(255, 255, 255)")

@@ -1,4 +1,4 @@
-"""The report shows what models planned beside plans that take no model, and says why where nobody planned."""
+"""The report compares a model's plans with model-free ones, or explains why there are none."""
 
 import re
 from dataclasses import replace
@@ -38,10 +38,10 @@ def test_every_way_of_planning_has_its_score_beside_those_that_take_no_model(fou
     for name, model in found.models.items():
         assert model.plans is not None
         score, missed, over, beside = row(page, name)
-        figures = metrics_of(study, model.plans)
-        assert score.startswith(decimal(figures.score.value, 1))
+        metrics = metrics_of(study, model.plans)
+        assert score.startswith(decimal(metrics.score.value, 1))
         assert missed.startswith(decimal(missed_cm(study, model.plans).mean(), 1))
-        assert over.startswith(decimal(figures.missed_over_zero.value, 2))
+        assert over.startswith(decimal(metrics.missed_over_zero.value, 2))
         assert bool(beside) == (name != "base")
     assert row(page, "demonstration within limits")[0].startswith("80.0")
     assert row(page, "doing nothing")[2].startswith("1.00")

@@ -1,4 +1,4 @@
-"""A model steers beside those it is compared with; table, figures and film tell the same."""
+"""The closed-loop benchmark: table, metrics and video agree."""
 
 import json
 import sys
@@ -32,7 +32,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(folder)
 
 
-def figures(folder: Path) -> dict:
+def metrics(folder: Path) -> dict:
     return json.loads((folder / FILE).read_text())
 
 
@@ -44,20 +44,20 @@ def test_the_command_prints_a_row_for_each_and_writes_figures_and_a_film(
     rows = {line.split("│")[1].strip(): line for line in shown.splitlines() if line.startswith("│")}
     assert list(rows) == ["tiny", "do nothing", "random", "oracle"]
     assert "reach in domain B: 2 problems of seed 0, 2 steps of 0.27 s" in shown
-    told = figures(tmp_path)
-    assert list(told["policies"]) == list(rows)
-    assert told["about"]["planning"]["samples"] == 6
-    assert told["about"]["success_below_cm"] == 5
-    for name, one in told["policies"].items():
+    reported = metrics(tmp_path)
+    assert list(reported["policies"]) == list(rows)
+    assert reported["about"]["planning"]["samples"] == 6
+    assert reported["about"]["success_below_cm"] == 5
+    for name, one in reported["policies"].items():
         distances = np.array(one["by_episode"]["distance_cm"])
         assert distances.shape == (2, 3)
         assert one["final_distance_cm"]["value"] == pytest.approx(distances[:, -1].mean(), abs=1e-3)
         assert one["by_episode"]["success"] == (distances[:, -1] < 5).tolist()
         assert f"{one['final_distance_cm']['value']:.1f} [" in rows[name]
-    assert told["policies"]["tiny"]["why_counts"] == {"planned": 4}
-    starts = [one["by_episode"]["distance_cm"][0][0] for one in told["policies"].values()]
+    assert reported["policies"]["tiny"]["why_counts"] == {"planned": 4}
+    starts = [one["by_episode"]["distance_cm"][0][0] for one in reported["policies"].values()]
     assert starts == starts[:1] * 4  # the same problems for all
-    assert count_frames(tmp_path / FILM, where="film") == 4 + 1 + 4  # the first and the last picture are held
+    assert count_frames(tmp_path / FILM, where="film") == 4 + 1 + 4  # the first and the last image are held
 
 
 def test_the_same_call_gives_the_same_figures_and_another_seed_others(model: str, tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_the_same_call_gives_the_same_figures_and_another_seed_others(model: str
     for name, seed in (("a", "3"), ("b", "3"), ("c", "4")):
         out = str(tmp_path / name)
         assert main(["simulate", model, *TWICE, "--films", "0", "--seed", seed, "--out", out, *SMALL]) == 0
-        found.append([one["by_episode"]["distance_cm"] for one in figures(tmp_path / name)["policies"].values()])
+        found.append([one["by_episode"]["distance_cm"] for one in metrics(tmp_path / name)["policies"].values()])
         assert not (tmp_path / name / FILM).exists()
     assert found[0] == found[1] != found[2]
 
@@ -80,7 +80,7 @@ def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
     out = tmp_path / "out"
     assert main(["simulate", str(tmp_path / "broken"), *TWICE, "--films", "0", "--out", str(out), *SMALL]) == 1
     assert "broken: of 4 decisions no finite energy 4" in capsys.readouterr().out
-    steered, nothing = (figures(out)["policies"][name]["by_episode"] for name in ("broken", "do nothing"))
+    steered, nothing = (metrics(out)["policies"][name]["by_episode"] for name in ("broken", "do nothing"))
     assert steered["distance_cm"] == nothing["distance_cm"]
 
 
@@ -91,9 +91,9 @@ def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path:
     steered = contest.results[0]
     frames = list(film_frames([steered]))
     episode = steered.episodes[0]
-    for frame, picture in ((frames[0], episode.pictures[0]), (frames[-1], episode.pictures[1])):
-        np.testing.assert_array_equal(frame[-360::2, :640:2], picture)
-        np.testing.assert_array_equal(frame[-360::2, -640::2], episode.goal_picture)
+    for frame, image in ((frames[0], episode.frames[0]), (frames[-1], episode.frames[1])):
+        np.testing.assert_array_equal(frame[-360::2, :640:2], image)
+        np.testing.assert_array_equal(frame[-360::2, -640::2], episode.goal_image)
     assert (frames[0] != frames[-1]).any()
 
 
@@ -149,8 +149,8 @@ def test_a_model_of_states_in_the_cameras_frame_is_refused(model: str, tmp_path:
 def test_a_task_with_a_block_has_its_own_number_of_steps(model: str, tmp_path: Path) -> None:
     asked = BenchmarkOptions(task="pick", episodes=1, films=0)
     contest, _ = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
-    assert figures(tmp_path)["about"]["steps"] == contest.results[0].steps == 12
-    assert figures(tmp_path)["policies"]["oracle"]["success"]["value"] == 1.0
+    assert metrics(tmp_path)["about"]["steps"] == contest.results[0].steps == 12
+    assert metrics(tmp_path)["policies"]["oracle"]["success"]["value"] == 1.0
 
 
 def test_a_stride_that_is_to_be_found_out_is_no_stride(model: str, tmp_path: Path) -> None:

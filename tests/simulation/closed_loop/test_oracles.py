@@ -1,4 +1,4 @@
-"""Who knows all solves push and pick; who does nothing or anything does not."""
+"""Oracles solve push and pick; doing nothing and random actions do not."""
 
 import numpy as np
 import pytest
@@ -35,15 +35,15 @@ def test_the_oracle_solves_it_and_nothing_and_chance_do_not(task: str, domain) -
         assert result.final_distance_cm.value > 8.0
 
 
-def test_the_goal_picture_shows_the_block_at_its_goal() -> None:
+def test_the_goal_image_shows_the_block_at_its_goal() -> None:
     arm = arm_for("pick", DOMAIN_A)
-    episode = run_episode(arm, DoNothing(), make_problem("pick", DOMAIN_A, 0, 0), steps=1, keep_pictures=True)
+    episode = run_episode(arm, DoNothing(), make_problem("pick", DOMAIN_A, 0, 0), steps=1, keep_frames=True)
 
-    def green(picture: np.ndarray) -> np.ndarray:
-        seen = picture.astype(int)
+    def green(image: np.ndarray) -> np.ndarray:
+        seen = image.astype(int)
         return np.argwhere(seen[..., 1] > 1.8 * np.maximum(seen[..., 0], seen[..., 2])).mean(axis=0)
 
-    assert green(episode.pictures[0])[0] - green(episode.goal_picture)[0] > 8  # it is lifted: higher in the picture
+    assert green(episode.frames[0])[0] - green(episode.goal_image)[0] > 8  # it is lifted: higher in the image
 
 
 def test_an_arm_without_a_block_cannot_push() -> None:

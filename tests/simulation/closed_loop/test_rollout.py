@@ -1,4 +1,4 @@
-"""Episodes end where the actions lead, and the figures say so."""
+"""Episodes end where the actions lead, and the metrics agree."""
 
 import numpy as np
 import pytest
@@ -29,11 +29,11 @@ class Scripted:
     def __init__(self, *actions: np.ndarray) -> None:
         self.actions, self.seen = list(actions), []
 
-    def reset(self, problem: TaskProblem, goal_picture: np.ndarray) -> None:  # noqa: ARG002 - of the protocol
-        self.left, self.goal_picture = list(self.actions), goal_picture
+    def reset(self, problem: TaskProblem, goal_image: np.ndarray) -> None:  # noqa: ARG002 - of the protocol
+        self.left, self.goal_image = list(self.actions), goal_image
 
-    def act(self, picture: np.ndarray, state: np.ndarray) -> np.ndarray:
-        self.seen.append((picture, state))
+    def act(self, image: np.ndarray, state: np.ndarray) -> np.ndarray:
+        self.seen.append((image, state))
         return self.left.pop(0)
 
 
@@ -64,15 +64,15 @@ def test_the_oracle_succeeds_and_nothing_and_chance_do_not(arm: SimulatedArm) ->
 
 def test_an_episode_starts_at_the_start_and_shows_the_goal(arm: SimulatedArm) -> None:
     problem, policy = make_problem("reach", DOMAIN_B, 0, 1), Scripted(way(0.05), way(0.0, 0.05))
-    result = run_episode(arm, policy, problem, steps=2, keep_pictures=True)
+    result = run_episode(arm, policy, problem, steps=2, keep_frames=True)
     np.testing.assert_allclose(result.states[0], problem.start, atol=1e-3)
     arm.set_state(problem.goal)
-    difference = np.abs(policy.goal_picture.astype(int) - arm.picture())
+    difference = np.abs(policy.goal_image.astype(int) - arm.image())
     assert difference.mean() < 2.0  # but for the spare joint
-    np.testing.assert_array_equal(policy.goal_picture, result.goal_picture)
-    assert (policy.goal_picture != result.pictures[0]).any()
-    for step, (picture, state) in enumerate(policy.seen):
-        np.testing.assert_array_equal(picture, result.pictures[step])
+    np.testing.assert_array_equal(policy.goal_image, result.goal_image)
+    assert (policy.goal_image != result.frames[0]).any()
+    for step, (image, state) in enumerate(policy.seen):
+        np.testing.assert_array_equal(image, result.frames[step])
         np.testing.assert_array_equal(state, result.states[step])
 
 
@@ -97,7 +97,7 @@ def test_the_same_problem_has_the_same_result_whatever_was_before(arm: Simulated
     run_episode(arm, RandomActions(SMALL, seed=1), make_problem("reach", DOMAIN_B, 5, 0), steps=3)
     again = run_episode(arm, RandomActions(SMALL), problem, steps=3)
     np.testing.assert_array_equal(first.states, again.states)
-    np.testing.assert_array_equal(first.goal_picture, again.goal_picture)
+    np.testing.assert_array_equal(first.goal_image, again.goal_image)
 
 
 def test_a_command_out_of_reach_takes_the_arm_part_of_the_way_and_is_counted(arm: SimulatedArm) -> None:
@@ -129,17 +129,17 @@ def test_what_is_no_action_is_refused(arm: SimulatedArm) -> None:
 def test_a_world_model_plans_within_its_limits_and_says_why(arm: SimulatedArm) -> None:
     config = PlanningConfig(samples=8, iterations=2, limits=SMALL, cem=CemConfig(elites=3))
     policy = Planning(Controller(tiny_model(), config), name="tiny")
-    told = []
+    reported = []
     result = run_task(
-        "reach", DOMAIN_B, policy, episodes=2, steps=2, keep_pictures=1, arm=arm, progress=lambda *n: told.append(n)
+        "reach", DOMAIN_B, policy, episodes=2, steps=2, keep_frames=1, arm=arm, progress=lambda *n: reported.append(n)
     )
     assert result.policy == "tiny"
     assert result.why_counts == {"planned": 4}
-    assert told == [(1, 2), (2, 2)]
+    assert reported == [(1, 2), (2, 2)]
     assert all((np.abs(episode.actions[:, :3]) <= 0.03).all() for episode in result.episodes)
     assert np.abs(result.episodes[0].actions[:, :3]).max() > 0
-    assert [episode.pictures is not None for episode in result.episodes] == [True, False]
-    assert result.episodes[0].pictures.shape == (3, 45, 80, 3)
+    assert [episode.frames is not None for episode in result.episodes] == [True, False]
+    assert result.episodes[0].frames.shape == (3, 45, 80, 3)
     assert (result.seconds > 0).all()
 
 
@@ -154,8 +154,8 @@ def fake(*distances_m: float, unreachable: int = 0) -> EpisodeResult:
         seconds=np.arange(1.0, count),
         whys=("planned",) * (count - 2) + ("out of time",),
         unreachable=unreachable,
-        goal_picture=np.zeros((2, 2, 3), dtype=np.uint8),
-        pictures=None,
+        goal_image=np.zeros((2, 2, 3), dtype=np.uint8),
+        frames=None,
     )
 
 

@@ -1,4 +1,4 @@
-"""What is recorded reads back as DROID, is consistent with the kinematics, and is the same every time."""
+"""Recordings read back as DROID, are consistent with the kinematics, and are reproducible."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -43,13 +43,13 @@ def test_the_loader_reads_what_was_recorded(recorded: Path) -> None:
         assert info.success is ("/success/" in made.file_path)
 
 
-def test_the_pictures_show_the_measured_state(recorded: Path) -> None:
+def test_the_images_show_the_measured_state(recorded: Path) -> None:
     source = RldsSource(DataConfig(path=str(recorded)))
     episode = source.read(0)
     arm = SimulatedArm(DOMAIN_B)
     for step in (0, STEPS - 1):
         arm.set_state(np.asarray(episode.states[step], dtype=np.float64))
-        difference = np.abs(episode.read_frames([step])[0].astype(int) - arm.picture())
+        difference = np.abs(episode.read_frames([step])[0].astype(int) - arm.image())
         assert difference.mean() < 4.0  # JPEG, and the arm's spare degree of freedom
 
 
@@ -80,7 +80,7 @@ def test_another_seed_gives_other_episodes() -> None:
     assert np.abs(first.observation.joint_position - second.observation.joint_position).max() > 0.01
 
 
-def test_another_look_changes_the_pictures_and_nothing_else() -> None:
+def test_another_look_changes_the_images_and_nothing_else() -> None:
     looks = DOMAIN_A, replace(DOMAIN_A, look=DOMAIN_B.look)
     first, second = (record_episode(0, domain=domain, steps=2, seed=0) for domain in looks)
     np.testing.assert_array_equal(first.observation.joint_position, second.observation.joint_position)
@@ -91,8 +91,8 @@ def test_another_look_changes_the_pictures_and_nothing_else() -> None:
 def test_one_camera_is_shared_by_all_three_and_three_differ() -> None:
     shared = record_episode(0, domain=DOMAIN_A, steps=2, seed=0)
     own = record_episode(0, domain=DOMAIN_A, steps=2, seed=0, cameras=3)
-    assert len({tuple(pictures) for pictures in shared.images.values()}) == 1
-    assert len({tuple(pictures) for pictures in own.images.values()}) == 3
+    assert len({tuple(images) for images in shared.images.values()}) == 1
+    assert len({tuple(images) for images in own.images.values()}) == 3
     assert own.images["exterior_image_1_left"] == shared.images["exterior_image_1_left"]
 
 
@@ -111,11 +111,11 @@ def test_every_episode_of_a_random_set_has_its_own_world() -> None:
 
 
 def test_progress_is_told_after_every_episode(tmp_path: Path) -> None:
-    told: list[tuple[int, int]] = []
+    reported: list[tuple[int, int]] = []
     record_dataset(
-        tmp_path / "random", domain="random", episodes=2, steps=2, progress=lambda *state: told.append(state)
+        tmp_path / "random", domain="random", episodes=2, steps=2, progress=lambda *state: reported.append(state)
     )
-    assert told == [(1, 2), (2, 2)]
+    assert reported == [(1, 2), (2, 2)]
 
 
 def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_written(tmp_path: Path) -> None:

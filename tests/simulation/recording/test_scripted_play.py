@@ -1,4 +1,4 @@
-"""Demonstrations with a block touch it, and are recorded as all others."""
+"""Demonstrations with a block touch it, and are recorded like all others."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What the cameras see is the arm where it is, in the domain's colours."""
+"""Camera images show the arm at its pose, in the domain's colours."""
 
 import sys
 from dataclasses import replace
@@ -29,7 +29,7 @@ def arm() -> SimulatedArm:
 
 
 def hand_pixel(arm: SimulatedArm) -> tuple[int, int]:
-    """Project the middle of the hand into the picture by the extrinsics and the state that the arm reports."""
+    """Project the middle of the hand into the image by the extrinsics and the state that the arm reports."""
     camera, pose = arm.extrinsics(), arm.state
     middle = pose[:3] + 0.035 * matrices_from_euler(pose[3:6])[:, 2]
     x, y, z = matrices_from_euler(camera[3:]).T @ (middle - camera[:3])
@@ -49,24 +49,24 @@ def test_the_scene_and_the_arithmetic_agree_on_where_the_flange_is() -> None:
 
 
 @pytest.mark.parametrize("domain", [DOMAIN_A, DOMAIN_B], ids=["A", "B"])
-def test_the_hand_is_in_the_picture_where_the_reported_poses_say(domain: Domain) -> None:
+def test_the_hand_is_in_the_image_where_the_reported_poses_say(domain: Domain) -> None:
     arm = SimulatedArm(domain)
-    pictures = []
+    images = []
     for joints in REACHES:
         arm.set_joints(joints + rest_joints(domain) - HOME, 0.0)
-        picture = arm.picture().astype(int)
+        image = arm.image().astype(int)
         column, row = hand_pixel(arm)
-        red, _, blue = picture[row, column]
+        red, _, blue = image[row, column]
         assert red > 2 * blue  # the hand's colour, which nothing else has
-        pictures.append(picture)
-    changed = (np.abs(pictures[0] - pictures[1]) > 40).any(axis=-1).mean()
+        images.append(image)
+    changed = (np.abs(images[0] - images[1]) > 40).any(axis=-1).mean()
     assert 0.03 < changed < 0.6
 
 
-def test_the_arm_is_large_in_the_picture(arm: SimulatedArm) -> None:
+def test_the_arm_is_large_in_the_image(arm: SimulatedArm) -> None:
     arm.set_joints(HOME, 0.0)
-    picture = arm.picture()[:, 38:281].astype(int)  # what the model sees of it
-    white, orange = picture.min(axis=-1) > 130, picture[..., 0] > 2 * picture[..., 2]
+    image = arm.image()[:, 38:281].astype(int)  # what the model sees of it
+    white, orange = image.min(axis=-1) > 130, image[..., 0] > 2 * image[..., 2]
     assert (white | orange).mean() > 0.08
     assert orange.mean() > 0.01
 
@@ -77,42 +77,42 @@ def test_leaving_out_rays_that_pass_the_arm_by_changes_no_pixel(monkeypatch: pyt
         sparing.set_joints(joints, 0.0)
         thorough.set_joints(joints, 0.0)
         with monkeypatch.context() as patch:
-            seen = sparing.picture()
+            seen = sparing.image()
             patch.setattr(View, "near_arm", lambda view, *_: np.arange(len(view.rays)))
-            np.testing.assert_array_equal(seen, thorough.picture())
+            np.testing.assert_array_equal(seen, thorough.image())
 
 
 def test_closing_the_gripper_is_seen(arm: SimulatedArm) -> None:
     arm.set_joints(HOME, 0.0)
-    opened = arm.picture()
+    opened = arm.image()
     arm.set_joints(HOME, 1.0)
-    assert (opened != arm.picture()).any()
+    assert (opened != arm.image()).any()
 
 
-def test_another_look_gives_another_picture_of_the_same_arm() -> None:
+def test_another_look_gives_another_image_of_the_same_arm() -> None:
     other = SimulatedArm(replace(DOMAIN_A, look=DOMAIN_B.look))
     first = SimulatedArm(DOMAIN_A)
     np.testing.assert_array_equal(first.state, other.state)
-    assert (np.abs(first.picture().astype(int) - other.picture()).max(axis=-1) > 20).mean() > 0.5
+    assert (np.abs(first.image().astype(int) - other.image()).max(axis=-1) > 20).mean() > 0.5
 
 
 def test_the_three_cameras_see_different_things(arm: SimulatedArm) -> None:
-    pictures = [arm.picture(name) for name in ("exterior_1", "exterior_2", "wrist")]
-    assert not (pictures[0] == pictures[1]).all()
-    assert not (pictures[1] == pictures[2]).all()
+    images = [arm.image(name) for name in ("exterior_1", "exterior_2", "wrist")]
+    assert not (images[0] == images[1]).all()
+    assert not (images[1] == images[2]).all()
     with pytest.raises(ValueError, match="no camera"):
-        arm.picture("elbow")
+        arm.image("elbow")
 
 
 def test_the_wrist_camera_moves_with_the_arm(arm: SimulatedArm) -> None:
     views = []
     for joints in REACHES[:2]:
         arm.set_joints(joints, 0.0)
-        views.append((arm.picture("wrist"), arm.extrinsics("wrist")))
+        views.append((arm.image("wrist"), arm.extrinsics("wrist")))
     assert np.linalg.norm(views[0][1][:3] - views[1][1][:3]) > 0.05
     fresh = SimulatedArm(DOMAIN_A)
     fresh.set_joints(REACHES[1], 0.0)
-    np.testing.assert_array_equal(fresh.picture("wrist"), views[1][0])
+    np.testing.assert_array_equal(fresh.image("wrist"), views[1][0])
 
 
 def test_a_fixed_camera_is_where_its_domain_puts_it_however_the_robot_is_mounted() -> None:
@@ -190,7 +190,7 @@ def test_the_opengl_camera_is_told_the_same_pose(monkeypatch: pytest.MonkeyPatch
             return np.zeros((180, 320, 3), dtype=np.uint8)
 
     monkeypatch.setattr(mujoco, "Renderer", FakeRenderer)
-    SimulatedArm(DOMAIN_A, renderer="opengl").picture()
+    SimulatedArm(DOMAIN_A, renderer="opengl").image()
     eye, pose = seen[0], DOMAIN_A.camera.pose()
     azimuth, elevation = np.deg2rad(eye.azimuth), np.deg2rad(eye.elevation)
     forward = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])

@@ -1,4 +1,4 @@
-"""With contacts the arm goes where it went without them, stops where something is in the way, and moves the block."""
+"""With contacts the arm follows the same commands, stops at obstacles, and moves the block."""
 
 import numpy as np
 import pytest
@@ -99,12 +99,12 @@ def test_the_camera_sees_the_block_where_it_is_now(arm: ContactArm) -> None:
     focal = 90.0 / np.tan(np.deg2rad(DOMAIN_B.camera.vertical_fov_deg) / 2)
     for y in (-0.15, 0.05):
         arm.place_block(block_at(DOMAIN_B, 0.55, y))
-        picture = arm.picture().astype(int)
+        image = arm.image().astype(int)
         x, down, far = matrices_from_euler(camera[3:]).T @ (arm.block[:3] - camera[:3])
         row, column = int(90 + focal * down / far), int(160 + focal * x / far)
-        red, green, blue = picture[row, column]
+        red, green, blue = image[row, column]
         assert green > 1.8 * max(red, blue)
-        is_green = picture[..., 1] > 1.8 * np.maximum(picture[..., 0], picture[..., 2])
+        is_green = image[..., 1] > 1.8 * np.maximum(image[..., 0], image[..., 2])
         rows, columns = np.nonzero(is_green)
         assert abs(rows.mean() - row) < 6
         assert abs(columns.mean() - column) < 6

@@ -1,4 +1,4 @@
-"""The arm is where Franka's published kinematics say, and goes where it is told."""
+"""The arm agrees with Franka's published kinematics, and follows commands."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Demonstrations stay in their box, move as far as they should, and are measured behind their commands."""
+"""Demonstrations stay in their box, move as far as specified, and are measured with a lag."""
 
 from dataclasses import replace
 

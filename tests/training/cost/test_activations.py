@@ -1,4 +1,4 @@
-"""What is said to be kept is what PyTorch keeps on a CPU: part by part, on sizes where each part dominates in turn."""
+"""Predicted activation memory equals what PyTorch saves on a CPU: part by part, with each part dominant in turn."""
 
 import contextlib
 import weakref

@@ -1,4 +1,4 @@
-"""The formulas count exactly what PyTorch's counter sees of a tiny model, and nearly what is known of the real one."""
+"""FLOP formulas equal PyTorch's counter for a tiny model, and nearly the known values of the real one."""
 
 import subprocess
 import sys

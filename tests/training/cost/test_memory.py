@@ -1,4 +1,4 @@
-"""The estimate adds up what is there at once, knows every knob that changes it, and doctor tells it."""
+"""The memory estimate adds up what is allocated at once, depends on every relevant knob, and doctor prints it."""
 
 import subprocess
 import sys
@@ -107,10 +107,10 @@ def test_doctor_says_whether_it_fits_and_what_it_has_not_been_compared_with(
     path = tmp_path / "run.yaml"
     path.write_text("run_dir: run\ndata: {path: set, frames: 16}\nmodel: {base: not-here.pt}\n")
     assert main(["doctor", str(path), f"training.batch_size={batch}"]) == status
-    said = capsys.readouterr().out
-    assert word in said
-    assert "not yet with a GPU's measured peak" in said
-    assert f"vjepa2-ac data check {path}" in said
+    reported = capsys.readouterr().out
+    assert word in reported
+    assert "not yet with a GPU's measured peak" in reported
+    assert f"vjepa2-ac data check {path}" in reported
 
 
 @pytest.mark.parametrize(("optimizer", "words"), [("adamw", "float32"), ("adamw_8bit", "8 bits")])
@@ -123,15 +123,15 @@ def test_doctor_says_how_moments_are_kept(optimizer: str, words: str) -> None:
 def test_a_run_on_latents_has_no_encoder_beside_the_predictor() -> None:
     sizes = ModelSizes()
     config = run_config(data__frames=16)
-    on_pictures, on_latents = (
+    on_frames, on_latents = (
         estimate_memory(config.model_copy(update={"data": config.data.model_copy(update={"cache": cache})}), sizes)
         for cache in ("off", "auto")
     )
-    assert on_latents.encoder_weights == on_latents.encoding == on_pictures.caching == 0
-    saved = on_pictures.total(checkpointing=False) - on_latents.total(checkpointing=False)
-    assert saved >= on_pictures.encoder_weights - on_latents.arriving
-    assert on_pictures.encoder_weights > 2e9
-    assert on_pictures.encoder_weights < on_latents.caching < on_latents.total(checkpointing=False)
+    assert on_latents.encoder_weights == on_latents.encoding == on_frames.caching == 0
+    saved = on_frames.total(checkpointing=False) - on_latents.total(checkpointing=False)
+    assert saved >= on_frames.encoder_weights - on_latents.arriving
+    assert on_frames.encoder_weights > 2e9
+    assert on_frames.encoder_weights < on_latents.caching < on_latents.total(checkpointing=False)
 
 
 @pytest.mark.parametrize(("cache_dtype", "number"), [("int8", 1), ("bf16", 2), ("fp32", 4)])

@@ -1,4 +1,4 @@
-"""Parameters are counted exactly: as many, tensor by tensor, as a model has that was built."""
+"""Parameter counts are exact: tensor by tensor those of a built model."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Training that makes the model worse says so, once for each cause, also when it goes on; other training does not."""
+"""A diverging run warns once per cause, also after resuming; other runs do not."""
 
 import json
 from collections.abc import Callable
@@ -29,10 +29,10 @@ def validation(one_step: float, rollout: float | None = None) -> dict[str, float
     }
 
 
-def said(config: Config, *rows: tuple[int, dict[str, Any]]) -> dict[int, list[str]]:
+def warned(config: Config, *rows: tuple[int, dict[str, Any]]) -> dict[int, list[str]]:
     """Return what is said of validations, by step."""
     watch = Watch(config)
-    found = {step: watch("validation", step, figures) for step, figures in rows}
+    found = {step: watch("validation", step, metrics) for step, metrics in rows}
     return {step: texts for step, texts in found.items() if texts}
 
 
@@ -50,11 +50,13 @@ def config(make_config: Callable[..., Config]) -> Config:
 
 
 def test_a_model_that_gets_better_or_stays_is_not_warned_of(config: Config) -> None:
-    assert not said(config, (0, validation(0.92)), (3, validation(0.92)), (6, validation(0.925)), (9, validation(0.8)))
+    assert not warned(
+        config, (0, validation(0.92)), (3, validation(0.92)), (6, validation(0.925)), (9, validation(0.8))
+    )
 
 
 def test_a_validation_that_is_worse_than_at_the_start_is_told_once(config: Config) -> None:
-    found = said(config, (0, validation(0.8)), (3, validation(0.85)), (6, validation(0.86)), (9, validation(0.7)))
+    found = warned(config, (0, validation(0.8)), (3, validation(0.85)), (6, validation(0.86)), (9, validation(0.7)))
     assert list(found) == [3]
     (text,) = found[3]
     assert "at step 3 the one-step error is 0.850 (before training 0.800) and the rollout error" in text
@@ -62,29 +64,29 @@ def test_a_validation_that_is_worse_than_at_the_start_is_told_once(config: Confi
 
 
 def test_one_that_is_worse_than_persistence_is_told_besides(config: Config) -> None:
-    found = said(config, (0, validation(0.8)), (3, validation(0.85)), (6, validation(1.34)), (9, validation(1.4)))
+    found = warned(config, (0, validation(0.8)), (3, validation(0.85)), (6, validation(1.34)), (9, validation(1.4)))
     assert list(found) == [3, 6]
     assert "copying the last frame would be better" in found[6][0]
 
 
 def test_a_rollout_alone_counts(config: Config) -> None:
-    (text,) = said(config, (0, validation(0.8, 0.9)), (3, validation(0.7, 1.0)))[3]
+    (text,) = warned(config, (0, validation(0.8, 0.9)), (3, validation(0.7, 1.0)))[3]
     assert "the rollout error at the last horizon is 1.000 (before training 0.900)" in text
     assert "one-step" not in text
 
 
 def test_a_start_that_was_no_better_than_persistence_is_not_compared_with_it(config: Config) -> None:
-    assert not said(config, (0, validation(1.3)), (3, validation(1.2)))
-    assert "copying" not in said(config, (0, validation(1.3)), (3, validation(1.5)))[3][0]
+    assert not warned(config, (0, validation(1.3)), (3, validation(1.2)))
+    assert "copying" not in warned(config, (0, validation(1.3)), (3, validation(1.5)))[3][0]
 
 
 def test_the_last_validation_is_told_again(config: Config) -> None:
-    assert list(said(config, (0, validation(0.8)), (50, validation(0.9)), (100, validation(0.9)))) == [50, 100]
+    assert list(warned(config, (0, validation(0.8)), (50, validation(0.9)), (100, validation(0.9)))) == [50, 100]
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), None])
 def test_an_error_that_is_not_finite_is_told(config: Config, value: float | None) -> None:
-    found = said(config, (0, validation(0.8)), (3, {**validation(0.7), "error_over_persistence": value}))
+    found = warned(config, (0, validation(0.8)), (3, {**validation(0.7), "error_over_persistence": value}))
     assert "not a finite number" in found[3][0]
 
 
@@ -113,17 +115,17 @@ def test_a_single_loss_that_is_high_or_missing_is_not_told(config: Config) -> No
     ],
 )
 def test_it_says_what_to_turn(make_config, changes: dict, words: list[str], absent: list[str]) -> None:
-    text = said(make_config(**changes), (0, validation(0.8)), (3, validation(0.9)))[3][0]
+    text = warned(make_config(**changes), (0, validation(0.8)), (3, validation(0.9)))[3][0]
     assert all(word in text for word in words), text
     assert not any(word in text for word in absent), text
 
 
 def test_a_run_that_diverges_says_so_and_its_report_does_too(make_diverging, reporter) -> None:
     run = train(make_diverging(), reporter)
-    told = [note for note in reporter.notes if note.startswith("Warning: ")]
+    reported = [note for note in reporter.notes if note.startswith("Warning: ")]
     rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] == "warning"]
     assert rows, "it did not diverge: this test tests nothing"
-    assert [f"Warning: {row['text']}" for row in rows] == told
+    assert [f"Warning: {row['text']}" for row in rows] == reported
     assert main(["evaluate", str(run), "--clips", "2", "--sensitivity-clips", "0", "--examples", "0"]) == 0
     notes = json.loads((run / "metrics.json").read_text())["notes"]
     assert f"In training, {rows[0]['text']}." in notes
@@ -160,7 +162,7 @@ def test_rows_that_a_stranger_wrote_do_no_harm(config: Config, tmp_path: Path) -
     ]  # fmt: skip
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     notes: list[str] = []
-    with WatchedMetricsLog(tmp_path, config=config, note=notes.append, first_step=1) as journal:
-        journal.write("validation", 2, validation(1.2))
+    with WatchedMetricsLog(tmp_path, config=config, note=notes.append, first_step=1) as metrics_log:
+        metrics_log.write("validation", 2, validation(1.2))
     assert not notes
     assert not warnings_of(tmp_path / "metrics.jsonl")

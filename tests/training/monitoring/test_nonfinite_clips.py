@@ -1,4 +1,4 @@
-"""Clips that broke a step are there to be looked at, and saving them never hides the error."""
+"""Clips of a step that is not finite are saved for inspection, and saving never hides the error."""
 
 import errno
 from pathlib import Path
@@ -42,8 +42,8 @@ def saved_starts(folder: Path) -> list[int]:
 
 def test_a_clip_reads_back_as_it_was(tmp_path: Path) -> None:
     one = batch(5, clips=1)
-    said = looking_back((one, float("inf"))).save(tmp_path / "step", process=0)
-    assert said == f"1 of them are saved in {tmp_path / 'step'}"
+    reported = looking_back((one, float("inf"))).save(tmp_path / "step", process=0)
+    assert reported == f"1 of them are saved in {tmp_path / 'step'}"
     clip = np.load(tmp_path / "step/process0-clip00.npz")
     assert (clip["frames"] == one.frames[0].numpy()).all()
     assert (clip["states"] == one.states[0].numpy()).all()
@@ -78,9 +78,9 @@ def test_a_full_disk_is_told_and_not_raised(tmp_path: Path, monkeypatch: pytest.
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(np, "savez_compressed", full)
-    said = looking_back((batch(0), 1.0)).save(tmp_path / "step", process=0)
-    assert "could not all be saved" in said
-    assert "No space left" in said
+    reported = looking_back((batch(0), 1.0)).save(tmp_path / "step", process=0)
+    assert "could not all be saved" in reported
+    assert "No space left" in reported
     assert not list((tmp_path / "step").iterdir())
 
 

@@ -1,4 +1,4 @@
-"""Waiting for data counts by the host's clock, and on CUDA only where the device had nothing left to do."""
+"""Waiting for data is measured by the host's clock, and on CUDA only while the device is idle."""
 
 import time
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Figures of health say what they say they do."""
+"""Throughput metrics equal their definitions."""
 
 import math
 import sys
@@ -71,12 +71,12 @@ def test_throughput_counts_clips_tokens_and_flops_per_second() -> None:
     config = parse_config({"run_dir": "r", "data": {"path": "d", "frames": 8}, "model": {"base": "b"}}, where="test")
     sizes, speed = ModelSizes(), matmul_speed(CPU, torch.bfloat16)
     throughput = Throughput.of(config, sizes, CPU, processes=2)
-    figures = throughput.figures(clips=12.0, seconds=4.0, waited_s=1.0)
-    assert figures["samples_per_second"] == 3.0
-    assert figures["tokens_per_second"] == 3.0 * 8 * 256
-    assert figures["data_wait_share"] == 0.25
-    assert figures["mfu"] == pytest.approx(3.0 * clip_flops(config, sizes).total / (2 * speed))
-    assert figures.keys() == MEASURED
+    metrics = throughput.metrics(clips=12.0, seconds=4.0, waited_s=1.0)
+    assert metrics["samples_per_second"] == 3.0
+    assert metrics["tokens_per_second"] == 3.0 * 8 * 256
+    assert metrics["data_wait_share"] == 0.25
+    assert metrics["mfu"] == pytest.approx(3.0 * clip_flops(config, sizes).total / (2 * speed))
+    assert metrics.keys() == MEASURED
 
 
 def test_the_ceiling_is_the_best_product_that_was_timed(clock: list[float], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,7 +105,7 @@ def test_peak_memory_grows_with_what_is_held() -> None:
 
 def test_every_row_of_training_says_how_the_run_and_the_machine_are(make_config, reporter) -> None:
     stepped: dict[int, dict[str, float]] = {}
-    reporter.stepped = lambda step, figures: stepped.update({step: figures})
+    reporter.stepped = lambda step, metrics: stepped.update({step: metrics})
     folder = train(make_config(training__steps=3, training__log_every=2, training__schedule="constant"), reporter)
     rows = [row for row in read_metrics_log(folder / "metrics.jsonl") if row["kind"] == "train"]
     assert [row["step"] for row in rows] == [2, 3]

@@ -1,1 +1,1 @@
-"""The Action Score: how near do plans come to what was demonstrated?"""
+"""The Action Score: how close are plans to the demonstrated actions?"""

@@ -1,4 +1,4 @@
-"""Would it plan what people did? Plans from frames of held-out clips, to be held against the demonstrated actions.
+"""Action Score measurement: plans from frames of held-out clips, compared with the demonstrated actions.
 
 Two plans from each start: one step towards the next frame, by the settings of the config's `planning`; and three steps
 towards the frame that came three steps later, by the Action Score's protocol (`planning_protocol`).
@@ -33,9 +33,9 @@ _SAME_M = 1e-6
 
 @dataclass(frozen=True)
 class PlanningStart:
-    """A frame of a held-out clip, what came after it, and what was done."""
+    """A frame of a held-out clip, the following frames, and the demonstrated actions."""
 
-    clip: int  # place in the evaluation's clips
+    clip: int  # index into the evaluation's clips
     episode_id: str
     place: int  # of the frame in the clip
     frame: Float[Tensor, "tokens dim"]
@@ -48,10 +48,10 @@ class PlanningStart:
 
 
 class WindowCost:
-    """How far from a goal action sequences lead that begin at one frame: the energy of the last prediction.
+    """The cost of action sequences from one frame: the energy of the last prediction with respect to a goal.
 
     The model never sees more than the last two frames, as in the Action Score's protocol; before one step that is one.
-    States are integrated with the actions, and the camera stays.
+    States are integrated with the actions, and the camera does not move.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class WindowCost:
 
 
 def planning_start(batch: LatentBatch, row: int, clip: int, seed: int) -> PlanningStart:
-    """Return a frame of a clip from which three steps are left; which one follows from the seed and the clip's name.
+    """Return a frame of a clip with three steps after it; it is drawn from the seed and the clip's name.
 
     Raises:
         ValueError: The clip has fewer than four frames.
@@ -107,7 +107,7 @@ def planning_start(batch: LatentBatch, row: int, clip: int, seed: int) -> Planni
 
 
 def one_step_settings(config: PlanningConfig) -> PlanningConfig:
-    """Return a config's settings for one step from one frame, as long as it takes: no figure hangs on a clock."""
+    """Return a config's settings for one step from one frame, without a time budget: no metric depends on a clock."""
     fixed = {"horizon": 1, "action_repeat": 1, "context": 1, "warm_start": False, "budget_s": None}
     return config.model_copy(update=fixed)
 
@@ -118,10 +118,10 @@ def measure_plans(
     """Plan from each start, one step and three.
 
     Args:
-        model: What predicts.
-        starts: From where; one or more.
-        config: How one step is planned; of three, only how many samples are computed at once.
-        progress: Told how many plans are done.
+        model: The predictor.
+        starts: One or more.
+        config: Settings of one-step plans; for three steps, only the number of samples per batch.
+        progress: Called with the number of finished plans.
     """
     began = time.perf_counter()
     one, scored = Planner(one_step_settings(config)), Planner(_as_protocol(config))
@@ -142,7 +142,7 @@ def measure_plans(
 
 
 def study_of(starts: Sequence[PlanningStart], config: PlanningConfig) -> PlanningStudy:
-    """Return what the plans of models are held against: what was demonstrated, and what takes no model."""
+    """Return the references for plans: the demonstrated actions, and model-free plans."""
     one, scored = pose_space(one_step_settings(config)), pose_space(SCORED)
     demonstrated = np.stack([start.demonstrated for start in starts])
     within = Plans(_allowed(one, demonstrated[:, :1])[None, :, 0], _allowed(scored, demonstrated)[None])
@@ -191,6 +191,6 @@ def _allowed(space: ActionSpace, actions: np.ndarray) -> np.ndarray:
 
 
 def _beyond(allowed: np.ndarray, demonstrated: np.ndarray) -> float:
-    """Return which share of demonstrated steps moves farther along an axis than a plan may."""
+    """Return the share of demonstrated steps that exceed the limits of a plan along an axis."""
     cut = np.abs(allowed - demonstrated)[..., :3] > _SAME_M
     return float(cut.any(axis=-1).mean())

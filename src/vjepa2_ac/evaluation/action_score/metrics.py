@@ -1,4 +1,4 @@
-"""How close are plans to what was demonstrated? The Action Score, errors in cm and degrees, with their intervals."""
+"""Metrics of plans: the Action Score, and errors in cm and degrees, with their intervals."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ LEAST_CM = 0.5  # a demonstrated step that is shorter has no direction, and alon
 _GRIPPER = 6
 _NONE = Estimate(np.nan, np.nan, np.nan)
 _NOWHERE_CM = 1e-7
-_NO_ANGLE = 90.0  # of a plan that goes nowhere: what random directions have on average
+_NO_ANGLE = 90.0  # of a plan that goes nowhere: the mean of random directions
 
 
 @dataclass(frozen=True)
 class PlanMetrics:
-    """Of one way of planning; cm and degrees."""
+    """Metrics of one planning method; cm and degrees."""
 
     score: Estimate  # 0 to 80
-    missed_cm: Estimate  # what the score is made of: sum over x, y, z of the difference of displacements
+    missed_cm: Estimate  # basis of the score: sum over x, y, z of the difference of displacements
     missed_over_zero: Estimate  # over that of doing nothing: 0 perfect, 1 as good
     step_cm: Estimate  # one step: distance of planned and demonstrated translation
     step_over_zero: Estimate
@@ -36,7 +36,7 @@ class PlanMetrics:
 
 @dataclass(frozen=True)
 class PlanDifferences:
-    """One way of planning minus another from the same starts; below 0 is better, but of the score."""
+    """One planning method minus another from the same starts; below 0 is better, except for the score."""
 
     score: Estimate
     missed_cm: Estimate
@@ -49,7 +49,7 @@ def ways_of(evaluation: Evaluation) -> dict[str, Plans]:
 
 
 def metrics_of(study: PlanningStudy, plans: Plans) -> PlanMetrics:
-    """Return how close plans are to what was demonstrated."""
+    """Return the errors of plans with respect to the demonstrated actions."""
     ids, missed, step = study.episode_ids, missed_cm(study, plans), _step_cm(study, plans)
     wanted, planned = 100 * study.demonstrated[:, 0, :3], 100 * plans.one_step[..., :3]
     return PlanMetrics(
@@ -66,7 +66,7 @@ def metrics_of(study: PlanningStudy, plans: Plans) -> PlanMetrics:
 
 
 def differences_of(study: PlanningStudy, plans: Plans, other: Plans) -> PlanDifferences:
-    """Return how much closer plans are than others, paired by start."""
+    """Return the differences of two plans' errors, paired by start."""
     ids, missed = study.episode_ids, [missed_cm(study, each) for each in (plans, other)]
     both = np.concatenate([_sums(each) for each in missed])
     return PlanDifferences(
@@ -77,7 +77,7 @@ def differences_of(study: PlanningStudy, plans: Plans, other: Plans) -> PlanDiff
 
 
 def missed_cm(study: PlanningStudy, plans: Plans) -> Float[np.ndarray, " starts"]:
-    """Return by how many cm the end of each plan misses the demonstrated one: the sum over x, y and z.
+    """Return the error of each plan's end position in cm: the sum over x, y and z.
 
     Source: facebookresearch/jepa-wms @ 6eafb14, evals/simu_env_planning/planning/plan_evaluator.py, PlanEvaluator.eval:
     end_distance_xyz.
@@ -92,7 +92,7 @@ def directed(study: PlanningStudy) -> Bool[np.ndarray, " starts"]:
 
 
 def signed_along(study: PlanningStudy, axis: int) -> Bool[np.ndarray, " starts"]:
-    """Return which of them go far enough along an axis to have a sign there."""
+    """Return which of them are long enough along an axis to have a sign there."""
     return np.asarray(100 * np.abs(study.demonstrated[:, 0, axis]) >= LEAST_CM)
 
 
@@ -123,7 +123,7 @@ def _angles(
 
 
 def _signs(study: PlanningStudy, planned: Float[np.ndarray, "draws starts 3"]) -> tuple[Estimate, Estimate, Estimate]:
-    """Return shares of right signs; a plan that stays where it is counts half."""
+    """Return shares of right signs; a plan that does not move counts half."""
     right = 0.5 + 0.5 * np.sign(planned) * np.sign(study.demonstrated[:, 0, :3])
     x, y, z = (
         _mean_where(right[..., axis].mean(axis=0), signed_along(study, axis), study.episode_ids) for axis in range(3)
@@ -132,7 +132,7 @@ def _signs(study: PlanningStudy, planned: Float[np.ndarray, "draws starts 3"]) -
 
 
 def _mean_where(values: np.ndarray, chosen: Bool[np.ndarray, " starts"], ids: Sequence[str]) -> Estimate:
-    """Return the mean over some starts; no figure where there are none."""
+    """Return the mean over some starts; NaN if there are none."""
     kept = [name for name, keep in zip(ids, chosen, strict=True) if keep]
     return mean_of(values[chosen], kept) if kept else _NONE
 

@@ -1,4 +1,4 @@
-"""How is the Action Score measured? Its protocol, which no option changes: figures of different runs are to compare.
+"""The protocol of the Action Score. No option changes it, so that scores of different runs are comparable.
 
 Source: facebookresearch/jepa-wms @ 6eafb14, configs/evals/simu_env_planning/droid/vj2ac,
 evals/simu_env_planning/planning (planner.py: CEMPlanner; objectives.py: ReprTargetDistMPCObjective; plan_evaluator.py:
@@ -9,7 +9,7 @@ Where it differs: docs/evaluation.md.
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 
 STEPS = 3  # of a scored plan
-FRAMES = STEPS + 1  # that a clip needs
+FRAMES = STEPS + 1  # required of a clip
 FRAMES_SEEN = 2  # by the model at most, predicted ones included
 BEST_SCORE = 80.0
 SCORED = PlanningConfig(

@@ -1,1 +1,1 @@
-"""Use of the actions: does the model tell what the robot did from what it did not?"""
+"""Action use: does the model distinguish the true action from others?"""

@@ -1,4 +1,4 @@
-"""Which action would a planner take? The energy over a grid of (dx, dy, dz), and where it is lowest.
+"""Energy landscapes: the energy over a grid of (dx, dy, dz), and its minimum.
 
 Source: facebookresearch/vjepa2 @ c2963a4, notebooks/energy_landscape_example.ipynb: the energy of a grid of actions
 after one step from one frame. There the grid is centred on zero; here it also has a node at the true action.
@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from vjepa2_ac.episode import Progress
-from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, try_actions
+from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.intervals import Estimate, mean_of
 from vjepa2_ac.evaluation.metrics import Predictor
 from vjepa2_ac.evaluation.result import Landscape, Landscapes
 
-_ROOM = 1.25  # how far the grid reaches beyond the largest true action
+_ROOM = 1.25  # extent of the grid relative to the largest true action
 _SAME = 1e-6  # energies this close, as a share, are equally low
 _CM = 100.0
 
@@ -35,13 +35,13 @@ def measure_landscapes(
     """Compute the energy over a grid of the first three numbers of the action, the others being the true ones.
 
     Args:
-        model: What predicts.
+        model: The predictor.
         starts: One frame of each clip; one or more.
         is_pose: The numbers are dx, dy, dz in metres, and are reported in cm.
         nodes: Along each axis.
         reach: The grid spans at least -reach .. reach (metres; of vectors: in its own numbers).
-        at_once: Samples that are computed together.
-        progress: Told how many starts are done.
+        at_once: Samples per batch.
+        progress: Called with the number of finished starts.
 
     Raises:
         ValueError: No starts, fewer than three nodes, or actions of fewer than three numbers.
@@ -61,14 +61,14 @@ def measure_landscapes(
 
 
 def grid_axes(true: Float[np.ndarray, " 3"], half: float, nodes: int) -> Float[np.ndarray, "3 nodes"]:
-    """Return the values along each axis: evenly apart, from about -half to half, one of them exactly the true one."""
+    """Return the values along each axis: equally spaced, from about -half to half, one of them exactly the true one."""
     distance = 2 * half / (nodes - 1)
     place = np.clip(np.round((true + half) / distance), 0, nodes - 1)
     return true[:, None] + distance * (np.arange(nodes)[None] - place[:, None])
 
 
 def lowest(energy: Float[np.ndarray, ...]) -> Bool[np.ndarray, ...]:
-    """Return where the energy is lowest; everywhere, where it is flat."""
+    """Return where the energy is lowest; everywhere, if it is flat."""
     least = energy.min()
     return np.asarray(energy <= least + _SAME * abs(least))
 
@@ -77,10 +77,10 @@ def _landscape(
     model: Predictor, start: RolloutStart, axes: np.ndarray, true: np.ndarray, unit: float, at_once: int
 ) -> Landscape:
     nodes = axes.shape[1]
-    tried = np.tile(start.action.cpu().numpy().astype(np.float64), (nodes**3, 1))
-    tried[:, :3] = _places(axes)
-    energy = try_actions(model, start, tried, at_once=at_once).energy.reshape(nodes, nodes, nodes)
-    minimum = tried[lowest(energy).ravel(), :3].mean(axis=0)
+    evaluated = np.tile(start.action.cpu().numpy().astype(np.float64), (nodes**3, 1))
+    evaluated[:, :3] = _places(axes)
+    energy = evaluate_actions(model, start, evaluated, at_once=at_once).energy.reshape(nodes, nodes, nodes)
+    minimum = evaluated[lowest(energy).ravel(), :3].mean(axis=0)
     return Landscape(
         episode_id=start.episode_id,
         start=start.first_step,
@@ -110,9 +110,9 @@ def _summary(maps: tuple[Landscape, ...], names: tuple[str, str, str], unit: str
 
 
 def _signs(maps: Sequence[Landscape], axis: int, least: float) -> tuple[Estimate, float, int]:
-    """Return how often the minimum lies on the true action's side of zero, the same of any node, and of how many clips.
+    """Return how often the minimum has the true action's sign, the same of any node, and the number of clips.
 
-    Clips that hardly move along the axis have no sign to agree with.
+    Clips that hardly move along the axis are not counted.
     """
     counted = [one for one in maps if abs(one.true[axis]) >= least]
     if not counted:

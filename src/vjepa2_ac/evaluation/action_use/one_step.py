@@ -1,4 +1,4 @@
-"""What would a model predict from one frame under many actions, and how far from the truth? The energy of an action."""
+"""One-step action energies: the prediction error of one frame under each of many actions."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from vjepa2_ac.evaluation.metrics import Predictor
 
 @dataclass(frozen=True)
 class RolloutStart:
-    """One frame of a held-out clip, and what really came next: where a planner would stand before an action."""
+    """One frame of a held-out clip, and the true next frame: the state of a planner before an action."""
 
-    clip: int  # place in the evaluation's clips
+    clip: int  # index into the evaluation's clips
     episode_id: str
     first_step: int  # control step at which the clip begins
     frame: Float[Tensor, "tokens dim"]
     following: Float[Tensor, "tokens dim"]  # the next frame
     state: Float[Tensor, " state_dim"]
-    action: Float[Tensor, " action_dim"]  # that led there
+    action: Float[Tensor, " action_dim"]  # that led to it
     extrinsics: Float[Tensor, " 6"] | None
 
     @property
@@ -33,20 +33,20 @@ class RolloutStart:
         return float((self.frame.float() - self.following.float()).abs().mean())
 
     def generator(self, seed: int) -> np.random.Generator:
-        """Return randomness that depends on the seed and on this clip alone, not on those before it."""
+        """Return a random generator that depends only on the seed and this clip, not on those before it."""
         return clip_generator(seed, self.episode_id, self.first_step)
 
 
 @dataclass(frozen=True)
-class TriedActions:
-    """What came of each action that was tried from a start."""
+class EvaluatedActions:
+    """The results of each evaluated action of a start."""
 
     energy: Float[np.ndarray, " samples"]  # L1 distance of the prediction to the true next frame
     change: Float[np.ndarray, " samples"]  # L1 distance of the prediction to that with the true action
 
 
 def clip_generator(seed: int, episode_id: str, first_step: int) -> np.random.Generator:
-    """Return randomness that depends on the seed and on the name of a clip alone, not on the clips before it."""
+    """Return a random generator that depends only on the seed and the name of a clip, not on the clips before it."""
     digest = hashlib.blake2b(f"{episode_id} {first_step}".encode(), digest_size=8).digest()
     return np.random.default_rng([seed, int.from_bytes(digest, "big")])
 
@@ -66,16 +66,16 @@ def start_of(batch: LatentBatch, row: int, step: int, clip: int) -> RolloutStart
 
 
 @torch.no_grad()
-def try_actions(
+def evaluate_actions(
     model: Predictor, start: RolloutStart, actions: Float[np.ndarray, "samples action_dim"], *, at_once: int
-) -> TriedActions:
-    """Predict one step from one frame under each action; the true state and camera throughout.
+) -> EvaluatedActions:
+    """Predict one step from one frame under each action; with the true state and camera.
 
     Args:
-        model: What predicts.
-        start: From where.
-        actions: To try, in the units of the data.
-        at_once: How many samples are computed together: bounds the memory.
+        model: The predictor.
+        start: The frame.
+        actions: In the units of the data.
+        at_once: Samples per batch: limits the memory.
     """
     expected = _predict(model, start, start.action[None])[0]
     energies, changes = [], []
@@ -83,13 +83,13 @@ def try_actions(
         predicted = _predict(model, start, part)
         energies.append((predicted - start.following.float()).abs().mean(dim=(1, 2)))
         changes.append((predicted - expected).abs().mean(dim=(1, 2)))
-    return TriedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
+    return EvaluatedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
 
 
 def _predict(
     model: Predictor, start: RolloutStart, actions: Float[Tensor, "samples action_dim"]
 ) -> Float[Tensor, "samples tokens dim"]:
-    """Return the predictions in float32. The only frame has its action beside it: no keys could be shared."""
+    """Return the predictions in float32. Keys are not shared: the only frame has its action beside it."""
     count = len(actions)
     camera = None if start.extrinsics is None else start.extrinsics.expand(count, 1, -1)
     frames = start.frame.expand(count, 1, *start.frame.shape)

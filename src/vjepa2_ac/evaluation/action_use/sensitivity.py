@@ -1,4 +1,4 @@
-"""Does a model listen to its actions? How predictions change with them, and where the true one ranks by its energy."""
+"""Action sensitivity: how predictions change with the actions, and the rank of the true action by energy."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.episode import Progress
-from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, try_actions
+from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.intervals import mean_of, ratio
 from vjepa2_ac.evaluation.metrics import Predictor
 from vjepa2_ac.evaluation.result import Ranking, Sensitivity
 
 TOP = (1, 5, 10)
-_SAME = 1e-6  # energies whose difference is a smaller share of them are equal: rounding decides no rank
+_SAME = 1e-6  # relative difference below which energies are equal: rounding decides no rank
 
 
 @dataclass(frozen=True)
 class ActionPool:
-    """Actions of all clips, to draw others from."""
+    """Actions of all clips, a pool to draw others from."""
 
     actions: Float[np.ndarray, "count action_dim"]
     episode_ids: tuple[str, ...]  # of each action
@@ -31,7 +31,7 @@ class ActionPool:
     def of_others(
         self, start: RolloutStart, samples: int, generator: np.random.Generator
     ) -> Float[np.ndarray, "samples action_dim"]:
-        """Draw actions of other episodes, with replacement; of the same one where there is no other."""
+        """Draw actions of other episodes, with replacement; of the same one if there is no other."""
         others = np.flatnonzero(np.array(self.episode_ids) != start.episode_id)
         chosen = generator.choice(others if len(others) else np.arange(len(self.actions)), size=samples)
         return np.asarray(self.actions[chosen])
@@ -39,18 +39,18 @@ class ActionPool:
     def in_box(
         self, start: RolloutStart, samples: int, generator: np.random.Generator
     ) -> Float[np.ndarray, "samples action_dim"]:
-        """Draw uniformly: of poses (dx, dy, dz) in the box, the rest as it truly was; of vectors every number."""
+        """Draw uniformly: for poses (dx, dy, dz) in the box, the rest being true; for vectors every number."""
         true = start.action.cpu().numpy().astype(np.float64)
         half = np.abs(self.actions).max(axis=0)
         drawn = generator.uniform(-1.0, 1.0, size=(samples, len(true)))
         if not self.is_pose:
             return np.asarray(drawn * half)
-        tried = np.tile(true, (samples, 1))
-        tried[:, :3] = drawn[:, :3] * self.reach
-        return tried
+        evaluated = np.tile(true, (samples, 1))
+        evaluated[:, :3] = drawn[:, :3] * self.reach
+        return evaluated
 
     def words(self, drawn_from: Literal["clips", "box"]) -> str:
-        """Say where actions are drawn from."""
+        """Return as text where actions are drawn from."""
         if drawn_from == "clips":
             return "actions of other episodes"
         if self.is_pose:
@@ -68,16 +68,16 @@ def measure_sensitivity(
     at_once: int,
     progress: Progress | None = None,
 ) -> Sensitivity:
-    """Try other actions from each start.
+    """Evaluate other actions from each start.
 
     Args:
-        model: What predicts.
-        starts: One frame of each clip that is measured.
-        pool: Where others come from.
-        samples: Others per start, from each of the two places.
-        seed: Decides which; a start gets the same ones whatever else is measured.
-        at_once: Samples that are computed together.
-        progress: Told how many starts are done.
+        model: The predictor.
+        starts: One frame of each clip.
+        pool: The pool of other actions.
+        samples: Others per start, from each of the two sources.
+        seed: A start gets the same actions whatever else is measured.
+        at_once: Samples per batch.
+        progress: Called with the number of finished starts.
     """
     changes, persistence = [], []
     ranks: dict[Literal["clips", "box"], list[tuple[float, float]]] = {"clips": [], "box": []}
@@ -85,11 +85,11 @@ def measure_sensitivity(
         generator = start.generator(seed)
         true = start.action.cpu().numpy().astype(np.float64)[None]
         drawn = [pool.of_others(start, samples, generator), pool.in_box(start, samples, generator)]
-        tried = try_actions(model, start, np.concatenate([true, *drawn]), at_once=at_once)
-        own, others, boxed = np.split(tried.energy, [1, 1 + samples])
+        evaluated = evaluate_actions(model, start, np.concatenate([true, *drawn]), at_once=at_once)
+        own, others, boxed = np.split(evaluated.energy, [1, 1 + samples])
         ranks["clips"].append(_place(own[0], others))
         ranks["box"].append(_place(own[0], boxed))
-        changes.append(float(tried.change[1 : 1 + samples].mean()))
+        changes.append(float(evaluated.change[1 : 1 + samples].mean()))
         persistence.append(start.persistence)
         if progress is not None:
             progress(done, len(starts))
@@ -103,7 +103,7 @@ def measure_sensitivity(
 
 
 def _place(true: float, others: Float[np.ndarray, " samples"]) -> tuple[float, float]:
-    """Return how many others have a lower energy, and how many the same."""
+    """Return how many others have a lower energy, and how many an equal one."""
     same = np.abs(others - true) <= _SAME * max(abs(true), 1e-12)
     return float(((others < true) & ~same).sum()), float(same.sum())
 

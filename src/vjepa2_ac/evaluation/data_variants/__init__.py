@@ -1,1 +1,1 @@
-"""Data variants: does the model predict the data better when it is read another way?"""
+"""Data variants: does the model predict the data better if it is read in another way?"""

@@ -1,4 +1,4 @@
-"""Which reading of the data of a config does a model fit best? See `evaluation.data_variants.measure`."""
+"""Measurement of data variants from a config. See `evaluation.data_variants.measure`."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from vjepa2_ac.evaluation.stride_calibration.from_config import load_named
 def probe_config(
     config: Config, dataset: Dataset, *, model: str, clips: int = 64, progress: Progress | None = None
 ) -> VariantProbe:
-    """Probe the data of a config, which is open at a stride that is a number, with a model.
+    """Probe the data of a config, opened at a fixed stride, with a model.
 
     Args:
         config: The device and the precision.
         dataset: The data.
         model: What `model.base` takes, or the folder of a run.
-        clips: To measure, of the validation episodes; of training episodes where there are no others.
-        progress: Told how many clips are measured.
+        clips: Number of clips, of the validation episodes; of training episodes if there are no others.
+        progress: Called with the number of measured clips.
 
     Raises:
         InputError: The data or the model cannot be used.

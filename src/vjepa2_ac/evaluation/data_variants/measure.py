@@ -1,7 +1,7 @@
-"""Under which variant of a data set does a model that knows robots predict best? As it is, mirrored, shifted, ...?
+"""Comparison of data variants: under which does a trained model predict best: unchanged, mirrored, shifted, ...?
 
-A model's one-step error is lowest where actions and states are those of the pictures. So the same clips are measured as
-they are and with one thing changed at a time; what surely fits better is most likely how the data really are.
+A model's one-step error is lowest where actions and states match the frames. So the same clips are measured unchanged
+and with one thing changed at a time; a variant that is certainly better is most likely the true reading of the data.
 """
 
 from __future__ import annotations
@@ -25,38 +25,38 @@ from vjepa2_ac.evaluation.metrics import Predictor, distances
 
 FRAMES = 8  # of a clip, at most
 SHIFTS = (1, 2, 4, 8)  # control steps
-_TRIED_FOR_ONE = 8  # windows that are looked at for each clip, since shifts need room on both sides
+_CANDIDATES_PER_CLIP = 8  # windows checked per clip, since shifts need room on both sides
 _EPISODES_TO_BE_SURE = 5
-_MARGIN = 2.0  # half-widths of the 95 % interval: one of a dozen variants is soon better by chance
-_GAIN = 0.01  # of persistence: what is less changes nothing
+_MARGIN = 2.0  # half-widths of the 95 % interval: one of a dozen variants is easily better by chance
+_GAIN = 0.01  # of persistence: smaller gains are irrelevant
 
 
 @dataclass(frozen=True)
-class TriedVariant:
-    """How well a model predicts under a variant."""
+class VariantResult:
+    """The prediction error of a model under a variant."""
 
     name: str
-    mend: str
+    repair: str
     ratio: Estimate  # one-step error over persistence
-    difference: Estimate  # of this to that of the data as they are, on the same clips; below 0: fits better
+    difference: Estimate  # to the unchanged data, on the same clips; below 0: fits better
 
 
 @dataclass(frozen=True)
 class VariantProbe:
-    """What was found of each variant."""
+    """The results of all variants."""
 
-    ratio: Estimate  # one-step error over persistence, of the data as they are
-    tried: tuple[TriedVariant, ...]
+    ratio: Estimate  # one-step error over persistence, of the unchanged data
+    results: tuple[VariantResult, ...]
     clips: int
     episodes: int
 
     @property
-    def better(self) -> TriedVariant | None:
-        """The variant that fits best, where it surely fits better than the data as they are."""
-        surely = [one for one in self.tried if self._is_surely_better(one)]
-        return min(surely, key=lambda one: one.difference.value) if surely else None
+    def better(self) -> VariantResult | None:
+        """The variant that fits best, if it certainly fits better than the unchanged data."""
+        certain = [one for one in self.results if self._is_certainly_better(one)]
+        return min(certain, key=lambda one: one.difference.value) if certain else None
 
-    def _is_surely_better(self, one: TriedVariant) -> bool:
+    def _is_certainly_better(self, one: VariantResult) -> bool:
         difference = one.difference
         if not difference.has_interval or self.episodes < _EPISODES_TO_BE_SURE:
             return False
@@ -64,22 +64,22 @@ class VariantProbe:
         return difference.value < -_GAIN and limit < 0 and one.ratio.high < 1  # else it only fails less
 
     def verdict(self) -> str:
-        """Say in words whether the data fit the model best as they are."""
-        said = f"error / persistence {self.ratio} on {self.clips} clips of {self.episodes} episodes"
+        """Return as text whether the unchanged data fit the model best."""
+        text = f"error / persistence {self.ratio} on {self.clips} clips of {self.episodes} episodes"
         if (better := self.better) is not None:
             less = f"{-better.difference.value:.3f} [{-better.difference.high:.3f}, {-better.difference.low:.3f}]"
-            return f"{said}, and {less} less with {better.name}: {better.mend}"
+            return f"{text}, and {less} less with {better.name}: {better.repair}"
         if self.episodes < _EPISODES_TO_BE_SURE:
-            return f"{said}: too few episodes to compare, {_EPISODES_TO_BE_SURE} are needed"
+            return f"{text}: too few episodes to compare, {_EPISODES_TO_BE_SURE} are needed"
         if self.ratio.value >= 1:
-            return f"{said}: the model predicts none of this better than persistence, and cannot tell"
-        return f"{said}; no variant surely fits better"
+            return f"{text}: the model predicts none of this better than persistence, so the result is unknown"
+        return f"{text}; no variant certainly fits better"
 
 
 def rows_of(probe: VariantProbe) -> Iterator[tuple[str, str, str]]:
-    """Yield name, error over persistence, and difference, for a table; the data as they are first."""
+    """Yield name, error over persistence, and difference, for a table; the unchanged data first."""
     yield "as they are", str(probe.ratio), ""
-    for one in probe.tried:
+    for one in probe.results:
         yield one.name, str(one.ratio), str(one.difference)
 
 
@@ -93,21 +93,23 @@ def probe_variants(
     batch_size: int = 8,
     progress: Progress | None = None,
 ) -> VariantProbe:
-    """Measure a model's one-step error on clips as they are, and under each variant.
+    """Measure a model's one-step error on unchanged clips, and under each variant.
 
     Args:
-        model: What predicts.
+        model: The predictor.
         encode: Turns a batch of pixels into latents on the model's device.
-        dataset: Where clips come from, at a stride that is a number.
+        dataset: The source of clips, at a fixed stride.
         split: Which episodes.
-        clips: How many, at most.
-        batch_size: Clips that are measured at once.
-        progress: Told (clips done, clips in all).
+        clips: Number of clips, at most.
+        batch_size: Clips per batch.
+        progress: Called with (clips done, clips in total).
 
     Raises:
         InputError: The split is empty, or a clip cannot be read.
     """
-    candidates = validation_windows(dataset, split, clips=clips * _TRIED_FOR_ONE)  # of whole clips, as a cache has them
+    candidates = validation_windows(
+        dataset, split, clips=clips * _CANDIDATES_PER_CLIP
+    )  # of whole clips, as a cache has them
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": min(dataset.config.frames, FRAMES)}))
     windows, shifts = _with_room(dataset, candidates, clips)
     variants = variants_of(dataset.config, shifts)
@@ -123,15 +125,15 @@ def probe_variants(
     plain, *others = [
         _Errors(*map(np.concatenate, zip(*of_one, strict=True))) for of_one in zip(*measured, strict=True)
     ]
-    tried = [
-        TriedVariant(variant.name, variant.mend, ratio(*one, ids), ratio_difference(one, plain, ids))
+    results = [
+        VariantResult(variant.name, variant.repair, ratio(*one, ids), ratio_difference(one, plain, ids))
         for variant, one in zip(variants, others, strict=True)
     ]
-    return VariantProbe(ratio(*plain, ids), tuple(tried), len(ids), len(set(ids)))
+    return VariantProbe(ratio(*plain, ids), tuple(results), len(ids), len(set(ids)))
 
 
 class _Errors(NamedTuple):
-    """Of each clip; persistence is another one where a variant changes the pictures."""
+    """Of each clip; persistence differs if a variant changes the frames."""
 
     one_step: Float[np.ndarray, " clips"]
     persistence: Float[np.ndarray, " clips"]
@@ -146,8 +148,8 @@ def _errors(model: Predictor, batch: LatentBatch) -> _Errors:
 
 
 def _of_batch(dataset: Dataset, batch: Batch) -> tuple[Dataset, list[tuple[int, int]]]:
-    """Return the data set such that each episode is read once for all variants, and where the clips of a batch are."""
-    config = dataset.config.model_copy(update={"workers": 0})  # what one has read, another would not know
+    """Return a data set that reads each episode once for all variants, and the windows of a batch."""
+    config = dataset.config.model_copy(update={"workers": 0})  # workers would not share episodes that were read
     places = [dataset.table.find(name) for name in batch.episode_ids]
     windows = [(place, start) for place, start in zip(places, batch.starts, strict=True) if place is not None]
     return replace(dataset, config=config, source=RememberingSource(dataset.source)), windows
@@ -161,10 +163,10 @@ def _under(
     windows: list[tuple[int, int]],
     plain: LatentBatch,
 ) -> _Errors:
-    """Return the errors of the same clips under a variant; pictures are encoded again only where it changes them."""
+    """Return the errors of the same clips under a variant; frames are encoded again only if it changes them."""
     source = ChangedSource(dataset.source, variant)
     changed = next(iter(batches_of(replace(dataset, source=source), windows, batch_size=len(windows))))
-    if variant.changes_pictures:
+    if variant.changes_frames:
         return _errors(model, encode(changed))
     device = plain.states.device
     return _errors(model, replace(plain, states=changed.states.to(device), actions=changed.actions.to(device)))
@@ -173,7 +175,7 @@ def _under(
 def _with_room(
     dataset: Dataset, candidates: list[tuple[int, int]], clips: int
 ) -> tuple[list[tuple[int, int]], tuple[int, ...]]:
-    """Return where clips start, and the shifts for which each has states before and behind it."""
+    """Return the starts of clips, and the shifts for which each has states before and after it."""
     steps, length = dataset.table.num_steps, dataset.config.clip_steps
     enough = max(1, min(clips, len(candidates) // 4))
     fitting: list[tuple[int, int]] = candidates

@@ -1,4 +1,4 @@
-"""How else could the data of a set be read? With pictures shifted, states mirrored or backwards, colours exchanged, ...
+"""Variants of a data set: shifted frames, mirrored or reversed states, swapped colour channels, ...
 
 A variant changes one thing of every episode and nothing on disk.
 """
@@ -22,39 +22,39 @@ class Variant:
     """Another reading of the same data."""
 
     name: str
-    mend: str  # what to do where it fits better
+    repair: str  # the fix, if it fits better
     change: Callable[[Episode], Episode]
-    changes_pictures: bool = False
+    changes_frames: bool = False
 
 
 def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
-    """Return the variants that make sense of this data.
+    """Return the variants that apply to this data.
 
     Args:
         config: The data.
-        shifts: Control steps by which to shift pictures against states.
+        shifts: Control steps by which to shift frames against states.
     """
     found = [
         Variant(
-            f"pictures {_steps(shift)} {'late' if shift > 0 else 'early'}",
-            f"give each picture the state of {_steps(shift)} {'before' if shift > 0 else 'after'}",
+            f"frames {_steps(shift)} {'late' if shift > 0 else 'early'}",
+            f"give each frame the state of {_steps(shift)} {'before' if shift > 0 else 'after'}",
             partial(_shifted, late=shift),
         )
         for size in shifts
         for shift in (size, -size)
     ]
     if config.actions == "difference":  # a command has no opposite
-        found.append(Variant("the states backwards", "turn the order of the pictures", _backwards))
+        found.append(Variant("the states backwards", "reverse the order of the frames", _backwards))
     if config.states == "pose":
         for axis, name in enumerate("xy"):
-            mend = f"negate {name}, with the rotation (as of a mirror)"
-            found.append(Variant(f"{name} negated", mend, partial(_with_mirrored_states, axis=axis)))
+            repair = f"negate {name}, with the rotation (as of a mirror)"
+            found.append(Variant(f"{name} negated", repair, partial(_with_mirrored_states, axis=axis)))
         found.append(Variant("the gripper inverted", _GRIPPER[config.source], _with_gripper_inverted))
     if config.source != "latents":
-        mend = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
-        found.append(Variant("red and blue exchanged", mend, _with_channels_exchanged, changes_pictures=True))
-        mend = "flip the pictures, left to right, where the data is written"
-        found.append(Variant("pictures mirrored", mend, _with_mirrored_pictures, changes_pictures=True))
+        repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
+        found.append(Variant("red and blue exchanged", repair, _with_channels_exchanged, changes_frames=True))
+        repair = "flip the frames, left to right, where the data is written"
+        found.append(Variant("frames mirrored", repair, _with_mirrored_frames, changes_frames=True))
     return found
 
 
@@ -68,7 +68,7 @@ _GRIPPER = {
 
 
 def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarray, "steps 7"]:
-    """Return poses as a mirror across the plane of two axes shows them: one coordinate and two rotations negated."""
+    """Return poses mirrored across the plane of two axes: one coordinate and two rotations negated."""
     mirror = np.ones(3)
     mirror[axis] = -1
     rotations = matrices_from_euler(states[:, 3:6]) * mirror[:, None] * mirror
@@ -77,42 +77,42 @@ def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarra
 
 @dataclass(frozen=True)
 class ChangedSource:
-    """A source under a variant; without pictures where the variant leaves these as they are."""
+    """A source under a variant; without frames where the variant does not change them."""
 
     source: EpisodeSource
     variant: Variant
 
     def infos(self, progress: Progress | None = None) -> Sequence[EpisodeInfo]:
-        """Return those of the source."""
+        """Return the infos of the source."""
         return self.source.infos(progress)
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
         """Return an episode, changed."""
         episode = self.variant.change(self.source.read(index, camera, needed))
-        if self.variant.changes_pictures:
+        if self.variant.changes_frames:
             return episode
-        return replace(episode, read_frames=_no_pictures, read_latents=None)
+        return replace(episode, read_frames=_no_frames, read_latents=None)
 
 
 @dataclass(frozen=True)
 class RememberingSource:
-    """A source that reads each episode once: of one far away, or in a large record, that takes long."""
+    """A source that reads each episode once: a remote one, or one in a large record, takes long."""
 
     source: EpisodeSource
     episodes: dict[tuple[int, str | None], Episode] = field(default_factory=dict)
 
     def infos(self, progress: Progress | None = None) -> Sequence[EpisodeInfo]:
-        """Return those of the source."""
+        """Return the infos of the source."""
         return self.source.infos(progress)
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
-        """Return an episode, as it was read first."""
+        """Return an episode, read at the first call."""
         if (index, camera) not in self.episodes:
             self.episodes[index, camera] = self.source.read(index, camera, needed)
         return self.episodes[index, camera]
 
 
-def _no_pictures(steps: Sequence[int]) -> np.ndarray:
+def _no_frames(steps: Sequence[int]) -> np.ndarray:
     return np.zeros((len(steps), 1, 1, 3), np.uint8)
 
 
@@ -121,7 +121,7 @@ def _steps(shift: int) -> str:
 
 
 def _shifted(episode: Episode, *, late: int) -> Episode:
-    """Give each step the state, and the command, of so many steps before; beyond the ends, the first or the last."""
+    """Give each step the state, and the command, of `late` steps before; beyond the ends, the first or the last."""
     steps = np.clip(np.arange(len(episode.states)) - late, 0, len(episode.states) - 1)
     commands = None if episode.commands is None else episode.commands[steps]
     return replace(episode, states=episode.states[steps], commands=commands)
@@ -142,14 +142,14 @@ def _with_gripper_inverted(episode: Episode) -> Episode:
 
 
 def _with_channels_exchanged(episode: Episode) -> Episode:
-    return _with_pictures(episode, lambda frames: frames[..., ::-1])
+    return _with_changed_frames(episode, lambda frames: frames[..., ::-1])
 
 
-def _with_mirrored_pictures(episode: Episode) -> Episode:
-    return _with_pictures(episode, lambda frames: frames[:, :, ::-1])
+def _with_mirrored_frames(episode: Episode) -> Episode:
+    return _with_changed_frames(episode, lambda frames: frames[:, :, ::-1])
 
 
-def _with_pictures(episode: Episode, change: Callable[[np.ndarray], np.ndarray]) -> Episode:
+def _with_changed_frames(episode: Episode, change: Callable[[np.ndarray], np.ndarray]) -> Episode:
     def read(steps: Sequence[int]) -> np.ndarray:
         return np.ascontiguousarray(change(episode.read_frames(steps)))
 

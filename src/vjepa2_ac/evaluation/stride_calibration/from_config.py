@@ -1,4 +1,4 @@
-"""Which stride does a model choose on the data of a config, outside of a run?"""
+"""Stride calibration from a config, outside of a run."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def calibrate_config(
 ) -> Calibration:
     """Calibrate the model of a config, or another one, on the config's data.
 
-    A latent cache has the frames of one stride's clips only, so pictures are encoded on the fly.
+    A latent cache has the frames of one stride's clips only, so frames are encoded on the fly.
 
     Args:
         config: The data, the model, the device and the precision.
         model: Another model: what `model.base` takes, or the folder of a run.
         split: Episodes to measure on.
-        clips: At each stride.
+        clips: Number at each stride.
         frames: Of a clip; None: the config's, but 8 at most.
-        indexing: Told where the data set is looked through.
-        measuring: Told how many clips are measured.
+        indexing: Called with the progress of indexing.
+        measuring: Called with the number of measured clips.
 
     Raises:
         InputError: The data or the model cannot be used.
@@ -58,7 +58,7 @@ def load_named(config: Config, model: str | None) -> WorldModel:
     """Return the model of a run's folder, or of what `model.base` takes; None: the config's own.
 
     Raises:
-        InputError: There is none, it cannot be read, or it is drawn at random.
+        InputError: There is none, it cannot be read, or it is randomly initialized.
     """
     if model is not None and (Path(model) / CONFIG).is_file():
         return load_run(Path(model)).world_model

@@ -1,7 +1,7 @@
-"""How long is a model step? The model itself says: at which stride is its prediction best, beside doing nothing?
+"""Stride calibration: the stride with the lowest prediction error relative to persistence.
 
-The step length of the released weights is unsettled (see IMPLEMENTATION_NOTES), and a robot of another control rate has
-another. At each candidate stride the same clips begin at the same control steps of the same held-out episodes.
+The step length of the released weights is unknown (see IMPLEMENTATION_NOTES), and robots differ in their control rate.
+At each candidate stride, the same clips begin at the same control steps of the same held-out episodes.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from vjepa2_ac.model.network.world_model import WorldModel
 
 FRAMES = 8  # of a clip at most: as the released weights were trained, and short enough for the widest stride
 _EPISODES_NEEDED = 2  # for an interval
-_EPISODES_TO_BE_SURE = 10  # an interval that is drawn from fewer is too narrow
+_EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
 
 
 @dataclass(frozen=True)
-class TriedStride:
+class StrideResult:
     """The one-step, teacher-forced error of a model at one stride."""
 
     stride: int
@@ -49,23 +49,23 @@ class TriedStride:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was found at each stride, and which one is best."""
+    """The results at each stride, and the best one."""
 
-    tried: tuple[TriedStride, ...]
-    impossible: dict[int, str]  # stride -> why it could not be tried
+    results: tuple[StrideResult, ...]
+    impossible: dict[int, str]  # stride -> why it could not be measured
     frames: int
     split: Split
-    runner_up: int | None  # the stride that comes second
+    runner_up: int | None  # the second-best stride
     difference: Estimate | None  # of the two best ratios, the best's minus the other's, paired by clip
 
     @property
-    def best(self) -> TriedStride:
+    def best(self) -> StrideResult:
         """The stride with the lowest ratio."""
-        return min(self.tried, key=lambda one: one.ratio.value)
+        return min(self.results, key=lambda one: one.ratio.value)
 
     @property
     def is_certain(self) -> bool:
-        """Whether the best stride beats the next with its whole 95 % interval, over episodes enough."""
+        """Whether the best stride is better than the next with its whole 95 % interval, over enough episodes."""
         return (
             self.difference is not None
             and self.difference.has_interval
@@ -74,7 +74,7 @@ class Calibration:
         )
 
     def verdict(self) -> str:
-        """Say in words which stride to take, and how sure that is."""
+        """Return as text the best stride, and how certain it is."""
         best = self.best
         words = (
             f"Best: stride {best.stride} ({best.seconds_per_step:.2f} s per model step), error/persistence {best.ratio}"
@@ -90,19 +90,19 @@ class Calibration:
         return words if words.endswith("?") else words + "."
 
     def lines(self) -> list[str]:
-        """Return what was found as lines of text, the verdict last."""
-        tried = [
+        """Return the results as lines of text, the verdict last."""
+        results = [
             f"  stride {one.stride} ({one.seconds_per_step:.2f} s): error/persistence {one.ratio},"
             f" {one.clips} clips of {one.episodes} episodes"
-            for one in self.tried
+            for one in self.results
         ]
-        return [*tried, *(f"  stride {n}: not possible: {why}" for n, why in self.impossible.items()), self.verdict()]
+        return [*results, *(f"  stride {n}: not possible: {why}" for n, why in self.impossible.items()), self.verdict()]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return every figure as plain values, for `calibration.json`."""
+        """Return all metrics as plain values, for `calibration.json`."""
         strides = [
-            {**{name: getattr(one, name) for name in _FIGURES}, "error_over_persistence": one.ratio.as_dict()}
-            for one in self.tried
+            {**{name: getattr(one, name) for name in _METRICS}, "error_over_persistence": one.ratio.as_dict()}
+            for one in self.results
         ]
         return {
             "stride": self.best.stride,
@@ -117,7 +117,7 @@ class Calibration:
         }
 
 
-_FIGURES = ("stride", "seconds_per_step", "error", "persistence", "moved_cm", "clips", "episodes")
+_METRICS = ("stride", "seconds_per_step", "error", "persistence", "moved_cm", "clips", "episodes")
 
 
 def _interval(difference: Estimate) -> str:
@@ -140,19 +140,19 @@ def calibrate(
     """Measure a model's one-step error over persistence at each stride.
 
     A stride is possible if clips of it fit into at least two episodes (one, if no stride fits into two). All possible
-    ones are tried on the starts from which a clip of the widest fits.
+    ones are measured on the starts from which a clip of the widest fits.
 
     Args:
-        model: What predicts.
+        model: The predictor.
         encode: Turns a batch of pixels into latents on the model's device.
-        dataset: Where clips come from; its own stride and number of frames do not matter.
+        dataset: The source of clips; its own stride and number of frames do not matter.
         split: Which episodes.
-        strides: To try; none: those of the config.
+        strides: The candidates; none: those of the config.
         frames: Of a clip; None: the config's, but 8 at most, so that wide strides fit.
-        clips: At each stride.
-        batch_size: Clips that are measured at once.
-        copies: How they get to the model's device.
-        progress: Told (clips done, clips in all).
+        clips: Number at each stride.
+        batch_size: Clips per batch.
+        copies: Copies them to the model's device.
+        progress: Called with (clips done, clips in total).
 
     Raises:
         InputError: The split is empty, no stride fits into any of its episodes, or a clip cannot be read.
@@ -167,21 +167,21 @@ def calibrate(
     for done, stride in enumerate(possible):
         batches = batches_of(views[stride], chosen, batch_size=batch_size, copies=copies)
         parts = _measure(model, encode, batches, is_pose=settings.states == "pose")
-        tell = _told(progress, done * len(chosen), len(possible) * len(chosen))
-        measured[stride] = _Measured.joined(list(tell(parts)))
+        report = _with_progress(progress, done * len(chosen), len(possible) * len(chosen))
+        measured[stride] = _Measured.joined(list(report(parts)))
     runner_up, difference = _compared(measured)
     rate = dataset.control_rate_hz
-    tried = tuple(one.summary(stride, stride / rate) for stride, one in measured.items())
-    return Calibration(tried, impossible, frames, split, runner_up, difference)
+    results = tuple(one.summary(stride, stride / rate) for stride, one in measured.items())
+    return Calibration(results, impossible, frames, split, runner_up, difference)
 
 
 @dataclass(frozen=True)
 class _Measured:
-    """Figures by clip; a clip is named by its episode and first step."""
+    """Metrics by clip; a clip is named by its episode and first step."""
 
     errors: Float[np.ndarray, " clips"]
     persistence: Float[np.ndarray, " clips"]
-    moved_cm: Float[np.ndarray, " steps"]  # none where the states are no poses
+    moved_cm: Float[np.ndarray, " steps"]  # none if the states are no poses
     clips: tuple[tuple[str, int], ...]
 
     @classmethod
@@ -201,8 +201,8 @@ class _Measured:
     def value(self) -> float:
         return float(self.errors.sum() / self.persistence.sum())
 
-    def summary(self, stride: int, seconds_per_step: float) -> TriedStride:
-        return TriedStride(
+    def summary(self, stride: int, seconds_per_step: float) -> StrideResult:
+        return StrideResult(
             stride=stride,
             seconds_per_step=seconds_per_step,
             ratio=ratio(self.errors, self.persistence, self.episode_ids),
@@ -226,8 +226,10 @@ def _measure(
         yield _Measured(errors, persistence, moved_cm, tuple(zip(batch.episode_ids, batch.starts, strict=True)))
 
 
-def _told(progress: Progress | None, before: int, total: int) -> Callable[[Iterator[_Measured]], Iterator[_Measured]]:
-    def tell(parts: Iterator[_Measured]) -> Iterator[_Measured]:
+def _with_progress(
+    progress: Progress | None, before: int, total: int
+) -> Callable[[Iterator[_Measured]], Iterator[_Measured]]:
+    def report(parts: Iterator[_Measured]) -> Iterator[_Measured]:
         done = before
         for part in parts:
             done += len(part.clips)
@@ -235,11 +237,11 @@ def _told(progress: Progress | None, before: int, total: int) -> Callable[[Itera
                 progress(done, total)
             yield part
 
-    return tell
+    return report
 
 
 def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:
-    """Tell the strides whose clips fit into episodes enough from the others, and say why not."""
+    """Return the strides whose clips fit into enough episodes, and for the others the reason why not."""
     fitting, reasons = {}, {}
     for stride, dataset in views.items():
         try:
@@ -256,7 +258,7 @@ def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[
 
 
 def _compared(measured: dict[int, _Measured]) -> tuple[int | None, Estimate | None]:
-    """Return the stride that comes second, and how far the best ratio lies below its ratio."""
+    """Return the second-best stride, and how far the best ratio is below its ratio."""
     if len(measured) < 2:
         return None, None
     first, second = sorted(measured, key=lambda stride: measured[stride].value)[:2]
@@ -273,7 +275,7 @@ def _compared(measured: dict[int, _Measured]) -> tuple[int | None, Estimate | No
 
 
 def require_learned(model: ModelConfig) -> None:
-    """Refuse to ask a model that is drawn at random.
+    """Refuse a randomly initialized model.
 
     Raises:
         InputError: It is.
@@ -308,7 +310,7 @@ def calibrate_model(
         raise InputError(
             where=f"data.path: {dataset.config.path}",
             found=f"latents that were encoded for clips at stride {dataset.config.stride}",
-            needed="frames at every stride that is tried",
+            needed="frames at every candidate stride",
             fix="Calibrate on the data set itself, with data.cache: off",
         )
     world_model.eval()

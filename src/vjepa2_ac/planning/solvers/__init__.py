@@ -1,1 +1,1 @@
-"""Solvers: which actions cost least? CEM, iCEM, MPPI, gradient descent."""
+"""Solvers: the search for the action sequence of lowest cost. CEM, iCEM, MPPI, gradient descent."""

@@ -1,4 +1,4 @@
-"""How does a planner try and learn? What all of them share: samples, their energies, the best of them."""
+"""The base of all solvers: samples, their energies, and the best of them."""
 
 from __future__ import annotations
 
@@ -14,50 +14,50 @@ from vjepa2_ac.planning.action_space import ActionSpace
 
 @dataclass(frozen=True)
 class EvaluatedPlans:
-    """Decisions with their energies; those without a finite one are left out, so there may be none at all."""
+    """Decisions with their energies; those without a finite one are left out, so it may be empty."""
 
     decisions: Float[Tensor, "finite decisions dim"]
     energies: Float[Tensor, " finite"]
     gradients: Float[Tensor, "samples decisions dim"] | None = None  # of all samples, 0 where not finite
 
     def best(self, count: int) -> EvaluatedPlans:
-        """Return the few of lowest energy, best first; fewer where there are no more."""
+        """Return the decisions of lowest energy, best first; fewer if there are not enough."""
         order = self.energies.sort(stable=True).indices[:count]
         return EvaluatedPlans(self.decisions[order], self.energies[order])
 
 
 @runtime_checkable
 class Solver(Protocol):
-    """One decision's search, from its first samples to its answer."""
+    """The search of one decision, from its first samples to its result."""
 
     elites: int  # how many of the best are recorded
     uses_gradients: bool
 
     @property
     def mean(self) -> Float[Tensor, "decisions dim"]:
-        """Where it looks."""
+        """The mean of the distribution."""
         ...
 
     @property
     def std(self) -> Float[Tensor, "decisions dim"]:
-        """How far around."""
+        """The standard deviation of the distribution."""
         ...
 
     def sample(self) -> Float[Tensor, "samples decisions dim"]:
-        """Return what to try next: allowed decisions."""
+        """Return the next decisions to evaluate, all allowed."""
         ...
 
-    def update(self, tried: EvaluatedPlans) -> None:
-        """Take what came of it into account. Without any finite energy, everything stays as it is."""
+    def update(self, evaluated: EvaluatedPlans) -> None:
+        """Update the distribution. Without any finite energy, nothing changes."""
         ...
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
-        """Return the decisions it stands for now; None: the best that was tried."""
+        """Return the current result; None: the best evaluated decisions."""
         ...
 
 
 def white_noise(space: ActionSpace, samples: int, generator: Generator) -> Float[Tensor, "samples decisions dim"]:
-    """Return independent standard normal numbers, zero on axes that are held throughout.
+    """Return independent standard normal numbers, zero on axes that are fixed in all decisions.
 
     Drawn decision by decision and for free axes only, in upstream's order: the same seed gives upstream's samples.
     """

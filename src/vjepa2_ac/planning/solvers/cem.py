@@ -1,4 +1,4 @@
-"""Cross-entropy method: draw from a normal distribution, move it to the best, again."""
+"""Cross-entropy method: sample from a normal distribution, fit it to the elites, repeat."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from vjepa2_ac.planning.solvers.base import EvaluatedPlans, white_noise
 
 
 class CemSolver:
-    """Upstream's: samples are clipped, mean and standard deviation keep a share of their old values.
+    """As upstream: samples are clipped, mean and standard deviation keep a share of their old values.
 
-    Differs from upstream in that a warm start is possible, in that samples without a finite energy are no elites, and
-    in that a held gripper is exact in the answer, too.
+    Differs from upstream: a warm start is possible, samples without a finite energy are no elites, and a fixed gripper
+    is exact in the result as well.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, cem.
     """
@@ -35,22 +35,22 @@ class CemSolver:
         self._keep_std = _momentum(space, config.momentum_std, config.momentum_std_gripper)
 
     def sample(self) -> Float[Tensor, "samples decisions dim"]:
-        """Return samples of the distribution, cut back to what is allowed."""
+        """Return samples of the distribution, clipped to the allowed set."""
         noise = white_noise(self._space, self._samples, self._generator)
         if self._tries_mean:
             noise[0] = 0.0
         return self._space.allowed(self.mean + self.std * noise)
 
-    def update(self, tried: EvaluatedPlans) -> None:
-        """Move the distribution towards the best; one alone says nothing of the standard deviation."""
-        best = tried.best(self.elites).decisions
+    def update(self, evaluated: EvaluatedPlans) -> None:
+        """Fit the distribution to the elites; a single one does not change the standard deviation."""
+        best = evaluated.best(self.elites).decisions
         if len(best):
             self.mean = self._keep_mean * self.mean + (1 - self._keep_mean) * best.mean(dim=0)
         if len(best) > 1:
             self.std = self._keep_std * self.std + (1 - self._keep_std) * best.std(dim=0)
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
-        """Return the mean, or ask for the best."""
+        """Return the mean, or None to request the best."""
         return self.mean if self._answers_mean else None
 
 

@@ -1,4 +1,4 @@
-"""Gradient descent through the model: several action sequences go downhill at once."""
+"""Gradient descent through the model, on several action sequences in parallel."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from vjepa2_ac.planning.solvers.base import EvaluatedPlans, white_noise
 
 
 class GradientSolver:
-    """Adam on decisions measured in their limits, cut back to what is allowed after every step.
+    """Adam on decisions in units of their limits, projected onto the allowed set after every step.
 
-    Each start descends by itself. The best of all that was tried is taken.
+    Each start descends independently. The result is the best of all evaluated decisions.
     """
 
     uses_gradients = True
@@ -36,37 +36,37 @@ class GradientSolver:
 
     @property
     def mean(self) -> Float[Tensor, "decisions dim"]:
-        """The middle of all descents."""
+        """The mean of all descents."""
         return self.sample().mean(dim=0)
 
     @property
     def std(self) -> Float[Tensor, "decisions dim"]:
-        """How far apart they are."""
+        """The standard deviation over the descents."""
         return self.sample().std(dim=0, correction=0)
 
     def sample(self) -> Float[Tensor, "samples decisions dim"]:
-        """Return where each descent is."""
+        """Return the current decisions of each descent."""
         return self._space.allowed(self._place * self._unit)
 
-    def update(self, tried: EvaluatedPlans) -> None:
-        """Take a step downhill.
+    def update(self, evaluated: EvaluatedPlans) -> None:
+        """Take one gradient step.
 
         Raises:
             ValueError: There are no gradients.
         """
-        if tried.gradients is None:
+        if evaluated.gradients is None:
             raise ValueError("the cost has no gradients")
-        self._place.grad = tried.gradients * self._unit
+        self._place.grad = evaluated.gradients * self._unit
         self._adam.step()
         self._fall.step()
         with torch.no_grad():
             self._place.copy_(self.sample() / self._unit)
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
-        """Ask for the best that was tried."""
+        """Return None to request the best evaluated decisions."""
         return None
 
 
 def _best_of(start: PlanStart) -> Float[Tensor, "decisions dim"]:
-    """Return the last best descent: the middle of several that lead to different places leads nowhere."""
+    """Return the best current descent: the mean of several that lead to different places leads nowhere."""
     return start.elites[0] if len(start.elites) else start.mean

@@ -1,4 +1,4 @@
-"""Improved cross-entropy method: noise that is smooth in time, and elites that take part again."""
+"""Improved cross-entropy method: noise correlated in time, and elites reused in the next iteration."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from vjepa2_ac.planning.solvers.base import EvaluatedPlans
 
 
 class IcemSolver:
-    """Fewer samples every iteration; elites are kept, shifted into the next decision; the best that was tried is taken.
+    """Fewer samples per iteration; elites are reused and shifted into the next decision; the result is the best sample.
 
-    The last iteration also tries the mean. Two numbers of a sample are independent, two decisions of a number are not.
+    The last iteration also evaluates the mean. Components of a sample are independent, decisions are correlated.
 
     Source: Pinneri et al., Sample-efficient Cross-Entropy Method for Real-time Planning, arXiv 2008.06389, algorithm 1.
     """
@@ -39,20 +39,20 @@ class IcemSolver:
         self._kept = self.mean[None][:0] if start is None else self._few(start.elites)
 
     def sample(self) -> Float[Tensor, "samples decisions dim"]:
-        """Return fresh samples, the kept elites, and in the last iteration the mean."""
+        """Return new samples, the reused elites, and in the last iteration the mean."""
         count = max(int(self._samples * self._config.shrink**-self._iteration), 2 * self.elites)
         noise = coloured_noise(
             count, self._space.decisions, self._space.dim, self._config.noise_exponent, self._generator
         )
-        tried = [self.mean + self.std * noise, self._kept]
+        evaluated = [self.mean + self.std * noise, self._kept]
         self._iteration += 1
         if self._iteration == self._iterations:
-            tried.append(self.mean[None])
-        return self._space.allowed(torch.cat(tried))
+            evaluated.append(self.mean[None])
+        return self._space.allowed(torch.cat(evaluated))
 
-    def update(self, tried: EvaluatedPlans) -> None:
-        """Move the distribution to the best, and keep some of them."""
-        best = tried.best(self.elites).decisions
+    def update(self, evaluated: EvaluatedPlans) -> None:
+        """Fit the distribution to the elites, and keep some of them."""
+        best = evaluated.best(self.elites).decisions
         keep = self._config.momentum
         if len(best):
             self.mean = keep * self.mean + (1 - keep) * best.mean(dim=0)
@@ -61,7 +61,7 @@ class IcemSolver:
             self.std = keep * self.std + (1 - keep) * best.std(dim=0)
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:
-        """Ask for the best that was tried."""
+        """Return None to request the best evaluated decisions."""
         return None
 
     def _few(self, elites: Float[Tensor, "elites decisions dim"]) -> Float[Tensor, "kept decisions dim"]:
@@ -73,7 +73,7 @@ def coloured_noise(
 ) -> Float[Tensor, "samples decisions dim"]:
     """Return normal numbers of variance 1 with a power spectrum 1 / frequency^exponent along decisions; 0: white.
 
-    The constant part has the power of the lowest frequency.
+    The constant component has the power of the lowest frequency.
 
     Source: Timmer and König, On generating power law noise, Astronomy and Astrophysics 300 (1995): normal Fourier
     coefficients, scaled.
@@ -81,7 +81,7 @@ def coloured_noise(
     frequency = torch.fft.rfftfreq(decisions).clamp(min=1 / decisions)
     scale = frequency ** (-exponent / 2)
     parts = torch.randn(2, samples, dim, len(frequency), generator=generator)
-    single = torch.zeros(len(frequency), dtype=torch.bool)  # coefficients that are real, and stand for one wave
+    single = torch.zeros(len(frequency), dtype=torch.bool)  # real coefficients, which stand for one wave
     single[0] = True
     single[-1] = single[-1] or decisions % 2 == 0
     wave = torch.complex(parts[0], parts[1].masked_fill(single, 0.0)) * torch.where(single, 1.0, 0.5**0.5)

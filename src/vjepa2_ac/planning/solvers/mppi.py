@@ -1,4 +1,4 @@
-"""Model predictive path integral control: the mean of all samples, each weighted by how little it costs."""
+"""Model predictive path integral control: the mean of all samples, weighted by their cost."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _RECORDED = 10
 
 
 class MppiSolver:
-    """Weights exp(-energy / temperature); the noise gets less by a fixed share, and the mean is tried itself.
+    """Weights exp(-energy / temperature); the noise decays by a fixed factor, and the mean is evaluated itself.
 
-    The term of the original that charges for control is left out: limits say what an action may be.
+    The control cost of the original is left out: the limits define the allowed actions.
 
     Source: Williams et al., Information Theoretic MPC for Model-Based Reinforcement Learning, ICRA 2017, algorithm 2.
     """
@@ -38,13 +38,15 @@ class MppiSolver:
         noise[0] = 0.0
         return self._space.allowed(self.mean + self.std * noise)
 
-    def update(self, tried: EvaluatedPlans) -> None:
+    def update(self, evaluated: EvaluatedPlans) -> None:
         """Move the mean to the weighted mean of the samples."""
-        if not len(tried.energies):
+        if not len(evaluated.energies):
             return
-        spread = tried.energies.std(correction=0).clamp(min=torch.finfo(torch.float32).tiny)
-        weights = torch.softmax((tried.energies.min() - tried.energies) / (self._config.temperature * spread), dim=0)
-        self.mean = torch.einsum("s,sdn->dn", weights, tried.decisions)
+        spread = evaluated.energies.std(correction=0).clamp(min=torch.finfo(torch.float32).tiny)
+        weights = torch.softmax(
+            (evaluated.energies.min() - evaluated.energies) / (self._config.temperature * spread), dim=0
+        )
+        self.mean = torch.einsum("s,sdn->dn", weights, evaluated.decisions)
         self.std = self.std * self._config.std_decay
 
     def result(self) -> Float[Tensor, "decisions dim"] | None:

@@ -1,1 +1,1 @@
-"""Figures: what do results, data and plans look like? Drawn with matplotlib."""
+"""Figures of results, data and plans, drawn with matplotlib."""

@@ -1,4 +1,4 @@
-"""How do pictures side by side look with a few words above them? One frame of a video."""
+"""Captioned frames: images side by side with a caption above each, as one frame of a video."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _GAP = 6
 def side_by_side(
     pictures: Sequence[UInt8[np.ndarray, "height width 3"]], captions: Sequence[str], title: str, *, enlarged: int = 2
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return pictures of one size in a row, a caption above each, a title above all.
+    """Return images of one size in a row, a caption above each, a title above all.
 
     Args:
-        pictures: What is shown.
+        pictures: The images.
         captions: One for each.
-        title: A line that may be as long as all are wide.
-        enlarged: How many pixels each pixel becomes, along both axes.
+        title: A line, at most as long as all images are wide.
+        enlarged: Pixels per pixel, along both axes.
 
     Raises:
-        ValueError: Not one caption for each picture.
+        ValueError: The number of captions is not the number of images.
     """
     if len(captions) != len(pictures):
         raise ValueError(f"{len(captions)} captions for {len(pictures)} pictures")

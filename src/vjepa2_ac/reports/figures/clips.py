@@ -1,4 +1,4 @@
-"""What is in these clips? A row each: some of its frames, and below them its states and actions over time."""
+"""The figure of clips: one row per clip with some of its frames, and its states and actions over time."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ _BAD = "#c0392b"
 
 @dataclass(frozen=True, eq=False)
 class ClipFigure:
-    """One clip, as it is shown."""
+    """One clip of the figure."""
 
     name: str
     frames: UInt8[np.ndarray, "time height width 3"]
-    numbers: dict[str, Float[np.ndarray, "_ _"]]  # by what they are: a row per model step
+    numbers: dict[str, Float[np.ndarray, "_ _"]]  # by name: a row per model step
 
 
 def plot_clips(title: str, clips: Sequence[ClipFigure], path: Path) -> Path:
-    """Write a picture of some clips as PNG; numbers that are not finite are marked. It appears whole or not at all.
+    """Write a figure of some clips as PNG; numbers that are not finite are marked. It is written atomically.
 
     Raises:
         ValueError: There is no clip.

@@ -1,4 +1,4 @@
-"""What does a data set look like? Episodes as film strips over their motion, under what is known of all of them."""
+"""The contact sheet of a data set: episodes as film strips and their motion, below a summary of the data set."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _LEAST, _MOST, _WELCOME = 4, 14, 1.15  # pictures in a row, and the height at wh
 
 @dataclass(frozen=True, eq=False)
 class Strip:
-    """One episode: some of its pictures, and its motion at every control step."""
+    """One episode: some of its frames, and its motion at every control step."""
 
     name: str
     success: bool | None
@@ -44,10 +44,10 @@ class Strip:
 
 @dataclass(frozen=True, eq=False)
 class ContactSheet:
-    """Everything that the picture of a data set shows.
+    """The content of a data set's contact sheet.
 
-    Its unit of motion is cm of the flange. Where the states are vectors it is the percentage of its range by which the
-    number changes that changes most; these have no places in space.
+    Its unit of motion is cm of the flange. For vectors it is the change of the number that changes most, as a
+    percentage of its range; these have no positions in space.
     """
 
     title: str
@@ -63,13 +63,13 @@ class ContactSheet:
 
 
 def pictures_per_row(height: int, width: int) -> int:
-    """Return how many pictures of a size stand in a row of the sheet."""
+    """Return the number of frames of a size in a row of the sheet."""
     across = _WIDTH - 2 * _SIDE - _LABEL
     return int(min(max(across // (_WELCOME * width / height + _GAP), _LEAST), _MOST))
 
 
 def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
-    """Write the picture of a data set as PNG; it appears whole or not at all."""
+    """Write the contact sheet of a data set as PNG; it is written atomically."""
     facts = [line for fact in sheet.facts for line in textwrap.wrap(fact, 205, subsequent_indent="    ")]
     head = _TITLE + _LINE * len(facts) + 0.3 + _PANELS + 0.75
     row = _PICTURE + _PLOT + _AXIS + _BETWEEN

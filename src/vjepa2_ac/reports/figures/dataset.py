@@ -1,4 +1,4 @@
-"""Which episodes, pictures and figures go on the contact sheet of a data set?"""
+"""Content of the contact sheet: the selection of episodes, frames and metrics of a data set."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _PLACES = 6000  # points of the map, at most
 def plot_dataset(
     dataset: Dataset, inspection: Inspection, path: Path, *, rows: int = 8, progress: Progress | None = None
 ) -> Path:
-    """Write the contact sheet of a data set that was looked at; decodes the pictures that it shows and no others.
+    """Write the contact sheet of an inspected data set; decodes only the frames that it shows.
 
-    `progress` is told (episodes whose pictures were read, episodes shown).
+    `progress` is called with (episodes whose frames were read, episodes shown).
 
     Raises:
-        InputError: A picture cannot be read, and `data.broken_episodes` does not leave its episode out.
+        InputError: A frame cannot be read, and `data.broken_episodes` does not leave its episode out.
     """
     shown = _rows_of(inspection, rows)
     names = _short_names([dataset.table.identity(one.index) for one in shown])
@@ -44,7 +44,7 @@ def plot_dataset(
 
 
 def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
-    """Return what the sheet shows besides the strips: the title, the facts and the data of the plots."""
+    """Return the content of the sheet besides the strips: the title, the facts and the data of the plots."""
     config, is_pose = inspection.config, inspection.is_pose
     places = np.concatenate([one.states[:, :3] for one in inspection.sample])
     moved = {one.stride: one.moved_cm for one in inspection.motions}
@@ -105,7 +105,7 @@ def _about_states(inspection: Inspection) -> str:
 
 
 def _rows_of(inspection: Inspection, rows: int) -> list[ReadEpisode]:
-    """Return episodes of the sample, some of each outcome that there is."""
+    """Return episodes of the sample, some of each outcome."""
     groups = [[one for one in inspection.sample if inspection.success[one.index] == kind] for kind in (1, 0, -1)]
     groups = [group for group in groups if group]
     whole = sum(map(len, groups))
@@ -116,7 +116,7 @@ def _rows_of(inspection: Inspection, rows: int) -> list[ReadEpisode]:
 
 
 def _short_names(names: Sequence[str]) -> list[str]:
-    """Return names without the folders that all of them begin with; of "a--b" only a, where that tells them apart."""
+    """Return names without their common leading folders; of "a--b" only a, if that is unique."""
     heads = [name.split("--")[0] for name in names]
     parts = [name.split("/") for name in (heads if len(set(heads)) == len(names) else names)]
     while len(parts) > 1 and len({part[0] for part in parts}) == 1 and min(map(len, parts)) > 1:
@@ -144,7 +144,7 @@ def _strip(dataset: Dataset, inspection: Inspection, one: ReadEpisode, name: str
 
 
 def _change_per_step(one: ReadEpisode, inspection: Inspection) -> Float[np.ndarray, " steps"]:
-    """Return by how much the robot moves in a control step, in the sheet's unit."""
+    """Return the motion in each control step, in the sheet's unit."""
     if len(one.states) == 1:
         return np.zeros(1)
     if not inspection.is_pose:

@@ -1,4 +1,4 @@
-"""What does it look like? One picture: error by horizon, use of the actions, and where predictions are wrong."""
+"""The figure of an evaluation: error by horizon, action use, and maps of the prediction error."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
-    """Write the picture of an evaluation as PNG; it appears whole or not at all."""
+    """Write the figure of an evaluation as PNG; it is written atomically."""
     with mpl.rc_context(_STYLE):
         figure = new_figure(13.0, 6.2, layout="constrained")
         figure.suptitle("\n".join(textwrap.wrap(verdict(evaluation), 150)), fontsize=10.5, x=0.01, ha="left")
@@ -43,7 +43,7 @@ def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
 
 
 def plot_comparison(comparison: Comparison, path: Path) -> Path:
-    """Write the curves of several runs as PNG; it appears whole or not at all."""
+    """Write the curves of several runs as PNG; it is written atomically."""
     with mpl.rc_context(_STYLE):
         figure = new_figure(9.5, 4.5, layout="constrained")
         axes = figure.subplots()
@@ -100,14 +100,14 @@ def _colours(evaluation: Evaluation) -> dict[str, str]:
 
 
 def _reach(value: Estimate) -> tuple[float, float]:
-    """How far an error bar reaches down and up; never negative, which rounding could make it."""
+    """Return the length of an error bar downwards and upwards; never negative, which rounding could make it."""
     if not value.has_interval:
         return 0.0, 0.0
     return max(0.0, value.value - value.low), max(0.0, value.high - value.value)
 
 
 def _filmstrip(figure: Any, example: Example, seconds_per_step: float) -> None:
-    """Show one clip: the first frame and some later ones, and under each where a prediction of it is wrong."""
+    """Draw one clip: the first frame and some later ones, and below each the error map of a prediction."""
     horizons = np.unique(np.linspace(1, len(example.true_colours) - 1, num=4).round().astype(int))
     grid = figure.subplots(1 + len(example.errors), 1 + len(horizons), squeeze=False)
     figure.suptitle("One held-out clip, and the error of each patch (brighter is worse)", x=0.02, ha="left", fontsize=9)

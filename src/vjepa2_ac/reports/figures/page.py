@@ -1,4 +1,4 @@
-"""Where does something stand on a picture that is a page? Measured in inches from the top left."""
+"""Page layout of a figure: positions in inches from the top left."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from matplotlib.figure import Figure
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """A matplotlib figure of so many inches."""
+    """A matplotlib figure with a size in inches."""
 
     figure: Any
     width: float
     height: float
 
     def axes(self, left: float, top: float, width: float, height: float) -> Any:
-        """Return axes whose frame stands there."""
+        """Return axes at this position."""
         return self.figure.add_axes(
             (left / self.width, 1 - (top + height) / self.height, width / self.width, height / self.height)
         )
 
     def text(self, left: float, top: float, words: str, **style: Any) -> None:
-        """Write words whose top left corner stands there."""
+        """Write text with its top left corner at this position."""
         style = {"va": "top", "ha": "left", **style}
         self.figure.text(left / self.width, 1 - top / self.height, words, **style)
 

@@ -1,4 +1,4 @@
-"""How did a planner come to its plan? One picture: what was seen, where it searched, what else would have cost."""
+"""The figure of a plan: the observed image, the search, and the energy of other actions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": _RED, "edgecolors": "
 
 
 def plot_plan(answer: PlanResult, path: Path) -> Path:
-    """Write the picture of a decision as PNG; it appears whole or not at all."""
+    """Write the figure of a decision as PNG; it is written atomically."""
     with mpl.rc_context(_STYLE):
         plan = answer.decision.plan
         rows = 1 if plan is None else 3 if answer.slices else 2

@@ -1,1 +1,1 @@
-"""What does an evaluation say, on one page that opens anywhere? HTML with no network, no script and no other file."""
+"""The HTML report of an evaluation: one page without network, scripts or other files."""

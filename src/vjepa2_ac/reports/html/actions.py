@@ -1,4 +1,4 @@
-"""Does the model use its actions? Costs of wrong ones, the place of the true one among others, energy landscapes."""
+"""Report section on action use: costs of wrong actions, the rank of the true action, energy landscapes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOST_LANDSCAPES = 3  # clips whose maps are shown
 
 
 def actions_section(evaluation: Evaluation) -> ReportSection:
-    """Return how much the predictions depend on the actions, and how well the true action stands out."""
+    """Return the section on how predictions depend on the actions, and on the rank of the true action."""
     drawings = [_ranks(evaluation, place) for place in range(2)]
     parts = [
         paragraph(
@@ -49,7 +49,7 @@ def actions_section(evaluation: Evaluation) -> ReportSection:
 
 
 def landscape_section(evaluation: Evaluation) -> ReportSection:
-    """Return energy landscapes around the true action, as maps and as figures."""
+    """Return the section on energy landscapes around the true action, as maps and as numbers."""
     title = "Energy landscapes"
     measured = {name: model.landscapes for name, model in evaluation.models.items() if model.landscapes is not None}
     if not measured:
@@ -60,8 +60,8 @@ def landscape_section(evaluation: Evaluation) -> ReportSection:
     maps = [_maps(drawn, place) for place in _typical(shown.maps)]
     how = (
         "Each map tries actions along two axes while the third axis and the rest of the action are the true ones. Dark"
-        " is low energy: what the model thinks was done. The cross is the true action, the ring is where the energy"
-        " of the whole grid is lowest (it may lie off the map, along the third axis): the closer, the better. The"
+        " is low energy: what the model thinks was done. The cross is the true action, the ring is the minimum over"
+        " the whole grid (it may be off the map, along the third axis): the closer, the better. The"
         " dotted lines are zero motion; a ring there means that the model expects too little to happen. Each clip and"
         f" model has its own range of colours. Of {len(shown.maps)} clips those with the nearest, the median and the"
         " farthest minimum are shown."
@@ -104,7 +104,7 @@ def _sensitivity(evaluation: Evaluation) -> Markup:
     head += [f"true action among the best {k}" for k in tops]
     caption = (
         "How much predictions change with the action (mean L1 distance between predictions with the true and with other"
-        " actions, as a share of the persistence error; 0: not at all), and where the true action stands among others"
+        " actions, as a share of the persistence error; 0: not at all), and the rank of the true action among others"
         " by energy (rank 0: always first, 1: always last; by chance 0.5; value [95 % interval])"
     )
     return table(caption, head, rows, class_="wordy")
@@ -154,7 +154,7 @@ def _landscape_table(measured: dict[str, Landscapes]) -> Markup:
 
 
 def _typical(maps: Sequence[Landscape]) -> list[int]:
-    """Return the places of the maps with the nearest, the median and the farthest minimum."""
+    """Return the indices of the maps with the nearest, the median and the farthest minimum."""
     order = sorted(range(len(maps)), key=lambda place: maps[place].distance)
     if len(order) <= _MOST_LANDSCAPES:
         return order
@@ -188,11 +188,11 @@ def _plane(model: str, landscapes: Landscapes, one: Landscape, first: int, secon
         MapAxis(landscapes.axis_names[axis] + unit, one.axes[axis], float(one.true[axis]), float(one.minimum[axis]))
         for axis in (first, second)
     )
-    says = (
+    description = (
         f"Energy of {model} over {across.label} and {up.label}: true action at {_point(one.true, first, second)},"
         f" lowest energy at {_point(one.minimum, first, second)}."
     )
-    return heat_map(says, energy, across, up, (float(one.energy.min()), float(one.energy.max())))
+    return heat_map(description, energy, across, up, (float(one.energy.min()), float(one.energy.max())))
 
 
 def _nearest(values: Float[np.ndarray, " grid"], wanted: float) -> int:

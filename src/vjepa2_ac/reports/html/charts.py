@@ -1,4 +1,4 @@
-"""How does a curve stand on a page, light or dark? As SVG whose colours are the page's: lines, bands, legend, axes."""
+"""Charts as SVG in the page's colours, light or dark: lines, bands, legend, axes."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ from vjepa2_ac.reports.html.markup import Markup, element, joined
 _WIDTH, _HEIGHT = 440.0, 270.0  # in units of the drawing; on a phone one is 0.8 px
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52.0, 12.0, 12.0, 44.0
 _RADIUS = 3.2
-_TINY = 1e-4  # steps below it are written with a power of ten
+_TINY = 1e-4  # steps below it are written with an exponent
 _MOST_MARKED = 40  # points; a line of more has no markers
 
 
 @dataclass(frozen=True)
 class Line:
-    """One curve. Points that are not finite are gaps."""
+    """One curve. Values that are not finite are gaps."""
 
     name: str
     x: Sequence[float]
     y: Sequence[float]
-    style: str  # a class of the page's style sheet that gives colour and dashes
+    style: str  # a class of the page's style sheet for colour and dashes
     low: Sequence[float] | None = None  # of the band; None: there is none
     high: Sequence[float] | None = None
 
 
 @dataclass(frozen=True)
 class Axis:
-    """What an axis shows, and from where to where."""
+    """The label and range of an axis."""
 
     label: str
     low: float
     high: float
     ticks: tuple[float, ...]
-    shown: tuple[str, ...]  # what is written at each tick
+    shown: tuple[str, ...]  # text at each tick
 
 
 def nice_axis(label: str, values: Sequence[float], *, most: int = 6, from_zero: bool = False) -> Axis:
-    """Return an axis with round ticks that holds all finite values."""
+    """Return an axis with round ticks whose range holds all finite values."""
     finite = [value for value in values if math.isfinite(value)] or [0.0, 1.0]
     low, high = min(finite), max(finite)
     low = min(low, 0.0) if from_zero else low
@@ -53,21 +53,23 @@ def nice_axis(label: str, values: Sequence[float], *, most: int = 6, from_zero: 
 
 
 def axis_at(label: str, values: Sequence[float], shown: Sequence[str], *, most: int = 8) -> Axis:
-    """Return an axis whose ticks are values themselves, all or every n-th, with a little air at both ends."""
+    """Return an axis whose ticks are values themselves, all or every n-th, with a small margin at both ends."""
     every = -(-len(values) // most)
     air = 0.04 * (values[-1] - values[0]) or 0.5
     return Axis(label, values[0] - air, values[-1] + air, tuple(values[::every]), tuple(shown[::every]))
 
 
-def line_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis, *, level: float | None = None) -> Markup:
+def line_chart(
+    description: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis, *, level: float | None = None
+) -> Markup:
     """Return curves as SVG.
 
     Args:
-        says: What the chart shows, for those who do not see it.
-        lines: The later ones lie above.
-        x_axis: From where to where.
-        y_axis: Likewise; what lies beyond is cut.
-        level: Where a horizontal line helps to compare.
+        description: Description of the chart, as alternative text.
+        lines: Later ones are drawn on top.
+        x_axis: The horizontal axis.
+        y_axis: The vertical axis; values outside are clipped.
+        level: Height of a horizontal reference line.
     """
     place = _Place(x_axis, y_axis)
     drawn = [_band(line, place) for line in lines] + [_curve(line, place) for line in lines]
@@ -76,25 +78,25 @@ def line_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis, *, 
     ) if level is not None else Markup()  # fmt: skip
     return element(
         "svg",
-        element("title", says),
+        element("title", description),
         _grid(place),
         reference,
         *drawn,
         class_="chart",
         viewBox=f"0 0 {_WIDTH:g} {_HEIGHT:g}",
         role="img",
-        aria_label=says,
+        aria_label=description,
     )
 
 
-def dot_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis) -> Markup:
-    """Return points that no curve joins, with the diagonal on which both of their values are the same, and zero.
+def dot_chart(description: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis) -> Markup:
+    """Return a scatter chart, with the diagonal of equal values, and zero lines.
 
     Args:
-        says: What the chart shows, for those who do not see it.
-        lines: The points; the later ones lie above.
-        x_axis: From where to where.
-        y_axis: Likewise, zero included.
+        description: Description of the chart, as alternative text.
+        lines: The points; later ones are drawn on top.
+        x_axis: The horizontal axis.
+        y_axis: The vertical axis, zero included.
     """
     place = _Place(x_axis, y_axis)
     low, high = max(x_axis.low, y_axis.low), min(x_axis.high, y_axis.high)
@@ -102,7 +104,7 @@ def dot_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis) -> M
     zero = {"x1": _LEFT, "x2": _WIDTH - _RIGHT, "y1": place.down(0.0), "y2": place.down(0.0)}
     return element(
         "svg",
-        element("title", says),
+        element("title", description),
         _grid(place),
         element("line", class_="axis", **zero),
         element("line", class_="level", **ends),
@@ -110,25 +112,25 @@ def dot_chart(says: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis) -> M
         class_="chart",
         viewBox=f"0 0 {_WIDTH:g} {_HEIGHT:g}",
         role="img",
-        aria_label=says,
+        aria_label=description,
     )
 
 
 def legend(lines: Sequence[Line]) -> Markup:
-    """Return the names of curves, each beside a piece of it."""
+    """Return the legend: each name beside a sample of its line."""
     entries = [element("li", swatch(line.style), line.name) for line in lines]
     return element("ul", *entries, class_="legend")
 
 
 def swatch(style: str) -> Markup:
-    """Return a short piece of a line, as it looks in the charts."""
+    """Return a sample of a line, as it is drawn in the charts."""
     line = element("line", x1=1, x2=27, y1=6, y2=6, class_=f"curve {style}")
     mark = element("circle", cx=14, cy=6, r=_RADIUS, class_=f"mark {style}")
     return element("svg", line, mark, class_="swatch", viewBox="0 0 28 12", width=28, height=12, aria_hidden="true")
 
 
 def _written(ticks: Sequence[float], step: float) -> tuple[str, ...]:
-    """Return ticks as short as they are exact: 0.25, 150k, 7.5e-5."""
+    """Return the shortest exact tick labels: 0.25, 150k, 7.5e-5."""
     largest = max(abs(tick) for tick in ticks)
     scale, suffix = next(
         ((scale, suffix) for scale, suffix in ((1e9, "G"), (1e6, "M"), (1e3, "k")) if largest >= max(scale, 1e5)),
@@ -149,7 +151,7 @@ def _nice_step(least: float) -> float:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where values stand in the drawing."""
+    """The mapping of values to positions in the drawing."""
 
     x_axis: Axis
     y_axis: Axis
@@ -222,7 +224,7 @@ def _mark(line: Line, x: float, y: float, place: _Place) -> Markup:
 def _pieces(
     points: Sequence[tuple[float, float]], placed: Callable[[float, float], tuple[float, float]]
 ) -> list[list[tuple[float, float]]]:
-    """Cut a curve where a value is missing."""
+    """Split a curve at missing values."""
     pieces: list[list[tuple[float, float]]] = [[]]
     for x, y in points:
         if math.isfinite(y):

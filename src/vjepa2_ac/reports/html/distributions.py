@@ -1,4 +1,4 @@
-"""How are figures spread? The ranks of the true action against chance, and all episodes from best to worst."""
+"""Distribution charts: ranks of the true action against chance, and all episodes from best to worst."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ _POINTS = 51
 
 
 def rank_chart(rankings: Sequence[tuple[Series, Ranking]]) -> Markup:
-    """Return in which share of clips the true action's rank is at most so much, for each model and by chance."""
+    """Return the cumulative distribution of the true action's rank over clips, for each model and by chance."""
     reached = np.linspace(0, 1, _POINTS).tolist()
     by_chance = Line("chance", [0.0, 1.0], [0.0, 100.0], "s-persistence")
     lines = [by_chance, *(Line(one.label, reached, _shares(ranking, reached), one.style) for one, ranking in rankings)]
     x_axis = nice_axis("rank of the true action (0: best)", [0.0, 1.0], most=5)
-    says = "Share of clips by rank of the true action: " + "; ".join(
+    description = "Share of clips by rank of the true action: " + "; ".join(
         f"{line.name} {line.y[_POINTS // 10]:.0f} % among the best tenth" for line in lines[1:]
     )
-    chart = line_chart(f"{says}.", lines, x_axis, nice_axis("share of clips (%)", [0.0, 100.0]))
+    chart = line_chart(f"{description}.", lines, x_axis, nice_axis("share of clips (%)", [0.0, 100.0]))
     return joined(chart, legend(lines))
 
 
@@ -34,8 +34,8 @@ def episode_chart(scores: Sequence[EpisodeScore]) -> Markup:
     y_axis = nice_axis("L1 error / persistence", [*line.y, 1.0], from_zero=True)
     x_axis = axis_at("episodes, best first", places, [f"{place:.0f}" for place in places])
     better = sum(score.over_persistence < 1 for score in scores)
-    says = f"Error over persistence of {len(scores)} episodes, best first: {better} of them are below 1."
-    return line_chart(says, [line], x_axis, y_axis, level=1.0)
+    description = f"Error over persistence of {len(scores)} episodes, best first: {better} of them are below 1."
+    return line_chart(description, [line], x_axis, y_axis, level=1.0)
 
 
 def _shares(ranking: Ranking, reached: Sequence[float]) -> list[float]:

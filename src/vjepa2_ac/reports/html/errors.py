@@ -1,4 +1,4 @@
-"""How large are the errors, how far ahead, and how do they compare? Curves and tables by horizon and by stratum."""
+"""Report section on errors: curves and tables by horizon and by stratum, compared between models."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _HOW = {
     "rollout": (
         "The model sees the first frame and the actions, and feeds its own predictions back. The dashed line at 1 is"
         " persistence: copying the first frame. Lower is better; above 1, doing nothing would have been better. Bands:"
-        " 95 % intervals over episodes; those of wrong actions stand in the table."
+        " 95 % intervals over episodes; those of wrong actions are in the table."
     ),
     "teacher_forced": (
         "The model predicts each frame from all true frames before it: always one step ahead, later ones with more"
@@ -51,19 +51,19 @@ _HOW = {
     ),
 }
 
-Figures = Callable[[Evaluation, Series, Mode, Metric], Sequence[Estimate]]
+CurveOf = Callable[[Evaluation, Series, Mode, Metric], Sequence[Estimate]]
 
 
 def error_section(evaluation: Evaluation) -> ReportSection:
-    """Return the error by horizon of every model, as curves and as numbers."""
+    """Return the section on the error by horizon of every model, as curves and as numbers."""
     drawings = []
     for mode in reversed(MODES):
         lines = [_line(evaluation, one, _ratios(evaluation, one, mode, "l1")) for one in models_of(evaluation)]
         wrong = [_line(evaluation, one, _ratios(evaluation, one, mode, "l1")) for one in wrong_actions_of(evaluation)]
         lines = [*(replace(line, low=None, high=None) for line in wrong), *lines]
         y_axis = nice_axis("L1 error / persistence", [*_reached(lines), 1.0], from_zero=True)
-        says = f"Error over persistence by horizon, {_MODES[mode]}: {_in_words(lines)}."
-        chart = line_chart(says, lines, _time_axis(evaluation), y_axis, level=1.0)
+        description = f"Error over persistence by horizon, {_MODES[mode]}: {_as_text(lines)}."
+        chart = line_chart(description, lines, _time_axis(evaluation), y_axis, level=1.0)
         key = legend([Line("persistence (doing nothing)", (), (), "s-persistence"), *reversed(lines)])
         drawings.append(figure(f"Error by horizon, {_MODES[mode]}", joined(chart, key), _HOW[mode]))
     tables = [_table(evaluation, mode, "l1", _ratios, "over persistence") for mode in reversed(MODES)]
@@ -85,7 +85,7 @@ def error_section(evaluation: Evaluation) -> ReportSection:
 
 
 def base_section(evaluation: Evaluation) -> ReportSection:
-    """Return how what was trained, and other runs, compare with the base: paired, clip by clip."""
+    """Return the section that compares the trained and other models with the base: paired, clip by clip."""
     title = "Compared with the base"
     if evaluation.base is None:
         why = "There is no base model in this evaluation to compare with."
@@ -93,12 +93,12 @@ def base_section(evaluation: Evaluation) -> ReportSection:
     compared = [one for one in models_of(evaluation) if one.model != evaluation.base]
     lines = [_line(evaluation, one, gain_over(evaluation, one.model, evaluation.base)) for one in compared]
     in_percent = [
-        replace(line, y=[100 * y for y in line.y], low=_hundredfold(line.low), high=_hundredfold(line.high))
+        replace(line, y=[100 * y for y in line.y], low=_in_percent(line.low), high=_in_percent(line.high))
         for line in lines
     ]
     y_axis = nice_axis("gain over the base (%)", [*_reached(in_percent), 0.0])
-    says = f"Gain over the base in percent by horizon, open-loop rollout: {_in_words(in_percent, 1)}."
-    chart = joined(line_chart(says, in_percent, _time_axis(evaluation), y_axis, level=0.0), legend(in_percent))
+    description = f"Gain over the base in percent by horizon, open-loop rollout: {_as_text(in_percent, 1)}."
+    chart = joined(line_chart(description, in_percent, _time_axis(evaluation), y_axis, level=0.0), legend(in_percent))
     how = (
         "By which share of the base's error the model's is smaller. Both predict the same clips, so what makes a clip"
         " hard for both cancels out. Above 0 is better than the base; where the band includes 0, nothing is shown."
@@ -109,7 +109,7 @@ def base_section(evaluation: Evaluation) -> ReportSection:
 
 
 def strata_section(evaluation: Evaluation) -> ReportSection:
-    """Return the one-step error of steps that have something in common."""
+    """Return the section on the one-step error of groups of steps."""
     title = "Where it helps: moving and idle, small and large actions"
     if not evaluation.strata:
         return ReportSection("strata", title, not_measured("Strata", "This result holds no strata."))
@@ -139,10 +139,10 @@ def _means(evaluation: Evaluation, one: Series, mode: Mode, metric: Metric) -> S
     return mean_error(evaluation, one.model, mode, metric, one.actions)
 
 
-def _table(evaluation: Evaluation, mode: Mode, metric: Metric, figures: Figures, over: str) -> Markup:
+def _table(evaluation: Evaluation, mode: Mode, metric: Metric, curve_of: CurveOf, over: str) -> Markup:
     shown = (*models_of(evaluation), *wrong_actions_of(evaluation))
     shown = shown if over else (persistence(), *shown)
-    columns = [figures(evaluation, one, mode, metric) for one in shown]
+    columns = [curve_of(evaluation, one, mode, metric) for one in shown]
     digits = 3 if over else 4
     rows = [
         [horizon_name(evaluation, h + 1), *(value(column[h], digits) for column in columns)]
@@ -197,7 +197,7 @@ def _line(evaluation: Evaluation, one: Series, curve: Sequence[Estimate]) -> Lin
     )
 
 
-def _hundredfold(side: Sequence[float] | None) -> Sequence[float] | None:
+def _in_percent(side: Sequence[float] | None) -> Sequence[float] | None:
     return None if side is None else [100 * each for each in side]
 
 
@@ -205,8 +205,8 @@ def _reached(lines: Sequence[Line]) -> list[float]:
     return [each for line in lines for side in (line.y, line.low, line.high) if side is not None for each in side]
 
 
-def _in_words(lines: Sequence[Line], digits: int = 2) -> str:
-    """Return where each curve begins and ends."""
+def _as_text(lines: Sequence[Line], digits: int = 2) -> str:
+    """Return as text the first and last value of each curve."""
     return "; ".join(f"{line.name} from {line.y[0]:.{digits}f} to {line.y[-1]:.{digits}f}" for line in reversed(lines))
 
 

@@ -1,4 +1,4 @@
-"""What do predictions look like? Clips frame by frame: where errors are, what latents are like, and the same moving."""
+"""Report section of example clips, frame by frame: errors, latents as colours, and an animation of them."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from vjepa2_ac.reports.html.markup import Markup, element, joined
 from vjepa2_ac.reports.html.series import models_of
 
 MOST_EXAMPLES = 4
-MOST_FRAMES = 16  # of a clip in the moving picture
+MOST_FRAMES = 16  # of a clip in the animation
 _MOST_COLUMNS = 8  # of the strip: the first frame and later ones
 _BYTES = 2_400_000  # of all photographs together
 _COLOURS = "inferno"
-_SIZE = 100.0  # of a picture, in units of its own drawing
-_SECONDS = 0.5  # that a frame stays, at least
+_SIZE = 100.0  # of an image, in units of its own drawing
+_SECONDS = 0.5  # duration of a frame, at least
 
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """An example whose photographs have names that other pictures refer to."""
+    """An example whose photographs have ids that other images refer to."""
 
     number: int
     example: Example
@@ -40,17 +40,17 @@ class _Shown:
 
     @property
     def worst(self) -> float:
-        """The largest error of a patch: the brightest colour in every picture of the example."""
+        """The largest error of a patch: the brightest colour in every image of the example."""
         return max(float(errors.max()) for errors in self.example.errors.values())
 
     @property
     def columns(self) -> list[int]:
-        """The times that stand one beside the other."""
+        """The times of the strip."""
         return _spread(self.times, _MOST_COLUMNS)
 
     @property
     def turns(self) -> list[int]:
-        """The times of the moving picture."""
+        """The times of the animation."""
         return _spread(self.times, MOST_FRAMES)
 
     def when(self, time: int) -> str:
@@ -58,11 +58,11 @@ class _Shown:
 
 
 def examples_section(evaluation: Evaluation) -> ReportSection:
-    """Return some clips in pictures."""
-    title = "Pictures"
+    """Return the section of example clips."""
+    title = "Example clips"
     examples = evaluation.examples[:MOST_EXAMPLES]
     if not examples:
-        why = why_not(evaluation, "example clips", "This evaluation made no pictures.")
+        why = why_not(evaluation, "example clips", "This evaluation made no example clips.")
         return ReportSection("pictures", title, not_measured("Example clips", why))
     photographs = jpeg_urls([list(_frames(example).values()) for example in examples], at_most=_BYTES)
     models = tuple(one.model for one in models_of(evaluation))
@@ -74,7 +74,7 @@ def examples_section(evaluation: Evaluation) -> ReportSection:
 
 
 def animation_style(examples: Sequence[Example]) -> str:
-    """Return the CSS that shows one frame of n after the other, for each n that occurs."""
+    """Return the CSS that shows n frames one after the other, for each n that occurs."""
     counts = sorted({len(_spread(len(example.true_colours), MOST_FRAMES)) for example in examples[:MOST_EXAMPLES]})
     rules = []
     for count in counts:
@@ -92,7 +92,7 @@ def _how() -> Markup:
         paragraph(
             "Rollouts from the first frame of held-out clips. ",
             element("strong", "Errors"),
-            " lie over the frames in grey: ",
+            " are drawn over the frames in grey: ",
             bar,
             " from 0 to the largest L1 error of a patch in that clip, the same colours for all models of the clip. ",
             element("strong", "Latents"),
@@ -111,7 +111,7 @@ def _spread(times: int, most: int) -> list[int]:
 
 
 def _frames(example: Example) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
-    """Return the photographs that are shown, by time."""
+    """Return the visible photographs, by time."""
     if example.frames is None:
         return {}
     times = len(example.true_colours)
@@ -121,7 +121,7 @@ def _frames(example: Example) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
 
 
 def _definitions(shown: _Shown, urls: Sequence[str]) -> Markup:
-    """Return the photographs, once each and unseen; `_photograph` shows them."""
+    """Return each photograph once, hidden; `_photograph` shows them."""
     size = {"width": _SIZE, "height": _SIZE}
     images = [
         element("image", id=f"e{shown.number}f{time}", href=url, preserveAspectRatio="none", **size)
@@ -135,7 +135,7 @@ def _example(shown: _Shown) -> Markup:
     name = f"{example.episode_id}, from control step {example.start}"
     parts = [element("h3", f"{example.why}: ", element("span", name, class_="id"))]
     if not shown.has_frames:
-        why = "The latents come from a cache that holds no pictures."
+        why = "The latents come from a cache that holds no frames."
         parts.append(not_measured("Photographs", why if example.frames is None else "They do not fit into a page."))
     parts.append(element("div", _film(shown, name), _strip(shown, name), class_="still-and-moving"))
     return element("article", *parts, class_="example")
@@ -148,11 +148,11 @@ def _strip(shown: _Shown, name: str) -> Markup:
     if shown.has_frames:
         rows.append(_row("true frames", [_photograph(shown, time) for time in columns]))
     for of in _measured(shown.example.errors, ("persistence", *shown.models)):
-        cells = [Markup() if time == 0 else _error_picture(shown, of, time) for time in columns]
+        cells = [Markup() if time == 0 else _error_image(shown, of, time) for time in columns]
         rows.append(_row(f"error of {of}", cells))
-    rows.append(_row("true latents", [_colour_picture(shown, "true", time) for time in columns]))
+    rows.append(_row("true latents", [_colour_image(shown, "true", time) for time in columns]))
     for of in _measured(shown.example.predicted_colours, shown.models):
-        cells = [Markup() if time == 0 else _colour_picture(shown, of, time) for time in columns]
+        cells = [Markup() if time == 0 else _colour_image(shown, of, time) for time in columns]
         rows.append(_row(f"latents predicted by {of}", cells))
     caption = element("caption", element("span", "Frame by frame: errors and latents over the horizon"))
     whole = element("table", caption, element("thead", head), element("tbody", *rows), class_="strip")
@@ -168,7 +168,7 @@ def _measured(given: Mapping[str, object], order: Sequence[str]) -> list[str]:
 
 
 def _film(shown: _Shown, name: str) -> Markup:
-    """Return the moving pictures, with a box to halt them; no script is needed."""
+    """Return the animations, with a checkbox to stop them; no script is needed."""
     times = shown.turns
     count = len(times)
     trained = shown.models[-1]
@@ -183,8 +183,8 @@ def _film(shown: _Shown, name: str) -> Markup:
     clock = [element("span", shown.when(time), class_=f"frame f{place}") for place, time in enumerate(times)]
     box = element("label", element("input", type="checkbox", class_="halt"), " pause")
     controls = element("div", box, element("span", *clock, class_="clock", aria_hidden="true"), class_="controls")
-    says = f"Moving picture of {name}: {count} frames, repeated. The same frames stand below, one beside the other."
-    parts = element("div", *panels, class_="panels", role="img", aria_label=says)
+    description = f"Animation of {name}: {count} frames, repeated. The same frames are shown below, side by side."
+    parts = element("div", *panels, class_="panels", role="img", aria_label=description)
     return element("div", controls, parts, class_=f"film film-{count}")
 
 
@@ -197,13 +197,15 @@ def _photograph(shown: _Shown, time: int) -> Markup:
     return _drawing(f"True frame, {shown.when(time)}", _photograph_inside(shown, time))
 
 
-def _error_picture(shown: _Shown, of: str, time: int) -> Markup:
+def _error_image(shown: _Shown, of: str, time: int) -> Markup:
     mean = float(shown.example.errors[of][time - 1].mean())
-    says = f"Error of {of}, {shown.when(time)}: mean {decimal(mean)}"
-    return joined(_drawing(says, _error_inside(shown, of, time)), element("span", decimal(mean), class_="number"))
+    description = f"Error of {of}, {shown.when(time)}: mean {decimal(mean)}"
+    return joined(
+        _drawing(description, _error_inside(shown, of, time)), element("span", decimal(mean), class_="number")
+    )
 
 
-def _colour_picture(shown: _Shown, of: str, time: int) -> Markup:
+def _colour_image(shown: _Shown, of: str, time: int) -> Markup:
     whose = "True latents" if of == "true" else f"Latents predicted by {of}"
     return _drawing(f"{whose} as colours, {shown.when(time)}", _colours_inside(shown, of, time))
 
@@ -213,7 +215,7 @@ def _photograph_inside(shown: _Shown, time: int) -> Markup:
 
 
 def _error_inside(shown: _Shown, of: str, time: int) -> Markup:
-    """Return the error of each patch over the frame in grey; of the first frame there is none."""
+    """Return the error of each patch over the frame in grey; the first frame has none."""
     below = element("use", href=f"#e{shown.number}f{time}", class_="grey") if shown.has_frames else Markup()
     if time == 0:
         return below
@@ -236,7 +238,7 @@ def _grid(pixels: UInt8[np.ndarray, "grid grid 3"], class_: str) -> Markup:
     return element("image", href=png_url(pixels), class_=f"grid {class_}", preserveAspectRatio="none", **size)
 
 
-def _drawing(says: str | None, *inside: Markup) -> Markup:
-    """Return a square picture; one that says nothing is described where it stands."""
-    described = {"role": "img", "aria_label": says} if says else {"aria_hidden": "true"}
+def _drawing(description: str | None, *inside: Markup) -> Markup:
+    """Return a square image; one without description is decorative."""
+    described = {"role": "img", "aria_label": description} if description else {"aria_hidden": "true"}
     return element("svg", *inside, class_="picture", viewBox=f"0 0 {_SIZE:g} {_SIZE:g}", **described)

@@ -1,14 +1,14 @@
-"""How is a number written? With its unit, as many digits as mean something, and its interval in brackets."""
+"""Number formatting: unit, significant digits, and the interval in brackets."""
 
 from __future__ import annotations
 
 import math
 
-NOT_MEASURED = "\N{EN DASH}"  # in a table; why is said beside it
+NOT_MEASURED = "\N{EN DASH}"  # in a table; the reason is given beside it
 
 
 def decimal(value: float, digits: int = 3) -> str:
-    """Return a number with fixed digits and a true minus; a dash where it is none."""
+    """Return a number with fixed digits and a true minus sign; a dash if it is not finite."""
     if not math.isfinite(value):
         return NOT_MEASURED
     shown = f"{value:.{digits}f}"
@@ -16,7 +16,7 @@ def decimal(value: float, digits: int = 3) -> str:
 
 
 def signed(value: float, digits: int = 3) -> str:
-    """Return a number with its sign, also where it is positive."""
+    """Return a number with its sign, also if it is positive."""
     shown = decimal(value, digits)
     return f"+{shown}" if math.isfinite(value) and float(f"{value:.{digits}f}") > 0 else shown
 

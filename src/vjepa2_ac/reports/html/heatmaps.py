@@ -1,4 +1,4 @@
-"""Where is the energy low? A map of it over two axes of the action, with the true action and the minimum marked."""
+"""Heatmaps of the energy over two axes of the action, with the true action and the minimum marked."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from vjepa2_ac.reports.html.markup import Markup, element
 
 _SIZE = 190.0  # of the map, in units of the drawing
 _LEFT, _TOP, _RIGHT, _BOTTOM = 46.0, 8.0, 12.0, 42.0
-_PIXELS = 96  # of the picture along each side
+_PIXELS = 96  # of the image along each side
 _COLOURS = "viridis"
 
 
 @dataclass(frozen=True, eq=False)
 class MapAxis:
-    """One axis of a map: its nodes, ascending, and what is marked on it."""
+    """One axis of a map: its nodes, ascending, and the marked values."""
 
     label: str
     nodes: Float[np.ndarray, " nodes"]
@@ -28,24 +28,24 @@ class MapAxis:
 
     @property
     def edges(self) -> Float[np.ndarray, " edges"]:
-        """Where the cells of the nodes meet: half way between them."""
+        """The borders between the cells of the nodes: half way between them."""
         middle = (self.nodes[1:] + self.nodes[:-1]) / 2
         return np.concatenate([[2 * self.nodes[0] - middle[0]], middle, [2 * self.nodes[-1] - middle[-1]]])
 
     @property
     def cell_of_pixel(self) -> Int[np.ndarray, " pixels"]:
-        """Which node each pixel of the picture shows."""
+        """The node of each pixel of the image."""
         edges = self.edges
         centres = edges[0] + (np.arange(_PIXELS) + 0.5) / _PIXELS * (edges[-1] - edges[0])
         return np.asarray(np.clip(np.searchsorted(edges, centres) - 1, 0, len(self.nodes) - 1))
 
     def share(self, value: float) -> float:
-        """Return where a value lies: 0 at the lower end, 1 at the upper."""
+        """Return the relative position of a value: 0 at the lower end, 1 at the upper."""
         return (value - float(self.edges[0])) / float(self.edges[-1] - self.edges[0])
 
 
 def heat_map(
-    says: str,
+    description: str,
     energy: Float[np.ndarray, "across up"],
     across: MapAxis,
     up: MapAxis,
@@ -56,7 +56,7 @@ def heat_map(
     frame = {"x": _LEFT, "y": _TOP, "width": _SIZE, "height": _SIZE}
     return element(
         "svg",
-        element("title", says),
+        element("title", description),
         element("image", href=png_url(np.ascontiguousarray(pixels)), preserveAspectRatio="none", **frame),
         *_axis_across(across),
         *_axis_up(up),
@@ -65,7 +65,7 @@ def heat_map(
         class_="map",
         viewBox=f"0 0 {_LEFT + _SIZE + _RIGHT:g} {_TOP + _SIZE + _BOTTOM:g}",
         role="img",
-        aria_label=says,
+        aria_label=description,
     )
 
 

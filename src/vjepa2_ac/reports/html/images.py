@@ -1,4 +1,4 @@
-"""How does an array become a picture within a page? As data: URL: PNG for numbers as colours, JPEG for photographs."""
+"""Images within the page, as data: URLs: PNG for arrays as colours, JPEG for photographs."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def png_url(pixels: UInt8[np.ndarray, "height width channels"]) -> str:
 
 
 def jpeg_urls(clips: Sequence[Sequence[UInt8[np.ndarray, "height width 3"]]], *, at_most: int) -> list[list[str]]:
-    """Return photographs as JPEG in data: URLs, in the best quality in which all of them together fit.
+    """Return photographs as JPEG in data: URLs, in the best quality in which all of them fit together.
 
     Args:
         clips: Photographs, clip by clip.
-        at_most: Bytes of all URLs together; if the lowest quality takes more, the photographs are left out.
+        at_most: Bytes of all URLs together; if the lowest quality needs more, the photographs are left out.
     """
     small = [[_shrunk(frame) for frame in frames] for frames in clips]
     for quality in _JPEG_QUALITIES:
@@ -54,7 +54,7 @@ def jpeg_urls(clips: Sequence[Sequence[UInt8[np.ndarray, "height width 3"]]], *,
 
 
 def _shrunk(frame: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Return a photograph that is at most so large, by averaging squares of pixels."""
+    """Return a photograph of at most this size, by averaging squares of pixels."""
     factor = -(-max(frame.shape[:2]) // _MOST_PIXELS)
     height, width = (size // factor for size in frame.shape[:2])
     squares = frame[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)

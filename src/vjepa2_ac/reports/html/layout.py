@@ -1,4 +1,4 @@
-"""What are the pieces of the page? Sections, figures with a word on how to read them, tables, folded parts."""
+"""Page elements: sections, figures with a reading hint, tables, collapsible parts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vjepa2_ac.reports.html.markup import Markup, element, joined, text
 
 @dataclass(frozen=True)
 class ReportSection:
-    """A part of the page that the contents name."""
+    """A section of the page, with an entry in the contents."""
 
     id: str
     title: str
@@ -31,17 +31,17 @@ def paragraph(*words: str, class_: str | None = None) -> Markup:
 
 
 def why_not(evaluation: Evaluation, what: str, otherwise: str) -> str:
-    """Return the note of an evaluation that says why something was not measured."""
+    """Return the note of an evaluation that explains why something was not measured."""
     return next((note for note in evaluation.notes if what in note), otherwise)
 
 
 def not_measured(what: str, why: str) -> Markup:
-    """Say that something was not measured, and why."""
+    """Return a note that something was not measured, and why."""
     return paragraph(element("strong", f"{what}: not measured."), f" {why}", class_="missing")
 
 
 def figure(title: str, body: str, how_to_read: str) -> Markup:
-    """Return a picture or chart under its title, and beside it how it is read."""
+    """Return a figure or chart under its title, with a reading hint."""
     caption = element("figcaption", element("h3", title), element("p", how_to_read, class_="how"))
     return element("figure", caption, element("div", body, class_="drawing"))
 
@@ -52,7 +52,7 @@ def side_by_side(*figures: str) -> Markup:
 
 
 def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], *, class_: str | None = None) -> Markup:
-    """Return a table; the first cell of a row names it. It scrolls by itself where the page is narrow."""
+    """Return a table; the first cell of a row is its header. It scrolls by itself if the page is narrow."""
     header = element("thead", element("tr", *(element("th", name, scope="col") for name in head)))
     lines = [
         element("tr", element("th", row[0], scope="row"), *(element("td", cell) for cell in row[1:])) for row in rows
@@ -64,12 +64,12 @@ def table(caption: str, head: Sequence[str], rows: Sequence[Sequence[str]], *, c
 
 
 def scrolling(body: str, label: str) -> Markup:
-    """Return something wide in a box that scrolls sideways, also by the keyboard."""
+    """Return wide content in a box that scrolls sideways, also by the keyboard."""
     return element("div", body, class_="scroll", tabindex=0, role="region", aria_label=label)
 
 
 def folded(summary: str, *body: str) -> Markup:
-    """Return something that shows when it is asked for, and in print."""
+    """Return collapsible content, which is expanded in print."""
     return element("details", element("summary", summary), *body)
 
 
@@ -79,7 +79,7 @@ def listed(*lines: str) -> Markup:
 
 
 def value(estimate: Estimate, digits: int = 3) -> Markup:
-    """Return a figure as value [low, high]."""
+    """Return an estimate as value [low, high]."""
     shown = decimal(estimate.value, digits)
     if not estimate.has_interval:
         return text(shown)

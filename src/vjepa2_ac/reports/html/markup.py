@@ -1,4 +1,4 @@
-"""How does text become HTML that nothing in it can break? Elements that escape all they are given."""
+"""HTML markup: elements that escape all text and attributes."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ from typing import TypeAlias
 
 Attribute: TypeAlias = str | int | float | bool | None
 
-# Without an end tag in HTML; those of SVG close themselves, which HTML allows in there only.
+# Without an end tag in HTML; those of SVG close themselves, which HTML allows only within SVG.
 _VOID = frozenset({"br", "hr", "img", "input", "meta", "wbr"})
 _SVG_LEAVES = frozenset({"circle", "image", "line", "path", "polyline", "rect", "use"})
 
-# What HTML cannot hold, and what would mislead a reader: control characters, halves of surrogate pairs, no characters,
-# and marks that turn the direction of text round.
+# Not allowed in HTML, or misleading for a reader: control characters, halves of surrogate pairs, noncharacters,
+# and marks that change the direction of text.
 _HIDDEN = re.compile("[\\x00-\\x08\\x0b-\\x1f\\x7f-\\x9f\\u202a-\\u202e\\u2066-\\u2069\\ud800-\\udfff\\ufffe\\uffff]")
 
 
 class Markup(str):
-    """Text that is HTML already, and is not escaped again. Only `element` and `joined` make it."""
+    """Text that is HTML already, and is not escaped again. Only `element` and `joined` create it."""
 
     __slots__ = ()
 
 
 def text(value: str) -> Markup:
-    """Return text as HTML that shows it."""
+    """Return text escaped as HTML."""
     return value if isinstance(value, Markup) else Markup(escape(_visible(value), quote=True))
 
 

@@ -1,4 +1,4 @@
-"""What does the whole page look like? The verdict on top, then everything that was measured, and how to read it."""
+"""The whole report page: the verdict first, then all measurements and how to read them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vjepa2_ac.reports.html.planning import planning_section
 from vjepa2_ac.reports.html.runs import calibration_section, episode_section, training_section
 from vjepa2_ac.storage import write_atomically
 
-# Nothing may be fetched and nothing may run: the page is what stands in it, whatever an episode is called.
+# Nothing may be fetched and nothing may run, whatever the names of episodes contain.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 _COLOURS = {1: "better", 0: "unclear", -1: "worse"}
 _GLOSSARY = {
@@ -39,7 +39,7 @@ _GLOSSARY = {
 
 
 def write_report(evaluation: Evaluation, verdict: str, path: Path) -> Path:
-    """Write the page; it appears whole or not at all. The same evaluation gives the same bytes."""
+    """Write the page; it is written atomically. The same evaluation gives the same bytes."""
     write_atomically(path, report_page(evaluation, verdict))
     return path
 
@@ -47,12 +47,12 @@ def write_report(evaluation: Evaluation, verdict: str, path: Path) -> Path:
 def report_page(evaluation: Evaluation, verdict: str) -> str:
     """Return an evaluation as one HTML page that needs no network, no script and no other file.
 
-    It is smaller than 5 MB whatever was measured: the numbers of clips, frames, points and rows shown are limited, and
-    photographs are kept in the best quality that fits.
+    It is smaller than 5 MB for any evaluation: the numbers of clips, frames, points and rows shown are limited, and
+    photographs have the best quality that fits.
 
     Args:
-        evaluation: What was measured.
-        verdict: What it says, in words: the first thing on the page.
+        evaluation: The evaluation.
+        verdict: The verdict as text: the first thing on the page.
     """
     sections = (
         error_section(evaluation),
@@ -70,7 +70,7 @@ def report_page(evaluation: Evaluation, verdict: str) -> str:
     )
     body = element(
         "body",
-        element("a", "Skip to the figures", href="#errors", class_="skip"),
+        element("a", "Skip to the results", href="#errors", class_="skip"),
         _header(evaluation, verdict),
         _contents(sections),
         element("main", *(section.markup() for section in sections)),
@@ -109,7 +109,7 @@ def _header(evaluation: Evaluation, verdict: str) -> Markup:
 
 
 def _tiles(evaluation: Evaluation) -> Markup:
-    """Return the few figures that one looks for first."""
+    """Return the most important metrics as tiles."""
     trained, base = evaluation.trained, evaluation.base
     ahead = f"{seconds(evaluation.seconds_ahead)} ahead, rollout, L1"
     tiles = [("error over persistence", value(over_persistence(evaluation, trained, "rollout")[-1]), ahead)]
@@ -130,7 +130,7 @@ def _tiles(evaluation: Evaluation) -> Markup:
 
 
 def _outcome(evaluation: Evaluation) -> tuple[str, str]:
-    """Return a colour and a few words: whether training clearly helped, beside the base and beside doing nothing."""
+    """Return a colour and a short text: whether training clearly helped, beside the base and beside doing nothing."""
     nothing = over_persistence(evaluation, evaluation.trained, "rollout")[-1].side(1.0)
     beside_nothing = {-1: "better than", 0: "not clearly different from", 1: "worse than"}[nothing] + " doing nothing"
     if evaluation.base is None:

@@ -1,4 +1,4 @@
-"""Would it plan what people did? The Action Score and errors beside plans without a model, and where each plan ends."""
+"""Report section on planning: Action Score and errors beside model-free plans, and the end of each plan."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ Row = tuple[str, Callable[[PlanMetrics], Estimate], int]
 
 
 def planning_section(evaluation: Evaluation) -> ReportSection:
-    """Return how close plans come to what was demonstrated."""
+    """Return the section on how close plans are to the demonstrations."""
     title, study = "Plans beside demonstrations", evaluation.planning
     if study is None:
         why = why_not(evaluation, "plans", "It takes a while, and was not asked for: vjepa2-ac evaluate --planning.")
         return ReportSection("planning", title, not_measured("Plans", why))
     how = paragraph(
         f"From one frame of each of {len(study)} clips the models plan towards frames that really came, and the plan is"
-        " held against what was demonstrated. People need not take the shortest way, so 0 cm is not to be expected,"
+        " compared with the demonstrated one. People need not take the shortest way, so 0 cm is not to be expected,"
         " but a model worth planning with is clearly nearer than doing nothing. Doing nothing, random plans (every"
         " number uniform within its limits) and the demonstration itself, cut to the limits, take no model: the last"
         " is the best that any plan could do.",
@@ -83,10 +83,10 @@ def _step_table(evaluation: Evaluation, study: PlanningStudy) -> Markup:
     ways = {name: metrics_of(study, plans) for name, plans in _ways(evaluation, study).items()}
     shown = [[label, *(value(of(found), digits) for found in ways.values())] for label, of, digits in rows]
     settings = study.settings
-    tried = f"{settings.samples} samples" if settings.planner != "gradient" else f"{settings.gradient.starts} starts"
+    effort = f"{settings.samples} samples" if settings.planner != "gradient" else f"{settings.gradient.starts} starts"
     most = ", ".join(f"{100 * one:g}" for one in settings.limits.xyz)
     caption = (
-        f"Plans of one step ({settings.planner}, {tried}, {settings.iterations} iterations,"
+        f"Plans of one step ({settings.planner}, {effort}, {settings.iterations} iterations,"
         f" {settings.energy.distance.upper()} energy, at most {most} cm along x, y, z;"
         f" {percent(study.one_step_beyond)} of the demonstrated steps go beyond that) and the demonstrated step (value"
         f" [95 % interval]). Angle and signs are of steps of at least {LEAST_CM:g} cm; by chance 90 degrees and 0.5"
@@ -130,18 +130,20 @@ def _scatter(evaluation: Evaluation, study: PlanningStudy, axis: int) -> Markup:
     x_axis = nice_axis(f"demonstrated along {name} (cm)", [*demonstrated, 0.0])
     y_axis = nice_axis(f"planned along {name} (cm)", reached)
     off = "; ".join(f"{one.name} off by {_mean_off(one):.1f} cm on average" for one in dots)
-    says = f"Planned against demonstrated displacement along {name} of {len(study)} plans of {STEPS} steps: {off}"
-    return dot_chart(f"{says}.", dots, x_axis, y_axis)
+    description = (
+        f"Planned against demonstrated displacement along {name} of {len(study)} plans of {STEPS} steps: {off}"
+    )
+    return dot_chart(f"{description}.", dots, x_axis, y_axis)
 
 
 def _drawn(evaluation: Evaluation) -> Sequence[tuple[Series, Plans]]:
-    """Return the models with their plans, what was trained last, so that it lies above."""
+    """Return the models with their plans, the trained one last, so that it is drawn on top."""
     found = ways_of(evaluation)
     return [(one, found[one.model]) for one in models_of(evaluation) if one.model in found]
 
 
 def _ends(values: Float[np.ndarray, "starts steps"]) -> list[float]:
-    """Return where steps along one axis lead, in cm."""
+    """Return the displacements along one axis, in cm."""
     return [100 * float(each) for each in values.sum(axis=-1)]
 
 

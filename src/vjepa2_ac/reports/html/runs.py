@@ -1,4 +1,4 @@
-"""What else is known of the run? Episodes from best to worst, how training went, at which stride it is best."""
+"""Report section on the run: episodes from best to worst, training curves, stride calibration."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _STYLES = ("s-trained", "s-base", "s-other0", "s-other1", "s-other2", "s-other3"
 
 
 def episode_section(evaluation: Evaluation) -> ReportSection:
-    """Return which episodes are predicted best and worst."""
+    """Return the section on the best and worst episodes."""
     scores = evaluation.episodes
     title = "Episodes, best and worst"
     if not scores:
-        return ReportSection("episodes", title, not_measured("Episodes", "This result holds no figures by episode."))
+        return ReportSection("episodes", title, not_measured("Episodes", "This result holds no metrics by episode."))
     how = (
         f"The L1 error of a rollout {seconds(evaluation.seconds_ahead)} ahead over that of persistence, by episode:"
-        " whether a mean hides a few bad ones. Episodes with few clips lie at both ends by chance alone: look at them"
+        " whether a mean hides a few bad ones. Episodes with few clips are at both ends by chance alone: look at them"
         " before you explain them."
     )
     drawing = figure(f"Error of {evaluation.trained} on every episode", episode_chart(scores), how)
@@ -43,7 +43,7 @@ def episode_section(evaluation: Evaluation) -> ReportSection:
 
 
 def training_section(evaluation: Evaluation) -> ReportSection:
-    """Return the curves of training, those of one kind in one chart."""
+    """Return the section on training curves, those of one kind in one chart."""
     curves = [curve for curve in evaluation.training if any(math.isfinite(value) for value in curve.values)]
     if not curves:
         why = "What was evaluated has no metrics.jsonl: it is a model, not a run, or the file is gone."
@@ -54,28 +54,30 @@ def training_section(evaluation: Evaluation) -> ReportSection:
     first = [kind for kind in _FIRST if kind in kinds]
     rest = [kind for kind in kinds if kind not in first]
     how = paragraph(
-        "From metrics.jsonl of the run, over optimizer steps. A loss of training that falls while a figure of"
+        "From metrics.jsonl of the run, over optimizer steps. A loss of training that falls while a metric of"
         f" validation rises is overfitting. Of long curves every n-th point is drawn, {_MOST_POINTS} at most.",
         class_="how",
     )
     body = joined(how, _training_charts(kinds, first))
     if rest:
-        body = joined(body, folded("Speed, memory and other figures", _training_charts(kinds, rest)))
+        body = joined(body, folded("Speed, memory and other metrics", _training_charts(kinds, rest)))
     return ReportSection("training", "Training", body)
 
 
 def calibration_section(evaluation: Evaluation) -> ReportSection:
-    """Return the error at each stride, where it was measured."""
+    """Return the section on the error at each stride, if it was measured."""
     found = evaluation.calibration
     title = "Length of a model step"
     if found is None:
-        why = "Strides are tried by `vjepa2-ac data calibrate`; this evaluation was made without."
+        why = "Strides are measured by `vjepa2-ac data calibrate`; this evaluation was made without."
         return ReportSection("strides", title, not_measured("Other strides", why))
     rows = [_stride(one) for one in found.get("strides", ())]
     head = ["stride (control steps)", "seconds per model step", "one-step L1 error / persistence", "clips", "episodes"]
     body = table("One-step, teacher-forced error at each stride (value [95 % interval])", head, rows)
-    untried = [f"Stride {stride} could not be tried: {why}." for stride, why in found.get("impossible", {}).items()]
-    parts = [paragraph(str(found.get("verdict", ""))), body, listed(*untried) if untried else Markup()]
+    unmeasured = [
+        f"Stride {stride} could not be measured: {why}." for stride, why in found.get("impossible", {}).items()
+    ]
+    parts = [paragraph(str(found.get("verdict", ""))), body, listed(*unmeasured) if unmeasured else Markup()]
     return ReportSection("strides", title, joined(*parts))
 
 
@@ -98,7 +100,7 @@ def _long_name(episode_id: str) -> Markup:
 
 
 def _kind(name: str) -> str:
-    """Return which chart a curve belongs to: those of losses, those of validation, or one of its own."""
+    """Return the chart of a curve: that of losses, of validation, or one of its own."""
     where, _, what = name.rpartition("/")
     if where == "validation":
         return "validation: error / persistence" if "over_persistence" in what else f"validation: {_words(what)}"
@@ -118,10 +120,10 @@ def _training_chart(kind: str, curves: Sequence[TrainingCurve]) -> Markup:
     lines = [_training_line(curve, style) for curve, style in zip(curves, _cycled(len(curves)), strict=True)]
     everything = [value for line in lines for value in line.y]
     x_axis = nice_axis("optimizer steps", [float(x) for line in lines for x in line.x], most=5)
-    says = f"{kind} over optimizer steps: " + "; ".join(
+    description = f"{kind} over optimizer steps: " + "; ".join(
         f"{curve.name} from {curve.values[0]:.4g} to {curve.values[-1]:.4g}" for curve in curves
     )
-    chart = line_chart(says, lines, x_axis, nice_axis("", everything, most=5))
+    chart = line_chart(description, lines, x_axis, nice_axis("", everything, most=5))
     return element("figure", element("figcaption", element("h3", kind)), chart, legend(lines))
 
 

@@ -1,4 +1,4 @@
-"""Which colour and which name has each curve? The same ones in every chart and table of the page."""
+"""Colours and names of the models, the same in each chart and table of the page."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 from vjepa2_ac.evaluation.result import Actions, Evaluation
 
-_OTHERS = 4  # colours for other runs; after these they begin again
+_OTHERS = 4  # colours for other runs, reused after these
 
 
 @dataclass(frozen=True)
 class Series:
-    """A way of predicting that was measured."""
+    """A measured way of predicting."""
 
     model: str  # its name in the result, or persistence
     actions: Actions
@@ -20,7 +20,7 @@ class Series:
 
 
 def persistence() -> Series:
-    """Return the one that copies a frame."""
+    """Return persistence."""
     return Series("persistence", "true", "persistence", "s-persistence")
 
 
@@ -35,7 +35,7 @@ def models_of(evaluation: Evaluation) -> tuple[Series, ...]:
 
 
 def wrong_actions_of(evaluation: Evaluation) -> tuple[Series, ...]:
-    """Return what was trained, given actions that are not the true ones."""
+    """Return the trained model, given other actions than the true ones."""
     name = evaluation.trained
     return (
         Series(name, "zero", f"{name}, zero actions", "s-zero"),

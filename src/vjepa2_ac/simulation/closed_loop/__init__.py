@@ -1,1 +1,1 @@
-"""Closed loop: how well does a policy steer the simulated arm?"""
+"""Closed loop: how well does a policy control the simulated arm?"""

@@ -1,4 +1,4 @@
-"""How does a model steer beside doing nothing, chance and an oracle? The same problems for all, and files of it."""
+"""The closed-loop benchmark: a model beside doing nothing, random actions and an oracle, on the same problems."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
 FILE, FILM = "closed_loop.json", "closed_loop.mp4"
-FORMAT = 1  # goes up when a reader of the file would have to change
+FORMAT = 1  # incremented when a reader of the file would have to change
 
 
 @dataclass(frozen=True)
 class BenchmarkOptions:
-    """What is to be done, how often, and what is kept of it."""
+    """The options of a benchmark."""
 
     task: TaskName = "reach"
     domain: str = "A"
     episodes: int = 50
-    steps: int | None = None  # model steps of an episode; None: as many as the task has by default
-    seed: int = 0  # which problems
+    steps: int | None = None  # model steps of an episode; None: the task's default
+    seed: int = 0  # of the problems
     films: int = 6  # episodes in the video; 0: no video
     renderer: Renderer = "rays"
 
@@ -49,7 +49,7 @@ class ClosedLoopBenchmark:
     """The results of a model (first), doing nothing, chance and the oracle, on the same problems."""
 
     subject: str
-    checkpoint: str  # which one, in words; "" of a model
+    checkpoint: str  # which one, as text; "" of a model
     asked: BenchmarkOptions
     planning: dict[str, Any]  # settings, as plain values
     planning_seed: int
@@ -57,23 +57,24 @@ class ClosedLoopBenchmark:
 
     @property
     def seconds_per_step(self) -> float:
-        """How long a model step is."""
+        """Length of a model step in seconds."""
         return self.results[0].stride / CONTROL_RATE_HZ
 
 
 def run_benchmark(
     steering: PlanningSession, asked: BenchmarkOptions, folder: Path, *, stage: Callable[[str], Progress] | None = None
 ) -> tuple[ClosedLoopBenchmark, tuple[Path, ...]]:
-    """Let all four do the same problems; write closed_loop.json and the film. What can fail cheaply does so first.
+    """Let all four solve the same problems; write closed_loop.json and the video. Cheap failures first.
 
     Args:
-        steering: The model and how it plans; its `data.stride` is the length of a model step.
-        asked: What to do.
-        folder: Where the files go; made where it is missing.
-        stage: Gives a bar for a part of the work, by its title.
+        steering: The model and its planning settings; its `data.stride` is the length of a model step.
+        asked: The options.
+        folder: The output folder; created if it is missing.
+        stage: Returns a progress bar for a part of the work, by its title.
 
     Raises:
-        InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, or a folder nobody can write.
+        InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, or a folder that is not
+            writable.
     """
     stride = steering.config.data.stride
     if stride == "auto":
@@ -104,7 +105,7 @@ def run_benchmark(
             seed=asked.seed,
             steps=asked.steps,
             stride=stride,
-            keep_pictures=asked.films if isinstance(policy, Planning) else 0,
+            keep_frames=asked.films if isinstance(policy, Planning) else 0,
             arm=arm,
             progress=stage(f"{asked.task}: {policy.name}") if stage else None,
         )
@@ -121,7 +122,7 @@ def run_benchmark(
 
 
 def benchmark_as_dict(contest: ClosedLoopBenchmark) -> dict[str, Any]:
-    """Return every figure as plain values; docs tell what each is."""
+    """Return all metrics as plain values; see the docs for their meaning."""
     return {
         "format": FORMAT,
         "about": {
@@ -137,7 +138,7 @@ def benchmark_as_dict(contest: ClosedLoopBenchmark) -> dict[str, Any]:
             "version": __version__,
             "time": utc_now(),
         },
-        "policies": {result.policy: _figures(result) for result in contest.results},
+        "policies": {result.policy: _metrics(result) for result in contest.results},
     }
 
 
@@ -151,7 +152,7 @@ def _policies(steering: PlanningSession, asked: BenchmarkOptions, arm: Simulated
     return model, DoNothing(), RandomActions(limits, seed=asked.seed), oracle_for(asked.task, limits, arm)
 
 
-def _figures(result: ClosedLoopResult) -> dict[str, Any]:
+def _metrics(result: ClosedLoopResult) -> dict[str, Any]:
     return {
         "success": result.success_rate.as_dict(),
         "success_ever": result.success_ever_rate.as_dict(),
@@ -172,7 +173,7 @@ def _figures(result: ClosedLoopResult) -> dict[str, Any]:
 
 def _rounded(number: float) -> float:
     if not math.isfinite(number):
-        raise ValueError(f"{number} among the figures of episodes")
+        raise ValueError(f"{number} among the metrics of episodes")
     return round(number, 4)
 
 

@@ -1,4 +1,4 @@
-"""What would one do who knows where the block is? Scripts that push and pick: the upper bound, and demonstrations."""
+"""Oracles: scripts that know the position of the block, push and pick. Upper bound and source of demonstrations."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from vjepa2_ac.simulation.closed_loop.policies import Oracle, Policy, shortened
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, TaskName, TaskProblem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 
-_PUSH_M = 0.035  # per model step: a block that is hit faster slides on by itself
-_NEAR_M = 0.006  # a block that is nearer to its goal is left alone
-_OVER_M = 0.012  # nearer to the place of the grasp than this, fingers can close
-_CLEAR_M = 0.065  # over the place of the grasp, fingers pass over the block
+_PUSH_M = 0.035  # per model step: a block that is hit faster slides on
+_NEAR_M = 0.006  # a block closer to its goal is not moved
+_OVER_M = 0.012  # closer to the place of the grasp than this, fingers can close
+_CLEAR_M = 0.065  # above the place of the grasp, fingers pass over the block
 
 
 class _Scripted:
-    """Watches the block.
+    """Base of the oracles: observes the block.
 
     Args:
-        limits: What is allowed.
-        arm: Whose block it watches.
+        limits: The allowed actions.
+        arm: The arm whose block is observed.
     """
 
     name, why = "oracle", "scripted"
@@ -32,22 +32,22 @@ class _Scripted:
 
 
 class PushOracle(_Scripted):
-    """Pushes the block along the line to its goal. Rotation is left as it is."""
+    """Pushes the block along the line to its goal. Does not rotate."""
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Learn the goal."""
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+        """Set the goal."""
         self._goal, self._end = _block(problem.block_goal)[:2], problem.goal
         way = self._goal - _block(problem.block_start)[:2]
         self._ahead = way / np.linalg.norm(way)
 
     def act(
         self,
-        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
         state: Float[np.ndarray, " 7"],
     ) -> Float[np.ndarray, " 7"]:
-        """Return the next step of the push: ahead, straight behind the block."""
+        """Return the next step of the push: forwards, straight behind the block."""
         block = _block(self._arm.block)[:2]
-        if (self._goal - block) @ self._ahead < _NEAR_M:  # what is left is not worth spoiling it, or it slid past
+        if (self._goal - block) @ self._ahead < _NEAR_M:  # the rest is too short, or it slid past
             return np.zeros(ACTION_DIM)
         to_block = block - state[:2]
         beside = to_block - self._ahead * (to_block @ self._ahead)
@@ -59,15 +59,15 @@ class PushOracle(_Scripted):
 
 
 class PickOracle(_Scripted):
-    """Goes over the block, down, closes, and lifts. Rotation is left as it is."""
+    """Moves over the block, down, closes, and lifts. Does not rotate."""
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Learn the goal."""
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+        """Set the goal."""
         self._end = problem.goal
 
     def act(
         self,
-        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
         state: Float[np.ndarray, " 7"],
     ) -> Float[np.ndarray, " 7"]:
         """Return the next step of the grasp."""
@@ -75,7 +75,7 @@ class PickOracle(_Scripted):
         way = np.zeros(ACTION_DIM)
         to_place = place - state[:3]
         if np.linalg.norm(to_place) < _OVER_M * 1.5 and state[6] > HOLDING - 0.1:
-            way[:3], way[6] = self._end[:3] - state[:3], 1.0 - state[6]  # it is held: lift, and go on closing
+            way[:3], way[6] = self._end[:3] - state[:3], 1.0 - state[6]  # it is held: lift, and keep closing
         elif np.linalg.norm(to_place) < _OVER_M:
             way[6] = 1.0 - state[6]
         else:
@@ -86,7 +86,7 @@ class PickOracle(_Scripted):
 
 
 def oracle_for(task: TaskName, limits: LimitsConfig, arm: SimulatedArm) -> Policy:
-    """Return who knows all and solves a task, with an arm from `arm_for` of it."""
+    """Return the oracle of a task, for an arm from `arm_for`."""
     if task == "push":
         return PushOracle(limits, arm)
     return PickOracle(limits, arm) if task == "pick" else Oracle(limits)

@@ -1,4 +1,4 @@
-"""Who drives the simulated robot? A planner, and those it is compared with: nothing, chance, and one who knows all."""
+"""Policies of the simulated robot: a planner, and its references: doing nothing, random actions and an oracle."""
 
 from __future__ import annotations
 
@@ -12,36 +12,36 @@ from vjepa2_ac.episode import ACTION_DIM
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem
 
-_ALMOST = 1 - 1e-9  # of a limit: rounding must not lead beyond it
+_ALMOST = 1 - 1e-9  # of a limit: rounding must not exceed it
 
 
 @runtime_checkable
 class Policy(Protocol):
-    """Something that chooses the action of the next model step (legend of actions: episode.py)."""
+    """Chooses the action of the next model step (legend of actions: episode.py)."""
 
     name: str
-    why: str  # of the last action, in a few words that can be counted
+    why: str  # reason of the last action, short enough to be counted
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:
-        """Begin an episode. Only a policy that is to know more than the pictures looks into the problem."""
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Begin an episode. Only an oracle uses more of the problem than the images."""
 
     def act(
-        self, picture: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
+        self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
     ) -> Float[np.ndarray, " 7"]:
-        """Return the action of the next model step from what the camera sees and the measured state, in base frame."""
+        """Return the action of the next model step from the camera image and the measured state, in base frame."""
 
 
 class DoNothing:
-    """Leaves the arm where it is."""
+    """Does not move the arm."""
 
     name, why = "do nothing", "nothing"
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:
-        """Need nothing."""
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Do nothing."""
 
     def act(
         self,
-        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
         state: Float[np.ndarray, " 7"],  # noqa: ARG002
     ) -> Float[np.ndarray, " 7"]:
         """Return no motion."""
@@ -49,11 +49,11 @@ class DoNothing:
 
 
 class RandomActions:
-    """Draws every action evenly from what is allowed; the same problem gets the same actions.
+    """Draws actions uniformly from the allowed ones; the same problem gets the same actions.
 
     Args:
-        limits: What is allowed: `xyz`, `rotation` and `gripper` of each axis, and the ball.
-        seed: Decides the actions, with the problem's number.
+        limits: The allowed actions: `xyz`, `rotation` and `gripper` of each axis, and the ball.
+        seed: Of the actions, with the problem's number.
     """
 
     name, why = "random", "random"
@@ -62,24 +62,24 @@ class RandomActions:
         self._limits, self._seed = limits, seed
         self._rng = np.random.default_rng(seed)
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Begin the draws of this problem."""
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+        """Seed the generator for this problem."""
         self._rng = np.random.default_rng([self._seed, problem.index])
 
     def act(
         self,
-        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
         state: Float[np.ndarray, " 7"],  # noqa: ARG002
     ) -> Float[np.ndarray, " 7"]:
-        """Return the next draw."""
+        """Return the next sample."""
         return shortened(self._rng.uniform(-1.0, 1.0, size=ACTION_DIM) * farthest(self._limits), self._limits)
 
 
 class Oracle:
-    """Knows the goal's state and goes straight there, as fast as is allowed. Rotation stays (`reach` needs none).
+    """Knows the goal state and moves straight to it, as fast as allowed. Does not rotate (`reach` needs no rotation).
 
     Args:
-        limits: What is allowed.
+        limits: The allowed actions.
     """
 
     name, why = "oracle", "scripted"
@@ -88,13 +88,13 @@ class Oracle:
         self._limits = limits
         self._problem: TaskProblem | None = None
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Learn the goal."""
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+        """Set the goal."""
         self._problem = problem
 
     def act(
         self,
-        picture: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
+        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
         state: Float[np.ndarray, " 7"],
     ) -> Float[np.ndarray, " 7"]:
         """Return the next step towards the goal.
@@ -110,39 +110,39 @@ class Oracle:
 
 
 class Planning:
-    """A world model that plans: sees the pictures and the measured state, nothing else.
+    """A world model that plans from the images and the measured state.
 
     Args:
-        controller: Plans with the model; its last `decision` can be looked at after every action.
-        name: Of the model, as tables show it.
+        controller: Plans with the model; its last `decision` can be read after every action.
+        name: Of the model, as shown in tables.
     """
 
     def __init__(self, controller: Controller, name: str = "model") -> None:
         self.controller, self.name, self.why = controller, name, ""
 
-    def reset(self, problem: TaskProblem, goal_picture: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Give the planner the goal's picture."""
-        self.controller.reset(goal_picture)
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+        """Give the planner the goal image."""
+        self.controller.reset(goal_image)
 
     def act(
-        self, picture: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
+        self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
     ) -> Float[np.ndarray, " 7"]:
         """Return the first action of a plan."""
-        action = self.controller.act(picture, state)
+        action = self.controller.act(image, state)
         self.why = self.controller.decision.why if self.controller.decision else ""
         return action
 
 
 def farthest(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
-    """Return the largest size of each number of an action, whatever the ball says; 0 where it is held."""
+    """Return the largest size of each component of an action, without the ball; 0 where it is fixed."""
     gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
     return np.array([*limits.xyz, *[limits.rotation] * 3, gripper])
 
 
 def shortened(way: Float[np.ndarray, " 7"], limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
-    """Return the way of a model step, in its direction, no farther than is allowed.
+    """Return the displacement of a model step, in its direction, clipped to the limits.
 
-    Position, rotation and gripper are shortened each by itself; a held axis is left out.
+    Position, rotation and gripper are scaled independently; a fixed axis is left out.
     """
     reach = farthest(limits)
     way = np.where(reach > 0, way, 0.0)

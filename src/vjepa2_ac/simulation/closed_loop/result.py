@@ -1,4 +1,4 @@
-"""What came of episodes in closed loop? What happened in each, and the figures of all together."""
+"""Closed-loop results: a record of each episode, and the metrics over all of them."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M, TaskName, TaskProb
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """What happened. Index 0 of `states`, `distances_m` and `pictures` is before the first action."""
+    """The record of an episode. Index 0 of `states`, `distances_m` and `frames` is before the first action."""
 
     problem: TaskProblem
     states: Float[np.ndarray, "time 7"]  # measured, in the robot base frame
-    actions: Float[np.ndarray, "steps 7"]  # as the policy named them
-    blocks: Float[np.ndarray, "time 4"] | None  # where the block was, as `TaskProblem` tells it; None: there is none
+    actions: Float[np.ndarray, "steps 7"]  # as returned by the policy
+    blocks: Float[np.ndarray, "time 4"] | None  # pose of the block, as in `TaskProblem`; None: there is none
     distances_m: Float[np.ndarray, " time"]  # of what the task moves, to its goal
-    seconds: Float[np.ndarray, " steps"]  # that the policy took
+    seconds: Float[np.ndarray, " steps"]  # taken by the policy
     whys: tuple[str, ...]  # of each action
-    unreachable: int  # commands that the arm could not follow to their end
-    goal_picture: UInt8[np.ndarray, "height width 3"]
-    pictures: UInt8[np.ndarray, "time height width 3"] | None  # where they are kept
+    unreachable: int  # commands that the arm could not follow completely
+    goal_image: UInt8[np.ndarray, "height width 3"]
+    frames: UInt8[np.ndarray, "time height width 3"] | None  # if they are stored
 
     @property
     def success(self) -> bool:
-        """Whether it is done at the end."""
+        """Whether the goal is reached at the end."""
         return bool(self.distances_m[-1] < SUCCESS_M[self.problem.task])
 
     @property
     def steps_needed(self) -> int | None:
-        """Model steps after which it was done for good; None: it is not done at the end."""
+        """Model steps after which it stays reached; None: it is not reached at the end."""
         if not self.success:
             return None
         not_done = np.flatnonzero(self.distances_m >= SUCCESS_M[self.problem.task])
@@ -42,7 +42,7 @@ class EpisodeResult:
 
     @property
     def success_ever(self) -> bool:
-        """Whether it was done after any of the steps, perhaps in passing."""
+        """Whether the goal was reached after any of the steps, perhaps in passing."""
         return bool(self.distances_m[1:].min() < SUCCESS_M[self.problem.task])
 
 
@@ -70,27 +70,27 @@ class ClosedLoopResult:
 
     @property
     def successes(self) -> Bool[np.ndarray, " episodes"]:
-        """Whether it is done at the end."""
+        """Whether the goal is reached at the end."""
         return np.array([episode.success for episode in self.episodes])
 
     @property
     def seconds(self) -> Float[np.ndarray, "episodes steps"]:
-        """What each decision took."""
+        """Seconds of each decision."""
         return np.stack([episode.seconds for episode in self.episodes])
 
     @property
     def unreachable(self) -> Int[np.ndarray, " episodes"]:
-        """Commands that the arm could not follow to their end."""
+        """Commands that the arm could not follow completely."""
         return np.array([episode.unreachable for episode in self.episodes])
 
     @property
     def success_rate(self) -> Estimate:
-        """Share of episodes that are done at the end."""
+        """Share of episodes with the goal reached at the end."""
         return share_of(int(self.successes.sum()), len(self.episodes))
 
     @property
     def success_ever_rate(self) -> Estimate:
-        """Share that was done after any step: the flattering number, to compare with others' only."""
+        """Share of episodes with the goal reached after any step: optimistic, only for comparison with others'."""
         return share_of(sum(episode.success_ever for episode in self.episodes), len(self.episodes))
 
     @property
@@ -100,7 +100,7 @@ class ClosedLoopResult:
 
     @property
     def steps_needed(self) -> Estimate | None:
-        """Mean model steps until it is done for good, of episodes that are done at the end; None: there are none."""
+        """Mean model steps until it stays reached, of episodes with success at the end; None: there are none."""
         needed = [episode.steps_needed for episode in self.episodes if episode.steps_needed is not None]
         return self._mean(np.array(needed, dtype=np.float64)) if needed else None
 
@@ -111,7 +111,7 @@ class ClosedLoopResult:
 
     @property
     def why_counts(self) -> dict[str, int]:
-        """How often each reason was given for an action, the commonest first."""
+        """How often each reason was given for an action, the most common first."""
         return dict(Counter(why for episode in self.episodes for why in episode.whys).most_common())
 
     def _mean(self, values: Float[np.ndarray, " episodes"]) -> Estimate:

@@ -1,7 +1,7 @@
-"""How well does a policy do what it is asked, when it sees what its actions lead to? Episodes and their figures.
+"""Closed-loop rollouts: a policy acts on what it observes, and each episode is measured.
 
-Every model step the policy sees a picture and the measured state and names an action; the state it leads to is sent as
-the command for `stride` control steps. What counts is where things are at the *end*: "once on the way" flatters.
+At each model step the policy sees an image and the measured state and returns an action; the state it leads to is sent
+as the command for `stride` control steps. Success is judged by the state at the *end*, not by passing it on the way.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from vjepa2_ac.simulation.world.domains import Domain, named_domain
 from vjepa2_ac.simulation.world.kinematics import OutOfReachError
 from vjepa2_ac.simulation.world.motion import rest_joints
 
-_PARTS = 8  # of a way that cannot be gone to its end
+_PARTS = 8  # of a displacement that cannot be completed
 
 
 def run_task(
@@ -34,23 +34,23 @@ def run_task(
     seed: int = 0,
     steps: int | None = None,
     stride: int = 4,
-    keep_pictures: int = 0,
+    keep_frames: int = 0,
     arm: SimulatedArm | None = None,
     progress: Progress | None = None,
 ) -> ClosedLoopResult:
-    """Let a policy do a task again and again. Every policy gets the same problems, so figures can be paired by row.
+    """Let a policy do a task repeatedly. Every policy gets the same problems, so metrics can be paired by row.
 
     Args:
-        task: What to do.
-        domain: Where: A, B, or a domain.
-        policy: Who does it.
-        episodes: How many problems, from number 0 on.
-        seed: Which problems. Settings that were chosen on one seed are to be reported on another.
-        steps: Model steps of an episode; None: as many as the task has by default.
+        task: The task.
+        domain: A, B, or a domain.
+        policy: The policy.
+        episodes: Number of problems, from number 0 on.
+        seed: Of the problems. Settings that were chosen on one seed have to be reported on another.
+        steps: Model steps of an episode; None: the task's default.
         stride: Control steps of a model step (15 per second).
-        keep_pictures: Of so many episodes, the first ones, for a video.
-        arm: In this domain, from `arm_for` of this task, to be used again; None: a new one.
-        progress: Told how many episodes are done.
+        keep_frames: Number of episodes, the first ones, whose frames are stored for a video.
+        arm: In this domain, from `arm_for` of this task, to be reused; None: a new one.
+        progress: Called with the number of finished episodes.
 
     Raises:
         InputError: MuJoCo is not installed, or no such domain.
@@ -64,8 +64,8 @@ def run_task(
     done: list[EpisodeResult] = []
     for index in range(episodes):
         problem = make_problem(task, domain, seed, index)
-        kept = index < keep_pictures
-        done.append(run_episode(arm, policy, problem, steps=steps, stride=stride, keep_pictures=kept))
+        kept = index < keep_frames
+        done.append(run_episode(arm, policy, problem, steps=steps, stride=stride, keep_frames=kept))
         if progress:
             progress(index + 1, episodes)
     return ClosedLoopResult(task, domain.name, policy.name, seed, steps, stride, tuple(done))
@@ -78,41 +78,41 @@ def run_episode(
     *,
     steps: int = 8,
     stride: int = 4,
-    keep_pictures: bool = False,
+    keep_frames: bool = False,
 ) -> EpisodeResult:
-    """Let a policy solve a problem, and return what happened.
+    """Let a policy solve a problem, and return the record.
 
-    A command that no joint angles lead to takes the arm as far on the straight way there as they do; it is counted.
+    If no joint angles reach a command, the arm moves along the straight line as far as possible; this is counted.
 
     Args:
-        arm: In the problem's domain; where it stands does not matter.
-        policy: Who does it.
-        problem: What is to be done.
+        arm: In the problem's domain; its pose does not matter.
+        policy: The policy.
+        problem: The problem.
         steps: Model steps.
         stride: Control steps of each.
-        keep_pictures: Whether the result holds what the camera saw.
+        keep_frames: Whether the result holds the camera images.
 
     Raises:
         UnreachableError: The problem's own start or goal cannot be reached.
-        ValueError: No steps, an action that is not 7 finite numbers, or a block to be moved that the arm has not.
+        ValueError: No steps, an action that is not 7 finite numbers, or a block to be moved but an arm without one.
     """
     if min(steps, stride) < 1:
         raise ValueError(f"{steps} model steps of {stride} control steps")
-    goal_picture = put(arm, problem.goal, problem.block_goal).picture()
+    goal_image = put(arm, problem.goal, problem.block_goal).image()
     put(arm, problem.start, problem.block_start)
-    policy.reset(problem, goal_picture)
-    states, blocks, pictures = [arm.state], [arm.block], [arm.picture()]
+    policy.reset(problem, goal_image)
+    states, blocks, frames = [arm.state], [arm.block], [arm.image()]
     actions, seconds, whys, unreachable = [], [], [], 0
     for _ in range(steps):
         began = time.perf_counter()
-        action = np.asarray(policy.act(pictures[-1], states[-1]), dtype=np.float64)
+        action = np.asarray(policy.act(frames[-1], states[-1]), dtype=np.float64)
         seconds.append(time.perf_counter() - began)
         actions.append(_checked(action, policy))
         whys.append(policy.why)
         unreachable += not _send(arm, action, stride)
         states.append(arm.state)
         blocks.append(arm.block)
-        pictures.append(arm.picture())
+        frames.append(arm.image())
     return EpisodeResult(
         problem=problem,
         states=np.stack(states),
@@ -122,13 +122,13 @@ def run_episode(
         seconds=np.array(seconds),
         whys=tuple(whys),
         unreachable=unreachable,
-        goal_picture=goal_picture,
-        pictures=np.stack(pictures) if keep_pictures else None,
+        goal_image=goal_image,
+        frames=np.stack(frames) if keep_frames else None,
     )
 
 
 def put(arm: SimulatedArm, state: Float[np.ndarray, " 7"], block: Float[np.ndarray, " 4"] | None) -> SimulatedArm:
-    """Put arm and block somewhere, by way of the arm's rest: its spare joint must not depend on what was before."""
+    """Put arm and block at a pose, via the arm's rest pose: its redundant joint must not depend on earlier motion."""
     arm.set_joints(rest_joints(arm.domain), 0.0)
     arm.set_state(state)
     if block is not None:
@@ -139,7 +139,7 @@ def put(arm: SimulatedArm, state: Float[np.ndarray, " 7"], block: Float[np.ndarr
 def ways_along(
     state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], parts: int = _PARTS
 ) -> Sequence[Float[np.ndarray, " 7"]]:
-    """Return states at even distances on the straight way of an action, the nearest first."""
+    """Return equally spaced states on the straight line of an action, the nearest first."""
     shares = np.arange(1, parts + 1)[:, None] / parts
     return list(apply_action(np.tile(state, (parts, 1)), shares * action))
 
@@ -151,7 +151,7 @@ def _checked(action: Float[np.ndarray, " dim"], policy: Policy) -> Float[np.ndar
 
 
 def _send(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int) -> bool:
-    """Command the state that an action leads to, its closedness within 0 .. 1; return whether it can be reached."""
+    """Command the state after an action, its closedness within 0 .. 1; return whether it can be reached."""
     target = _with_real_gripper(apply_action(arm.state, action))
     try:
         arm.command(target, stride)

@@ -1,4 +1,4 @@
-"""What is the simulated robot to do? Problems: where arm and block begin, where they shall be, and what counts as done.
+"""Tasks of the simulated robot: start and target of arm and block, and the criterion of success.
 
 They are drawn in the world frame: a problem looks the same in every domain, however the robot is mounted.
 """
@@ -32,10 +32,10 @@ SUCCESS_M: dict[TaskName, float] = {"reach": 0.05, "push": 0.04, "pick": 0.05}
 """Closer than this at the end is a success: the flange to its goal (reach), or the block's middle to its own."""
 
 STEPS: dict[TaskName, int] = {"reach": 8, "push": 8, "pick": 12}
-"""Model steps of an episode, where nothing else is asked for."""
+"""Default number of model steps of an episode."""
 
 REACH_WAY_M, PUSH_WAY_M, LIFT_M = (0.12, 0.25), (0.10, 0.16), (0.10, 0.14)
-"""How far start and goal lie apart: of the flange (reach), of the block (push), of the block upwards (pick)."""
+"""Distance between start and goal: of the flange (reach), of the block (push), of the block upwards (pick)."""
 
 GRASP_M = FINGERTIP_M - 0.02
 """Height of the flange over the middle of a block that is to be grasped."""
@@ -52,20 +52,20 @@ _MOST_TURNED_RAD = 0.4  # of block and hand, from straight ahead
 
 @dataclass(frozen=True)
 class TaskProblem:
-    """One start and one goal. All is in the robot base frame of the domain (legend: episode.py).
+    """One start and one goal. All poses are in the robot base frame of the domain (legend: episode.py).
 
-    A block is told by the middle of it and its turn about z: x, y, z in metres, radians.
+    A block is given by its centre and its rotation about z: x, y, z in metres, radians.
     """
 
     task: TaskName
     index: int
     start: Float[np.ndarray, " 7"]
-    goal: Float[np.ndarray, " 7"]  # of the arm in the goal picture
+    goal: Float[np.ndarray, " 7"]  # of the arm in the goal image
     block_start: Float[np.ndarray, " 4"] | None = None  # None: there is no block
     block_goal: Float[np.ndarray, " 4"] | None = None
 
     def distance_m(self, state: Float[np.ndarray, " 7"], block: Float[np.ndarray, " 4"] | None = None) -> float:
-        """Return how far what the task moves is from its goal: the block where there is one, else the flange.
+        """Return the distance of the moved object to its goal: of the block if there is one, else of the flange.
 
         Rotations and the gripper do not count.
 
@@ -82,15 +82,15 @@ class TaskProblem:
 def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskProblem:
     """Return a problem: a pure function of its arguments, and the same in the world in every domain.
 
-    reach: both ends in the box of `MotionRecipe`, gripper pointing down, the same turn and gripper at both.
-    push: the closed gripper stands behind the block, low; the goal lies straight ahead, the gripper still behind it.
-    pick: the open gripper is over the block; in the goal it holds it in the air.
+    reach: both ends in the box of `MotionRecipe`, gripper pointing down, the same rotation and gripper at both.
+    push: the closed gripper is behind the block, low; the goal is straight ahead, the gripper still behind the block.
+    pick: the open gripper is over the block; at the goal it holds the block in the air.
 
     Args:
-        task: What to do.
-        domain: Where; decides only in which frame the problem is told.
-        seed: Which problems.
-        index: Which of them.
+        task: The task.
+        domain: Determines only the frame of the problem.
+        seed: Of the problems.
+        index: Of the problem.
 
     Raises:
         ValueError: No such task, or a negative seed or index.
@@ -112,7 +112,7 @@ class _Drawn:
     """Start and goal in the world frame."""
 
     flange: Float[np.ndarray, "2 3"]
-    turn: float  # of the hand about the vertical, at both
+    turn: float  # rotation of the hand about the vertical, at both
     closedness: tuple[float, float]
     blocks: Float[np.ndarray, "2 4"] | None = None
 
@@ -128,7 +128,7 @@ def _reach(rng: np.random.Generator) -> _Drawn:
 
 
 def _push(rng: np.random.Generator) -> _Drawn:
-    """Push ahead with the fingers' broad side, or to the left or right with a finger's outer side."""
+    """Push forwards with the fingers' broad side, or to the left or right with a finger's outer side."""
     while True:
         turn = rng.uniform(-_MOST_TURNED_RAD, _MOST_TURNED_RAD)
         side = int(rng.integers(-1, 2))  # right, ahead, left
@@ -165,7 +165,7 @@ def _turned(places: Float[np.ndarray, "places 3"], turn: float) -> Float[np.ndar
 
 
 def _states(drawn: _Drawn, domain: Domain) -> Float[np.ndarray, "2 7"]:
-    """Return start and goal of the arm in the base frame: pointing down, turned about z."""
+    """Return start and goal of the arm in the base frame: pointing down, rotated about z."""
     poses = poses_in_base(downward_poses(_turned(drawn.flange, drawn.turn)), domain)
     return np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
 
@@ -183,7 +183,7 @@ def arm_for(
     height: int = FRAME_HEIGHT,
     width: int = FRAME_WIDTH,
 ) -> SimulatedArm:
-    """Return an arm that can do a task: `reach` needs no contacts.
+    """Return an arm for a task: `reach` needs no contacts.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.

@@ -1,4 +1,4 @@
-"""What do episodes in closed loop look like? The camera beside the goal, step by step, as a video."""
+"""Videos of closed-loop episodes: the camera image beside the goal image, step by step."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from vjepa2_ac.reports.figures.caption import side_by_side
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult, EpisodeResult
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
 
-_HOLD = 4  # as many frames as this are the first and the last picture of an episode shown
+_HOLD = 4  # number of repetitions of the first and the last image of an episode
 
 
 def write_film(path: str | Path, results: Sequence[ClosedLoopResult]) -> Path:
-    """Write the kept pictures of policies that did the same problems as a video, in the time that they took.
+    """Write the stored frames of policies that solved the same problems as a video, in real time.
 
     Args:
         path: Of an MP4.
-        results: A camera picture for each, side by side, the goal's picture last.
+        results: One camera image for each, side by side, the goal image last.
 
     Raises:
         InputError: PyAV is not installed.
-        ValueError: No pictures were kept.
+        ValueError: No frames were stored.
     """
     return write_video(path, film_frames(results), rate_hz=CONTROL_RATE_HZ / results[0].stride)
 
 
 def film_frames(results: Sequence[ClosedLoopResult]) -> Iterator[UInt8[np.ndarray, "_ _ 3"]]:
-    """Yield the frames of the film, one for every model step, the first and last of an episode for longer."""
+    """Yield the frames of the video, one per model step, the first and last of an episode repeated."""
     for index, episodes in enumerate(zip(*(result.episodes for result in results), strict=True)):
-        if any(episode.pictures is None for episode in episodes):
+        if any(episode.frames is None for episode in episodes):
             return
         for step in range(results[0].steps + 1):
             frame = _frame(results, episodes, index, step)
@@ -50,8 +50,8 @@ def _frame(
         f"    step {step} of {first.steps}"
     )
     captions = [_caption(result, episode, step) for result, episode in zip(results, episodes, strict=True)]
-    pictures = [episode.pictures[step] for episode in episodes if episode.pictures is not None]
-    return side_by_side([*pictures, episodes[0].goal_picture], [*captions, "goal"], title)
+    frames = [episode.frames[step] for episode in episodes if episode.frames is not None]
+    return side_by_side([*frames, episodes[0].goal_image], [*captions, "goal"], title)
 
 
 def _caption(result: ClosedLoopResult, episode: EpisodeResult, step: int) -> str:

@@ -1,1 +1,1 @@
-"""Recording: how are demonstrations of the simulated arm made?"""
+"""Recording: demonstrations of the simulated arm."""

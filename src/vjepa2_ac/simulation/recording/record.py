@@ -1,4 +1,4 @@
-"""How is a data set of the simulated arm recorded? Random reaching, filmed, written as RLDS in DROID's schema."""
+"""Recording of a simulated data set: random reaching, filmed, written as RLDS in DROID's schema."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRec
 from vjepa2_ac.simulation.world.scene import load_mujoco
 
 SUCCESS_SHARE = 0.9
-JPEG_QUALITY = 85  # some 11 KB a picture, as in DROID
+JPEG_QUALITY = 85  # some 11 KB an image, as in DROID
 _INSTRUCTIONS = {None: "reach around over the table", "push": "push the block", "pick": "pick up the block"}
 _SIMULATED_CAMERAS = dict(zip(CAMERAS, ("exterior_1", "exterior_2", "wrist"), strict=True))
 
@@ -53,19 +53,19 @@ def record_dataset(
     Other versions of MuJoCo, NumPy or the JPEG library may change last digits and bytes, not the episodes.
 
     Args:
-        folder: Where the data set shall stand; must not hold anything yet.
+        folder: The folder of the data set; must be new or empty.
         domain: A `Domain`, or the name of one. For another world in every episode, `DomainRanges` to draw it from, or
             `random`.
-        episodes: How many.
+        episodes: Number of episodes.
         steps: Control steps of each (15 per second).
-        seed: Decides motion, outcome and, for `random`, the worlds.
+        seed: Determines motion, outcome and, for `random`, the worlds.
         shards: TFRecord files; one for every 32 episodes by default.
-        cameras: 1: the three pictures of a step are the same one. 3: each camera sees its own.
+        cameras: 1: the three images of a step are the same one. 3: one image per camera.
         workers: Processes. More than one needs `if __name__ == "__main__":` in a script that calls this.
         renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
-        recipe: How the arm moves, without a task.
+        recipe: Ranges of the motion, without a task.
         task: With a block on the table: half of the episodes push or pick it by script, half play around it at random.
-        progress: Called with (episodes done, episodes in all).
+        progress: Called with (episodes done, episodes in total).
 
     Raises:
         InputError: MuJoCo or OpenGL is missing, an unknown domain, a number out of range, or a folder that is in use or
@@ -117,7 +117,7 @@ def record_episode(
         images = _film(world, motion, cameras, renderer)
     else:
         from vjepa2_ac.simulation.recording.scripted_play import (
-            play,  # torch comes with it, which reaching around does without
+            play,  # it imports torch, which random reaching does not need
         )
 
         images = {}
@@ -145,7 +145,7 @@ def record_episode(
 
 
 def episode_folder(index: int, seed: int, domain_name: str) -> str:
-    """Return the folder that an episode pretends to come from; as in DROID, only it says success or failure."""
+    """Return the source folder stored in the episode; as in DROID, the only record of success or failure."""
     succeeded = np.random.default_rng([seed, index, 2]).uniform() < SUCCESS_SHARE
     minute, hour, day = index % 60, index // 60 % 24, 1 + index // 1440 % 28
     place = f"{domain_name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"
@@ -162,10 +162,10 @@ def _film(world: Domain, motion: Motion, cameras: int, renderer: Renderer) -> di
 
 
 def _take(arm: SimulatedArm, films: dict[str, list[bytes]], cameras: int) -> None:
-    """Add what the cameras see now to their films."""
+    """Append the current camera images to the films."""
     for feature in CAMERAS[:cameras]:
-        picture = arm.picture(_SIMULATED_CAMERAS[feature])
-        films.setdefault(feature, []).append(encode_jpeg(picture, quality=JPEG_QUALITY))
+        image = arm.image(_SIMULATED_CAMERAS[feature])
+        films.setdefault(feature, []).append(encode_jpeg(image, quality=JPEG_QUALITY))
 
 
 def _commands(motion: Motion) -> DroidCommands:
@@ -184,13 +184,13 @@ def _commands(motion: Motion) -> DroidCommands:
 
 
 def _velocity(positions: Float[np.ndarray, "steps dim"]) -> Float[np.ndarray, "steps dim"]:
-    """Return the velocity that led to each position; the first is that of the second."""
+    """Return the velocity that led to each position; the first equals the second."""
     ways = np.diff(positions, axis=0)
     return np.concatenate([ways[:1], ways]) * CONTROL_RATE_HZ
 
 
 def _recorded(record: Callable[[int], DroidEpisode], episodes: int, workers: int) -> Iterator[DroidEpisode]:
-    """Yield the episodes in order; a few at a time are under way."""
+    """Yield the episodes in order; a few are recorded in parallel."""
     if workers == 1:
         yield from map(record, range(episodes))
         return

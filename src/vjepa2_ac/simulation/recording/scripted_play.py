@@ -1,6 +1,6 @@
-"""How is a demonstration with a block made? An oracle with unsteady hands, or random play around the block.
+"""Demonstrations with a block: an oracle with noise, or random play around the block.
 
-Commands are those of the closed loop: every model step one state is sent, and held for the step.
+Commands are as in the closed loop: one target state per model step, held for that step.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.kinematics import OutOfReachError, inverse_kinematics
 from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, rest_joints
 
-_UNSTEADY_M = 0.008  # standard deviation of what is added to each axis of an oracle's step
+_NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's step
 _LOWEST_M, _HIGHEST_M = 0.155, 0.34  # of the flange while playing
-_TO_BLOCK = 0.5  # chance that a step of play goes for the block, or through it
+_TO_BLOCK = 0.5  # probability that a step of play goes to the block, or through it
 _AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # of the flange while playing, in the world
 
 
@@ -42,13 +42,13 @@ def play(
     """Return a demonstration of `steps` control steps with an arm that touches the block.
 
     Args:
-        task: Which problem is begun with, and whether the gripper is used.
-        domain: Where.
+        task: The problem at the start, and whether the gripper is used.
+        domain: The world.
         steps: Control steps.
-        rng: Decides everything.
-        script: Whether an oracle solves the problem, with unsteady hands; otherwise, random play.
+        rng: The only source of randomness.
+        script: Whether an oracle solves the problem, with noise; otherwise, random play.
         renderer: Of the arm's cameras.
-        look: Called at every control step, when its measurements are taken.
+        look: Called at every control step, at the time of its measurements.
 
     Raises:
         InputError: MuJoCo or OpenGL is missing.
@@ -65,9 +65,9 @@ def play(
     for step in range(steps):
         if step % recipe.stride == 0:
             if script:
-                action = _unsteady(oracle.act(np.zeros((1, 1, 3), dtype=np.uint8), arm.state), limits, rng)
+                action = _with_noise(oracle.act(np.zeros((1, 1, 3), dtype=np.uint8), arm.state), limits, rng)
             else:
-                action = _playful(arm, problem, limits, rng)
+                action = _play_action(arm, problem, limits, rng)
             joints, grip = _sent(arm, action)
         rows.append((joints, grip, arm.joints, arm.closedness))
         if look:
@@ -77,12 +77,12 @@ def play(
     return Motion(np.array(commanded), np.array(commanded_grip), np.array(measured), np.array(measured_grip))
 
 
-def _unsteady(action: Float[np.ndarray, " 7"], limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
-    return shortened(action + np.append(rng.normal(0.0, _UNSTEADY_M, size=3), np.zeros(4)), limits)
+def _with_noise(action: Float[np.ndarray, " 7"], limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
+    return shortened(action + np.append(rng.normal(0.0, _NOISE_M, size=3), np.zeros(4)), limits)
 
 
-def _playful(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
-    """Return a step to or through the block, or anywhere; for `pick`, now and then the gripper opens or closes."""
+def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
+    """Return a step to or through the block, or anywhere; for `pick`, sometimes the gripper opens or closes."""
     state, block = arm.state, arm.block
     if block is None:
         raise ValueError("there is no block to play with")
@@ -104,7 +104,7 @@ def _playful(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng:
 
 
 def _sent(arm: SimulatedArm, action: Float[np.ndarray, " 7"]) -> tuple[np.ndarray, float]:
-    """Return the joints and closedness that a step is sent to, as far on its way as they lead."""
+    """Return the joints and closedness of a step's command, as far along it as joint angles exist."""
     rest, joints = rest_joints(arm.domain), arm.joints
     target = apply_action(arm.state, action)
     for way in [target, *reversed(ways_along(arm.state, action)[:-1])]:

@@ -1,4 +1,4 @@
-"""What is the simulated robot? An arm that goes where it is told, with a lag, and is filmed by three cameras."""
+"""The simulated arm: follows commands with a lag and is filmed by three cameras."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ WRIST_FOV_DEG = 70.0
 
 
 class SimulatedArm:
-    """A Franka-like arm in a domain. Motion is kinematic: the joints are set, nothing collides.
+    """A Franka-like arm in a domain. Motion is kinematic: the joints are set, there are no collisions.
 
     States are *measured*, in the robot base frame (legend: episode.py).
 
     Args:
-        domain: The world it stands in.
+        domain: Its world.
         renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
-        height, width: Size of the pictures.
+        height, width: Size of the images.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
@@ -66,11 +66,11 @@ class SimulatedArm:
 
     @property
     def block(self) -> Float[np.ndarray, " 4"] | None:
-        """Where the block is, as `TaskProblem` tells it; None: there is none."""
+        """Pose of the block, as in `TaskProblem`; None: there is none."""
         return None
 
     def place_block(self, block: Float[np.ndarray, " 4"]) -> None:
-        """Put the block there at once, at rest.
+        """Put the block at a pose at once, at rest.
 
         Raises:
             ValueError: There is none.
@@ -78,7 +78,7 @@ class SimulatedArm:
         raise ValueError(f"no block to be put at {block.tolist()}: this arm touches nothing")
 
     def set_joints(self, joints: Float[np.ndarray, " 7"], closedness: float) -> None:
-        """Put the arm there at once."""
+        """Put the arm at joint angles at once."""
         self._closedness = closedness
         self._data.qpos[:7] = joints
         self._data.qpos[7:9] = FINGER_TRAVEL_M * (1.0 - closedness)
@@ -94,7 +94,7 @@ class SimulatedArm:
         self.set_joints(inverse_kinematics(state[:6], self.joints, rest=rest), float(state[6]))
 
     def can_reach(self, state: Float[np.ndarray, " 7"]) -> bool:
-        """Return whether a command for the flange to go there from here would be followed."""
+        """Return whether a command to move the flange from here to this pose can be followed."""
         try:
             inverse_kinematics(state[:6], self.joints, rest=rest_joints(self.domain))
         except OutOfReachError:
@@ -102,7 +102,7 @@ class SimulatedArm:
         return True
 
     def command(self, target: Float[np.ndarray, " 7"], control_steps: int = 1) -> Float[np.ndarray, " 7"]:
-        """Send the flange towards a state for some control steps and return the state that is measured then.
+        """Move the flange towards a state for some control steps and return the measured state.
 
         Raises:
             UnreachableError: No joint angles lead there.
@@ -113,22 +113,22 @@ class SimulatedArm:
     def command_joints(
         self, goal: Float[np.ndarray, " 7"], closedness: float, control_steps: int = 1
     ) -> Float[np.ndarray, " 7"]:
-        """Send the joints (radians) and the gripper there for some control steps; return the state measured then."""
+        """Move joints (radians) and gripper towards a target for some control steps; return the measured state."""
         left = (1.0 - tracking_share(self.domain.lag_s)) ** control_steps
         grip_left = (1.0 - tracking_share(GRIPPER_LAG_S)) ** control_steps
         joints = goal + left * (self.joints - goal)
         self.set_joints(joints, closedness + grip_left * (self._closedness - closedness))
         return self.state
 
-    def picture(self, camera: str = "exterior_1") -> UInt8[np.ndarray, "height width 3"]:
-        """Return what `exterior_1`, `exterior_2` or `wrist` sees now."""
+    def image(self, camera: str = "exterior_1") -> UInt8[np.ndarray, "height width 3"]:
+        """Return the current image of `exterior_1`, `exterior_2` or `wrist`."""
         eye = self._camera(camera)
         if camera == "wrist":
             eye.move(self._wrist_pose())
-        return np.asarray(eye.picture(self._data))
+        return np.asarray(eye.image(self._data))
 
     def extrinsics(self, camera: str = "exterior_1") -> Float[np.ndarray, " 6"]:
-        """Return the pose of a camera in the robot base frame: x right, y down, z into the picture."""
+        """Return the pose of a camera in the robot base frame: x right, y down, z into the image."""
         pose = np.linalg.inv(self.domain.base_pose()) @ self._camera_pose(camera)
         return np.concatenate([pose[:3, 3], euler_from_matrices(pose[:3, :3])])
 

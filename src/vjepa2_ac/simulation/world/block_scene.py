@@ -1,4 +1,4 @@
-"""How does the scene become one in which things touch? A block on the table, friction, fingers that hold, servos."""
+"""The scene with contacts: a block on the table, friction, a gripper that holds, servos."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
 from vjepa2_ac.simulation.world.scene import ARM_GROUP, BLOCK_M, as_text, load_mujoco, scene_tree
 
 WORK_AREA_M = ((0.28, 0.74), (-0.38, 0.38))
-"""Ranges of x and y in the world that are kept clear of other things, for the block."""
+"""Ranges of x and y in the world that are kept free of other objects, for the block."""
 SUBSTEPS = 32
 """Steps of physics per control step."""
 
 _BLOCK_KG = 0.15
-_GREEN = (0.10, 0.72, 0.22)  # which nothing else in domains A and B has
+_GREEN = (0.10, 0.72, 0.22)  # not used elsewhere in domains A and B
 _SLIDING, _HOLDING = "1.0 0.01 0.001", "1.5 0.05 0.001"  # friction: sliding, about the normal, rolling
 _HARD = "0.005 1"  # time constant (s) and damping of contacts: the servos must not press fingers into the table
 _ARM_STIFFNESS = (4000.0,) * 4 + (1500.0,) * 3  # N m / rad
@@ -26,10 +26,10 @@ _FINGER_STIFFNESS, _FINGER_FORCE = 1500.0, 40.0  # N / m, N
 
 
 def compile_contact_scene(domain: Domain) -> Any:
-    """Return the compiled `mujoco.MjModel` of a domain with a free body `block`, behind all other coordinates.
+    """Return the compiled `mujoco.MjModel` of a domain with a free body `block`, after all other coordinates.
 
-    Servos `joint1` .. `joint7`, `finger1`, `finger2` drive the arm, on which gravity does not act. The fingers and the
-    hand touch block, table and things; the links do not. Things in the work area are left out.
+    Servos `joint1` .. `joint7`, `finger1`, `finger2` drive the arm, without gravity. The fingers and the hand have
+    contacts with block, table and objects; the links have none. Objects in the work area are left out.
 
     Raises:
         InputError: MuJoCo is not installed.
@@ -63,7 +63,7 @@ def _clear_work_area(world: ET.Element) -> None:
 
 
 def _drive(body: ET.Element) -> None:
-    """Free a body of the arm from gravity; let it touch what is no arm if it is part of the gripper."""
+    """Disable gravity for a body of the arm; enable contacts with other bodies if it is part of the gripper."""
     is_gripper = body.get("name") in {"hand", "finger1", "finger2"}
     body.set("gravcomp", "1")
     for geom in body.findall("geom"):
@@ -87,7 +87,7 @@ def _add_block(world: ET.Element) -> None:
         size=as_text([half] * 3),
         mass=repr(_BLOCK_KG),
         rgba=as_text([*_GREEN, 1.0]),
-        group=str(ARM_GROUP),  # what moves
+        group=str(ARM_GROUP),  # moving geoms
         contype="1",
         conaffinity="3",
         condim="4",

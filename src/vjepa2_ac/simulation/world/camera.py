@@ -1,7 +1,7 @@
-"""What does a camera see? Pictures by ray casting: no OpenGL, no display.
+"""Simulated cameras: images by ray casting, without OpenGL or a display.
 
-MuJoCo says which geom each pixel's ray meets, and where; colour, light and shadow are numpy. What never moves is cast
-and lit once per camera; per picture only the arm is cast, and its shadow, and only where they can be.
+MuJoCo finds the geom and the point that each pixel's ray meets; colour, light and shadow are numpy. Static parts are
+cast and lit once per camera; per image only the arm and its shadow are cast, and only where they can be.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from vjepa2_ac.simulation.world.ray_renderer import Caster, Hits, View, lamp_vie
 from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, light_position, load_mujoco
 
 FRAME_HEIGHT, FRAME_WIDTH = 180, 320
-"""Size of DROID's pictures in RLDS."""
+"""Size of DROID's images in RLDS."""
 
-_SHADOW = 0.35  # share of the lamp's light that reaches a shadowed spot all the same
-_FAR_M = 20.0  # where the background of a ray that meets nothing is taken to be
+_SHADOW = 0.35  # share of the lamp's light that remains in the shadow
+_FAR_M = 20.0  # assumed distance of the background for a ray that meets nothing
 
 
 @dataclass(frozen=True)
 class _Background:
-    """What does not move, as one camera sees it; pixels are flat."""
+    """The static part of the image of one camera; pixels are flattened."""
 
     lit: UInt8[np.ndarray, "pixels 3"]
-    shaded: UInt8[np.ndarray, "pixels 3"]  # as it is where the arm's shadow falls
+    shaded: UInt8[np.ndarray, "pixels 3"]  # in the arm's shadow
     distance_m: Float[np.ndarray, " pixels"]
     spots: Float[np.ndarray, "pixels 3"]
     from_camera: View
@@ -36,14 +36,14 @@ class _Background:
 
 
 class RayCamera:
-    """A camera in the world that sees by casting one ray per pixel.
+    """A camera in the world that casts one ray per pixel.
 
     Args:
-        model: The scene as `scene.compile_scene` gives it.
-        domain: Its look.
-        pose: The camera's frame in the world: x right, y down, z into the picture.
-        vertical_fov_deg: Angle from the upper to the lower edge of the picture.
-        height, width: Size of the picture.
+        model: The scene from `scene.compile_scene`.
+        domain: Its appearance.
+        pose: The camera's frame in the world: x right, y down, z into the image.
+        vertical_fov_deg: Angle from the upper to the lower edge of the image.
+        height, width: Size of the image.
     """
 
     def __init__(
@@ -64,12 +64,12 @@ class RayCamera:
         self._background: _Background | None = None
 
     def move(self, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Put the camera elsewhere; the next picture is cast anew, walls and table included."""
+        """Move the camera; the next image is cast anew, including walls and table."""
         self._pose = pose
         self._background = None
 
-    def picture(self, data: Any) -> UInt8[np.ndarray, "height width 3"]:
-        """Return what the camera sees of this `mujoco.MjData`, whose kinematics must be up to date."""
+    def image(self, data: Any) -> UInt8[np.ndarray, "height width 3"]:
+        """Return the image of this `mujoco.MjData`, whose kinematics must be up to date."""
         behind = self._background = self._background or self._see_background(data)
         pixels = behind.lit.copy()
         near = behind.from_lamp.near_arm(self._caster, data)
@@ -97,7 +97,7 @@ class RayCamera:
         return _Background(lit, shaded, distance, spots, view, lamp_view(self._lamp, spots))
 
     def _light(self, data: Any, spots: Any, hits: Hits, group: int) -> tuple[Any, Any]:
-        """Return the colour of spots in the light from everywhere, and what the lamp adds; the group shades itself."""
+        """Return the colour of points in ambient light, and the lamp's part; the group casts shadows on itself."""
         colour = self._colours.at(hits.geoms, spots)
         to_lamp = self._lamp - spots
         to_lamp /= np.maximum(np.linalg.norm(to_lamp, axis=1, keepdims=True), 1e-9)
@@ -109,7 +109,7 @@ class RayCamera:
 
 
 class _Colours:
-    """Colours by geom, and by place for those that carry a pattern, so that pictures have texture."""
+    """Colours by geom, and by position for those with a pattern, so that images have texture."""
 
     def __init__(self, model: Any) -> None:
         mujoco = load_mujoco()
@@ -129,7 +129,7 @@ class _Colours:
 
 
 def _planks(spots: Any) -> Any:
-    """Boards along x, each of its own tone, with a faint grain."""
+    """Boards along x, each of its own shade, with a faint grain."""
     board = np.floor(spots[:, 1] / 0.125)
     tone = 0.93 + 0.07 * np.sin(board * 12.9898)
     grain = 0.03 * np.sin(60.0 * spots[:, 1] + 2.0 * np.sin(5.0 * spots[:, 0] + board))
@@ -144,7 +144,7 @@ def _tiles(spots: Any) -> Any:
 
 
 def _panels(spots: Any) -> Any:
-    """Wide upright panels over a dark skirting, brighter to the top."""
+    """Wide upright panels over a dark skirting, brighter towards the top."""
     along = spots[:, 0] + spots[:, 1]
     panel = np.floor(along / 0.6) % 2
     shade = 0.86 + 0.10 * panel + 0.08 * np.clip(spots[:, 2], -0.7, 1.5)

@@ -1,7 +1,7 @@
-"""In which worlds is the arm filmed? Where the camera stands, how things look, how the arm is mounted.
+"""Domains of the simulated arm: camera positions, appearance, and how the arm is mounted.
 
-The world frame stands on the table under the robot: x to the front, y to the robot's left, z up. The robot base may be
-mounted turned about z (`base_yaw_deg`); states and actions are in the *base* frame, pictures show the world.
+The origin of the world frame is on the table under the robot: x to the front, y to the robot's left, z up. The robot
+base may be rotated about z (`base_yaw_deg`); states and actions are in the *base* frame, images show the world.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class CameraPlace:
-    """Where a camera stands and looks: around `look_at_m`; azimuth 0 is in front of the robot, 90 at its left."""
+    """Position and direction of a camera: around `look_at_m`; azimuth 0 is in front of the robot, 90 at its left."""
 
     azimuth_deg: float
     elevation_deg: float
@@ -29,7 +29,7 @@ class CameraPlace:
     vertical_fov_deg: float = 36.0
 
     def pose(self) -> Float[np.ndarray, "4 4"]:
-        """Return the camera's frame in the world: x right, y down, z into the picture (OpenCV's convention)."""
+        """Return the camera's frame in the world: x right, y down, z into the image (OpenCV's convention)."""
         azimuth, elevation = np.deg2rad(self.azimuth_deg), np.deg2rad(self.elevation_deg)
         outward = np.array(
             [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
@@ -41,7 +41,7 @@ class CameraPlace:
         return pose
 
     def turned(self, angle_deg: float) -> CameraPlace:
-        """Return the place further round the same circle."""
+        """Return the same position, rotated further on the circle."""
         return replace(self, azimuth_deg=self.azimuth_deg + angle_deg)
 
 
@@ -57,7 +57,7 @@ class Look:
     wall: Rgb
     light_azimuth_deg: float = 100.0
     light_elevation_deg: float = 55.0
-    ambient: float = 0.45  # share of the light that comes from everywhere
+    ambient: float = 0.45  # share of ambient light
 
 
 @dataclass(frozen=True)
@@ -67,11 +67,9 @@ class Domain:
     name: str
     camera: CameraPlace
     look: Look
-    base_yaw_deg: float = (
-        0.0  # mounting of the robot: the same action moves the arm in another direction in the picture
-    )
+    base_yaw_deg: float = 0.0  # mounting of the robot: the same action moves the arm in another direction in the image
     lag_s: float = 0.08  # time constant with which the measured pose follows the commanded one
-    clutter_seed: int = 0  # decides what lies on the table, and where
+    clutter_seed: int = 0  # selects the objects on the table, and their positions
 
     def base_pose(self) -> Float[np.ndarray, "4 4"]:
         """Return the robot base frame in the world."""
@@ -84,7 +82,7 @@ class Domain:
 
 @dataclass(frozen=True)
 class DomainRanges:
-    """From what `sample_domain` draws, uniformly."""
+    """The ranges of `sample_domain`, drawn uniformly."""
 
     azimuth_deg: Range = (25.0, 75.0)
     elevation_deg: Range = (18.0, 38.0)
@@ -148,7 +146,7 @@ def named_domain(name: str) -> Domain:
 def sample_domain(rng: np.random.Generator, ranges: DomainRanges = DomainRanges()) -> Domain:
     """Return a random world: camera, light, colours and mounting, for training a base over many of them.
 
-    The arm is always light before dark or dark before light, so that it can be seen.
+    The arm is always light before dark or dark before light, so that it is visible.
     """
 
     def draw(bounds: Range) -> float:

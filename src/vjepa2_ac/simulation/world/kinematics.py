@@ -1,4 +1,4 @@
-"""Where is the flange for given joint angles, and which joint angles bring it to a pose?
+"""Forward and inverse kinematics of the arm: the flange pose of joint angles, and joint angles for a pose.
 
 Franka's published kinematics as plain arithmetic: no simulator is needed to know where the arm is. Poses are 6 numbers
 in the robot base frame: x, y, z in metres; roll, pitch, yaw in radians, extrinsic xyz Euler (legend: episode.py).
@@ -19,7 +19,7 @@ FLANGE_OFFSET_M = 0.107
 
 @dataclass(frozen=True)
 class Joint:
-    """A revolute joint and how its frame stands in the one before it: Rx(twist) Tx(length) Rz(angle) Tz(offset)."""
+    """A revolute joint and its frame in that of the previous joint: Rx(twist) Tx(length) Rz(angle) Tz(offset)."""
 
     length_m: float
     twist_deg: float
@@ -64,8 +64,8 @@ def inverse_kinematics(
 ) -> Float[np.ndarray, " 7"]:
     """Return joint angles that bring the flange to a pose: to 0.01 mm and 0.006 degrees, within the limits.
 
-    Damped least squares, the damping falling with the error; the spare degree of freedom is drawn to `rest`: a smooth
-    path of poses, each started at the solution before, gives a smooth path of joints.
+    Damped least squares, the damping falling with the error; the redundant degree of freedom is pulled to `rest`: a
+    smooth path of poses, each started at the previous solution, gives a smooth path of joints.
 
     Raises:
         UnreachableError: The pose was not reached from `start`, nor from `rest`.
@@ -88,7 +88,7 @@ def _limited_step(
     joints: Float[np.ndarray, " 7"],
     rest: Float[np.ndarray, " 7"],
 ) -> Float[np.ndarray, " 7"]:
-    """Return the joints one step further; one at its limit that pushes on stays, and the others make up for it."""
+    """Return the joints after one step; a joint pushed against its limit stays, and the others compensate."""
     free = np.ones(7)
     for _ in range(3):
         step = _step(jacobian * free, error, (rest - joints) * free)
@@ -104,7 +104,7 @@ def _step(
 ) -> Float[np.ndarray, " 7"]:
     """Return one damped step towards the pose, and in its null space towards rest.
 
-    The pull to rest fades with the error: near the pose nothing may disturb the convergence.
+    The pull to rest fades with the error: near the pose it must not disturb the convergence.
     """
     size = float(np.linalg.norm(error))
     damped = jacobian @ jacobian.T + (1e-7 + 0.05 * size**2) * np.eye(6)

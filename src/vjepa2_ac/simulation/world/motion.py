@@ -1,7 +1,8 @@
-"""How does the arm move in a demonstration? Smooth random reaching, as commanded and as measured.
+"""Motion of a demonstration: smooth random reaching, as commanded and as measured.
 
-Every model step the flange is sent a random way further, inside a box over the table; the gripper points down, turns a
-little and now and then opens or closes. The measured joints follow the commanded ones with a lag, as on a real robot.
+At every model step the flange target moves by a random amount, inside a box over the table; the gripper points down,
+rotates a little and sometimes opens or closes. The measured joints follow the commanded ones with a lag, as on a real
+robot.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ GRIPPER_LAG_S = 0.12
 
 @dataclass(frozen=True)
 class MotionRecipe:
-    """What random reaching is drawn from. The box is in the world frame, for the flange."""
+    """Ranges of random reaching. The box is in the world frame, for the flange."""
 
     stride: int = 4  # control steps per model step
-    reach_m: float = 0.075  # farthest way per axis and model step
+    reach_m: float = 0.075  # largest displacement per axis and model step
     low_m: tuple[float, float, float] = (0.32, -0.24, 0.20)
     high_m: tuple[float, float, float] = (0.60, 0.24, 0.48)
-    turn_rad: float = 0.12  # farthest turn about the vertical per model step
+    turn_rad: float = 0.12  # largest rotation about the vertical per model step
     max_turn_rad: float = 0.6
-    gripper_share: float = 0.12  # chance per model step that the gripper opens or closes
+    gripper_share: float = 0.12  # probability per model step that the gripper opens or closes
 
 
 @dataclass(frozen=True)
@@ -44,12 +45,12 @@ class Motion:
 
     @property
     def commanded_poses(self) -> Float[np.ndarray, "steps 6"]:
-        """Where the flange was sent."""
+        """Commanded poses of the flange."""
         return forward_kinematics(self.commanded_joints)
 
     @property
     def poses(self) -> Float[np.ndarray, "steps 6"]:
-        """Where the flange was measured."""
+        """Measured poses of the flange."""
         return forward_kinematics(self.joints)
 
 
@@ -81,7 +82,7 @@ def rest_joints(domain: Domain) -> Float[np.ndarray, " 7"]:
 
 
 def downward_poses(path: Float[np.ndarray, "steps 4"]) -> Float[np.ndarray, "steps 6"]:
-    """Return poses with the gripper pointing down; a turn of 0 holds the fingers across the robot's front."""
+    """Return poses with the gripper pointing down; a rotation of 0 holds the fingers across the robot's front."""
     down = np.tile([np.pi, 0.0], (len(path), 1))
     return np.concatenate([path[:, :3], down, path[:, 3:] - np.pi / 4], axis=1)
 
@@ -94,14 +95,14 @@ def poses_in_base(poses: Float[np.ndarray, "steps 6"], domain: Domain) -> Float[
 
 
 def tracking_share(lag_s: float) -> float:
-    """Return the share of the way to the command that is covered in one control step."""
+    """Return the share of the distance to the command that is covered in one control step."""
     return float(1.0 - np.exp(-1.0 / (CONTROL_RATE_HZ * lag_s)))
 
 
 def follow(commands: Float[np.ndarray, "steps_and_one dim"], share: float) -> Float[np.ndarray, "steps dim"]:
-    """Return what is measured when commands are followed with a lag, from rest at the first command, which is left out.
+    """Return the measurements if commands are followed with a lag, from rest at the first command, which is left out.
 
-    Measurement t is what the robot shows when command t is issued, so it can follow only the commands before it.
+    Measurement t is taken when command t is issued, so it can follow only the commands before it.
     """
     measured = np.empty_like(commands[1:], dtype=np.float64)
     measured[0] = commands[0]
@@ -113,7 +114,7 @@ def follow(commands: Float[np.ndarray, "steps_and_one dim"], share: float) -> Fl
 def _waypoints(
     ways: int, rng: np.random.Generator, recipe: MotionRecipe
 ) -> tuple[Float[np.ndarray, "ways 3"], Float[np.ndarray, " ways"], Float[np.ndarray, " ways"]]:
-    """Return positions, turns about the vertical and closedness; a way that would leave the box is mirrored back."""
+    """Return positions, rotations about the vertical and closedness; a step out of the box is mirrored back."""
     low, high = np.append(recipe.low_m, -recipe.max_turn_rad), np.append(recipe.high_m, recipe.max_turn_rad)
     reach = np.array([recipe.reach_m] * 3 + [recipe.turn_rad])
     points, closed = [rng.uniform(low, high)], [float(rng.uniform() < 0.5)]

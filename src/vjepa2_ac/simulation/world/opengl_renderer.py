@@ -1,4 +1,4 @@
-"""What does a camera see through MuJoCo's own renderer, where OpenGL works?"""
+"""The OpenGL renderer: camera images by MuJoCo's own renderer, where OpenGL works."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vjepa2_ac.simulation.world.scene import load_mujoco
 
 
 class OpenGlCamera:
-    """The same camera by MuJoCo's own renderer, where `MUJOCO_GL` works. Colours as in the MJCF, without patterns.
+    """The same camera by MuJoCo's own renderer, if `MUJOCO_GL` works. Colours as in the MJCF, without patterns.
 
     Raises:
         InputError: OpenGL does not work here.
@@ -45,7 +45,7 @@ class OpenGlCamera:
             ) from error
 
     def move(self, pose: Float[np.ndarray, "4 4"]) -> None:
-        """Put the camera elsewhere."""
+        """Move the camera."""
         forward = pose[:3, 2]
         self._eye = self._mujoco.MjvCamera()
         self._eye.type = self._mujoco.mjtCamera.mjCAMERA_FREE
@@ -54,8 +54,8 @@ class OpenGlCamera:
         self._eye.azimuth = np.rad2deg(np.arctan2(forward[1], forward[0]))
         self._eye.elevation = np.rad2deg(np.arcsin(forward[2]))
 
-    def picture(self, data: Any) -> UInt8[np.ndarray, "height width 3"]:
-        """Return what the camera sees of this `mujoco.MjData`."""
+    def image(self, data: Any) -> UInt8[np.ndarray, "height width 3"]:
+        """Return the image of this `mujoco.MjData`."""
         self._model.vis.global_.fovy = self._fov
         self._renderer.update_scene(data, camera=self._eye)
         return np.asarray(self._renderer.render())

@@ -1,4 +1,4 @@
-"""Which rays meet the arm, and where? MuJoCo casts them; those that pass it by are sorted out beforehand."""
+"""The ray renderer: which rays meet the arm, and where? Cast by MuJoCo; rays that cannot meet it are skipped."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float, Int
 from vjepa2_ac.simulation.world.domains import CameraPlace
 from vjepa2_ac.simulation.world.scene import ARM_GROUP, load_mujoco
 
-_SKIN_M = 6e-3  # a spot does not shade itself
+_SKIN_M = 6e-3  # a point does not shade itself
 _LAMP_CELLS = 160  # cells along each edge of the lamp's view
 _LAMP_HALF_VIEW = 1.6  # tangent of half its opening angle; the arm is always inside
 
 
 class Hits(NamedTuple):
-    """What each ray meets first."""
+    """The first hit of each ray."""
 
     distance_m: Float[np.ndarray, " rays"]
     geoms: Int[np.ndarray, " rays"]  # -1: nothing
@@ -24,7 +24,7 @@ class Hits(NamedTuple):
 
 
 class Caster:
-    """MuJoCo's ray casting at one group of geoms, and where the arm's geoms are."""
+    """MuJoCo's ray casting on one group of geoms, and bounding spheres of the arm's geoms."""
 
     def __init__(self, model: Any) -> None:
         self._mujoco, self._model = load_mujoco(), model
@@ -36,7 +36,7 @@ class Caster:
         return data.geom_xpos[self._arm], self._radii
 
     def cast(self, data: Any, origin: Float[np.ndarray, " 3"], rays: Float[np.ndarray, "rays 3"], group: int) -> Hits:
-        """Return what unit rays from one point meet."""
+        """Return the hits of unit rays from one point."""
         count = len(rays)
         geoms = np.full(count, -1, dtype=np.int32)
         distance, normals = np.full(count, -1.0), np.zeros((count, 3))
@@ -51,7 +51,7 @@ class Caster:
     def shaded(
         self, data: Any, lamp: Float[np.ndarray, " 3"], spots: Float[np.ndarray, "spots 3"], group: int
     ) -> Bool[np.ndarray, " spots"]:
-        """Return which spots are in the shadow of one group of geoms."""
+        """Return which points are in the shadow of one group of geoms."""
         ways = spots - lamp
         reach = np.linalg.norm(ways, axis=1)
         hits = self.cast(data, lamp, ways / np.maximum(reach, 1e-9)[:, None], group)
@@ -59,7 +59,7 @@ class Caster:
 
 
 class View:
-    """Unit rays from one point, sorted into the cells of a grid: those that may meet the arm are found without casting.
+    """Unit rays from one point, sorted into the cells of a grid: those that may hit the arm are found without casting.
 
     Args:
         pose: Frame of the view in the world: x right, y down, z forward.
@@ -89,7 +89,7 @@ class View:
         centres, radii = caster.arm_spheres(data)
         inside = (centres - self.origin) @ self._rotation
         ends = inside[:, 2] - radii, inside[:, 2] + radii
-        if ends[0].min() <= 0.0:  # the view is in the midst of the arm
+        if ends[0].min() <= 0.0:  # the view is inside the arm
             return np.arange(len(self.rays))
         edges = np.stack([(inside[:, :2] + sign * radii[:, None]) / end[:, None] for sign in (-1, 1) for end in ends])
         low = np.clip(self._cell(edges.min(axis=0)), 0, self._cells).astype(int)
@@ -105,7 +105,7 @@ class View:
 
 
 def lamp_view(lamp: Float[np.ndarray, " 3"], spots: Float[np.ndarray, "spots 3"]) -> View:
-    """Return spots as the lamp sees them."""
+    """Return points in the view of the lamp."""
     distance = float(np.linalg.norm(lamp))
     azimuth = float(np.rad2deg(np.arctan2(lamp[1], lamp[0])))
     elevation = float(np.rad2deg(np.arcsin(lamp[2] / distance)))

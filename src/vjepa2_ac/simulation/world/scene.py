@@ -1,4 +1,4 @@
-"""What stands in the simulated room? The arm from primitives, a table with things on it, walls: our own MJCF."""
+"""The simulated scene: the arm from primitives, a table with objects, walls. Our own MJCF."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from vjepa2_ac.simulation.world.domains import Domain, Look
 from vjepa2_ac.simulation.world.kinematics import FLANGE_OFFSET_M, JOINTS
 
 STATIC_GROUP, ARM_GROUP = 0, 1
-"""Geom groups: what never moves, and what does."""
+"""Geom groups: static, and moving."""
 FINGER_TRAVEL_M = 0.04
 FINGER_INSIDE_M, FINGER_OUTSIDE_M, FINGER_HALF_M = 0.004, 0.028, 0.014
 """Of a closed finger: from the middle of the hand to its inner and outer side, and half its width across."""
 FINGERTIP_M = 0.15
-"""How far the fingers reach beyond the flange."""
+"""Length of the fingers beyond the flange."""
 BLOCK_M = 0.06
-"""Edge of the block, a cube, in scenes that have one."""
+"""Edge length of the block, a cube, in scenes with one."""
 
 Coordinate = float | int
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -35,7 +35,7 @@ class Shape:
     start: Point
     end: Point
     radius_m: float
-    colour: str  # which colour of the Look
+    colour: str  # a colour of the Look
 
 
 LINK_SHAPES: tuple[tuple[Shape, ...], ...] = (
@@ -121,7 +121,7 @@ def scene_xml(domain: Domain) -> str:
 
 
 def scene_tree(domain: Domain) -> ET.Element:
-    """Return the scene as the tree of its MJCF, for others to add to."""
+    """Return the scene as the tree of its MJCF, which can be extended."""
     root = ET.Element("mujoco", model="arm")
     ET.SubElement(root, "compiler", angle="radian", autolimits="true")
     visual = ET.SubElement(root, "visual")
@@ -145,7 +145,7 @@ def scene_tree(domain: Domain) -> ET.Element:
 
 
 def light_position(look: Look) -> np.ndarray:
-    """Return where the lamp hangs in the world."""
+    """Return the position of the lamp in the world."""
     azimuth, elevation = np.deg2rad(look.light_azimuth_deg), np.deg2rad(look.light_elevation_deg)
     outward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     return 2.2 * np.array(outward)
@@ -167,7 +167,7 @@ def _add_room(world: ET.Element, look: Look) -> None:
 
 
 def _add_clutter(world: ET.Element, rng: np.random.Generator) -> None:
-    """Put five things on the table, outside the robot's foot."""
+    """Put five objects on the table, outside the robot's foot."""
     for index in range(5):
         x, y = rng.uniform(0.25, 0.8), rng.uniform(-0.5, 0.5)
         size, height = rng.uniform(0.02, 0.04), rng.uniform(0.02, 0.05)
@@ -245,5 +245,5 @@ def _add_box(world: ET.Element, name: str, centre: Point, half: Point, colour: t
 
 
 def as_text(numbers: Any) -> str:
-    """Return numbers as an attribute of MJCF, to the last digit."""
+    """Return numbers as an attribute of MJCF, exactly."""
     return " ".join(repr(float(number)) for number in numbers)

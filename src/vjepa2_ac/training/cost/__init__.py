@@ -1,1 +1,1 @@
-"""What does a run cost before it is started: trained parameters, memory, arithmetic? Computed without torch."""
+"""The cost of a run before it starts: trained parameters, memory, FLOPs. Computed without torch."""

@@ -1,4 +1,4 @@
-"""What does autograd keep of a training objective until the backward pass? Teacher forcing, rollout, and losses."""
+"""Activation memory of the training objective: what autograd saves for teacher forcing, rollout and losses."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ _HEADS = ("predictor_embed", *_CONDITIONS)
 
 @dataclass(frozen=True)
 class Activations:
-    """Counts what is kept for one micro-batch of a run, on one kind of device.
+    """Counts what autograd saves for one micro-batch of a run, on one kind of device.
 
     Args:
         config: The run.
         sizes: Sizes of its model.
-        device: Where it runs.
+        device: The device type.
     """
 
     config: Config
@@ -31,16 +31,16 @@ class Activations:
         return self.teacher_forcing() + self.rollout() + self.losses() + self.cast_cache()
 
     def with_checkpointing(self) -> int:
-        """Return the most that is kept at once when blocks keep only what they are given, and are computed again.
+        """Return the peak when blocks save only their inputs, and are recomputed.
 
-        When the longest pass computes its blocks again, its losses and what came after its blocks are gone; inputs of
-        trained heads that are still there then are small, and left out. The casts that autocast holds on to
-        (`cast_cache`) come on top: autograd does not keep them.
+        When the longest pass recomputes its blocks, its losses and later parts are already freed; remaining inputs of
+        trained heads are small, and left out. The casts that autocast caches (`cast_cache`) are extra: autograd does
+        not save them.
         """
         return self._inputs() + max(self._ends(), self.recomputed())
 
     def after_forward(self) -> int:
-        """Return what is kept, with checkpointing, when the losses are computed."""
+        """Return what is saved, with checkpointing, when the losses are computed."""
         return self._inputs() + self._ends()
 
     def teacher_forcing(self) -> int:
@@ -57,7 +57,7 @@ class Activations:
         return self._setting.patches(predicted) * self.sizes.encoder.width * FLOAT32
 
     def recomputed(self) -> int:
-        """Return the bytes of the block that keeps most, with its weights as they are cast."""
+        """Return the bytes of the block that saves most, with its weights as they are cast."""
         blocks = [self._block(index, self._steps) for index in range(self.sizes.predictor.depth)]
         return max(size + self._casts(index) for index, size in enumerate(blocks))
 
@@ -69,13 +69,13 @@ class Activations:
         return sum(adapter_casts(self._setting, name) for name in self._setting.layers)
 
     def _inputs(self) -> int:
-        """Return the bytes of what blocks are given."""
+        """Return the bytes of the inputs of blocks."""
         given = self._tokens(self._steps) if self._heads_are_trained or self._block_is_trained else 0
         given += len(self._past_of_passes) * self._tokens(1) * 3  # and keys and values that the rollout reuses
         return self.sizes.predictor.depth * given * self._setting.width * self._setting.number
 
     def _ends(self) -> int:
-        """Return the bytes of what comes before and after the blocks of all passes, losses included."""
+        """Return the bytes of all parts before and after the blocks of all passes, losses included."""
         passes = len(self._past_of_passes)
         heads = self._head(self._steps, fed_back=False) + passes * self._head(1, fed_back=True)
         casts = adapter_casts(self._setting, "predictor_proj")
@@ -94,7 +94,7 @@ class Activations:
         return block_bytes(self._setting, index, steps, past, reached=reached)
 
     def _head(self, steps: int, *, fed_back: bool) -> int:
-        """Return the bytes of what comes before and after the blocks."""
+        """Return the bytes of the parts before and after the blocks."""
         setting = self._setting
         patches, latent = setting.patches(steps), self.sizes.encoder.width
         reached = fed_back or self._heads_are_trained or self._block_is_trained
@@ -142,6 +142,6 @@ class Activations:
 
     @property
     def _past_of_passes(self) -> range:
-        """How many steps each pass of the rollout after the first prediction finds in the cache."""
+        """The number of cached steps for each pass of the rollout after the first prediction."""
         training = self.config.training
         return range(1, training.rollout_steps if training.rollout_weight else 1)

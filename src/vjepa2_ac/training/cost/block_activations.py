@@ -1,13 +1,13 @@
-"""What does autograd keep of one layer or one block of the predictor? Counted operation by operation, in bytes.
+"""Activation memory of one layer or block of the predictor, counted operation by operation, in bytes.
 
-Only what a gradient needs is kept. A frozen linear layer keeps nothing of its input; its adapter, or a weight that is
-trained whole, keeps it, in the arithmetic's type, and an adapter its own two matrices, cast. A norm keeps its input and
-two statistics a token, attention keeps query, key, value, output and a log-sum-exp a head, GELU its input, dropout its
-mask. DoRA, as PEFT computes it, keeps two outputs of each layer, and with dropout a copy of the weights.
+Only what a gradient needs is saved. A frozen linear layer saves nothing of its input; its adapter, or a weight that is
+trained whole, saves it, in the arithmetic's type, and an adapter its own two matrices, cast. A norm saves its input and
+two statistics a token, attention saves query, key, value, output and a log-sum-exp a head, GELU its input, dropout its
+mask. DoRA, as PEFT computes it, saves two outputs of each layer, and with dropout a copy of the weights.
 
 Devices differ in two of these. Where weights have another type than the arithmetic, CUDA's autocast computes norms from
-a float32 copy and keeps that, where the CPU's leaves the input as it is; and CUDA keeps a mask of one byte, the CPU one
-of the masked tensor's type.
+a float32 copy and saves that, while the CPU's leaves the input unchanged; and CUDA saves a mask of one byte, the CPU
+one of the masked tensor's type.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _QKV = ("attn.q", "attn.k", "attn.v")
 
 @dataclass(frozen=True)
 class Setting:
-    """How large the tensors of a run are, in which arithmetic, and what is trained."""
+    """The sizes of a run's tensors, their types, and the trained layers."""
 
     config: Config
     sizes: ModelSizes
@@ -42,7 +42,7 @@ class Setting:
 
     @property
     def norm_number(self) -> int:
-        """Bytes of a number that a norm keeps."""
+        """Bytes of a number that a norm saves."""
         return FLOAT32 if self.copies_for_norms else self.number
 
     @property
@@ -82,7 +82,7 @@ class Setting:
 
     @property
     def shares_inputs(self) -> bool:
-        """Whether layers that read one tensor keep it once: nothing is masked, and nothing is cast for each."""
+        """Whether layers that read one tensor save it once: nothing is masked, and nothing is cast for each."""
         if self.trains_everything:
             return True
         return not self.config.adapter.dropout and (self.is_plain or self.number == FLOAT32)
@@ -113,18 +113,18 @@ class Setting:
 
 
 def block_bytes(setting: Setting, index: int, steps: int, past: int = 0, *, reached: bool = True) -> int:
-    """Return what one block keeps, without its weights.
+    """Return what one block saves, without its weights.
 
     Args:
         setting: The run.
         index: Which block, from 0.
         steps: Steps that it computes.
-        past: Steps before them whose keys and values it is given.
-        reached: Whether gradients go further back than this block.
+        past: Earlier steps whose keys and values it receives.
+        reached: Whether gradients flow further back than this block.
     """
     tokens, width, number = setting.tokens(steps), setting.width, setting.number
     trained = {name for name in (*_QKV, "attn.o", "mlp.fc1") if _is_trained(setting, f"blocks.{index}.{name}")}
-    attends = reached or bool(trained & set(_QKV))  # what comes before is needed from here on
+    attends = reached or bool(trained & set(_QKV))  # gradients are needed from here on
     adds = attends or "attn.o" in trained
     activates = adds or "mlp.fc1" in trained
     norm = tokens * (width * setting.norm_number + 2 * setting.norm_number)
@@ -140,13 +140,13 @@ def block_bytes(setting: Setting, index: int, steps: int, past: int = 0, *, reac
 
 
 def layer_bytes(setting: Setting, name: str, tokens: int, *, reached: bool) -> int:
-    """Return what a linear layer and its adapter keep of so many tokens: input, mask, what is between A and B.
+    """Return what a linear layer and its adapter save for so many tokens: input, mask, the tensor between A and B.
 
     Args:
         setting: The run.
-        name: Which layer.
-        tokens: How many tokens.
-        reached: Whether gradients go further back than this layer.
+        name: The layer.
+        tokens: The number of tokens.
+        reached: Whether gradients flow further back than this layer.
     """
     layer, number = setting.layers[name], setting.number
     if setting.trains_whole(name):
@@ -183,7 +183,7 @@ def _dora(setting: Setting, layer: Layer, tokens: int, *, reached: bool) -> int:
 
 
 def _shared(setting: Setting, tokens: int, steps: int, trained: set[str]) -> int:
-    """Return what was counted more than once: tensors that several operations keep."""
+    """Return what was counted more than once: tensors that several operations save."""
     if not setting.shares_inputs:
         return 0
     twice = max(0, len(trained & set(_QKV)) - 1)  # they read one tensor

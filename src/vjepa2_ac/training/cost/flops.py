@@ -1,10 +1,10 @@
-"""How much arithmetic is one clip, or one plan? Operations by formula: no model is built and torch is not needed.
+"""FLOPs of one clip or one plan, by formula: no model is built and torch is not needed.
 
-What counts is what the mathematics asks for, once (model FLOPs): a product of matrices is two operations per pair of
-numbers; forward, backward with respect to inputs wherever a gradient has to pass, with respect to weights only for what
-is trained. What is computed again (gradient checkpointing, the scores in a fused attention's backward pass) does not
-count, nor do norms, activations and rotations, which are no products of matrices. Attention is counted as the
-block-causal it is: a token of step t looks at the tokens of steps up to t.
+Model FLOPs are counted: only what the mathematics requires, once. A matrix product is two operations per pair of
+numbers; forward, backward with respect to inputs wherever a gradient has to pass, and with respect to weights only for
+trained ones. Recomputation (gradient checkpointing, the scores in a fused attention's backward pass) is not counted,
+nor are norms, activations and rotations, which are no matrix products. Attention is counted as block-causal: a token of
+step t attends to the tokens of steps up to t.
 
 Not counted: the norms of weights that DoRA needs.
 """
@@ -28,7 +28,7 @@ class ClipFlops:
 
     @property
     def predictor(self) -> int:
-        """What is left where the latents are there already."""
+        """The work if the latents are cached."""
         return self.forward + self.backward
 
     @property
@@ -53,12 +53,12 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
 
 
 def plan_flops(sizes: ModelSizes, steps: int, before: int = 0) -> int:
-    """Return the operations of predicting where one action sequence leads, with no adapter beside the weights.
+    """Return the operations of predicting the result of one action sequence, without an adapter beside the weights.
 
     Args:
         sizes: Of the model.
         steps: Actions of the sequence.
-        before: Frames seen before the present one, whose keys and values are there already.
+        before: Frames before the current one, whose keys and values are cached.
     """
     passes = _Passes(sizes)
     return sum(
@@ -91,7 +91,7 @@ class _Passes:
     def __init__(
         self, sizes: ModelSizes, ranks: Mapping[str, int] | None = None, whole: Collection[str] = frozenset()
     ) -> None:
-        """Take a model.
+        """Create a counter for a model.
 
         Args:
             sizes: Of the model.
@@ -104,7 +104,7 @@ class _Passes:
 
     @classmethod
     def of(cls, config: Config, sizes: ModelSizes) -> _Passes:
-        """Take the model as a run trains it."""
+        """Create a counter for the model as a run trains it."""
         everything = config.adapter.kind == "none"
         whole = linear_layers(sizes) if everything else config.adapter.modules_to_save
         return cls(sizes, adapter_ranks(config, sizes), whole)
@@ -114,8 +114,8 @@ class _Passes:
 
         Args:
             steps: Steps whose tokens are computed.
-            keys: For each of them, how many steps its tokens look at.
-            fed_back: Whether its latents are predictions, through which gradients pass.
+            keys: For each of them, the number of steps that its tokens attend to.
+            fed_back: Whether its latents are predictions, through which gradients flow.
         """
         patches = steps * _patches(self._sizes)
         work = self._linear("predictor_embed", patches, into=fed_back)
@@ -130,13 +130,13 @@ class _Passes:
         return work + self._linear("predictor_proj", patches, into=flowing)
 
     def _block(self, block: str, tokens: int, pairs: int, *, flowing: bool) -> tuple[_Work, bool]:
-        """Return the work of a block, and whether a gradient has to pass through what comes out.
+        """Return the work of a block, and whether its output needs a gradient.
 
         Args:
             block: Its name.
             tokens: Whose queries are computed.
-            pairs: Queries and keys that meet.
-            flowing: Whether a gradient has to pass through what comes in.
+            pairs: Pairs of queries and keys.
+            flowing: Whether its input needs a gradient.
         """
         work = _Work()
         projections = [f"{block}.attn.{name}" for name in ("q", "k", "v")]

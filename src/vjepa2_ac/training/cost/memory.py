@@ -1,7 +1,7 @@
-"""Will a run fit on the GPU? Its memory, part by part, by arithmetic: no model is built and torch is not needed.
+"""GPU memory of a run, part by part, by arithmetic: no model is built and torch is not needed.
 
-The counts of parameters are exact. What autograd keeps (`training.cost.activations`) is held by a test to what PyTorch
-really keeps on a CPU. The whole has not yet been compared with the peak that a GPU measures.
+The parameter counts are exact. What autograd saves (`training.cost.activations`) is tested against what PyTorch saves
+on a CPU. The total has not yet been compared with the peak that a GPU measures.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from vjepa2_ac.training.cost.parameters import (
 )
 
 GIGABYTE = 10**9
-ALLOWANCE = 3 * GIGABYTE // 2  # CUDA context 0.5, cuBLAS workspaces, holes between blocks: not computed, allowed for
+ALLOWANCE = 3 * GIGABYTE // 2  # CUDA context 0.5, cuBLAS workspaces, fragmentation: not computed but assumed
 USUAL_GPU = 24 * GIGABYTE
 
 _BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
@@ -32,31 +32,31 @@ _SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # of bitsandbytes
 
 @dataclass(frozen=True)
 class MemoryEstimate:
-    """Bytes on the GPU, part by part. `total` is the largest of five moments: they do not happen at once."""
+    """Bytes on the GPU, part by part. `total` is the largest of five moments: they do not occur at once."""
 
     parameters: Parameters
-    checkpointing: bool  # what the config asks for
+    checkpointing: bool  # as the config requests
     encoder_weights: int
-    predictor_weights: int  # frozen; none where the whole predictor is trained
+    predictor_weights: int  # frozen; 0 if the whole predictor is trained
     trained: int
     gradients: int
     moments: int
-    arriving: int  # the next batch, on its way to the GPU; pictures as if they were of the model's size
+    arriving: int  # the next batch, on its way to the GPU; frames as if they were of the model's size
     latents: int
     encoding: int  # activations of the encoder, for one chunk of frames, and the frames
     teacher_forcing: int
     rollout: int
     losses: int
     cast_cache: int  # copies of trained weights in the arithmetic's type
-    checkpointed: int  # all of teacher forcing, rollout and losses, when blocks are computed again
+    checkpointed: int  # all of teacher forcing, rollout and losses, when blocks are recomputed
     temporaries: int
-    optimizer_temporaries: int  # AdamW is fused; but of logged steps `update_to_weight` needs what was before
+    optimizer_temporaries: int  # AdamW is fused; but on logged steps `update_to_weight` needs the old weights
     validating: int  # all of a batch of validation
-    caching: int  # all of encoding a cache, which is over before the rest begins
+    caching: int  # all of encoding a cache, which ends before the rest begins
 
     @property
     def standing(self) -> int:
-        """What is there all the time."""
+        """What is allocated all the time."""
         weights = self.encoder_weights + self.predictor_weights + self.trained
         return weights + self.moments + self.arriving + ALLOWANCE
 
@@ -69,12 +69,12 @@ class MemoryEstimate:
 
 
 def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> MemoryEstimate:
-    """Return what a run needs.
+    """Return the memory that a run needs.
 
     Args:
         config: The run.
         sizes: Sizes of its model, such as `model.base_model.base_sizes` gives.
-        device: Whose rules of what is kept are meant.
+        device: The device type whose rules for saved tensors apply.
     """
     parameters = count_parameters(config, sizes)
     number = 2 if config.model.dtype == "bfloat16" else FLOAT32
@@ -103,7 +103,7 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
 
 
 def ways_to_fit(config: Config, sizes: ModelSizes, available: int) -> list[str] | None:
-    """Return the knobs to turn, one after the other, until the run fits; None where all of them do not suffice."""
+    """Return the knobs to change, one after the other, until the run fits; None if all of them do not suffice."""
     turned: list[str] = []
     for knob, turn in _KNOBS:
         if _total(config, sizes) <= available:

@@ -1,4 +1,4 @@
-"""How many parameters has a model, and which of them are trained? By arithmetic: no model is built."""
+"""Parameter counts: how many a model has, and which are trained. By arithmetic: no model is built."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Monitoring: how fast is training, and is it going wrong?"""
+"""Monitoring: how fast is training, and does it diverge?"""

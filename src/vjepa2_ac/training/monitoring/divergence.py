@@ -1,6 +1,6 @@
-"""Has training made the model worse? Said once for each cause, in metrics.jsonl and to the person who watches.
+"""Divergence warnings: has training made the model worse? One warning per cause, in metrics.jsonl and on the console.
 
-What is looked at is the journal's rows alone, so that a run that goes on says neither less nor the same once more.
+Only the rows of the metrics log are used, so that a resumed run neither loses nor repeats a warning.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ _MEASURES = {
     "error_over_persistence": "one-step error",
     "rollout_over_persistence_last": "rollout error at the last horizon",
 }
-_NOISE = 1.01  # validation clips are always the same ones; as much changes without meaning anything
-_LOSSES = 10  # rows of `train` whose median is compared, and as few as
+_NOISE = 1.01  # validation clips are always the same; smaller changes mean nothing
+_LOSSES = 10  # number of `train` rows whose median is compared
 _FEWEST_LOSSES = 5
-_FAR_ABOVE = 2.0  # the lowest such median
+_FAR_ABOVE = 2.0  # times the lowest such median
 
 
 class WatchedMetricsLog(MetricsLog):
-    """A journal that says when its rows tell that training goes wrong.
+    """A metrics log that warns when its rows show that training diverges.
 
     Args:
         run_dir: The run's folder.
-        config: Its config, for what to turn.
-        note: Told what a person should know.
+        config: Its config, for the knobs to change.
+        note: Receives messages for the user.
         first_step: As of `MetricsLog`.
         trackers: As of `MetricsLog`.
     """
@@ -51,16 +51,16 @@ class WatchedMetricsLog(MetricsLog):
         for row in read_metrics_log(self.path):
             self._watch(str(row.get("kind")), row["step"], row)
 
-    def write(self, kind: str, step: int, figures: Mapping[str, Any]) -> None:
-        """Append a row, and behind it what it warns of."""
-        super().write(kind, step, figures)
-        for text in self._watch(kind, step, figures):
+    def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
+        """Append a row, followed by its warnings."""
+        super().write(kind, step, metrics)
+        for text in self._watch(kind, step, metrics):
             super().write(WARNING, step, {"text": text})
             self._note(f"Warning: {text}")
 
 
 class Watch:
-    """Looks at row after row of a journal.
+    """Checks the rows of a metrics log one after the other.
 
     Args:
         config: Of the run.
@@ -68,20 +68,20 @@ class Watch:
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._said: set[str] = set()
+        self._reported: set[str] = set()
         self._at_start: dict[str, float] = {}
         self._losses: deque[float] = deque(maxlen=_LOSSES)
         self._lowest = math.inf
 
-    def __call__(self, kind: str, step: int, figures: Mapping[str, Any]) -> list[str]:
-        """Return what is to be said of a row: nothing where all is well or it was said before."""
+    def __call__(self, kind: str, step: int, metrics: Mapping[str, Any]) -> list[str]:
+        """Return the warnings of a row: none if it is fine or the cause is known already."""
         found = {"validation": self._of_validation, "train": self._of_loss}.get(kind)
-        new = {cause: text for cause, text in found(step, figures) if cause not in self._said} if found else {}
-        self._said |= set(new)
-        return [f"at step {step:,} {text}. {way_out(self._config)}" for text in new.values()]
+        new = {cause: text for cause, text in found(step, metrics) if cause not in self._reported} if found else {}
+        self._reported |= set(new)
+        return [f"at step {step:,} {text}. {advice(self._config)}" for text in new.values()]
 
-    def _of_validation(self, step: int, figures: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        now = {name: _number(figures.get(key)) for key, name in _MEASURES.items()}
+    def _of_validation(self, step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        now = {name: _number(metrics.get(key)) for key, name in _MEASURES.items()}
         if step == 0:
             self._at_start = now
             return
@@ -91,15 +91,15 @@ class Watch:
         worse = [name for name, value in now.items() if value > _NOISE * starts[name]]
         if not worse:
             return
-        told = " and ".join(f"the {name} is {now[name]:.3f} (before training {starts[name]:.3f})" for name in worse)
+        errors = " and ".join(f"the {name} is {now[name]:.3f} (before training {starts[name]:.3f})" for name in worse)
         beyond = any(now[name] > 1.0 > starts[name] for name in worse)
         copying = "; copying the last frame would be better" if beyond else ""
         last = step == self._config.training.steps
-        yield f"{worse} {beyond} {last}", f"{told} of persistence's in the validation{copying}"
+        yield f"{worse} {beyond} {last}", f"{errors} of persistence's in the validation{copying}"
 
-    def _of_loss(self, step: int, figures: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    def _of_loss(self, step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         del step
-        loss = _number(figures.get("loss"))
+        loss = _number(metrics.get("loss"))
         if not math.isfinite(loss):  # a step without clips, or one that was refused
             return
         self._losses.append(loss)
@@ -111,8 +111,8 @@ class Watch:
             yield "loss", f"the loss is {typical:.4g}, and was {self._lowest:.4g} (medians of {_LOSSES} rows)"
 
 
-def way_out(config: Config) -> str:
-    """Return what to turn in a config whose training has made the model worse."""
+def advice(config: Config) -> str:
+    """Return the knobs to change in a config whose training has made the model worse."""
     training, adapter = config.training, config.adapter
     knobs = [f"lower training.learning_rate ({training.learning_rate:g})"]
     if adapter.kind == "lora":
@@ -125,5 +125,5 @@ def way_out(config: Config) -> str:
 
 
 def _number(value: Any) -> float:
-    """Return a figure; NaN for one that JSON could not hold."""
+    """Return a number; NaN for one that JSON could not hold."""
     return float(value) if isinstance(value, int | float) else math.nan

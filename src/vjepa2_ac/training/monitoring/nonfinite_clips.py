@@ -1,7 +1,7 @@
-"""Which clips made a loss or gradient that is not finite? They are saved for a look, in RUN/not_finite/step-XXXXXXXX.
+"""Clips whose loss or gradient is not finite: saved for inspection in RUN/not_finite/step-XXXXXXXX.
 
-Each process saves its own: an npz per clip (frames, states, actions, episode_id, start) and one picture of them. Clips
-from a latent cache have no frames: their latents are saved instead, as float32, and the film is blank.
+Each process saves its own: an npz per clip (frames, states, actions, episode_id, start) and one figure of all. Clips
+from a latent cache have no frames: their latents are saved instead, as float32, and their film strip is blank.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vjepa2_ac.episode import Batch, StoredLatents
 from vjepa2_ac.storage import atomic_writer
 
 MOST_CLIPS = 16
-MOST_BYTES = 512 * 10**6  # of frames, which are kept until the step is known to be well
+MOST_BYTES = 512 * 10**6  # of frames, stored until the gradients are known to be finite
 
 
 class ClipRecorder:
@@ -31,32 +31,32 @@ class ClipRecorder:
         self._bytes = 0
 
     def add(self, batch: Batch, loss: Float[Tensor, ""]) -> None:
-        """Keep a micro-batch and its loss, unless too much is kept already. The loss is not waited for."""
+        """Store a micro-batch and its loss, unless too much is stored already. Does not wait for the loss."""
         self._bytes += 0 if batch.frames is None else batch.frames.nbytes
         self._bytes += 0 if batch.latents is None else batch.latents.values.nbytes
         if self._bytes <= MOST_BYTES:
             self._kept.append((batch, loss.detach()))
 
     def save(self, folder: Path, process: int) -> str:
-        """Write some clips, the suspicious ones first, and say where they are; or, where that fails, why it does.
+        """Write some clips, the suspicious ones first, and return where they are; or, if that fails, the reason.
 
-        Nothing is raised: the error that is being told is more important.
+        Nothing is raised: the error that is being reported is more important.
 
         Args:
             folder: RUN/not_finite/step-XXXXXXXX.
-            process: Whose clips they are.
+            process: The process of the clips.
         """
         try:
             chosen = self._most_suspicious()
             for number, (batch, place) in enumerate(chosen):
                 _write(batch, place, folder / f"process{process}-clip{number:02d}.npz")
             _draw(chosen, folder / f"process{process}.png")
-        except Exception as error:  # a full disk, no permission, a picture that cannot be drawn
+        except Exception as error:  # a full disk, no permission, a frame that cannot be drawn
             return f"they could not all be saved in {folder}: {type(error).__name__}: {error}"
         return f"{len(chosen)} of them are saved in {folder}"
 
     def _most_suspicious(self) -> list[tuple[Batch, int]]:
-        """Return micro-batch and place of clips: those with numbers that are not finite, then by their loss."""
+        """Return micro-batch and index of clips: those with numbers that are not finite, then by their loss."""
         found = []
         for batch, loss in self._kept:
             sound = bool(torch.isfinite(loss))
@@ -93,7 +93,7 @@ def _draw(chosen: Sequence[tuple[Batch, int]], path: Path) -> None:
     from vjepa2_ac.reports.figures.clips import ClipFigure, plot_clips
 
     blank = np.full((1, 9, 16, 3), 224, np.uint8)
-    pictures = [
+    figures = [
         ClipFigure(
             name=f"{batch.episode_ids[place]} from step {batch.starts[place]}",
             frames=_seen(batch, place).get("frames", blank),
@@ -101,4 +101,4 @@ def _draw(chosen: Sequence[tuple[Batch, int]], path: Path) -> None:
         )
         for batch, place in chosen
     ]
-    plot_clips(f"Clips of a step whose loss or gradient is not finite ({len(pictures)})", pictures, path)
+    plot_clips(f"Clips of a step whose loss or gradient is not finite ({len(figures)})", figures, path)

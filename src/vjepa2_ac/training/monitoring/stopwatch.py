@@ -1,4 +1,4 @@
-"""How long was it waited? By the host's clock, or by what a CUDA device stood idle meanwhile."""
+"""The stopwatch for waiting time: by the host's clock, or by the idle time of a CUDA device."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from vjepa2_ac.data.clips.streams import Cuda
 
 @runtime_checkable
 class Stopwatch(Protocol):
-    """Adds up how long waiting took."""
+    """Sums up waiting time."""
 
     @property
     def seconds(self) -> float:
-        """So far."""
+        """Seconds so far."""
         ...
 
     def running(self) -> AbstractContextManager[None]:
@@ -28,7 +28,7 @@ class Stopwatch(Protocol):
 
 
 class HostStopwatch:
-    """Measures what the host waits."""
+    """Measures the waiting time of the host."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -44,7 +44,7 @@ class HostStopwatch:
 
 
 class IdleStopwatch:
-    """Measures what a CUDA device stands idle while the host waits: between the end of what it had to do and the next.
+    """Measures the idle time of a CUDA device while the host waits: from the end of its queued work to the next work.
 
     Args:
         cuda: The device.
@@ -52,12 +52,12 @@ class IdleStopwatch:
 
     def __init__(self, cuda: Cuda) -> None:
         self._cuda = cuda
-        self._spans: deque[tuple[Any, Any]] = deque()  # events that the device may not have come to yet
+        self._spans: deque[tuple[Any, Any]] = deque()  # events that the device may not have reached yet
         self._seconds = 0.0
 
     @property
     def seconds(self) -> float:
-        """So far; waiting that the device has not come to yet counts when it has. Nothing waits for it."""
+        """Seconds so far; waiting that the device has not reached yet counts later. Does not synchronize."""
         while self._spans and self._spans[0][1].query():
             began, ended = self._spans.popleft()
             self._seconds += began.elapsed_time(ended) / 1000
@@ -74,5 +74,5 @@ class IdleStopwatch:
 
 
 def stopwatch_for(device: torch.device) -> Stopwatch:
-    """Return what measures the waiting for data where a run computes."""
+    """Return the stopwatch for the device of a run."""
     return IdleStopwatch(Cuda(device)) if device.type == "cuda" else HostStopwatch()

@@ -1,12 +1,12 @@
-"""Is a run well, and is the machine busy? Figures of one optimizer step, for the journal and for the console.
+"""Training and throughput metrics of one optimizer step, for the metrics log and the console.
 
 update_to_weight    norm of the update over the norm of the weights before it, of all that is trained together
-data_wait_share     share of the step's wall time that was spent waiting for the loader; on CUDA only what the device
-                    stood idle, since it computes what it has while the host waits
+data_wait_share     share of the step's wall time spent waiting for the loader; on CUDA only the device's idle time,
+                    since it computes queued work while the host waits
 samples_per_second  clips, of all processes
 tokens_per_second   patch tokens of the frames of these clips
-mfu                 model FLOPs per second (`training.cost.flops`) over the ceiling: what this device does in a large
-                    product of matrices in the run's precision, measured for a fraction of a second at the start
+mfu                 model FLOPs per second (`training.cost.flops`) over the ceiling: the rate of this device in a large
+                    matrix product in the run's precision, measured for a fraction of a second at the start
 memory_gb           peak so far in 10^9 bytes: of PyTorch's allocator on CUDA, resident elsewhere
 """
 
@@ -31,18 +31,18 @@ from vjepa2_ac.training.cost.flops import clip_flops
 from vjepa2_ac.training.monitoring.stopwatch import HostStopwatch, Stopwatch
 
 MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "memory_gb"})
-"""Figures of the machine: two runs that are the same differ in them."""
+"""Metrics of the machine: they differ between identical runs."""
 
 _CEILING_S = 0.2
 _CUDA_MATRIX, _CPU_MATRIX = 8192, 512
 
 
 class TimedBatches:
-    """Hands on batches, and knows how long it was waited for them, also when they are fetched ahead.
+    """Passes on batches, and measures how long the loader was waited for, also for prefetched ones.
 
     Args:
         batches: The loader's.
-        stopwatch: Measures the waiting; None: by the host's clock.
+        stopwatch: Measures the waiting time; None: by the host's clock.
     """
 
     def __init__(self, batches: Iterator[Batch], stopwatch: Stopwatch | None = None) -> None:
@@ -50,7 +50,7 @@ class TimedBatches:
 
     @property
     def waited_s(self) -> float:
-        """Seconds of all waiting so far."""
+        """Total waiting time in seconds."""
         return self._stopwatch.seconds
 
     def __iter__(self) -> TimedBatches:
@@ -63,18 +63,18 @@ class TimedBatches:
             return next(self._batches)
 
     def prefetch_next(self) -> None:
-        """Fetch the next batch where that can be done ahead."""
+        """Fetch the next batch in advance, if the loader can."""
         with self._stopwatch.running():
             prefetch_next(self._batches)
 
 
 @dataclass(frozen=True)
 class Throughput:
-    """Turns a step's clips and seconds into figures."""
+    """Turns a step's clips and seconds into metrics."""
 
     flops_per_clip: int
     tokens_per_clip: int
-    ceiling: float  # FLOPs per second of all processes together
+    ceiling: float  # FLOPs per second of all processes
     device: torch.device
 
     @classmethod
@@ -88,20 +88,20 @@ class Throughput:
             sizes: Of its model.
             device: Of this process.
             processes: Of the run.
-            encodes: Whether the encoder's work counts; latents from a cache need none.
+            encodes: Whether the encoder's work counts; cached latents need none.
         """
         tokens = config.data.frames * (sizes.image_size // sizes.patch_size) ** 2
         ceiling = processes * matmul_speed(device, PRECISIONS[config.training.precision])
         flops = clip_flops(config, sizes)
         return cls(flops.total if encodes else flops.predictor, tokens, ceiling, device)
 
-    def figures(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
-        """Return the figures of one step.
+    def metrics(self, clips: float, seconds: float, waited_s: float) -> dict[str, float]:
+        """Return the metrics of one step.
 
         Args:
             clips: Of all processes.
             seconds: The step's wall time.
-            waited_s: Of which this process waited for the loader.
+            waited_s: The part of it spent waiting for the loader.
         """
         return {
             "samples_per_second": clips / seconds,
@@ -119,12 +119,12 @@ class Throughput:
 
 
 class Update:
-    """How far does an optimizer step move the weights? Keeps a copy of them until it is asked.
+    """Measures how far an optimizer step moves the weights. Keeps a copy of them until it is read.
 
-    Where weights are sharded over processes, each of them has to make one and to ask.
+    If weights are sharded over processes, each of them has to create and read one.
 
     Args:
-        parameters: What the optimizer moves, before it does.
+        parameters: Those of the optimizer, before the step.
     """
 
     def __init__(self, parameters: Iterable[Tensor]) -> None:
@@ -132,7 +132,7 @@ class Update:
         self._before = [parameter.detach().clone() for parameter in self._parameters]
 
     def to_weight(self) -> float:
-        """Return the norm of the update over the norm of the weights before it, of all tensors together; ask once."""
+        """Return the norm of the update over that of the weights before it, of all tensors together; read it once."""
         weight = _norm(self._before)
         for before, parameter in zip(self._before, self._parameters, strict=True):
             before -= parameter.detach()  # in the copy's own memory
@@ -148,14 +148,14 @@ def peak_memory_gb(device: torch.device) -> float:
 
 @lru_cache(maxsize=8)
 def matmul_speed(device: torch.device, dtype: torch.dtype) -> float:
-    """Return the FLOPs per second of a large product of matrices, the best of what a fraction of a second allows.
+    """Return the FLOPs per second of a large matrix product, the best within a fraction of a second.
 
-    Measured once for each device and type in a program: what other programs do meanwhile counts, too.
+    Measured once per device and type in a program: load by other programs affects it.
     """
     size = _CUDA_MATRIX if device.type == "cuda" else _CPU_MATRIX
-    generator = torch.Generator(device).manual_seed(0)  # of its own: training's numbers stay what they are
+    generator = torch.Generator(device).manual_seed(0)  # its own, so that training's random numbers do not change
     matrix = torch.randn(size, size, device=device, generator=generator).to(dtype)
-    _product_s(matrix)  # a first one pays for what is set up once
+    _product_s(matrix)  # warm-up
     best, ends = math.inf, time.perf_counter() + _CEILING_S
     while best == math.inf or time.perf_counter() < ends:
         best = min(best, _product_s(matrix))
