@@ -54,7 +54,7 @@ def _compiled(torch: Path) -> Path:
         return library
     kept.mkdir(parents=True, exist_ok=True)
     unfinished = library.with_suffix(f".{os.getpid()}")
-    flags = ["-std=c++20", "-O1", "-shared", "-fPIC", f"-I{torch / 'include'}"]
+    flags = ["-std=c++20", "-O0", "-shared", "-fPIC", f"-I{torch / 'include'}"]
     linked = [f"-L{torch / 'lib'}", "-lc10", "-ltorch_cpu", f"-Wl,-rpath,{torch / 'lib'}"]
     command = [*_compiler(), *flags, str(SOURCE), "-o", str(unfinished), *linked]
     done = subprocess.run(command, check=False, capture_output=True, text=True)  # noqa: S603

@@ -101,7 +101,7 @@ def test_a_table_says_what_was_refused_warned_hinted_and_missed(
         "as it is": ("quiet", "quiet"), "y negated": ("missed", "named"), "pictures reversed": ("refused", "misled"),
         "stale poses, every 5th": ("warned", "missed"), "BGR": ("hinted", "missed"),
     }  # fmt: skip
-    assert "error agreement: pictures and states run against each other" in printed
+    assert "error agreement: frames and states run against each other" in printed
     assert "0.500 with y negated" in printed
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from ranks import Rank
 from same_run import assert_same_run
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.distributed.preemption import EXIT_STATUS, SIGNALS, StoppedError, stop_on_signals
@@ -18,13 +19,6 @@ from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
 
-COMMAND = """
-import signal, sys, torch
-signal.signal(signal.SIGINT, signal.default_int_handler)  # also where these tests run behind a shell's &
-torch.set_num_threads(1)
-from vjepa2_ac.cli import main
-sys.exit(main(sys.argv[1:]))
-"""
 WAITING = """
 import time
 from vjepa2_ac.distributed.preemption import stop_on_signals
@@ -86,13 +80,10 @@ def test_a_signal_to_the_whole_group_stops_the_run_and_its_workers_in_good_order
     changes = {"training__steps": 40, "validation__every": 40, "checkpoint__every": 40, "data__workers": 2}
     config = make_config(run_dir=str(tmp_path / "stopped"), **changes)
     (tmp_path / "config.yaml").write_text(config_as_yaml(config))
-    process = subprocess.Popen(
-        [sys.executable, "-c", COMMAND, "train", str(tmp_path / "config.yaml")],
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
-    )  # fmt: skip
+    process = Rank(["-m", "vjepa2_ac.cli", "train", str(tmp_path / "config.yaml")], dict(os.environ))
     deadline = time.monotonic() + 120
     while not any(row["kind"] == "train" for row in read_metrics_log(tmp_path / "stopped/metrics.jsonl")):
-        assert process.poll() is None, process.stderr.read()
+        assert process.poll() is None, process.written()
         assert time.monotonic() < deadline
         time.sleep(0.02)
     family = psutil.Process(process.pid).children(recursive=True)

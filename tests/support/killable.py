@@ -1,4 +1,4 @@
-"""Runs killed with SIGKILL at chosen moments, twenty times in a minute or two.
+"""Processes that start at once, and runs killed with SIGKILL at chosen moments.
 
 Starting Python with PyTorch takes seconds. A `Nursery` is a process that has imported everything, done nothing yet and
 has one thread; it forks a child per start, which runs the command line as any process does and dies as any does.
@@ -6,14 +6,18 @@ has one thread; it forks a child per start, which runs the command line as any p
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
+import runpy
 import signal
 import subprocess
 import sys
 import time
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import psutil
@@ -24,7 +28,7 @@ KILLED = -signal.SIGKILL
 
 
 class Nursery:
-    """Starts commands of `vjepa2-ac`, one after the other, each in a process of its own."""
+    """Starts commands of `vjepa2-ac`, or scripts, each in a process of its own."""
 
     def __init__(self) -> None:
         self._process = subprocess.Popen(
@@ -39,26 +43,38 @@ class Nursery:
 
         Its standard output is the file `out`; its standard error the file `err`, else that of this process.
         """
-        self._say({"arguments": arguments, "folder": str(folder), "die_at": die_at, "out": out, "err": err})
-        return Child(int(self._answer()), self)
+        wish = {"arguments": arguments, "folder": str(folder), "die_at": die_at, "out": out, "err": err}
+        return Child(self._ask(wish), self)
 
-    def status_of_last(self) -> int:
-        """Wait for the last child; return its status, negative where a signal ended it."""
-        return int(self._answer())
+    def start_script(self, *words: str, environment: dict[str, str], out: str, err: str) -> Child:
+        """Start `python SCRIPT …`, or `python -m vjepa2_ac.cli …`, in another environment, in the present folder."""
+        wish = {"die_at": None, "out": out, "err": err, "environment": environment, "cwd": str(Path.cwd())}
+        wish |= {"arguments": words[2:]} if words[0] == "-m" else {"script": words[0], "arguments": words[1:]}
+        return Child(self._ask(wish), self)
+
+    def wait_for(self, child: int) -> int:
+        """Wait for a child; return its status, negative where a signal ended it."""
+        return self._ask({"wait": child})
 
     def close(self) -> None:
         self._process.stdin.close()
         self._process.stdout.close()
         self._process.wait(timeout=60)
 
-    def _say(self, what: dict) -> None:
+    def _ask(self, what: dict) -> int:
         self._process.stdin.write(json.dumps(what) + "\n")
         self._process.stdin.flush()
-
-    def _answer(self) -> str:
         answer = self._process.stdout.readline()
         assert answer, "the nursery is gone"
-        return answer
+        return int(answer)
+
+
+@cache
+def nursery() -> Nursery:
+    """The nursery of this test process, for as long as it lives."""
+    made = Nursery()
+    atexit.register(made.close)
+    return made
 
 
 @dataclass(frozen=True)
@@ -75,7 +91,7 @@ class Child:
             return False
 
     def wait(self) -> int:
-        return self.nursery.status_of_last()
+        return self.nursery.wait_for(self.pid)
 
     def kill_after(self, delay_s: float) -> int:
         """Let it run for a while, then kill it; return its status, which is another one where it was done before."""
@@ -114,11 +130,13 @@ def _serve() -> None:
     torch.set_num_threads(1)
     for line in sys.stdin:
         wish = json.loads(line)
+        if "wait" in wish:
+            _tell(os.waitstatus_to_exitcode(os.waitpid(wish["wait"], 0)[1]))
+            continue
         child = os.fork()
         if child == 0:
             _become(wish, main)
         _tell(child)
-        _tell(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 
 def _tell(number: int) -> None:
@@ -139,9 +157,29 @@ def _become(wish: dict, main: Callable[[list[str]], int]) -> None:
             os.dup2(os.open(wish["err"], os.O_WRONLY | os.O_NOCTTY), 2)
         if wish["die_at"] is not None:
             _die_at(wish["die_at"], wish["folder"])
-        status = main(wish["arguments"])
+        if "environment" in wish:
+            os.environ.clear()
+            os.environ.update(wish["environment"])
+            os.chdir(wish["cwd"])
+        status = _script(wish) if "script" in wish else main(wish["arguments"])
     finally:
         os._exit(status)
+
+
+def _script(wish: dict) -> int:
+    sys.argv = [wish["script"], *wish["arguments"]]
+    sys.path.insert(0, str(Path(wish["script"]).parent))
+    try:
+        runpy.run_path(wish["script"], run_name="__main__")
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    except BaseException:
+        traceback.print_exc()
+        return 1
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    return 0
 
 
 def _die_at(number: int, folder: str) -> None:

@@ -1,9 +1,13 @@
 """Start several processes of a run on this machine, and wait for them."""
 
 import os
+import signal
 import socket
-import subprocess
-import sys
+import tempfile
+import time
+from pathlib import Path
+
+import killable
 
 
 def free_port() -> int:
@@ -12,18 +16,56 @@ def free_port() -> int:
         return probe.getsockname()[1]
 
 
-def start_rank(arguments: list[str], rank: int, processes: int, port: int, **more: str) -> subprocess.Popen:
+class Rank:
+    """A process that is running; as `subprocess.Popen`."""
+
+    def __init__(self, words: list[str], environment: dict[str, str]) -> None:
+        self.returncode: int | None = None
+        self._folder = Path(tempfile.mkdtemp())
+        self._said = [self._folder / "out", self._folder / "err"]
+        for file in self._said:
+            file.touch()
+        out, err = map(str, self._said)
+        self._child = killable.nursery().start_script(*words, environment=environment, out=out, err=err)
+
+    @property
+    def pid(self) -> int:
+        return self._child.pid
+
+    def poll(self) -> int | None:
+        if self.returncode is None and not self._child.is_running():
+            self.returncode = self._child.wait()
+        return self.returncode
+
+    def send_signal(self, number: int) -> None:
+        os.kill(self._child.pid, number)
+
+    def kill(self) -> None:
+        if self.poll() is None:
+            self.send_signal(signal.SIGKILL)
+
+    def communicate(self, timeout: float = 120.0) -> tuple[str, str]:
+        """Wait for it; return what it wrote."""
+        until = time.monotonic() + timeout
+        while self.poll() is None:
+            assert time.monotonic() < until, self.written()
+            time.sleep(0.01)
+        return self.written()
+
+    def written(self) -> tuple[str, str]:
+        out, err = (file.read_text() for file in self._said)
+        return out, err
+
+
+def start_rank(words: list[str], rank: int, processes: int, port: int, **more: str) -> Rank:
     """Start one process of a run, as srun does; `more` goes into its environment."""
     place = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": processes, "LOCAL_WORLD_SIZE": processes}
     environment = {**os.environ, **{name: str(value) for name, value in place.items()}, "OMP_NUM_THREADS": "1"}
     environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), **more}
-    return subprocess.Popen(
-        [sys.executable, *arguments],
-        env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    return Rank(words, environment)
 
 
-def finish(processes: list[subprocess.Popen], status: int = 0) -> list[tuple[str, str]]:
+def finish(processes: list, status: int = 0) -> list[tuple[str, str]]:
     """Wait for all; return what each wrote. None is left behind."""
     try:
         said = [process.communicate(timeout=120) for process in processes]

@@ -1,10 +1,11 @@
 """A tiny run on synthetic episodes."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+import killable
 from killable import Nursery
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
@@ -57,11 +58,9 @@ def base_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def nursery() -> Iterator[Nursery]:
+def nursery() -> Nursery:
     """Starts real processes in no time."""
-    nursery = Nursery()
-    yield nursery
-    nursery.close()
+    return killable.nursery()
 
 
 MakeConfig = Callable[..., Config]
