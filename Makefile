@@ -41,8 +41,9 @@ $(OLDEST)/installed: pyproject.toml constraints.txt
 		torch==2.11.0 transformers==5.17.0 -e ".[sim,dev]"
 	touch $@
 
-test-oldest: $(OLDEST)/installed  ## model, training and what is compiled, on the oldest PyTorch and transformers allowed
-	$(OLDEST)/bin/pytest -q tests/model tests/training tests/planning tests/encoding
+test-oldest: $(OLDEST)/installed  ## model, runs, training and planning on the oldest PyTorch and transformers allowed
+	$(OLDEST)/bin/pytest -q -n logical --maxprocesses 8 --dist loadfile \
+		tests/model tests/distributed tests/runs tests/encoding tests/planning tests/training tests/export
 
 soak: $(INSTALLED)  ## runs that are killed 20 times each (0 and 2 loader workers, with and without a best checkpoint)
 	VJEPA2_AC_SOAK=20 $(BIN)/pytest -q --log-cli-level=INFO tests/training/test_soak.py

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
-from collections import defaultdict
+from collections import Counter, defaultdict
 from functools import cache
 from pathlib import Path
 
@@ -240,3 +240,23 @@ def test_only_the_command_line_prints() -> None:
             calls = [node for node in ast.walk(tree_of(path)) if isinstance(node, ast.Call)]
             wrong += [module for call in calls if isinstance(call.func, ast.Name) and call.func.id == "print"]
     assert not wrong
+
+
+def figures() -> str:
+    """Rooms, arrows between them and most files of a folder; `python tests/test_architecture.py` prints them."""
+    lines = []
+    for folder in ("", *(name for name in ORDERS if name and "." not in name)):
+        arrows = set()
+        rooms = {rooms_within(folder, module) for module in modules()} - {None}
+        for module, path in modules().items():
+            room = rooms_within(folder, module)
+            if room is not None:
+                others = {rooms_within(folder, other) for other in own_imports(path)}
+                arrows |= {(room, other) for other in others if other not in {None, room}}
+        lines.append(f"{folder or 'the package':12} {len(rooms):3} rooms {len(arrows):4} arrows")
+    most = max(Counter(path.parent for path in modules().values()).values())
+    return "\n".join([*lines, f"{len(modules())} files, {most} at most in one folder"])
+
+
+if __name__ == "__main__":
+    sys.stdout.write(figures() + "\n")
