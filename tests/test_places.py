@@ -100,7 +100,7 @@ def actions_of(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.
 
 
 def test_every_path_on_the_command_line_is_read_alike() -> None:
-    words = {"CONFIG", "FOLDER", "DIR", "PATH", "PNG", "PICTURE", "RUN", "MODEL", "RUN_OR_MODEL"}
+    words = {"CONFIG", "FOLDER", "DIR", "PATH", "PNG", "IMAGE", "RUN", "MODEL", "RUN_OR_MODEL"}
     found = 0
     for command, action in actions_of(_parser()):
         is_path = words & set(str(action.metavar).replace("|", " ").split())

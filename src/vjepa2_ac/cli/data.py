@@ -62,7 +62,7 @@ def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
         metavar="RUN_OR_MODEL",
         type=as_model,
         help="probe the data with a model that knows robots (a run, or what model.base takes): does it predict better"
-        " where pictures are shifted, mirrored, reversed, BGR, or the gripper is inverted?",
+        " where frames are shifted, mirrored, reversed, BGR, or the gripper is inverted?",
     )
 
 
@@ -130,7 +130,7 @@ def _index(options: argparse.Namespace) -> None:
 
 def _add_inspect(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = _command(
-        commands, "inspect", _inspect, "Say what is in a data set, and picture it: text, inspect.json, a contact sheet."
+        commands, "inspect", _inspect, "Say what is in a data set, and draw it: text, inspect.json, a contact sheet."
     )
     parser.add_argument("--out", metavar="DIR", type=as_path, default=Path("inspection"), help="where to (inspection)")
     parser.add_argument(
@@ -164,9 +164,9 @@ def _inspect(options: argparse.Namespace) -> None:
         console.print(f"For comparison: {RELEASED}.")
     write_atomically(options.out / "inspect.json", json.dumps(inspection.as_dict(), indent=1).encode())
     path = options.out / "contact_sheet.png"
-    with _progress("reading pictures") as progress:
-        picture = plot_dataset(dataset, inspection, path, rows=options.rows, progress=progress)
-    console.print(f"  {picture}\n  {options.out / 'inspect.json'}")
+    with _progress("reading frames") as progress:
+        image = plot_dataset(dataset, inspection, path, rows=options.rows, progress=progress)
+    console.print(f"  {image}\n  {options.out / 'inspect.json'}")
 
 
 def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:

@@ -196,10 +196,10 @@ def _add_compare(commands: Commands[argparse.ArgumentParser]) -> None:
         commands,
         "compare",
         _compare,
-        "Put runs side by side that `evaluate` has measured on the same clips: one table, one picture.",
+        "Put runs side by side that `evaluate` has measured on the same clips: one table, one image.",
     )
     parser.add_argument("runs", metavar="RUN", type=as_path, nargs="+", help="folders with a metrics.json, two or more")
-    parser.add_argument("--out", metavar="PNG", type=as_path, default=Path("comparison.png"), help="the picture")
+    parser.add_argument("--out", metavar="PNG", type=as_path, default=Path("comparison.png"), help="the image")
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -31,7 +31,7 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         commands,
         "plan",
         _plan,
-        "Plan from a picture and a state to a goal's picture: plan.json, and a picture of how the planner came to it."
+        "Plan from an image and a state to a goal image: plan.json, and an image of how the planner came to it."
         " Status 1 where the model gives no finite energy.",
     )
     parser._negative_number_matcher = re.compile(r"^-[\d.]")  # "-0.3,0.1,..." is a value, not an option
@@ -40,7 +40,7 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as planning.horizon=2")
     parser.add_argument(
-        "--start", metavar="PICTURE", type=as_local, required=True, help="what the camera sees: PNG or JPEG"
+        "--start", metavar="IMAGE", type=as_local, required=True, help="what the camera sees: PNG or JPEG"
     )
     parser.add_argument(
         "--state",
@@ -50,7 +50,7 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument(
         "--goal",
-        metavar="PICTURE",
+        metavar="IMAGE",
         type=as_local,
         required=True,
         action="append",
@@ -63,9 +63,9 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
     )
     parser.add_argument(
         "--mask",
-        metavar="PICTURE",
+        metavar="IMAGE",
         type=as_local,
-        help="what of the picture counts: of the goal's size, black where it does not",
+        help="what of the image counts: of the goal's size, black where it does not",
     )
     parser.add_argument(
         "--extrinsics",
@@ -121,10 +121,10 @@ def _plan(options: argparse.Namespace) -> int:
         progress = stages("planning, iterations")
         controller = steering.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
         found = decide(controller, question, nodes=options.nodes)
-    pictures = {"start": options.start, "goals": options.goal, "mask": options.mask}
+    images_given = {"start": options.start, "goals": options.goal, "mask": options.mask}
     with user_can_write(options.out):
         written = [
-            write_plan(found, steering.as_dict() | pictures, options.out / PLAN_FILE),
+            write_plan(found, steering.as_dict() | images_given, options.out / PLAN_FILE),
             plot_plan(found, options.out / PLAN_IMAGE),
         ]
     console.print(plan_table(found))
@@ -156,8 +156,8 @@ def _images(options: argparse.Namespace) -> _Images:
     from vjepa2_ac.planning.input_checks import require_image, require_mask
 
     goals = tuple(read_image(path) for path in options.goal)
-    for path, picture in zip(options.goal, goals, strict=True):
-        require_image(picture, where=f"--goal {path}", like=goals[0])
+    for path, image in zip(options.goal, goals, strict=True):
+        require_image(image, where=f"--goal {path}", like=goals[0])
     start = read_image(options.start)
     require_image(start, where=f"--start {options.start}", like=goals[0])
     mask = None if options.mask is None else read_image(options.mask).max(axis=-1)

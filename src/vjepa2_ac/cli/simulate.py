@@ -38,7 +38,7 @@ def add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
         commands,
         "simulate",
         _simulate,
-        "Let a model steer a simulated arm to a goal picture, beside doing nothing, chance and an oracle. Or, as"
+        "Let a model steer a simulated arm to a goal image, beside doing nothing, chance and an oracle. Or, as"
         " `simulate record FOLDER`: record demonstrations of the arm as a DROID data set. Status 1 where the model gave"
         " no finite energy in any decision.",
     )
@@ -69,7 +69,7 @@ def add_simulate(commands: Commands[argparse.ArgumentParser]) -> None:
     _add_steering(parser.add_argument_group("of a model that steers"))
     recording = parser.add_argument_group("of record")
     recording.add_argument(
-        "--cameras", type=whole_number(1, 3), choices=[1, 3], help="1: all three pictures are the same one (1)"
+        "--cameras", type=whole_number(1, 3), choices=[1, 3], help="1: all three images are the same one (1)"
     )
     recording.add_argument("--workers", type=count, help="processes; the data are the same whatever their number (1)")
     parser.set_defaults(checkpoint=None)

@@ -177,7 +177,7 @@ def read_run_config(folder: Path) -> Config:
 def places_elsewhere(config: Config) -> list[str]:
     """Return a line for each place away from this machine that a config names: its knob, and its address.
 
-    A run's config may come from anybody: whoever goes on with it should know where it leads.
+    A run's config may be untrusted: the addresses in it are shown before they are used.
     """
     knobs = config_as_flat_dict(config).items()
     named = [f"{key}: {value}" for key, value in knobs if isinstance(value, str) and is_url(value)]
