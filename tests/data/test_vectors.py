@@ -1,4 +1,4 @@
-"""Robots without a pose: the numbers arrive as they are, of any width, from every source that can have them."""
+"""Robots without poses: vectors of any width arrive unchanged from every source that supports them."""
 
 import json
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""An image in a file becomes its RGB pixels, or the user reads what is in the file."""
+"""Image files: decoded to RGB pixels, or an error that describes the file."""
 
 import io
 import struct

@@ -1,4 +1,4 @@
-"""One bound on images holds for every form of data, before room is made, and as an error that breaks one episode."""
+"""The image size limit: the same for every form of data, before allocation, as an error of one episode."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A frame at a place is the same frame, however little else is decoded."""
+"""Video frames: independent of which other frames are decoded."""
 
 import io
 import sys

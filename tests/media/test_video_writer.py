@@ -1,4 +1,4 @@
-"""A video that is written can be read back, whole, by our own reader."""
+"""Written videos: our reader reads them back completely."""
 
 import sys
 from pathlib import Path

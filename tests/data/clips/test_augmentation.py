@@ -1,4 +1,4 @@
-"""A drawn change is a pure function, stays inside the frame, and is the same for all frames of a clip."""
+"""Augmentation: a pure function, inside the frame, and the same for all frames of a clip."""
 
 import numpy as np
 import pytest

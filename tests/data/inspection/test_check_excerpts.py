@@ -1,4 +1,4 @@
-"""Pictures and states that do not belong together are seen without a model; those that do give no alarm."""
+"""Checks of excerpts: frames and states that do not match are found without a model; matching ones give no alarm."""
 
 from collections.abc import Callable
 from pathlib import Path

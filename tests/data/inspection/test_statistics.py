@@ -1,4 +1,4 @@
-"""Figures of a data set equal those computed by hand."""
+"""Statistics of a data set: equal to those computed by hand."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""DROID's raw recordings tell the same story as its RLDS."""
+"""DROID's raw recordings: the same content as its RLDS."""
 
 import pickle
 import re

@@ -1,4 +1,4 @@
-"""A LeRobot data set that was damaged anywhere is either named, or gives what it gave before."""
+"""Damaged LeRobot data sets: the damage is named, or has no effect."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Anybody's robot, as plain arrays."""
+""".npz episodes: any robot as plain arrays."""
 
 import pickle
 import shutil

@@ -1,4 +1,4 @@
-"""Of a short Parquet file that claims to be long, no more is unpacked than a data set has; and it is named."""
+"""Parquet bombs: a short file that claims to be long is named, and not decompressed beyond the limits."""
 
 import tracemalloc
 from pathlib import Path

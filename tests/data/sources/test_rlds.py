@@ -1,4 +1,4 @@
-"""RLDS episodes are read exactly, and whatever is wrong with them is named."""
+"""RLDS episodes: read exactly, and every error is named."""
 
 import dataclasses
 import json

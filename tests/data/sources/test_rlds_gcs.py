@@ -1,4 +1,4 @@
-"""RLDS on Google Cloud Storage is read like RLDS on this machine, with few bytes, whatever the network does."""
+"""RLDS on Google Cloud Storage: read like local RLDS, with few bytes, over networks that fail."""
 
 import pickle
 import threading

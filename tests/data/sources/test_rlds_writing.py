@@ -1,4 +1,4 @@
-"""What we write is DROID's schema as TFDS writes it (golden/DATA_ORIGIN.md), and appears whole or not at all."""
+"""Writing RLDS: DROID's schema as TFDS writes it (golden/DATA_ORIGIN.md), complete or not at all."""
 
 import dataclasses
 import errno
