@@ -141,8 +141,8 @@ class Mirror:
                 self._place, error,
             )  # fmt: skip
         except (InputError, OSError) as error:
-            say = logger.info if self._outage_reported else logger.warning
-            say(
+            log = logger.info if self._outage_reported else logger.warning
+            log(
                 "checkpoint.remote is not up to date: %s. Training continues; next attempt in %g minutes",
                 reason_of(error), self._every_minutes,
             )  # fmt: skip
