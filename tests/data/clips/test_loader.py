@@ -268,7 +268,7 @@ def test_an_error_passes_the_pinning_unharmed(
     assert caught.value.needed == "a JPEG image"
 
 
-def test_pictures_of_two_sizes_do_not_stack(droid: Path) -> None:
+def test_frames_of_two_sizes_do_not_stack(droid: Path) -> None:
     config = config_of(droid)
     clip = clip_at(open_dataset(config), 0, 0)
     other = replace(clip, frames=clip.frames[:, :20], episode_id="the other")
