@@ -69,8 +69,8 @@ def read_sizes(folder: Path) -> ModelSizes:
     try:
         return ModelSizes.model_validate_json(json.dumps(card.get("sizes")))
     except ValidationError as error:
-        problems = [f"{'.'.join(map(str, ('sizes', *one['loc'])))}: {message_of(one)}" for one in error.errors()[:4]]
-        raise InputError(where=where, found="; ".join(problems), needed=needed, fix=fix) from None
+        said = [f"{'.'.join(map(str, ('sizes', *one['loc'])))}: {message_of(one)}" for one in error.errors()[:4]]
+        raise InputError(where=where, found="; ".join(said), needed=needed, fix=fix) from None
 
 
 def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -> None:
