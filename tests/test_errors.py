@@ -1,4 +1,4 @@
-"""An error reads as sentences, and travels between processes."""
+"""Errors: they read as sentences, and can be sent between processes."""
 
 import pickle
 

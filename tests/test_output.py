@@ -1,4 +1,4 @@
-"""What a command says never stops it; where it is a run, never holds it up either. With real processes and pipes."""
+"""Output of a command: it never stops a command and never blocks a run. With real processes and pipes."""
 
 import errno
 import fcntl
@@ -74,7 +74,7 @@ def test_a_reader_who_never_reads_holds_up_nothing_and_what_was_left_out_is_told
     os.close(reader), os.close(writer)
     assert process.returncode == 0
     assert path.read_bytes() == b"done"
-    assert said == b"warning: standard output: 20000 lines were left out, because nobody read them in time\n"
+    assert said == b"warning: standard output: 20000 lines were dropped, because they were not read in time\n"
 
 
 def test_what_waits_for_a_reader_is_bounded() -> None:
@@ -120,9 +120,7 @@ def test_a_full_disk_of_a_log_is_told_once_where_somebody_reads(third) -> None:
         )  # fmt: skip
         _, said = process.communicate(timeout=60)
     assert (process.returncode, path.read_bytes()) == (0, b"done")
-    assert said == (
-        b"warning: standard output: cannot be written (No space left on device): not all that was said is there\n"
-    )
+    assert said == (b"warning: standard output: cannot be written (No space left on device): some output is missing\n")
 
 
 COMMAND = "from vjepa2_ac.cli import main; sys.exit(main({}))"

@@ -1,4 +1,4 @@
-"""Every path that can be given means the same, and none is taken for what it is not."""
+"""Paths: each has one meaning everywhere, and none is mistaken for another kind."""
 
 import argparse
 from collections.abc import Iterator

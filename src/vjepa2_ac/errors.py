@@ -5,9 +5,7 @@ import resource
 import unicodedata
 
 _MOST_CHARACTERS = 8_000  # of a part of a message: quoted input may have any length
-_CONTROL = frozenset(
-    {"Cc", "Cf", "Cs", "Zl", "Zp"}
-)  # some of these control terminals; lone surrogates cannot be encoded
+_CONTROL = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})  # some control terminals; lone surrogates cannot be encoded
 
 
 class InputError(Exception):

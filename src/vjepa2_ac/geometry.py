@@ -35,7 +35,7 @@ def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray
     Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/droid.py, poses_to_diffs.
     """
     if len(states) < 2:
-        raise ValueError(f"an action lies between two states; got {len(states)}")
+        raise ValueError(f"an action needs two states; got {len(states)}")
     rotations = matrices_from_euler(states[:, 3:6])
     delta = euler_from_matrices(rotations[1:] @ rotations[:-1].swapaxes(-1, -2))
     return np.concatenate([np.diff(states[:, :3], axis=0), delta, np.diff(states[:, 6:], axis=0)], axis=-1)

@@ -220,7 +220,7 @@ def _occupy_closed_numbers() -> None:
 
 def _what_is_missing(writer: Writer) -> str:
     if writer.has_lost and writer.problem:
-        return f"cannot be written ({writer.problem.strerror}): not all that was said is there"
+        return f"cannot be written ({writer.problem.strerror}): some output is missing"
     if writer.lines_dropped:
-        return f"{writer.lines_dropped} lines were left out, because nobody read them in time"
+        return f"{writer.lines_dropped} lines were dropped, because they were not read in time"
     return ""

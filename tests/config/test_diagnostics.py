@@ -1,4 +1,4 @@
-"""What is wrong with a config is said all at once, also what one mistake would hide of the next; and nothing untrue."""
+"""Config errors: all are reported at once, also those hidden by other errors, and none that is wrong."""
 
 import re
 from typing import Any

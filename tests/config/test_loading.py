@@ -1,4 +1,4 @@
-"""Every knob once; everything that is wrong at once."""
+"""Config loading: every knob once, all errors at once."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""Robots without a pose: the numbers arrive as they are, of any width, from every source that can have them."""
+"""Robots without poses: vectors of any width arrive unchanged from every source that supports them."""
 
 import json
 from collections.abc import Callable
@@ -255,14 +255,14 @@ def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: s
     assert words in found[about].text
 
 
-def test_pictures_that_never_change_while_a_number_does_are_an_error() -> None:
+def test_frames_that_never_change_while_a_number_does_are_an_error() -> None:
     moving = batch(vectors(9, 5, seed=0))
     stuck = Batch(torch.zeros_like(moving.frames), moving.states, moving.actions, None, ("e",), (0,))
     found = {one.about: one for one in findings_in([stuck], is_pose=False)}
     assert found["pictures"].level == "error"
 
 
-def test_inspection_and_picture_of_vectors(tmp_path: Path) -> None:
+def test_inspection_and_frame_of_vectors(tmp_path: Path) -> None:
     from vjepa2_ac.console.data import inspection_lines, motion_table
 
     dataset = open_dataset(knobs(write_vectors(tmp_path / "set", width=14)))

@@ -1,4 +1,4 @@
-"""Several processes make the run that one makes: the same clips, the same weights up to rounding, one stop."""
+"""Several processes: the same run as one process, with the same clips, weights up to rounding, and one stop."""
 
 import os
 import signal

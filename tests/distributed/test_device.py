@@ -1,4 +1,4 @@
-"""What a GPU cannot compute is said at every door, before anything is read or loaded."""
+"""Unsupported arithmetic of a GPU: refused by every entry point, before anything is read or loaded."""
 
 import importlib.util
 from pathlib import Path

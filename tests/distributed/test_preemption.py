@@ -1,4 +1,4 @@
-"""A signal ends a run where it can go on from; two signals end it at once."""
+"""Stop signals: one ends a run where it can be resumed, two end it at once."""
 
 import os
 import signal

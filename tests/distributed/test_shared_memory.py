@@ -1,4 +1,4 @@
-"""A run whose workers may fill /dev/shm says so, with the number and the ways out."""
+"""Shared memory: a run whose workers may fill /dev/shm warns with sizes and fixes."""
 
 import os
 from types import SimpleNamespace

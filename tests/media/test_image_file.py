@@ -1,4 +1,4 @@
-"""An image in a file becomes its RGB pixels, or the user reads what is in the file."""
+"""Image files: decoded to RGB pixels, or an error that describes the file."""
 
 import io
 import struct
@@ -36,7 +36,7 @@ def test_a_jpeg_is_its_pixels_in_the_order_of_rgb() -> None:
     np.testing.assert_allclose(found.astype(int), red, atol=6)
 
 
-def test_grey_and_transparent_pictures_become_rgb() -> None:
+def test_grey_and_transparent_images_become_rgb() -> None:
     grey = Image.fromarray(PIXELS[..., 0])
     np.testing.assert_array_equal(decode_image(png(grey), "here"), PIXELS[..., :1].repeat(3, axis=-1))
     seen_through = Image.fromarray(np.dstack([PIXELS, PIXELS[..., :1]]))
@@ -53,7 +53,7 @@ def test_grey_and_transparent_pictures_become_rgb() -> None:
         (png(Image.fromarray(PIXELS[..., 0].astype(np.uint16))), "not 8 bits a channel"),
     ],
 )
-def test_what_is_no_picture_is_refused(data: bytes, complaint: str, tmp_path: Path) -> None:
+def test_what_is_no_image_is_refused(data: bytes, complaint: str, tmp_path: Path) -> None:
     (tmp_path / "goal.png").write_bytes(data)
     with pytest.raises(InputError, match=rf"goal\.png.*{complaint}"):
         read_image(tmp_path / "goal.png")
@@ -75,7 +75,7 @@ def claimed_jpeg(height: int, width: int) -> bytes:
 
 @pytest.mark.parametrize("claimed", [claimed_png, claimed_jpeg])
 @pytest.mark.parametrize("size", [(65_500, 65_500), (10_001, 10_000), (1, 65_500 * 1_530)])
-def test_a_picture_that_claims_to_be_huge_is_refused_before_anything_is_made(
+def test_an_image_that_claims_to_be_huge_is_refused_before_anything_is_made(
     claimed: Callable[[int, int], bytes], size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if claimed is claimed_jpeg and max(size) > 65_535:
@@ -97,7 +97,7 @@ def test_a_jpeg_that_goes_over_its_pixels_again_and_again_is_refused() -> None:
     assert decode_image(progressive.getvalue(), "goal").shape == PIXELS.shape
 
 
-def test_pictures_that_are_too_many_of_their_size_are_not_decoded_together() -> None:
+def test_images_that_are_too_many_of_their_size_are_not_decoded_together() -> None:
     require_bounded(720, 1280, "clip", count=256)
     with pytest.raises(InputError, match="clip: 64 images of 10000 x 10000 pixels at once"):
         require_bounded(10_000, 10_000, "clip", count=64)

@@ -1,4 +1,4 @@
-"""One bound on images holds for every form of data, before room is made, and as an error that breaks one episode."""
+"""The image size limit: the same for every form of data, before allocation, as an error of one episode."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -53,7 +53,7 @@ FORMS: dict[str, Callable[[Path], FrameReader]] = {
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_every_form_of_data_refuses_pictures_beyond_the_bound(
+def test_every_form_of_data_refuses_images_beyond_the_bound(
     tmp_path: Path, form: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read = FORMS[form](tmp_path)
@@ -76,7 +76,7 @@ def test_a_short_jpeg_that_claims_65500_pixels_each_way_breaks_an_episode_and_no
         decode_jpegs([huge], [5], "episode 3")
 
 
-def test_libav_itself_makes_no_room_for_a_picture_beyond_the_bound(
+def test_libav_itself_makes_no_room_for_an_image_beyond_the_bound(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES)

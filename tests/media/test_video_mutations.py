@@ -1,4 +1,4 @@
-"""Whatever happens to a recording's bytes, the outcome is an episode or an error that names the file."""
+"""Damaged recordings: the result is an episode or an error that names the file."""
 
 import collections
 import os

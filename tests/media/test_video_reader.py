@@ -1,4 +1,4 @@
-"""A frame at a place is the same frame, however little else is decoded."""
+"""Video frames: independent of which other frames are decoded."""
 
 import io
 import sys
@@ -27,7 +27,7 @@ def every_frame(path: Path) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("gop", "b_frames"), [(1, 0), (2, 0), (12, 0), (12, 3), (250, 3)])
-def test_asked_pictures_equal_those_of_decoding_everything(tmp_path: Path, gop: int, b_frames: int) -> None:
+def test_asked_frames_equal_those_of_decoding_everything(tmp_path: Path, gop: int, b_frames: int) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=gop, b_frames=b_frames)
     frames, generator = every_frame(path), np.random.default_rng(gop)
     for _ in range(25):
@@ -36,7 +36,7 @@ def test_asked_pictures_equal_those_of_decoding_everything(tmp_path: Path, gop: 
         np.testing.assert_array_equal(read_frames(path, steps, where="a", clock=Clock(0.0, 15.0)), frames[steps])
 
 
-def test_an_open_group_of_pictures_is_entered_where_its_pictures_can_be_decoded(
+def test_an_open_group_of_frames_is_entered_where_its_frames_can_be_decoded(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """x265's key frames are preceded by frames that are stored after them."""
@@ -84,7 +84,7 @@ def test_any_order_of_the_files_parts_is_read(tmp_path: Path, flags: str) -> Non
     assert count_frames(path, where="a") == STEPS
 
 
-def test_only_what_the_asked_pictures_need_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_what_the_asked_frames_need_is_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES, gop=12)
     decoded: list[int] = []
     keep = video_reader._Video._keep
@@ -164,7 +164,7 @@ def test_a_damaged_video_is_named_and_libav_is_silent(
 
 
 @pytest.mark.parametrize("clock", [None, Clock(0.0, 15.0)])
-def test_a_picture_past_the_end_is_named(tmp_path: Path, clock: Clock | None) -> None:
+def test_a_frame_past_the_end_is_named(tmp_path: Path, clock: Clock | None) -> None:
     path = write_mp4(tmp_path / "a.mp4", FRAMES)
     with pytest.raises(InputError, match=r"40 frames. needed: at least 43|no frame at 2.800 s"):
         read_frames(path, [3, 42], where="a", clock=clock)
@@ -187,7 +187,7 @@ def test_without_pyav_the_way_to_install_it_is_named(tmp_path: Path, monkeypatch
         read_frames(tmp_path / "a.mp4", [0], where="a")
 
 
-def test_pictures_that_are_moved_without_a_word_in_the_header_are_found_by_time(tmp_path: Path) -> None:
+def test_frames_that_are_moved_without_a_word_in_the_header_are_found_by_time(tmp_path: Path) -> None:
     """A file of key frames alone needs no reordering to be decoded, yet may be shown in another order."""
     shown = [1, 3, 2, 5, 4, 7, 6, 8]  # when each stored picture is shown
     whole = every_frame(write_mp4(tmp_path / "whole.mp4", FRAMES[:8], gop=1))
@@ -200,7 +200,7 @@ def test_pictures_that_are_moved_without_a_word_in_the_header_are_found_by_time(
     np.testing.assert_array_equal(read_frames(tmp_path / "moved.mp4", range(8), where="a"), expected)
 
 
-def test_a_clock_too_coarse_for_its_pictures_shows_none_twice(tmp_path: Path) -> None:
+def test_a_clock_too_coarse_for_its_frames_shows_none_twice(tmp_path: Path) -> None:
     """Of a time scale of 0 libav makes whole seconds: all frames of one would be taken for the same."""
     path = write_mp4(tmp_path / "a.mp4", FRAMES)
     data = bytearray(path.read_bytes())

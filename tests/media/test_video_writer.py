@@ -1,4 +1,4 @@
-"""A video that is written can be read back, whole, by our own reader."""
+"""Written videos: our reader reads them back completely."""
 
 import sys
 from pathlib import Path
@@ -13,17 +13,17 @@ from vjepa2_ac.media.video_writer import write_video
 av = pytest.importorskip("av", reason="the extra `video` is not installed")
 
 
-def pictures(count: int = 5, height: int = 33, width: int = 48) -> list[np.ndarray]:
+def frames(count: int = 5, height: int = 33, width: int = 48) -> list[np.ndarray]:
     shades = np.linspace(40, 220, count).astype(np.uint8)
     made = [np.full((height, width, 3), shade, dtype=np.uint8) for shade in shades]
-    for picture in made:
-        picture[:, : width // 2, 0] = 200
-        picture[:, : width // 2, 2] = 30
+    for frame in made:
+        frame[:, : width // 2, 0] = 200
+        frame[:, : width // 2, 2] = 30
     return made
 
 
 def test_what_was_written_is_what_is_shown(tmp_path: Path) -> None:
-    made = pictures()
+    made = frames()
     path = write_video(tmp_path / "new" / "film.mp4", iter(made), rate_hz=3.75)
     assert count_frames(path, where="film") == 5
     shown = read_frames(path, range(5), where="film")
@@ -36,7 +36,7 @@ def test_what_was_written_is_what_is_shown(tmp_path: Path) -> None:
 
 
 def test_nothing_is_left_of_a_video_that_cannot_be(tmp_path: Path) -> None:
-    for made, wrong in (([], "without frames"), ([*pictures(1), *pictures(1, 20)], "in one video")):
+    for made, wrong in (([], "without frames"), ([*frames(1), *frames(1, 20)], "in one video")):
         with pytest.raises(ValueError, match=wrong):
             write_video(tmp_path / "film.mp4", made, rate_hz=4.0)
         assert not list(tmp_path.iterdir())
@@ -45,4 +45,4 @@ def test_nothing_is_left_of_a_video_that_cannot_be(tmp_path: Path) -> None:
 def test_missing_pyav_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
     with pytest.raises(InputError, match=r'pip install -c constraints.txt -e "\.\[video\]"'):
-        write_video(tmp_path / "film.mp4", pictures(), rate_hz=4.0)
+        write_video(tmp_path / "film.mp4", frames(), rate_hz=4.0)

@@ -1,4 +1,4 @@
-"""A checkpoint is whole or is not used."""
+"""Checkpoints: complete or not used."""
 
 import errno
 import json

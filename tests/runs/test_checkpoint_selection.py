@@ -1,4 +1,4 @@
-"""The checkpoint that is meant is found, or the user reads which there are."""
+"""Checkpoint selection: the requested one, or an error that lists the existing ones."""
 
 from pathlib import Path
 

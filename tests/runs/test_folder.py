@@ -1,4 +1,4 @@
-"""A folder is a run's from its first file on."""
+"""The run's folder: it belongs to a run from its first file on."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The files of a run may be anybody's: what cannot be what this program wrote is refused by name."""
+"""Run files of unknown origin: invalid ones are refused by name."""
 
 import json
 import os

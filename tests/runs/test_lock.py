@@ -1,4 +1,4 @@
-"""One process at a time trains in a folder, and a dead one never stands in the way."""
+"""The lock: one process trains in a folder at a time, and a dead one never blocks it."""
 
 import errno
 import fcntl

@@ -1,4 +1,4 @@
-"""Rows are appended, survive a kill, and are not written twice."""
+"""The metrics log: rows are appended, survive a kill, and are not written twice."""
 
 import errno
 import json

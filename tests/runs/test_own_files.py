@@ -1,4 +1,4 @@
-"""A run writes into its own folder only, whatever a stranger has put there; and names of others are no checkpoints."""
+"""Own files: a run writes into its own folder only, despite links; foreign names are no checkpoints."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""A stranger's run may lead anywhere: which addresses it names is said before one of them is contacted."""
+"""Addresses in a run of unknown origin: listed before one of them is contacted."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""A run of relative paths can be measured from anywhere, goes on where it was started, and says where that is."""
+"""Relative paths: a run can be evaluated from anywhere, and is resumed only from its own folder."""
 
 import json
 import shutil

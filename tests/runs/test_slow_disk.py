@@ -1,4 +1,4 @@
-"""A run on a disk that does not answer waits for it, says so, and is the run that it would have been."""
+"""Slow disks: a run waits for them with a message, and its results do not change."""
 
 import logging
 import os

@@ -1,4 +1,4 @@
-"""Trackers get the metrics, and go on in the same run; one that fails costs a warning and nothing else."""
+"""Trackers: they get the metrics, and resume the same run; a failing one causes a warning only."""
 
 import logging
 import sys

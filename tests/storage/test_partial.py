@@ -1,4 +1,4 @@
-"""What a killed writer leaves is removed by the next one, and what is being written by none. With real processes."""
+"""Partial files: removed after a killed writer, never during writing. With real processes."""
 
 import fcntl
 import os

@@ -1,4 +1,4 @@
-"""Files are whole or absent, and URLs read like local paths."""
+"""Storage: files are complete or absent, and URLs read like local paths."""
 
 import errno
 import hashlib

@@ -79,7 +79,7 @@ def test_a_run_that_nobody_reads_from_is_the_run_that_it_would_be(start: Start, 
     err.touch()
     assert start(out=path, err=str(err)).wait() == 0
     os.close(filler)
-    assert "lines were left out, because nobody read them" in err.read_text()
+    assert "lines were dropped, because they were not read" in err.read_text()
     assert_same_run(whole, tmp_path / "run")
 
 

@@ -45,22 +45,22 @@ class Trackers:
         self, openings: Mapping[str, Opening], *, opening_s: float = PATIENCE_S, closing_s: float = CLOSING_S
     ) -> None:
         self._closing_s = closing_s
-        self._guests = [TrackerThread(name, opening, patience_s=opening_s) for name, opening in openings.items()]
+        self._threads = [TrackerThread(name, opening, patience_s=opening_s) for name, opening in openings.items()]
 
     def log(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Log the numbers of a row; lists, such as errors by horizon, number by number from 1."""
         numbers = {f"{kind}/{key}": value for key, value in _numbers(metrics).items()}
-        for guest in self._guests:
-            guest.log(numbers, step)
+        for thread in self._threads:
+            thread.log(numbers, step)
 
     def close(self) -> None:
         """Close all; a second call does nothing."""
-        guests, self._guests = self._guests, []
+        threads, self._threads = self._threads, []
         until_s = time.monotonic() + self._closing_s
-        for guest in guests:
-            guest.end()
-        for guest in guests:
-            guest.wait(max(0.0, until_s - time.monotonic()), self._closing_s)
+        for thread in threads:
+            thread.end()
+        for thread in threads:
+            thread.wait(max(0.0, until_s - time.monotonic()), self._closing_s)
 
 
 def require_installed(tracking: TrackingConfig) -> None:

@@ -25,9 +25,7 @@ _MOST_BYTES = 1 << 30  # of an array that is read completely
 _DEFLATE_LIMIT = 1040  # DEFLATE compresses a thousandfold at most: a higher ratio is damage
 _CHUNK_BYTES = 1 << 20
 _MOST_HEADER_BYTES = 1 << 14  # numpy reads as much as a header claims, gigabytes, before it refuses 10,000 bytes
-_KINDS = frozenset(
-    {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}
-)  # as numpy writes; other methods have no bound on the ratio
+_KINDS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # as numpy writes; others have no bounded ratio
 _FIX = "Write the file again, with numpy.savez"
 _DAMAGE = (
     zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError, SyntaxError, EOFError, KeyError, ValueError,

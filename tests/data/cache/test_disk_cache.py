@@ -1,4 +1,4 @@
-"""What was fetched once is there, whole, until the limit is reached."""
+"""The disk cache: fetched data is stored, undamaged, up to the limit."""
 
 import errno
 import logging

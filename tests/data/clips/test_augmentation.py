@@ -1,4 +1,4 @@
-"""A drawn change is a pure function, stays inside the frame, and is the same for all frames of a clip."""
+"""Augmentation: a pure function, inside the frame, and the same for all frames of a clip."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def pairs(low: float, high: float) -> st.SearchStrategy[list[float]]:
 
 @settings(max_examples=150, deadline=None)
 @given(st.integers(1, 400), st.integers(1, 400), pairs(0.01, 1.0), pairs(0.1, 9.0), st.integers(0, 2**40))
-def test_the_box_lies_inside_the_picture(
+def test_the_box_lies_inside_the_frame(
     height: int, width: int, scale: list[float], aspect: list[float], position: int
 ) -> None:
     config = AugmentConfig(crop_scale=tuple(scale), crop_aspect=tuple(aspect))

@@ -1,4 +1,4 @@
-"""What takes part is decided once, counted, and the same for every source."""
+"""Selection of episodes and steps: once, counted, and the same for every source."""
 
 import hashlib
 import time

@@ -1,4 +1,4 @@
-"""Batches follow from seed and position alone; what goes wrong in a worker is what the user reads."""
+"""The loader: batches depend on seed and position only; a worker's error reaches the user."""
 
 import itertools
 import json
@@ -268,7 +268,7 @@ def test_an_error_passes_the_pinning_unharmed(
     assert caught.value.needed == "a JPEG image"
 
 
-def test_pictures_of_two_sizes_do_not_stack(droid: Path) -> None:
+def test_frames_of_two_sizes_do_not_stack(droid: Path) -> None:
     config = config_of(droid)
     clip = clip_at(open_dataset(config), 0, 0)
     other = replace(clip, frames=clip.frames[:, :20], episode_id="the other")
@@ -487,7 +487,7 @@ def test_a_validation_of_nothing_but_broken_clips_is_refused(in_memory: Callable
     dataset = broken_set(in_memory, {0}, validation_share=0.5)
     windows = dataset.windows("validation")
     nothing = broken_set(in_memory, set(windows.episodes.tolist()), validation_share=0.5)
-    with pytest.raises(InputError, match=r"no clip that was tried can be read; broken episodes: episode \d+"):
+    with pytest.raises(InputError, match=r"none of the clips can be read; broken episodes: episode \d+"):
         list(validation_batches(nothing, "validation", clips=1, batch_size=1))
 
 

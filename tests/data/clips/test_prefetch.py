@@ -1,4 +1,4 @@
-"""What is fetched ahead is on its way to the device, and nobody knows of it before its turn."""
+"""Prefetching: a batch is being copied to the device, and not reported before its turn."""
 
 from collections.abc import Generator
 

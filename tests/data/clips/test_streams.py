@@ -1,4 +1,4 @@
-"""Copies are enqueued beside computing, and only who uses them waits, for these copies alone."""
+"""Copies: they overlap with computation, and only their users wait, for these copies only."""
 
 import pytest
 import torch

@@ -28,7 +28,7 @@ def test_the_square_is_what_the_official_code_evaluates_on() -> None:
         assert crop_box(row["height"], row["width"], "square") == CropBox(*row["eval_crop"])
 
 
-def test_of_a_tall_picture_the_square_is_the_middle() -> None:
+def test_of_a_tall_frame_the_square_is_the_middle() -> None:
     frames = np.random.default_rng(0).integers(0, 256, (2, 32, 18, 3), dtype=np.uint8)
     assert np.array_equal(view(frames, "square"), frames[:, 7:25])
 
@@ -46,9 +46,7 @@ def test_a_letterbox_shows_every_pixel_between_black_bars(height: int, width: in
 
 
 @pytest.mark.parametrize(("height", "width", "expected"), [(200, 100, (33, 0, 133, 100)), (180, 243, (0, 0, 180, 243))])
-def test_tall_pictures_are_cut_too_and_cropped_ones_are_left(
-    height: int, width: int, expected: tuple[int, ...]
-) -> None:
+def test_tall_frames_are_cut_too_and_cropped_ones_are_left(height: int, width: int, expected: tuple[int, ...]) -> None:
     assert crop_box(height, width) == CropBox(*expected)
 
 
@@ -87,7 +85,7 @@ def test_shrinking_samples_pixels_and_does_not_average_them() -> None:
     torch.testing.assert_close(pixels_to_input(frames, 8), pixels_to_input(frames[:, :, 1::3, 1::3], 8))
 
 
-def test_a_picture_of_the_mean_colour_becomes_zero() -> None:
+def test_a_frame_of_the_mean_colour_becomes_zero() -> None:
     frames = torch.tensor([124, 116, 104], dtype=torch.uint8).expand(1, 1, 8, 8, 3)
     assert pixels_to_input(frames, 8).abs().max() < 0.02
 

@@ -1,4 +1,4 @@
-"""Splits, windows and order are pure functions: nothing but identities, lengths, seed and position counts."""
+"""Splits, windows and order: pure functions of identities, lengths, seed and position."""
 
 import itertools
 import json

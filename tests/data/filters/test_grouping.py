@@ -1,4 +1,4 @@
-"""What belongs together lands in one split; a name that fits no group is refused, and no pattern runs for ever."""
+"""Groups stay in one split; unknown groups are refused, and no pattern runs for ever."""
 
 from collections import defaultdict
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Idle steps are found as openpi finds them, and never where the robot moves."""
+"""Idle steps: the same as in openpi, and never where the robot moves."""
 
 import json
 import pickle

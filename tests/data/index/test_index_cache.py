@@ -1,4 +1,4 @@
-"""What was found out of a data set is found out once, and never trusted when damaged."""
+"""The index cache: a data set is scanned once, and a damaged cache is not used."""
 
 import errno
 import logging

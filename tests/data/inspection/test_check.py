@@ -1,4 +1,4 @@
-"""Each way in which numbers can be wrong has its own line."""
+"""Checks of batches: each kind of wrong numbers has its own finding."""
 
 import itertools
 from pathlib import Path

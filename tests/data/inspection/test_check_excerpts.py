@@ -1,4 +1,4 @@
-"""Pictures and states that do not belong together are seen without a model; those that do give no alarm."""
+"""Checks of excerpts: frames and states that do not match are found without a model; matching ones give no alarm."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -174,7 +174,7 @@ def test_a_standing_robot_before_a_standing_camera_is_neither_stale_nor_copied()
     assert not alarms_in([(states[rest], frames[rest]) for states, frames in recorded()])
 
 
-def test_small_pictures_are_means_of_parts() -> None:
+def test_small_frames_are_means_of_parts() -> None:
     frames = np.random.default_rng(0).integers(0, 256, (2, 2 * ROWS + 5, 3 * COLUMNS, 3)).astype(np.uint8)
     grey = small_grey(frames)
     assert grey.shape == (2, ROWS, COLUMNS)

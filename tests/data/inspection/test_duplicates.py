@@ -1,4 +1,4 @@
-"""An episode that is there under several names is found in every form of data, and said wherever data is looked at."""
+"""Duplicates: an episode under several names is found in every form of data, and reported by every command."""
 
 from dataclasses import replace
 from pathlib import Path

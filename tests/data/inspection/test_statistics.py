@@ -1,4 +1,4 @@
-"""Figures of a data set equal those computed by hand."""
+"""Statistics of a data set: equal to those computed by hand."""
 
 import json
 from pathlib import Path
@@ -109,7 +109,7 @@ def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplo
         inspect_dataset(in_memory(frozenset({7}), "error"))
 
 
-def test_a_broken_picture_is_left_out_of_the_contact_sheet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_broken_frame_is_left_out_of_the_contact_sheet(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     sheets: list[ContactSheet] = []
     monkeypatch.setattr(figure, "plot_contact_sheet", lambda sheet, path: sheets.append(sheet) or path)
     dataset = in_memory(frozenset(), "skip", frozenset({7}))

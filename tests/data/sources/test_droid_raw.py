@@ -1,4 +1,4 @@
-"""DROID's raw recordings tell the same story as its RLDS."""
+"""DROID's raw recordings: the same content as its RLDS."""
 
 import pickle
 import re
@@ -62,7 +62,7 @@ def test_an_episode_holds_the_measured_states_its_task_and_its_outcome(tree: Pat
     assert (episode.control_rate_hz, episode.metadata) == (15.0, {"language": "move to place 0"})
 
 
-def test_pictures_and_actions_equal_those_of_rlds_within_what_the_codecs_lose(tree: Path) -> None:
+def test_frames_and_actions_equal_those_of_rlds_within_what_the_codecs_lose(tree: Path) -> None:
     drawn = synthetic_episode(0, steps=STEPS, size=SIZE)
     pictures = np.stack([simplejpeg.decode_jpeg(jpeg) for jpeg in drawn.images["exterior_image_1_left"]])
     episode = source(tree).read(1)
@@ -92,7 +92,7 @@ def test_a_folder_of_ones_own_layout_is_an_episode_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("frames", [STEPS - 1, STEPS, STEPS + 1])
-def test_an_episode_has_as_many_steps_as_pictures(tmp_path: Path, frames: int) -> None:
+def test_an_episode_has_as_many_steps_as_frames(tmp_path: Path, frames: int) -> None:
     write(tmp_path, pictures={LEFT: (FRAMES[LEFT] * 2)[:frames]})
     raw = source(tmp_path)
     steps = min(frames, STEPS)
@@ -102,21 +102,21 @@ def test_an_episode_has_as_many_steps_as_pictures(tmp_path: Path, frames: int) -
         raw.read(0).read_frames([steps])
 
 
-def test_the_camera_with_the_fewest_pictures_sets_the_steps(tmp_path: Path) -> None:
+def test_the_camera_with_the_fewest_frames_sets_the_steps(tmp_path: Path) -> None:
     write(tmp_path, pictures={LEFT: FRAMES[LEFT], RIGHT: FRAMES[RIGHT][:-1]})
     raw = source(tmp_path, camera=("left", "right"))
     assert [raw.infos()[0].num_steps, len(raw.read(0, "left").states)] == [STEPS - 1, STEPS - 1]
 
 
 @pytest.mark.parametrize("right", [STEPS - 2, STEPS + 2])
-def test_every_camera_must_have_a_picture_for_every_step(tmp_path: Path, right: int) -> None:
+def test_every_camera_must_have_a_frame_for_every_step(tmp_path: Path, right: int) -> None:
     write(tmp_path, pictures={LEFT: FRAMES[LEFT][:-1], RIGHT: (FRAMES[RIGHT] * 2)[:right]})
     assert source(tmp_path).infos()[0].num_steps == STEPS - 1
     with pytest.raises(InputError, match=f"24 steps, but {right} frames in {RIGHT}.mp4"):
         source(tmp_path, camera=("left", "right")).infos()
 
 
-def test_steps_without_an_operator_are_dropped_with_their_pictures_or_kept(tmp_path: Path) -> None:
+def test_steps_without_an_operator_are_dropped_with_their_frames_or_kept(tmp_path: Path) -> None:
     skipped = [0, 5, 6]
     kept = np.setdiff1d(np.arange(STEPS), skipped)
     poses = np.arange(STEPS * 6.0).reshape(STEPS, 6) / 100
@@ -294,7 +294,7 @@ def test_a_network_that_fails_within_a_video_is_neither_damage_nor_silence(
     np.testing.assert_array_equal(frames([40, 44]), source(noisy).read(0).read_frames([40, 44]))
 
 
-def test_a_video_in_the_cloud_that_became_shorter_is_no_picture(noisy: Path, gcs: Gcs, tmp_path: Path) -> None:
+def test_a_video_in_the_cloud_that_became_shorter_is_no_frame(noisy: Path, gcs: Gcs, tmp_path: Path) -> None:
     raw = source(gcs.upload(noisy, "bucket/raw"), disk_cache={"dir": str(tmp_path)})
     frames = raw.read(0).read_frames
     frames([0])

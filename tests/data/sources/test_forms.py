@@ -1,4 +1,4 @@
-"""One trajectory in every form gives the same clips in the same order."""
+"""All forms of data: one trajectory gives the same clips in the same order."""
 
 import errno
 import itertools

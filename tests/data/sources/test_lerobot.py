@@ -128,7 +128,7 @@ def test_the_same_trajectory_gives_the_same_episode_from_rlds(tmp_path: Path) ->
 
 @pytest.mark.parametrize("gop", [2, 10])
 @pytest.mark.parametrize("write", [write_v30, write_v21])
-def test_each_picture_is_that_of_its_step(
+def test_each_frame_is_that_of_its_step(
     write: Callable[..., Path], gop: int, episodes: list[Recorded], tmp_path: Path
 ) -> None:
     source = source_of(write(tmp_path / "set", episodes, gop=gop))
@@ -203,7 +203,7 @@ def test_a_row_group_of_several_episodes_is_decoded_once_on_a_machine(
 
 @pytest.mark.parametrize("pictures", ["png", "jpeg"])
 @pytest.mark.parametrize("write", [write_v30, write_v21])
-def test_pictures_may_be_in_the_table(
+def test_frames_may_be_in_the_table(
     write: Callable[..., Path], pictures: str, episodes: list[Recorded], tmp_path: Path
 ) -> None:
     source = source_of(write(tmp_path / "set", episodes[:3], pictures=pictures))
@@ -213,7 +213,7 @@ def test_pictures_may_be_in_the_table(
         np.testing.assert_array_equal(frames[0], episodes[1].frames[KEY][7])
 
 
-def test_a_picture_in_the_table_that_is_none_is_named(episodes: list[Recorded], tmp_path: Path) -> None:
+def test_a_frame_in_the_table_that_is_none_is_named(episodes: list[Recorded], tmp_path: Path) -> None:
     root = write_v21(tmp_path / "set", episodes[:1], pictures="png")
     rows = pq.read_table(first_rows(root)).column(KEY).to_pylist()
     rows[3]["bytes"] = rows[3]["bytes"][:40]
@@ -507,7 +507,7 @@ def test_a_video_that_is_shorter_than_its_rows_is_found_when_it_is_read(
         episode.read_frames([3, 9])
 
 
-def test_pictures_that_come_at_other_times_are_not_taken_for_the_right_ones(
+def test_frames_that_come_at_other_times_are_not_taken_for_the_right_ones(
     v21: Path, episodes: list[Recorded], tmp_path: Path
 ) -> None:
     root = Path(shutil.copytree(v21, tmp_path / "set"))

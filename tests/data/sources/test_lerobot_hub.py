@@ -1,4 +1,4 @@
-"""LeRobot data sets that lie elsewhere: at `hf://datasets/owner/name`, and in a bucket."""
+"""Remote LeRobot data sets: at `hf://datasets/owner/name`, and in a bucket."""
 
 import json
 import pickle

@@ -1,4 +1,4 @@
-"""A LeRobot data set that was damaged anywhere is either named, or gives what it gave before."""
+"""Damaged LeRobot data sets: the damage is named, or has no effect."""
 
 import json
 import shutil
@@ -24,12 +24,12 @@ class Seen:
     """What a data set gave: its episodes, what was said of the others, or of all."""
 
     episodes: dict[str, tuple[object, ...]]
-    pictures: dict[str, bytes]
+    frames: dict[str, bytes]
     errors: tuple[str, ...]
 
     @property
     def counted(self) -> int:
-        return len(self.episodes.keys() | self.pictures.keys()) + len(self.errors)
+        return len(self.episodes.keys() | self.frames.keys()) + len(self.errors)
 
 
 def seen(root: Path, cache: Path) -> Seen:
@@ -37,7 +37,7 @@ def seen(root: Path, cache: Path) -> Seen:
     config = {"source": "lerobot", "path": str(root), "disk_cache": {"dir": str(cache)}}
     source = LeRobotSource(DataConfig.model_validate_json(json.dumps(config)))
     episodes: dict[str, tuple[object, ...]] = {}
-    pictures: dict[str, bytes] = {}
+    frames: dict[str, bytes] = {}
     try:
         infos = source.infos()
     except InputError as error:
@@ -52,12 +52,12 @@ def seen(root: Path, cache: Path) -> Seen:
         velocities = None if episode.joint_velocities is None else episode.joint_velocities.tobytes()
         content = (info.num_steps, info.success, episode.states.tobytes(), velocities, episode.control_rate_hz)
         try:
-            pictures[info.id] = episode.read_frames(STEPS).tobytes()
+            frames[info.id] = episode.read_frames(STEPS).tobytes()
         except InputError as error:
             errors.append(str(error))
             continue
         episodes[info.id] = content
-    return Seen(episodes, pictures, tuple(errors))
+    return Seen(episodes, frames, tuple(errors))
 
 
 def mutated(data: bytes, generator: np.random.Generator) -> bytes:
@@ -106,8 +106,8 @@ def check_mutations(
         path.write_bytes(data)
 
 
-def pictures_are_equal(before: Seen, after: Seen, case: str) -> None:
-    assert all(pictures == before.pictures[name] for name, pictures in after.pictures.items()), case
+def frames_are_equal(before: Seen, after: Seen, case: str) -> None:
+    assert all(frames == before.frames[name] for name, frames in after.frames.items()), case
 
 
 def nothing_more(*_: object) -> None:
@@ -117,10 +117,10 @@ def nothing_more(*_: object) -> None:
 @pytest.mark.parametrize(
     ("version", "pattern", "check"),
     [
-        ("v30", "data/**/*.parquet", pictures_are_equal),
-        ("v30", "meta/episodes/**/*.parquet", pictures_are_equal),
-        ("v21", "data/**/*.parquet", pictures_are_equal),
-        ("v21", "meta/*.json*", pictures_are_equal),
+        ("v30", "data/**/*.parquet", frames_are_equal),
+        ("v30", "meta/episodes/**/*.parquet", frames_are_equal),
+        ("v21", "data/**/*.parquet", frames_are_equal),
+        ("v21", "meta/*.json*", frames_are_equal),
         ("v30", "videos/observation.images.exterior_1_left/**/*.mp4", nothing_more),
     ],
 )

@@ -1,4 +1,4 @@
-"""A library that is not installed is not an episode that is broken."""
+"""Missing libraries: not counted as broken episodes."""
 
 import json
 import sys

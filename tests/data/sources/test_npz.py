@@ -1,4 +1,4 @@
-"""Anybody's robot, as plain arrays."""
+""".npz episodes: any robot as plain arrays."""
 
 import pickle
 import shutil
@@ -86,7 +86,7 @@ class CountedFile:
         return getattr(self.file, name)
 
 
-def test_of_a_plain_file_only_the_asked_pictures_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_a_plain_file_only_the_asked_frames_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write(tmp_path / "one.npz")
     episode = source(tmp_path).read(0)
     opened: list[CountedFile] = []

@@ -1,4 +1,4 @@
-"""A short .npz file that claims to be long is a named problem, and is not unpacked to find that out."""
+""".npz bombs: a short file that claims to be long is named, without decompressing it."""
 
 import struct
 import tracemalloc

@@ -1,4 +1,4 @@
-"""Of a short Parquet file that claims to be long, no more is unpacked than a data set has; and it is named."""
+"""Parquet bombs: a short file that claims to be long is named, and not decompressed beyond the limits."""
 
 import tracemalloc
 from pathlib import Path
@@ -77,7 +77,7 @@ def test_rows_without_end_are_refused_in_one_group_and_in_many(
         rows_of(path).rows(str(path), 0)
 
 
-def test_pictures_that_repeat_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_that_repeat_without_end_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, picture = tmp_path / "rows.parquet", b"\xff\xd8" + bytes(99_998)
     table = pa.table({"episode_index": np.repeat([0, 1], 50), "image": repeated(picture, 100)})
     pq.write_table(table, path, compression="zstd")

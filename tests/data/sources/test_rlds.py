@@ -1,4 +1,4 @@
-"""RLDS episodes are read exactly, and whatever is wrong with them is named."""
+"""RLDS episodes: read exactly, and every error is named."""
 
 import dataclasses
 import json
@@ -81,7 +81,7 @@ def test_only_the_frames_asked_for_are_decoded(spoiled: Spoil) -> None:
         episode.read_frames([4, 5])
 
 
-def test_states_and_pictures_equal_what_tfds_reads_bit_for_bit(shared: Path) -> None:
+def test_states_and_images_equal_what_tfds_reads_bit_for_bit(shared: Path) -> None:
     folder = shared / "data" / "droid_rlds"
     expected = json.loads((folder / "expected.json").read_text())
     with np.load(folder / "expected.npz") as arrays:
@@ -224,7 +224,7 @@ def test_a_state_of_the_wrong_width_says_what_it_is_made_of(droid: Path) -> None
 
 
 @pytest.mark.parametrize("check_crc", ["once", "always", "never"])
-def test_a_picture_too_few_is_named(spoiled: Spoil, check_crc: str) -> None:
+def test_an_image_too_few_is_named(spoiled: Spoil, check_crc: str) -> None:
     """The CRC is right, so only a count can tell; without it all later images would be those of other states."""
     folder = spoiled(lambda features: features["steps/observation/exterior_image_1_left"][1].pop(3) and None)
     for camera in ("exterior_1_left", "wrist_left"):  # the config's camera, and one that is asked for

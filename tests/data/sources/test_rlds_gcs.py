@@ -1,4 +1,4 @@
-"""RLDS on Google Cloud Storage is read like RLDS on this machine, with few bytes, whatever the network does."""
+"""RLDS on Google Cloud Storage: read like local RLDS, with few bytes, over networks that fail."""
 
 import pickle
 import threading
@@ -178,7 +178,7 @@ def test_without_room_a_later_clip_fetches_its_frames_alone(
     assert 0 < gcs.bytes_read() / record < 0.1
 
 
-def test_only_the_pictures_of_needed_steps_are_kept(
+def test_only_the_images_of_needed_steps_are_kept(
     long: Path, far: Callable[..., RldsSource], gcs: Gcs, tmp_path: Path
 ) -> None:
     source = far(long)

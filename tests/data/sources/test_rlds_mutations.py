@@ -1,4 +1,4 @@
-"""A file that is damaged at random is read right, or its damage is named: no garbage, no crash, no hang."""
+"""Randomly damaged RLDS files: read correctly or named; no garbage, no crash, no hang."""
 
 import os
 import time

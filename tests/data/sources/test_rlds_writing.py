@@ -1,4 +1,4 @@
-"""What we write is DROID's schema as TFDS writes it (golden/DATA_ORIGIN.md), and appears whole or not at all."""
+"""Writing RLDS: DROID's schema as TFDS writes it (golden/DATA_ORIGIN.md), complete or not at all."""
 
 import dataclasses
 import errno
@@ -79,7 +79,7 @@ def test_flags_and_reward_follow_from_length_and_path(tmp_path: Path) -> None:
         }
 
 
-def test_values_and_pictures_are_written_unchanged(tmp_path: Path) -> None:
+def test_values_and_images_are_written_unchanged(tmp_path: Path) -> None:
     episode = synthetic_episode(0, steps=5, size=(16, 32))
     folder = write_droid_rlds(tmp_path / "set", [episode], shards=1)
     features = decode_example(read_record(index_records(next(folder.glob("*.tfrecord-*")))[0]), where="")

@@ -1,4 +1,4 @@
-"""Records come back as they were written, and every damage is noticed and named."""
+"""TFRecords: read back as written, and every damage is found and named."""
 
 from collections.abc import Callable
 from pathlib import Path

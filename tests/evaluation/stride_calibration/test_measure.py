@@ -183,7 +183,7 @@ def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(mon
     assert found.best.episodes == len(dataset.windows("validation").episodes) - 1
     assert [one.clips for one in found.results] == [found.results[0].clips] * 3
     damaged = set(range(20))
-    with pytest.raises(InputError, match="no clip that was tried can be read; broken episodes: track"):
+    with pytest.raises(InputError, match="none of the clips can be read; broken episodes: track"):
         calibrate(GoesOn(8), encode, dataset, batch_size=4)
 
 

@@ -1,4 +1,4 @@
-"""An adapter's file of anybody becomes our own knobs, or is refused by name; PEFT does not see it."""
+"""Adapter files of unknown origin: converted to our knobs, or refused by name; PEFT does not see them."""
 
 import json
 from collections.abc import Callable

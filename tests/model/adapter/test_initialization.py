@@ -1,4 +1,4 @@
-"""Where a fresh predictor begins."""
+"""Initial values of a fresh predictor."""
 
 import pytest
 import torch

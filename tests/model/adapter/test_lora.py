@@ -1,4 +1,4 @@
-"""The laws of an adapter."""
+"""Properties of an adapter."""
 
 import copy
 import json

@@ -1,4 +1,4 @@
-"""A layer with plain LoRA computes what PEFT's does, in fewer passes."""
+"""Plain LoRA layers: the same results as PEFT's, in fewer passes."""
 
 import contextlib
 from typing import Any

@@ -1,4 +1,4 @@
-"""What `model.base` names is found, or said to be missing with the way out."""
+"""`model.base`: found, or reported missing with a fix."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""The official code's own figures, for both reference checkpoints; and what a checkpoint must be."""
+"""Official checkpoints: the official code's own numbers for both references, and validation of the file."""
 
 import io
 import json

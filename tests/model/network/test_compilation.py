@@ -1,4 +1,4 @@
-"""Compiled blocks compute what plain ones do, and are compiled a few times, not for every step, layer or length."""
+"""Compiled blocks: the same results as plain ones, and few compilations, not one per step, layer or length."""
 
 import shutil
 from typing import Any

@@ -1,4 +1,4 @@
-"""The laws of fresh input heads: a robot of other states or actions than the base knows."""
+"""Properties of fresh input heads: for robots with other states or actions than the base."""
 
 import json
 from pathlib import Path

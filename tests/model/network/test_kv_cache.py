@@ -1,4 +1,4 @@
-"""Steps that come one after the other, seeing earlier ones through the cache, are what they are all at once."""
+"""The KV cache: steps computed one after another equal those computed at once."""
 
 import dataclasses
 from typing import Any

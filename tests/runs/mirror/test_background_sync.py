@@ -1,4 +1,4 @@
-"""A run's mirror is what the run was a moment ago, whatever the network does; and it is nobody else's."""
+"""Background upload: the mirror follows the run over any network, and belongs to this run only."""
 
 import json
 import logging

@@ -1,4 +1,4 @@
-"""A machine that is killed in the middle of its first upload leaves a place that it, and any other, can go on with."""
+"""A machine killed during its first upload: any machine can resume from the place."""
 
 import logging
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Before the first step a run knows whether its mirror can be written, whose it is, and what is further on there."""
+"""Opening the mirror: before the first step its owner, access and newer checkpoints are known."""
 
 import logging
 import shutil

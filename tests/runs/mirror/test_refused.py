@@ -1,4 +1,4 @@
-"""A place that fills, or is closed to us, in the middle of a run: said once, and up to date when it works again."""
+"""A place that fills up or is closed during a run: one warning, and up to date when it works again."""
 
 import errno
 import logging
@@ -69,7 +69,7 @@ def test_a_bucket_that_is_closed_for_a_while_costs_one_warning(
     go_on(run, mirror, 20, 30)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert str(status) in caplog.text
-    assert "Training goes on; tried again in 0 minutes" in caplog.text
+    assert "Training continues; next attempt in 0 minutes" in caplog.text
     gcs.forget()
     go_on(run, mirror, 40)
     assert there("gs://bucket/run") == (names(20, 30, 40) if match == "DELETE" else names(10, 40))

@@ -1,4 +1,4 @@
-"""A machine that goes away takes no run with it: another one goes on from the mirror as if nothing had happened."""
+"""Resuming from the mirror: another machine continues the run without a difference."""
 
 import logging
 import os

@@ -1,4 +1,4 @@
-"""Of two machines that mirror one run to one place the later start keeps it, and the earlier one is told."""
+"""Two machines with one mirror: the later start keeps it, and the earlier one is warned."""
 
 import json
 import logging
@@ -65,7 +65,7 @@ def test_the_later_start_keeps_the_place_and_the_earlier_one_is_told_once(
     first.mirror.finish(lambda: False)
     assert content(place) == before
     (said,) = [record for record in caplog.records if record.levelno >= logging.WARNING]
-    assert f"{place} is kept by a later start of this run, on 'two', at '20" in said.getMessage()
+    assert f"{place} is used by a later start of this run, on 'two', at '20" in said.getMessage()
     second.go_on(40)
     second.mirror.finish(lambda: False)
     assert sorted(complete(RemoteCheckpoints(place).listing()))[-1] == checkpoint_name(40)
@@ -85,7 +85,7 @@ def test_two_that_begin_at_once_do_not_both_keep_the_place(
     first.go_on(20)
     second.go_on(20)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
-    assert "goes on here alone" in caplog.text or "on this machine alone" in caplog.text
+    assert "continues without it" in caplog.text or "on this machine alone" in caplog.text
     name = f"{place}/checkpoints/{checkpoint_name(20)}/state.json"
     assert json.loads(storage.read_bytes(name))["run_id"] == "that"
 
@@ -98,7 +98,7 @@ def test_a_list_of_starts_that_tells_nothing_is_another_start_all_the_same(
     first.go_on(10)
     (Path(place) / ENVIRONMENT).write_bytes(starts)
     first.go_on(20)
-    assert "kept by a later start of this run, elsewhere" in caplog.text
+    assert "used by a later start of this run, elsewhere" in caplog.text
 
 
 def test_who_removed_the_list_of_starts_took_the_place_from_nobody(machine, place: str, caplog) -> None:

@@ -1,4 +1,4 @@
-"""A ranged file reads like the file, and fetches little more than is read."""
+"""The ranged file: reads like a file, and fetches little more than is read."""
 
 import io
 import os

@@ -1,4 +1,4 @@
-"""Google is asked as the user where there is a login, and anonymously where there is none."""
+"""Google login: the user where there is one, anonymous otherwise."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""What a network does to reads heals, or says in time what is wrong; a server is really asked, and really fails."""
+"""Remote reads: network failures are retried, or reported in time; with a real server that fails."""
 
 import importlib
 import os

@@ -1,4 +1,4 @@
-"""Waits grow, are not the same twice, and end."""
+"""Waits of retries: they grow, vary, and end."""
 
 import json
 import time

@@ -1,4 +1,4 @@
-"""What is written elsewhere arrives whole, through failures that pass; those that do not are named in time."""
+"""Uploads: complete despite temporary failures; permanent ones are reported in time."""
 
 import os
 from pathlib import Path

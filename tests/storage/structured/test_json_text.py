@@ -1,4 +1,4 @@
-"""JSON of anybody is read within bounds, or refused with its file: never a traceback, a flood or a wait."""
+"""Untrusted JSON: read within bounds, or refused with its file: no traceback, flood or wait."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""Patterns that may run for ever are refused; records are what their annotations say."""
+"""Patterns that may run for ever are refused; records match their annotations."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

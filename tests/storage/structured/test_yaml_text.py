@@ -1,4 +1,4 @@
-"""YAML of anybody: what people mean is read; what they do not mean is refused with line and column; nothing hangs."""
+"""Untrusted YAML: read as people mean it, or refused with line and column; nothing hangs."""
 
 import math
 from typing import Any

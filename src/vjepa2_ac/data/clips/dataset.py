@@ -141,8 +141,8 @@ class Dataset:
     @cached_property
     def control_rate_hz(self) -> float:
         """Control steps per second: of the whole data set if the source knows it, else of its first episode."""
-        said = self.table.texts.get("control_rate_hz")
-        return float(said) if said is not None else self.source.read(int(self.episodes[0])).control_rate_hz
+        rate = self.table.texts.get("control_rate_hz")
+        return float(rate) if rate is not None else self.source.read(int(self.episodes[0])).control_rate_hz
 
     @cached_property
     def widths(self) -> Widths:
@@ -153,8 +153,8 @@ class Dataset:
         """
         if self.config.states == "pose":
             return POSE_WIDTHS
-        if said := self.table.texts.get("widths"):
-            return Widths(*map(int, said.split()))
+        if widths := self.table.texts.get("widths"):
+            return Widths(*map(int, widths.split()))
         first_error: InputError | None = None
         for episode in self.episodes[:_MOST_EPISODES_READ].tolist():
             try:

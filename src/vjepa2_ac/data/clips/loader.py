@@ -121,9 +121,9 @@ def _some_of(batches: Iterator[Batch], dataset: Dataset) -> Iterator[Batch]:
     if empty:
         raise InputError(
             where=f"data.path: {dataset.config.path}",
-            found=f"no clip that was tried can be read; broken episodes: {named(dataset.broken.names)}",
+            found=f"none of the clips can be read; broken episodes: {named(dataset.broken.names)}",
             needed="at least one",
-            fix="Mend or fetch these episodes again, or add them to data.exclude",
+            fix="Repair or fetch these episodes again, or add them to data.exclude",
         )
 
 

@@ -82,7 +82,7 @@ class BrokenEpisodes:
             found=f"{len(self)} of {self._episodes} episodes are broken: {named(self.names)}."
             f" The first, {name}: {reason.rstrip('.')}",
             needed=f"{MOST_BROKEN:.0%} at most: data.broken_episodes is skip",
-            fix="Mend or fetch them again, or add them to data.exclude",
+            fix="Repair or fetch them again, or add them to data.exclude",
         )
 
 

@@ -67,11 +67,11 @@ def _groups(table: EpisodeTable, members: Int[np.ndarray, " members"], split_by:
 
 def _without_group(table: EpisodeTable, lacking: list[int], members: int, split_by: str) -> InputError:
     from_source = split_by in table.labels
-    said = "the data set does not say it of" if from_source else "found nothing in the identities of"
+    reason = "the data set does not say it of" if from_source else "found nothing in the identities of"
     names = [table.identity(index) for index in lacking]
     return InputError(
         where=f"data.split_by: {split_by}",
-        found=f"{said} {len(lacking)} of {members} episodes: {named(names)}",
+        found=f"{reason} {len(lacking)} of {members} episodes: {named(names)}",
         needed="a group for every episode that takes part",
         fix="Leave these out with data.exclude, or "
         + ("choose another field" if from_source else "choose a pattern that fits every identity"),

@@ -93,9 +93,7 @@ def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:
         except InputError as error:
             if split == "train":
                 raise
-            level: Level = (
-                "error" if split == "validation" or share else "ok"
-            )  # training opens every split that has a share
+            level: Level = "error" if split == "validation" or share else "ok"  # training opens splits with a share
             yield Finding(level, split, f"{_shortened(error.found)}. {error.fix}")
             continue
         episodes = len(np.unique(windows.episodes))

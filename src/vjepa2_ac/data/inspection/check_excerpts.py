@@ -54,17 +54,17 @@ def signs_in(excerpts: Sequence[Excerpt], *, is_pose: bool, stride: int, control
 
 
 def _agreement(found: Agreement, stride: int, control_rate_hz: float, *, is_sound: bool) -> Finding:
-    said = f"rank correlation of their changes over {found.episodes} episodes"
-    text = f"{said} {found.best:.2f}, {found.chance:.2f} with another episode's frames"
+    measure = f"rank correlation of their changes over {found.episodes} episodes"
+    text = f"{measure} {found.best:.2f}, {found.chance:.2f} with another episode's frames"
     if found.episodes < FEWEST_EPISODES:
         needed = f"{FEWEST_EPISODES} are needed to tell whether frames and states belong together"
         return Finding("ok", "agreement", f"not known of {found.episodes} moving episodes of enough steps: {needed}")
     if found.verdict == "reversed":
-        text = f"{said} {found.backwards:.2f} with the frames backwards, {found.best:.2f} forwards"
+        text = f"{measure} {found.backwards:.2f} with the frames backwards, {found.best:.2f} forwards"
         return Finding("error", "agreement", f"frames and states run against each other in time: {text}")
     if found.verdict == "late":
         steps = abs(found.lag)
-        text = f"{said} {found.best:.2f} so, {found.unshifted:.2f} as they are"
+        text = f"{measure} {found.best:.2f} so, {found.unshifted:.2f} as they are"
         fix = f"Give each frame the state of {_steps(steps)} {'before' if found.lag > 0 else 'after'}"
         level: Level = "error" if steps >= stride else "warning"  # then each action is paired with another one's frames
         by = f"frames are {'at least ' * found.is_farthest}{_shift(found.lag)} ({steps / control_rate_hz:.2f} s)"

@@ -85,7 +85,7 @@ def repetitions(excerpts: Sequence[Excerpt], moved: Sequence[Float[np.ndarray, "
         yield Finding("warning", "repeated", f"{text}: filmed at a lower rate. Check the control rate")
     singly = np.concatenate([_alone(one) for one in _by_episode(held & still, excerpts)])
     if len(singly) and (copied := float(singly.mean())) > _COPIED:
-        text = f"{copied:.0%} of the steps repeat the one before, singly: recorded at a lower rate than is said"
+        text = f"{copied:.0%} of the steps repeat the one before, singly: recorded at a lower rate than stated"
         yield Finding("warning", "repeated", f"{text}. Check the control rate, or double data.stride")
 
 

@@ -61,8 +61,8 @@ def read_adapter_file(folder: Path, defaults: Mapping[str, Any]) -> AdapterConfi
     try:
         config = AdapterConfig.model_validate_json(json.dumps({"kind": "lora", **_as_knobs(values)}))
     except ValidationError as error:
-        said = [f"{_peft_name(detail['loc'])}: {message_of(detail)}" for detail in error.errors()[:4]]
-        raise InputError(where=str(path), found="; ".join(said), needed=_NEEDED, fix=_FIX) from None
+        problems = [f"{_peft_name(detail['loc'])}: {message_of(detail)}" for detail in error.errors()[:4]]
+        raise InputError(where=str(path), found="; ".join(problems), needed=_NEEDED, fix=_FIX) from None
     for pattern in (*config.rank_pattern, *config.alpha_pattern):
         require_quick(pattern, where=str(path))
     return config

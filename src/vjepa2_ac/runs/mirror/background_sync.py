@@ -136,14 +136,14 @@ class Mirror:
         except OvertakenError as error:
             self._is_off = True
             logger.warning(
-                "checkpoint.remote: %s is kept by a later start of this run, %s. This one goes on here alone;"
+                "checkpoint.remote: %s is used by a later start of this run, %s. This one continues without it;"
                 " stop one of the two",
                 self._place, error,
             )  # fmt: skip
         except (InputError, OSError) as error:
-            say = logger.info if self._outage_reported else logger.warning
-            say(
-                "checkpoint.remote is not up to date: %s. Training goes on; tried again in %g minutes, and in the end",
+            log = logger.info if self._outage_reported else logger.warning
+            log(
+                "checkpoint.remote is not up to date: %s. Training continues; next attempt in %g minutes",
                 reason_of(error), self._every_minutes,
             )  # fmt: skip
             self._outage_reported = True

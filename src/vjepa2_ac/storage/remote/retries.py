@@ -149,9 +149,7 @@ def status_of(error: BaseException) -> int | None:
             found = getattr(holder, name, None)
             if isinstance(found, int | str) and str(found).isdigit():
                 return int(found)
-    return (
-        403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None
-    )  # as gcsfs reports it
+    return 403 if isinstance(error, PermissionError) or str(error).startswith("Forbidden") else None  # as gcsfs says
 
 
 def _comes_from_outside(error: Exception) -> bool:

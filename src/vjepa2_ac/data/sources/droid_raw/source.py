@@ -107,7 +107,7 @@ class RawDroidSource:
                 where=self._path(place, TRAJECTORY),
                 found=f"{len(trajectory.states)} steps",
                 needed=f"the {info.num_steps} that were indexed",
-                fix="Leave files in peace while a run reads them",
+                fix="Do not change files while a run reads them",
             )
         video = self._path(place, f"{VIDEOS}/{serial}.mp4")
         return Episode(

@@ -237,8 +237,8 @@ class EpisodeFile:
         if "scales" in names and types["scales"] != "F32":
             raise _damaged(self.path, f"scales of {types['scales']}", "F32")
         if image_type != "U8" or image_bytes != [max(self._arrays["picture_ends"], default=0)]:
-            said = f"pictures of {image_bytes} values of {image_type}"
-            raise _damaged(self.path, said, "as many bytes as picture_ends says")
+            text = f"pictures of {image_bytes} values of {image_type}"
+            raise _damaged(self.path, text, "as many bytes as picture_ends says")
 
 
 _NUMBERS = (torch.float32, torch.float64)

@@ -138,9 +138,11 @@ class LatentSource:
                 path = path_of(self._folder, number, camera)
                 found = size_of(path)
                 if found != sizes[number]:
-                    said = "no such file" if found is None else f"{found:,} bytes"
+                    state = "no such file" if found is None else f"{found:,} bytes"
                     name = opened.table.identity(number)
-                    problems.append(EpisodeProblem(name, f"{path} ({name})", said, f"{sizes[number]:,} bytes", _ENCODE))
+                    problems.append(
+                        EpisodeProblem(name, f"{path} ({name})", state, f"{sizes[number]:,} bytes", _ENCODE)
+                    )
         return problems
 
     def require_encoded(self, episodes: Int[np.ndarray, " episodes"]) -> None:

@@ -139,10 +139,10 @@ def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[Episode
             continue
         with_line = f"{where}: line {number + 1}"
         row = json_object(line, where=with_line, needed="an episode", fix=_FIX, allow_nan=True)
-        yield _checked(with_line, _of_line, info, row, videos)
+        yield _checked(with_line, _episode_of_line, info, row, videos)
 
 
-def _of_line(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str]) -> EpisodeRow:
+def _episode_of_line(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str]) -> EpisodeRow:
     index = _count(row["episode_index"])
     chunk = index // info.chunk_episodes
     return EpisodeRow(

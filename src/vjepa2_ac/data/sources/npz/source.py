@@ -73,7 +73,7 @@ class NpzSource:
                 where=path,
                 found=f"{len(found.states)} steps",
                 needed=f"the {info.num_steps} that were indexed",
-                fix="Leave files in peace while a run reads them",
+                fix="Do not change files while a run reads them",
             )
         return Episode(
             info=info,

@@ -26,9 +26,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.remote import UnreachableError
 
 _WINDOW = 1 << 16
-_LENGTH_BYTES = (
-    5  # lengths that grow with a name: of the text, its list, the feature, the entry of the map, and all of them
-)
+_LENGTH_BYTES = 5  # lengths that grow with a name: of text, list, feature, entry of the map, and all of them
 
 
 def hashes_of_lookalikes(
