@@ -183,7 +183,7 @@ def test_episodes_are_read_once_for_all_variants_of_a_batch_however_many_they_ar
 def test_a_model_that_predicts_nothing_cannot_tell() -> None:
     probe = probed(dataset_of(FAULTS["y negated"]), Copier())
     assert probe.better is None
-    assert "cannot tell" in probe.verdict()
+    assert "the result is unknown" in probe.verdict()
 
 
 @pytest.mark.parametrize(("steps", "widest"), [(STEPS, 8), (22, 4), (14, 2), (11, 1), (9, 0)])
