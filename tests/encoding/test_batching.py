@@ -91,7 +91,7 @@ def test_an_episode_that_breaks_half_way_leaves_the_others_whole() -> None:
 
 
 class Enqueued(Brightness):
-    """Tells the device that a chunk is encoded."""
+    """Records that a chunk is encoded."""
 
     def __init__(self, cuda: RecordingCuda) -> None:
         super().__init__(scales=True)

@@ -301,7 +301,7 @@ def test_what_cannot_be_encoded_is_refused_before_the_data_is_opened(
 
 @pytest.fixture
 def mend(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
-    """Episode 3 has a frame that cannot be decoded; mended by a call."""
+    """Episode 3 has a frame that cannot be decoded; a call repairs it."""
     from vjepa2_ac.data.filters import broken_episodes
     from vjepa2_ac.data.sources.rlds.source import RldsSource
 

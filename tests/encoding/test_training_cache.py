@@ -22,7 +22,7 @@ from vjepa2_ac.training.loop import train
 
 
 class KilledError(Exception):
-    """Stands for the end of the process."""
+    """Simulates the end of the process."""
 
 
 def encoded(config: Config) -> Path:

@@ -97,7 +97,7 @@ def test_actions_are_called_used_only_where_wrong_ones_are_clearly_worse() -> No
 
 
 def by(l1: float, others: float, *, noise: float = 0.02) -> Predicted:
-    """Return errors that stand otherwise to persistence by L1 than by L2 and cosine."""
+    """Return errors for which L1 differs from L2 and cosine relative to persistence."""
     one, two = errors(l1, noise).l1, errors(others, noise).l1
     return Predicted(*[Errors(one, two, two)] * 2)
 

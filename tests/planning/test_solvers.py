@@ -172,7 +172,7 @@ def test_a_cost_that_wants_ever_more_does_not_push_a_plan_beyond_the_limits(plan
 
 
 class Watch:
-    """A clock that goes only when it is told."""
+    """A clock that only a test advances."""
 
     def __init__(self) -> None:
         self.time = 100.0

@@ -27,7 +27,7 @@ from vjepa2_ac.training.step import step_seed, training_step
 
 
 class KilledError(Exception):
-    """Stands for the end of the process."""
+    """Simulates the end of the process."""
 
 
 def dying_reporter(reporter, last_step: int):
@@ -259,7 +259,7 @@ def test_another_config_on_purpose_is_written_and_what_changes_is_said(make_conf
 
 
 def test_what_the_optimizer_is_told_anew_on_purpose_counts(make_config, reporter) -> None:
-    """Its saved state knows the old settings, and would bring them back."""
+    """Its saved state has the old settings, and would restore them."""
     train(make_config(training__steps=2, training__weight_decay=0.04), reporter)
     run = set_up(make_config(training__weight_decay=0.5, training__betas=[0.8, 0.9]), reporter.note)
     assert [(group["weight_decay"], group["betas"]) for group in run.optimizer.param_groups] == [(0.5, (0.8, 0.9))]

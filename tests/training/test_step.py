@@ -105,7 +105,7 @@ def with_loss_scale(run: Run, scale: float) -> Run:
 
 @pytest.fixture(params=["plain", "fused"])
 def adamw(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """AdamW as it is on a CPU, and as it is on CUDA: the gradient scaler gives a fused one its word on overflows."""
+    """AdamW as on a CPU, and as on CUDA: the gradient scaler passes overflows to a fused one."""
     monkeypatch.setattr(optim, "_are_on_cuda", lambda _: request.param == "fused")
 
 

@@ -117,7 +117,7 @@ def test_how_many_samples_are_computed_at_once_changes_no_plan() -> None:
 
 
 class Witness(Oracle):
-    """Knows the world, and notes what it is asked."""
+    """An oracle that records its calls."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[Tensor, Tensor, Tensor, Tensor | None]] = []

@@ -60,7 +60,7 @@ class TwoSided(MemorySource):
 
 
 class Knowing:
-    """Knows where each frame was taken, and what an action does to a place, a rotation and a gripper."""
+    """An oracle for the time of each frame, and for the effect of an action on position, rotation and gripper."""
 
     def __init__(self, steps: int = STEPS, *, sees_bgr: bool = False, sees_mirrored: bool = False) -> None:
         self._latents = [self._latent(at(0)(truth(number, steps))) for number in range(EPISODES)]
@@ -97,7 +97,7 @@ class Knowing:
         return after
 
     def rollout(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        """Nobody asks for it."""
+        """Not used."""
         raise NotImplementedError
 
 

@@ -18,7 +18,7 @@ from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibra
 
 
 class Tracks:
-    """Episodes in which x grows by 1 mm a step, or by a little more or less where `noise` says so."""
+    """Episodes in which x grows by 1 mm a step, plus `noise`."""
 
     def __init__(self, lengths: Sequence[int], noise: float = 0.0) -> None:
         self.lengths, self.noise = list(lengths), noise

@@ -22,7 +22,7 @@ SMALL = LimitsConfig(xyz=(0.03, 0.03, 0.03))
 
 
 class Scripted:
-    """Does what it is told, and remembers what it saw."""
+    """Follows a script, and records its observations."""
 
     name, why = "scripted", "told"
 

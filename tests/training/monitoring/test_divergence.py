@@ -30,7 +30,7 @@ def validation(one_step: float, rollout: float | None = None) -> dict[str, float
 
 
 def warned(config: Config, *rows: tuple[int, dict[str, Any]]) -> dict[int, list[str]]:
-    """Return what is said of validations, by step."""
+    """Return the warnings of validations, by step."""
     watch = Watch(config)
     found = {step: watch("validation", step, metrics) for step, metrics in rows}
     return {step: texts for step, texts in found.items() if texts}
