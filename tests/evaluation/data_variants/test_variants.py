@@ -135,7 +135,7 @@ def test_each_fault_is_named_and_mending_it_makes_the_model_fit(name: str) -> No
 
 
 @pytest.mark.parametrize("name", ["red and blue exchanged", "frames mirrored"])
-def test_frames_that_are_otherwise_are_named(name: str) -> None:
+def test_changed_frames_are_named(name: str) -> None:
     knowing = Knowing(sees_bgr=name.startswith("red"), sees_mirrored=name.startswith("frames"))
     probe = probed(dataset_of(at(0)), knowing)
     assert probe.better is not None
@@ -187,7 +187,7 @@ def test_a_model_that_predicts_nothing_cannot_tell() -> None:
 
 
 @pytest.mark.parametrize(("steps", "widest"), [(STEPS, 8), (22, 4), (14, 2), (11, 1), (9, 0)])
-def test_shifts_are_tried_as_far_as_states_reach_on_both_sides(steps: int, widest: int) -> None:
+def test_shifts_are_measured_as_far_as_states_reach_on_both_sides(steps: int, widest: int) -> None:
     dataset = dataset_of(at(0), steps=steps)
     knowing = Knowing(steps)
     asked: list[tuple[int, int]] = []
