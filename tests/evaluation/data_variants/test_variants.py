@@ -180,7 +180,7 @@ def test_episodes_are_read_once_for_all_variants_of_a_batch_however_many_they_ar
     assert len(dataset.source.decoded) == 3 * 16 * 3
 
 
-def test_a_model_that_predicts_nothing_cannot_tell() -> None:
+def test_a_model_that_predicts_nothing_gives_no_result() -> None:
     probe = probed(dataset_of(FAULTS["y negated"]), Copier())
     assert probe.better is None
     assert "the result is unknown" in probe.verdict()
