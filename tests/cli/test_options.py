@@ -31,7 +31,7 @@ CALIBRATE = ["data", "calibrate", "config.yaml"]
         (SIMULATE, "--cameras", ["x"], "a whole number from 1 to 3"),
     ],
 )
-def test_a_number_that_cannot_be_is_told_what_can(
+def test_an_invalid_number_is_refused_with_the_valid_range(
     command: list[str], option: str, wrong: list[str], needed: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for text in wrong:
@@ -172,7 +172,7 @@ def test_a_mistake_of_ours_is_no_error_of_the_users(monkeypatch: pytest.MonkeyPa
         main(["config", "schema"])
 
 
-def test_a_working_directory_that_is_gone_is_said(
+def test_a_missing_working_directory_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "gone"

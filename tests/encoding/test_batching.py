@@ -91,7 +91,7 @@ def test_an_episode_that_breaks_half_way_leaves_the_others_whole() -> None:
 
 
 class Enqueued(Brightness):
-    """Tells the device that a chunk is encoded."""
+    """Records that a chunk is encoded."""
 
     def __init__(self, cuda: RecordingCuda) -> None:
         super().__init__(scales=True)
@@ -177,7 +177,7 @@ def test_frames_come_in_the_order_in_which_they_are_wanted_and_are_read_once(ahe
     assert sorted(index for index, _, _ in source.reads) == [0, 1, 2]
 
 
-def test_an_episode_that_cannot_be_read_is_told_once_and_the_next_ones_come(ahead: Ahead) -> None:
+def test_unreadable_episode_is_reported_once_and_the_next_ones_follow(ahead: Ahead) -> None:
     long = FRAMES_AT_ONCE * 3
     found = list(ahead(MemorySource([long, long, 2], unreadable=frozenset({0}), pictureless=frozenset({1}))))
     assert [type(one) for one in found] == [Unreadable, Unreadable, Part]

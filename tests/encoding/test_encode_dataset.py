@@ -259,7 +259,7 @@ def test_a_folder_that_cannot_be_written_is_refused(make_config: MakeConfig, tmp
         encode(make_config(), tmp_path / "file" / "out")
 
 
-def test_a_folder_of_other_things_is_refused_and_left_as_it_is(make_config: MakeConfig, tmp_path: Path) -> None:
+def test_a_folder_of_other_files_is_refused_and_not_changed(make_config: MakeConfig, tmp_path: Path) -> None:
     (tmp_path / "config.yaml").touch()
     with pytest.raises(InputError, match=r"other things in it, such as config\.yaml"):
         encode(make_config(), tmp_path)
@@ -301,7 +301,7 @@ def test_what_cannot_be_encoded_is_refused_before_the_data_is_opened(
 
 @pytest.fixture
 def mend(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
-    """Episode 3 has a frame that cannot be decoded; mended by a call."""
+    """Episode 3 has a frame that cannot be decoded; a call repairs it."""
     from vjepa2_ac.data.filters import broken_episodes
     from vjepa2_ac.data.sources.rlds.source import RldsSource
 
@@ -356,7 +356,7 @@ def test_an_episode_that_was_mended_is_encoded_by_the_next_start(
     assert not read_manifest(out).broken
 
 
-def test_what_a_damaged_file_is_said_to_need_makes_the_cache_sound_again(
+def test_the_fix_for_a_damaged_file_repairs_the_cache(
     make_config: MakeConfig, tmp_path: Path, encoded_frames: list[int]
 ) -> None:
     out = tmp_path / "out"

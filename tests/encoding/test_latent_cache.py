@@ -118,7 +118,7 @@ def flipped(path: Path, place: int, bit: int = 4) -> None:
 
 
 def place_of(path: Path, name: str, byte: int = 0) -> int:
-    """Return where a byte of a tensor lies in a file."""
+    """Return the position of a tensor's byte in a file."""
     header = int.from_bytes(path.read_bytes()[:8], "little")
     begin, end = json.loads(path.read_bytes()[8 : 8 + header])[name]["data_offsets"]
     assert byte < end - begin
@@ -250,7 +250,7 @@ EVERYTHING = {
 
 @pytest.fixture(scope="module")
 def droid_with_rests(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Sixteen episodes of 12 to 27 steps, which stand still for a while."""
+    """Sixteen episodes of 12 to 27 steps, with some standstill."""
     drawn = []
     for number in range(16):
         one = synthetic_episode(number, steps=12 + number, size=(36, 64), success=number % 3 != 2)

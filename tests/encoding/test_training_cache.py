@@ -21,7 +21,7 @@ from vjepa2_ac.training.loop import train
 
 
 class KilledError(Exception):
-    """Stands for the end of the process."""
+    """Simulates the end of the process."""
 
 
 def encoded(config: Config) -> Path:
@@ -71,7 +71,7 @@ def test_training_on_a_rounded_cache_differs_by_what_is_rounded_off(
     assert all(0 < abs(one / other - 1) < most for one, other in losses)
 
 
-def test_a_run_goes_on_from_a_cache_where_it_stopped_on_the_fly(make_config, reporter, tmp_path) -> None:
+def test_a_run_on_frames_is_resumed_on_a_cache(make_config, reporter, tmp_path) -> None:
     changes = {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches")}
     whole = make_config(run_dir=str(tmp_path / "whole"), **changes)
     train(whole, reporter)

@@ -208,7 +208,7 @@ WRONG: dict[str, tuple[Callable[[Config], EvaluationOptions], str]] = {
 
 
 @pytest.mark.parametrize(("make", "words"), WRONG.values(), ids=WRONG)
-def test_what_cannot_be_measured_is_said_before_a_model_is_loaded(
+def test_invalid_input_is_reported_before_a_model_is_loaded(
     config: Config, run: str, make: Callable[[Config], EvaluationOptions], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("vjepa2_ac.evaluation.evaluate_run.load_run", lambda *_: pytest.fail("loaded"))

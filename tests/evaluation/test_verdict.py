@@ -97,7 +97,7 @@ def test_actions_are_called_used_only_where_wrong_ones_are_clearly_worse() -> No
 
 
 def by(l1: float, others: float, *, noise: float = 0.02) -> Predicted:
-    """Return errors that stand otherwise to persistence by L1 than by L2 and cosine."""
+    """Return errors for which L1 differs from L2 and cosine relative to persistence."""
     one, two = errors(l1, noise).l1, errors(others, noise).l1
     return Predicted(*[Errors(one, two, two)] * 2)
 
@@ -137,7 +137,7 @@ def test_l2_is_compared_with_doing_nothing_where_there_is_no_base() -> None:
     assert "By L2 and cosine it is another matter: 1.20 of doing nothing" in verdict(found)
 
 
-def test_what_a_reader_must_know_is_said() -> None:
+def test_notes_for_the_reader_are_given() -> None:
     assert verdict(replace(evaluation(model("model", 0.5)), notes=("There is no base.",))).endswith("There is no base.")
 
 

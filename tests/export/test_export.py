@@ -197,7 +197,9 @@ def test_we_load_what_goes_to_the_hub(trained, base_folder: Path, tmp_path: Path
     assert_predicts_as(model, run)
 
 
-def test_the_card_tells_base_data_and_training(trained, base_folder: Path, data_folder: Path, tmp_path: Path) -> None:
+def test_the_card_describes_base_data_and_training(
+    trained, base_folder: Path, data_folder: Path, tmp_path: Path
+) -> None:
     run = trained()
     export_run(run, tmp_path / "hub", "hub")
     card = (tmp_path / "hub" / CARD).read_text()
@@ -215,7 +217,7 @@ def test_the_card_tells_base_data_and_training(trained, base_folder: Path, data_
     assert f"{sum(value.numel() for name, value in weights.items() if '.lora_' in name):,} parameters" in card
 
 
-def test_the_card_tells_what_is_unusual_about_an_adapter(trained, tmp_path: Path) -> None:
+def test_the_card_describes_unusual_adapter_settings(trained, tmp_path: Path) -> None:
     heads = {"adapter__modules_to_save": ["action_encoder"]}
     loss = {"training__loss": "l2", "training__rollout_weight": 2}
     export_run(trained(adapter__init="pissa", adapter__dora=True, **heads, **loss), tmp_path / "hub", "hub")

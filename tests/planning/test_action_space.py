@@ -36,7 +36,7 @@ def test_nothing_beyond_the_limits_comes_out(values: list[float], ball: str, rad
         assert torch.linalg.vector_norm(found[:3], ord=int(ball[1])) <= radius
 
 
-def test_what_is_allowed_stays_as_it_is() -> None:
+def test_allowed_actions_are_not_changed() -> None:
     inside = torch.tensor([[0.01, -0.02, 0.0, 0.1, -0.1, 0.19, -0.7]])
     assert torch.equal(pose(ball="l1", radius=0.031).allowed(inside), inside)
 

@@ -51,7 +51,7 @@ def test_the_same_seed_gives_the_same_actions_again() -> None:
     assert not np.array_equal(actions(controller(seed=1)), first)
 
 
-def test_a_decision_tells_where_its_plan_leads() -> None:
+def test_a_decision_holds_the_predicted_states_of_its_plan() -> None:
     run = controller()
     actions(run, 1)
     assert run.decision is not None

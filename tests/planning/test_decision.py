@@ -72,7 +72,7 @@ def test_words_say_how_far_it_goes_and_what_it_is_worth() -> None:
     assert f"Planner cem, seed 5: {plan.evaluations} action sequences in 3 iterations" in words
 
 
-def test_at_the_goal_nothing_is_done_and_said(tmp_path: Path) -> None:
+def test_at_the_goal_nothing_is_done_and_the_summary_says_so(tmp_path: Path) -> None:
     found = asked(7, start=7)
     assert summarize(found).startswith("Does nothing: what the model sees now")
     file = read(found, tmp_path)
@@ -105,27 +105,27 @@ def test_goals_without_a_part_in_the_plan_are_named() -> None:
     assert asked(100, 101, 102, energy=EnergyConfig(steps="sum")).unused_goals == (2,)
 
 
-def test_goals_share_the_horizon_unless_told() -> None:
+def test_goals_share_the_horizon_by_default() -> None:
     one = PlanRequest(image(0), STATE, (image(1), image(2), image(3)))
     assert one.with_equal_durations(6).durations == (2, 2)
     assert one.with_equal_durations(1).durations == (1, 1)
 
 
-def test_an_action_at_its_limit_is_said_to_be() -> None:
+def test_an_action_at_its_limit_is_reported() -> None:
     found = asked(limits=LimitsConfig(xyz=(0.05, 0.0, 0.05)))
     found.actions[0, :3] = (-0.0495, 0.0, 0.048)
     assert axes_at_limit(found) == ["dx"]
     assert "at its limit along dx (" in summarize(found)
 
 
-def test_a_plan_that_is_no_better_than_doing_nothing_is_said_to_be() -> None:
+def test_a_plan_that_is_no_better_than_doing_nothing_is_reported() -> None:
     found = asked()
     assert "better than doing nothing" not in summarize(found)
     object.__setattr__(found, "doing_nothing", -1.0)
     assert "None of the evaluated actions is predicted to be better than doing nothing." in summarize(found)
 
 
-def test_running_out_of_time_is_said() -> None:
+def test_running_out_of_time_is_reported() -> None:
     ticks = iter(range(1000))
     controller = Controller(tiny_model(), QUICK.model_copy(update={"budget_s": 4.0}), clock=lambda: float(next(ticks)))
     found = decide(controller, PlanRequest(image(0), STATE, (image(100),)))

@@ -19,7 +19,7 @@ def changed(place: int, value: float) -> np.ndarray:
 
 @pytest.mark.parametrize("place", range(7))
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_number_that_cannot_be_is_refused_wherever_it_stands(place: int, sign: int) -> None:
+def test_an_invalid_number_is_refused_at_any_position(place: int, sign: int) -> None:
     complaint = ["millimetres", "degrees", "0 for open"][place // 3]
     wrong = {0: 300.0, 1: 90.0, 2: 1.2 if sign > 0 else 0.2}[place // 3]
     with pytest.raises(InputError, match=complaint):

@@ -81,7 +81,7 @@ def test_fp8_needs_a_device_that_has_it() -> None:
 
 @pytest.fixture
 def has_fp8(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Torchao makes fp8 weights on a CPU, too, if nobody asks which device it is."""
+    """Let torchao make fp8 weights on a CPU, without its device check."""
     quant_api = pytest.importorskip("torchao.quantization.quant_api", reason="the extra quantize is not installed")
     monkeypatch.setattr(quantization, "_has_fp8", lambda _: True)
     monkeypatch.setattr(quant_api, "_check_hardware_support", lambda _: None)

@@ -189,7 +189,7 @@ def test_fp8_that_the_device_has_not_is_refused_before_a_model_is_loaded(make_co
         load_to_plan("no such model", config=path, overrides=["model.dtype=bfloat16"])
 
 
-def test_a_run_from_before_there_was_a_planning_section_goes_on_unchanged(make_config) -> None:
+def test_a_run_from_before_the_planning_section_resumes_unchanged(make_config) -> None:
     config = make_config()
     folder = open_run_folder(config, "name")
     plain = config_as_dict(config)

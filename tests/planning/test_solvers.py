@@ -172,7 +172,7 @@ def test_a_cost_that_wants_ever_more_does_not_push_a_plan_beyond_the_limits(plan
 
 
 class Watch:
-    """A clock that goes only when it is told."""
+    """A clock that only a test advances."""
 
     def __init__(self) -> None:
         self.time = 100.0
@@ -199,7 +199,7 @@ def test_no_iteration_begins_that_would_end_after_the_time_budget(planner: str, 
     assert math.isfinite(plan.energy)
 
 
-def test_how_far_it_is_is_told_after_every_iteration() -> None:
+def test_progress_is_reported_after_every_iteration() -> None:
     reported: list[tuple[int, int]] = []
     planner = Planner(config("cem", iterations=3), space(), progress=lambda done, total: reported.append((done, total)))
     planner.plan(parabola(torch.zeros(1, 2)), torch.Generator())
@@ -207,7 +207,7 @@ def test_how_far_it_is_is_told_after_every_iteration() -> None:
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_when_time_is_up_no_mean_is_returned_that_is_worse_than_what_was_tried(planner: str) -> None:
+def test_when_time_is_up_no_mean_worse_than_an_evaluated_sample_is_returned(planner: str) -> None:
     watch = Watch()
 
     def two_valleys(actions: Tensor) -> Tensor:
@@ -222,7 +222,7 @@ def test_when_time_is_up_no_mean_is_returned_that_is_worse_than_what_was_tried(p
 
 
 @pytest.mark.parametrize("planner", PLANNERS)
-def test_a_plan_tells_how_it_was_found(planner: str) -> None:
+def test_a_plan_records_its_search(planner: str) -> None:
     cost = parabola(torch.tensor([[0.3, -0.2]]))
     plan = solve(planner, cost, space(), iterations=15)
     for one in plan.iterations:

@@ -119,7 +119,7 @@ def test_every_product_of_a_plan_in_bfloat16_is_of_bfloat16(
 
 
 @every_adapter
-def test_the_model_that_is_given_stays_as_it_is(adapter: AdapterConfig) -> None:
+def test_the_given_model_is_not_changed(adapter: AdapterConfig) -> None:
     model = trained_model(adapter, torch.bfloat16).train()
     weights = {name: value.clone() for name, value in model.state_dict().items()}
     trained = [value.requires_grad for value in model.parameters()]

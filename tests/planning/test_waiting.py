@@ -17,7 +17,7 @@ ASKING = {
 
 
 class Recorder(TorchDispatchMode):
-    """Knows the names of all operations that ran."""
+    """Records the names of all operations."""
 
     def __init__(self) -> None:
         super().__init__()

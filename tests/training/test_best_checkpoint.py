@@ -35,7 +35,7 @@ def test_the_best_of_other_frames_no_longer_counts_and_the_reason_is_named(make_
     assert (state.best_step, state.best_error) == (4, 0.6), "0.2 was of three steps ahead"
 
 
-def test_the_best_stays_where_a_run_goes_on_with_what_it_had(make_config, reporter) -> None:
+def test_the_best_checkpoint_stays_when_a_run_is_resumed_unchanged(make_config, reporter) -> None:
     now = of(make_config())
     known = replace(BEST, measured_on=now)
     moved = make_config(

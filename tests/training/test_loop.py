@@ -27,7 +27,7 @@ from vjepa2_ac.training.step import step_seed, training_step
 
 
 class KilledError(Exception):
-    """Stands for the end of the process."""
+    """Simulates the end of the process."""
 
 
 def dying_reporter(reporter, last_step: int):
@@ -229,7 +229,7 @@ def test_episodes_cannot_change_their_split_within_a_run(make_config, reporter) 
         train(make_config(training__steps=2, data__split_by=r"episode_(\d+)"), reporter)
 
 
-def test_copies_in_other_splits_are_said_before_the_first_step(make_config, reporter, tmp_path) -> None:
+def test_copies_in_other_splits_are_reported_before_the_first_step(make_config, reporter, tmp_path) -> None:
     folder = write_rlds(tmp_path / "copied", [number // 2 for number in range(16)])
     train(make_config(data__path=str(folder), data__frames=3, training__steps=1), reporter, check_only=True)
     (reported,) = [note for note in reporter.notes if "copy in another split" in note]
@@ -240,7 +240,7 @@ def test_copies_in_other_splits_are_said_before_the_first_step(make_config, repo
     assert not [note for note in reporter.notes if "states of another" in note]
 
 
-def test_another_config_on_purpose_is_written_and_what_changes_is_said(make_config, reporter) -> None:
+def test_an_allowed_config_change_is_written_and_reported(make_config, reporter) -> None:
     train(make_config(), reporter)
     changed = make_config(training__steps=8, training__learning_rate=2e-3)
     train(changed, reporter, check_only=True, allow_config_change=True)
@@ -258,8 +258,8 @@ def test_another_config_on_purpose_is_written_and_what_changes_is_said(make_conf
     train(changed, reporter)
 
 
-def test_what_the_optimizer_is_told_anew_on_purpose_counts(make_config, reporter) -> None:
-    """Its saved state knows the old settings, and would bring them back."""
+def test_allowed_changes_of_the_optimizer_take_effect(make_config, reporter) -> None:
+    """Its saved state has the old settings, and would restore them."""
     train(make_config(training__steps=2, training__weight_decay=0.04), reporter)
     run = set_up(make_config(training__weight_decay=0.5, training__betas=[0.8, 0.9]), reporter.note)
     assert [(group["weight_decay"], group["betas"]) for group in run.optimizer.param_groups] == [(0.5, (0.8, 0.9))]

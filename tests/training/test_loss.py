@@ -33,7 +33,7 @@ def test_losses_equal_the_official_code(name: str) -> None:
 
 
 def sizes_of(config: dict[str, int]) -> ModelSizes:
-    """Only what a checkpoint cannot say of itself."""
+    """Settings that are not in the checkpoint."""
     return ModelSizes.model_validate(
         {
             "image_size": config["img"],

@@ -22,7 +22,7 @@ STEPS = 3
 
 
 class Recorder:
-    """Stands for a CUDA graph: a replay does again what was recorded, if gradients lie where they lay then."""
+    """Simulates a CUDA graph: a replay repeats the recorded body, if gradients still have their addresses."""
 
     def __init__(self, run: Run) -> None:
         self.run, self.captures, self.replays = run, 0, 0

@@ -20,7 +20,7 @@ from vjepa2_ac.training.loop import train
         ("tensorboard", "tracking__tensorboard", True, r"-e \."),
     ],
 )
-def test_what_a_run_lacks_is_said_before_its_mirror_or_data_are_opened(
+def test_missing_libraries_are_reported_before_mirror_or_data_are_opened(
     make_config, reporter, monkeypatch, library: str, knob: str, value: object, extra: str
 ) -> None:
     for name in (library, f"{library}.optim"):

@@ -88,9 +88,7 @@ def test_from_recordings_to_a_model_of_its_own(
         export_run(folder, tmp_path / "official.pt", "official")
 
 
-def test_a_run_with_fresh_heads_that_was_stopped_goes_on_bit_for_bit(
-    make_robot: MakeConfig, reporter: Any, tmp_path: Path
-) -> None:
+def test_a_run_with_new_heads_resumes_bit_for_bit(make_robot: MakeConfig, reporter: Any, tmp_path: Path) -> None:
     whole, stopped = ({"run_dir": str(tmp_path / name)} for name in ("whole", "stopped"))
     train(make_robot(**whole), type(reporter)())
 
@@ -178,7 +176,7 @@ def test_a_model_of_one_robot_is_not_measured_on_another(make_robot: MakeConfig,
     assert str(folder) in str(caught.value)
 
 
-def test_the_card_on_the_hub_tells_of_the_fresh_heads(make_robot: MakeConfig, reporter: Any, tmp_path: Path) -> None:
+def test_the_card_on_the_hub_describes_the_new_heads(make_robot: MakeConfig, reporter: Any, tmp_path: Path) -> None:
     folder = train(make_robot(ROBOTS["8/7"], training__steps=1), reporter)
     card = (export_run(folder, tmp_path / "hub", "hub").path / "README.md").read_text()
     assert "fresh, for states of 8 and actions of 7 numbers" in card

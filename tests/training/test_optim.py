@@ -130,7 +130,7 @@ def test_the_count_of_steps_of_a_fused_optimizer_is_on_the_device(monkeypatch: p
 
 
 @pytest.mark.parametrize("kinds", [(False, True), (True, False), (True, True)])
-def test_a_run_goes_on_with_the_moments_of_a_fused_optimizer_and_of_a_plain_one(
+def test_a_run_resumes_with_the_moments_of_a_fused_and_of_a_plain_optimizer(
     fuse: Callable[[bool], None], kinds: tuple[bool, bool]
 ) -> None:
     training = TrainingConfig(learning_rate=1e-2)

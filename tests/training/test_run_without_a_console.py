@@ -70,7 +70,7 @@ def test_a_run_whose_reader_leaves_is_the_run_that_it_would_be(start: Start, pip
     assert_same_run(whole, tmp_path / "run")
 
 
-def test_a_run_that_nobody_reads_from_is_the_run_that_it_would_be(start: Start, pipe, tmp_path: Path, whole) -> None:
+def test_a_run_without_a_reader_is_unchanged(start: Start, pipe, tmp_path: Path, whole) -> None:
     path, reader = pipe
     fcntl.fcntl(reader, fcntl.F_SETPIPE_SZ, SMALLEST_PIPE)
     filler = os.open(path, os.O_WRONLY)
@@ -88,7 +88,7 @@ def test_a_run_whose_log_has_no_room_is_the_run_that_it_would_be(start: Start, t
     assert_same_run(whole, tmp_path / "run")
 
 
-def test_a_run_whose_terminal_is_gone_goes_on_and_stops_in_good_order_when_it_is_told(
+def test_a_run_whose_terminal_is_gone_continues_and_stops_cleanly_on_a_signal(
     start: Start, tmp_path: Path, make_config, reporter, whole: Path
 ) -> None:
     ours, theirs = pty.openpty()

@@ -27,14 +27,14 @@ CHANGES = {
 
 
 class Killer:
-    """Starts a run, kills it in one of three ways by turns, and counts."""
+    """Starts a run, kills it in one of three ways in turn, and counts."""
 
     def __init__(self, nursery: Nursery, seed: int) -> None:
         self.kills, self.in_a_checkpoint, self.processes = 0, 0, set()
         self._nursery, self._chance = nursery, np.random.default_rng(seed)
 
     def kill(self, config_file: Path, run: Path) -> int:
-        """Start a run or let it go on, and kill it; return its status: another one where it was done before."""
+        """Start or resume a run, and kill it; return its status, which differs if it was done before."""
         before = half_written(run)
         child, wait = self._start(WAYS[self.kills % len(WAYS)], config_file, run)
         self.processes.add(child.pid)

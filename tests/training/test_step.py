@@ -73,7 +73,7 @@ def test_a_step_without_a_clip_moves_nothing_and_says_so(make_config, reporter) 
     assert all(torch.equal(old, new) for old, new in zip(before, run.world_model.parameters(), strict=True))
 
 
-def test_bytes_per_clip_are_told_of_data_that_lies_elsewhere(make_config, reporter) -> None:
+def test_bytes_per_clip_are_reported_for_remote_data(make_config, reporter) -> None:
     run = prepared(make_config, reporter, 2, 2)
     batches = [
         replace(batch, bytes_fetched=500)
@@ -105,7 +105,7 @@ def with_loss_scale(run: Run, scale: float) -> Run:
 
 @pytest.fixture(params=["plain", "fused"])
 def adamw(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """AdamW as it is on a CPU, and as it is on CUDA: the gradient scaler gives a fused one its word on overflows."""
+    """AdamW as on a CPU, and as on CUDA: the gradient scaler passes overflows to a fused one."""
     monkeypatch.setattr(optim, "_are_on_cuda", lambda _: request.param == "fused")
 
 
@@ -144,7 +144,7 @@ def test_gradients_that_overflow_whatever_the_loss_scale_stop_the_run(make_confi
         training_step(run, training_loader(run.dataset, seed=0, batch_size=2), 1)
 
 
-def test_the_loss_scale_goes_on_where_it_stood(make_config, reporter, tmp_path) -> None:
+def test_the_loss_scale_is_restored(make_config, reporter, tmp_path) -> None:
     config = make_config(training__max_grad_norm=None, training__precision="fp16")
     on_cpu = make_accelerator(make_config())  # which fp16 would be refused on
     run = with_loss_scale(set_up(config, reporter.note, accelerator=on_cpu), 64.0)

@@ -31,7 +31,7 @@ def test_a_run_chooses_keeps_and_never_chooses_again(
     assert not [note for note in more.notes if "Best: stride" in note]
 
 
-def test_the_run_equals_one_that_was_told_the_stride(make_config: Make, reporter: Any, tmp_path: Path) -> None:
+def test_the_run_equals_one_with_a_given_stride(make_config: Make, reporter: Any, tmp_path: Path) -> None:
     same: dict[str, Any] = {"data__stride_candidates": [2], "training__steps": 2}
     chosen = train(make_config(run_dir=str(tmp_path / "a"), data__stride="auto", **same), reporter)
     reported = train(make_config(run_dir=str(tmp_path / "b"), data__stride=2, **same), reporter)

@@ -24,7 +24,7 @@ def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path
 
     Args:
         answer: The decision.
-        about: What answered, and where the images came from: plain values.
+        about: The model and the sources of the images, as plain values.
         path: The file.
     """
     write_atomically(path, json_text(plan_as_dict(answer, about)))
@@ -32,7 +32,7 @@ def write_plan(answer: PlanResult, about: Mapping[str, Any], path: Path) -> Path
 
 
 def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what stands in the file; numbers that are not finite are null."""
+    """Return the content of the file; numbers that are not finite are null."""
     decision, plan, config = answer.decision, answer.decision.plan, answer.controller.config
     return {
         "format": FORMAT,

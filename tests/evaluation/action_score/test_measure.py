@@ -50,7 +50,7 @@ def test_a_model_that_knows_the_world_gets_the_best_score_and_no_error(oracle: E
     assert [sign.value for sign in found.signs] == [1.0, 1.0, 1.0]
 
 
-def test_a_model_that_is_deaf_to_actions_plans_no_better_than_nothing(oracle: Evaluation) -> None:
+def test_a_model_that_ignores_actions_plans_no_better_than_nothing(oracle: Evaluation) -> None:
     study, deaf = parts(oracle, "base")
     found, nothing = metrics_of(study, deaf), metrics_of(study, study.zero)
     assert found.missed_cm.value > nothing.missed_cm.value
@@ -117,7 +117,7 @@ def test_how_many_samples_are_computed_at_once_changes_no_plan() -> None:
 
 
 class Witness(Oracle):
-    """Knows the world, and notes what it is asked."""
+    """An oracle that records its calls."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[Tensor, Tensor, Tensor, Tensor | None]] = []
@@ -256,7 +256,7 @@ def test_progress_counts_every_plan_of_a_model() -> None:
     assert reported == [(1, 4), (2, 4), (3, 4), (4, 4)]
 
 
-def test_of_vectors_no_plans_are_made_and_the_reason_is_said() -> None:
+def test_there_are_no_plans_of_vectors_and_the_reason_is_given() -> None:
     found = planned(Copier(), is_pose=False)
     assert found.planning is None
     assert found.models["adapter"].plans is None

@@ -89,7 +89,7 @@ def test_plans_are_measured_on_held_out_clips_with_the_configs_settings(
 @pytest.mark.parametrize(
     "adapter", [{"rank": 4}, {"rank": 4, "dora": True}, {"kind": "none"}], ids=["lora", "dora", "none"]
 )
-def test_what_was_trained_plans_merged_and_its_errors_are_measured_as_it_is(
+def test_a_trained_model_plans_merged_and_its_errors_are_measured_unmerged(
     make_config, adapter: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small = {"samples": 12, "iterations": 2, "cem": {"elites": 4}}

@@ -60,7 +60,7 @@ class TwoSided(MemorySource):
 
 
 class Knowing:
-    """Knows where each frame was taken, and what an action does to a place, a rotation and a gripper."""
+    """An oracle for the time of each frame, and for the effect of an action on position, rotation and gripper."""
 
     def __init__(self, steps: int = STEPS, *, sees_bgr: bool = False, sees_mirrored: bool = False) -> None:
         self._latents = [self._latent(at(0)(truth(number, steps))) for number in range(EPISODES)]
@@ -97,7 +97,7 @@ class Knowing:
         return after
 
     def rollout(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        """Nobody asks for it."""
+        """Not used."""
         raise NotImplementedError
 
 
@@ -135,7 +135,7 @@ def test_each_fault_is_named_and_mending_it_makes_the_model_fit(name: str) -> No
 
 
 @pytest.mark.parametrize("name", ["red and blue exchanged", "frames mirrored"])
-def test_frames_that_are_otherwise_are_named(name: str) -> None:
+def test_changed_frames_are_named(name: str) -> None:
     knowing = Knowing(sees_bgr=name.startswith("red"), sees_mirrored=name.startswith("frames"))
     probe = probed(dataset_of(at(0)), knowing)
     assert probe.better is not None
@@ -180,14 +180,14 @@ def test_episodes_are_read_once_for_all_variants_of_a_batch_however_many_they_ar
     assert len(dataset.source.decoded) == 3 * 16 * 3
 
 
-def test_a_model_that_predicts_nothing_cannot_tell() -> None:
+def test_a_model_that_predicts_nothing_gives_no_result() -> None:
     probe = probed(dataset_of(FAULTS["y negated"]), Copier())
     assert probe.better is None
-    assert "cannot tell" in probe.verdict()
+    assert "the result is unknown" in probe.verdict()
 
 
 @pytest.mark.parametrize(("steps", "widest"), [(STEPS, 8), (22, 4), (14, 2), (11, 1), (9, 0)])
-def test_shifts_are_tried_as_far_as_states_reach_on_both_sides(steps: int, widest: int) -> None:
+def test_shifts_are_measured_as_far_as_states_reach_on_both_sides(steps: int, widest: int) -> None:
     dataset = dataset_of(at(0), steps=steps)
     knowing = Knowing(steps)
     asked: list[tuple[int, int]] = []

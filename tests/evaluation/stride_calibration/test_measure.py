@@ -18,7 +18,7 @@ from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibra
 
 
 class Tracks:
-    """Episodes in which x grows by 1 mm a step, or by a little more or less where `noise` says so."""
+    """Episodes in which x grows by 1 mm a step, plus `noise`."""
 
     def __init__(self, lengths: Sequence[int], noise: float = 0.0) -> None:
         self.lengths, self.noise = list(lengths), noise
@@ -98,7 +98,7 @@ def test_ratios_are_those_computed_by_hand() -> None:
     assert found.difference.value == pytest.approx(-7 / 15, abs=1e-3)
 
 
-def test_every_stride_is_tried_on_the_same_starts() -> None:
+def test_every_stride_is_measured_on_the_same_starts() -> None:
     seen: dict[int, list[tuple[str, int]]] = {}
 
     def noting(batch: Batch) -> LatentBatch:
@@ -142,7 +142,7 @@ def split_is_train() -> bool:
     return split_of("track 0", dataset_of(Tracks([80])).config) == "train"
 
 
-def test_a_stride_that_fits_no_episode_is_named_and_the_others_are_tried() -> None:
+def test_a_stride_that_fits_no_episode_is_named_and_the_others_are_measured() -> None:
     found = calibrated(GoesOn(4), Tracks([30] * 6))
     assert [one.stride for one in found.results] == [4, 8]
     assert list(found.impossible) == [15]
@@ -161,7 +161,7 @@ def test_where_no_stride_fits_the_first_reason_is_the_error() -> None:
         calibrated(GoesOn(4), Tracks([5] * 6))
 
 
-def test_clips_are_shortened_to_eight_frames_unless_told_otherwise() -> None:
+def test_clips_are_shortened_to_eight_frames_by_default() -> None:
     source = Tracks([130] * 4)
     assert calibrate(GoesOn(4), encode, dataset_of(source, frames=16)).frames == 8
     assert calibrate(GoesOn(4), encode, dataset_of(source, frames=16), frames=3).frames == 3

@@ -48,7 +48,7 @@ def test_any_number_of_rows_and_any_shape_of_image_fit(
     assert [path.name for path in tmp_path.iterdir()] == ["sheet.png"]
 
 
-def test_what_the_model_sees_is_shown_as_it_is_and_the_rest_is_pale(tmp_path: Path) -> None:
+def test_the_crop_is_shown_unchanged_and_the_rest_is_pale(tmp_path: Path) -> None:
     seen = pixels(plot_contact_sheet(sheet(strip()), tmp_path / "sheet.png"))
     as_it_is = (abs(seen - (200, 30, 40)).max(axis=-1) <= 2).sum()
     pale = (abs(seen - (149, 98, 101)).max(axis=-1) <= 2).sum()
@@ -63,7 +63,7 @@ def test_episodes_stand_below_one_another_in_their_order(tmp_path: Path) -> None
     assert centres == sorted(centres)
 
 
-def test_names_lose_what_all_share_and_keep_what_tells_them_apart() -> None:
+def test_names_lose_their_common_part() -> None:
     assert _short_names(["/a/b/c/one--x", "/a/b/d/two--x"]) == ["c/one", "d/two"]
     assert _short_names(["/a/out--1", "/a/out--2"]) == ["out--1", "out--2"]
     assert _short_names(["/a/b"]) == ["/a/b"]

@@ -15,7 +15,7 @@ from vjepa2_ac.reports.figures.evaluation import plot_comparison, plot_evaluatio
 NAMES = ("runs/lora", "_hidden", r"$\frac$", *(f"run {number}" for number in range(10)))
 
 
-def test_every_run_stands_in_the_image_under_its_own_name_with_a_look_of_its_own(tmp_path, monkeypatch) -> None:
+def test_every_run_is_drawn_under_its_own_name_and_style(tmp_path, monkeypatch) -> None:
     drawn: list[Figure] = []
     save = Figure.savefig
     monkeypatch.setattr(Figure, "savefig", lambda self, *a, **k: (drawn.append(self), save(self, *a, **k))[1])

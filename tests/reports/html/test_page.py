@@ -103,7 +103,7 @@ def table_of(page: Page, caption: str) -> list[list[str]]:
     return found[0]
 
 
-def test_the_verdict_stands_on_top_in_words() -> None:
+def test_the_verdict_is_on_top() -> None:
     _, _, page = usual()
     assert VERDICT in page.shown
     before, _, after = page.shown.partition(VERDICT)
@@ -158,7 +158,7 @@ def test_strata_ranks_landscapes_and_episodes_are_those_of_the_result() -> None:
     assert [row[2] for row in episodes] == [decimal(score.over_persistence) for score in one.episodes]
 
 
-def test_strides_are_shown_with_their_errors_and_those_that_could_not_be_tried_with_the_reason() -> None:
+def test_strides_are_shown_with_their_errors_or_the_reason_why_not() -> None:
     error = {"value": 0.9, "low": 0.8, "high": 1.0}
     measured = {"stride": 4, "seconds_per_step": 0.25, "error_over_persistence": error, "clips": 7, "episodes": 3}
     found = {"verdict": "Best: stride 4.", "strides": [measured], "impossible": {"15": "episodes are too short"}}
@@ -389,7 +389,7 @@ def test_photographs_take_the_best_quality_in_which_all_of_them_fit_or_are_left_
     assert image.size == (200, 100)
 
 
-def test_the_darkest_place_of_a_map_lies_under_the_ring() -> None:
+def test_the_darkest_point_of_a_map_is_under_the_ring() -> None:
     across, up = np.array([-3.0, -1.0, 1.0, 4.0]), np.array([-2.0, 0.0, 2.0])
     energy = np.full((4, 3), 1.0)
     energy[3, 0] = 0.0  # at (4, -2): to the right, below

@@ -26,7 +26,7 @@ def page(found: Evaluation) -> str:
 
 
 def row(page: str, name: str) -> list[str]:
-    """Return what stands in the cells of the first row of that name."""
+    """Return the cells of the first row with that name."""
     cells = re.search(rf'<th scope="row">{re.escape(name)}</th>(.*?)</tr>', page)
     assert cells is not None, name
     return [re.sub("<[^>]+>", "", cell) for cell in re.findall("<td>(.*?)</td>", cells[1])]

@@ -129,7 +129,7 @@ def test_what_cannot_be_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_missing_library_is_told_before_anything_is_done(
+def test_a_missing_library_is_reported_before_anything_is_done(
     model: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "av", None)

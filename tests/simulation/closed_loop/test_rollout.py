@@ -22,7 +22,7 @@ SMALL = LimitsConfig(xyz=(0.03, 0.03, 0.03))
 
 
 class Scripted:
-    """Does what it is told, and remembers what it saw."""
+    """Follows a script, and records its observations."""
 
     name, why = "scripted", "told"
 
@@ -159,7 +159,7 @@ def fake(*distances_m: float, unreachable: int = 0) -> EpisodeResult:
     )
 
 
-def test_success_counts_at_the_end_and_in_passing_is_told_apart() -> None:
+def test_success_counts_at_the_end_and_passing_is_separate() -> None:
     episodes = (fake(0.04, 0.03, 0.2), fake(0.2, 0.1, 0.049), fake(0.01, 0.2, 0.051, unreachable=2))
     result = ClosedLoopResult("reach", "A", "x", 0, 2, 4, episodes)
     assert result.successes.tolist() == [False, True, False]

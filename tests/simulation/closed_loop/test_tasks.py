@@ -44,7 +44,7 @@ def test_problems_are_a_pure_function_of_seed_and_index() -> None:
         assert np.abs(make_problem("reach", DOMAIN_A, seed, index).goal - first.goal).max() > 0.01
 
 
-def test_reach_lies_in_the_box_and_asks_for_a_way_of_12_to_25_cm_without_a_turn() -> None:
+def test_reach_is_in_the_box_and_12_to_25_cm_away_without_rotation() -> None:
     problems = [make_problem("reach", DOMAIN_A, 0, index) for index in range(100)]
     ways = np.array([problem.distance_m(problem.start) for problem in problems])
     assert ((ways >= 0.12) & (ways <= 0.25)).all()

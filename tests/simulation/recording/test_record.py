@@ -110,7 +110,7 @@ def test_every_episode_of_a_random_set_has_its_own_world() -> None:
     assert np.ptp(walls, axis=0).max() > 20
 
 
-def test_progress_is_told_after_every_episode(tmp_path: Path) -> None:
+def test_progress_is_reported_after_every_episode(tmp_path: Path) -> None:
     reported: list[tuple[int, int]] = []
     record_dataset(
         tmp_path / "random", domain="random", episodes=2, steps=2, progress=lambda *state: reported.append(state)

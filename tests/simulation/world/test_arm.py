@@ -151,7 +151,7 @@ def test_sampled_domains_stay_in_their_ranges_and_differ() -> None:
     assert sample_domain(np.random.default_rng(1)) == sample_domain(np.random.default_rng(1))
 
 
-def test_domain_b_lies_outside_of_what_the_base_is_trained_on() -> None:
+def test_domain_b_is_outside_the_training_domains_of_the_base() -> None:
     ranges = DomainRanges()
     assert ranges.azimuth_deg[0] <= DOMAIN_A.camera.azimuth_deg <= ranges.azimuth_deg[1] < DOMAIN_B.camera.azimuth_deg
     assert ranges.base_yaw_deg[1] < DOMAIN_B.base_yaw_deg
@@ -177,7 +177,7 @@ def test_opengl_that_does_not_work_is_one_clear_error(monkeypatch: pytest.Monkey
         SimulatedArm(DOMAIN_A, renderer="opengl")
 
 
-def test_the_opengl_camera_is_told_the_same_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_opengl_camera_has_the_same_pose(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
     class FakeRenderer:

@@ -31,7 +31,7 @@ class Held:
 
 
 class Keeping(torch.autograd.graph.saved_tensors_hooks):
-    """Knows the bytes that autograd keeps, each storage once, without what is there anyway, such as weights."""
+    """Counts the bytes that autograd saves, each storage once, without existing tensors such as weights."""
 
     def __init__(self, known: Iterable[Tensor]) -> None:
         self.held: weakref.WeakSet[Held] = weakref.WeakSet()

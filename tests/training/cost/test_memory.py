@@ -64,7 +64,7 @@ def test_the_peak_is_that_of_training_or_of_validation() -> None:
     assert estimate.total(checkpointing=True) > estimate_memory(few, ModelSizes()).total(checkpointing=True)
 
 
-def test_what_is_trained_otherwise_is_counted() -> None:
+def test_other_trained_layers_are_counted() -> None:
     plain = estimate_memory(run_config(), ModelSizes())
     dora, pissa = (
         estimate_memory(run_config({**LORA, **how}), ModelSizes()) for how in ({"dora": True}, {"init": "pissa"})
@@ -83,7 +83,7 @@ def test_fp16_keeps_copies_of_bfloat16_weights_and_float32_copies_for_norms() ->
     assert estimates[1].teacher_forcing - estimates[0].teacher_forcing == copies + norms
 
 
-def test_a_run_that_fits_needs_no_knob_and_a_large_one_is_told_which() -> None:
+def test_a_run_that_fits_needs_no_knob_and_a_large_one_names_them() -> None:
     sizes = ModelSizes()
     small, large = run_config(data__frames=16), run_config(data__frames=16, training__batch_size=8)
     assert ways_to_fit(small, sizes, USUAL_GPU) == []

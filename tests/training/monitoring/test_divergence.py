@@ -30,7 +30,7 @@ def validation(one_step: float, rollout: float | None = None) -> dict[str, float
 
 
 def warned(config: Config, *rows: tuple[int, dict[str, Any]]) -> dict[int, list[str]]:
-    """Return what is said of validations, by step."""
+    """Return the warnings of validations, by step."""
     watch = Watch(config)
     found = {step: watch("validation", step, metrics) for step, metrics in rows}
     return {step: texts for step, texts in found.items() if texts}
@@ -55,7 +55,7 @@ def test_a_model_that_gets_better_or_stays_is_not_warned_of(config: Config) -> N
     )
 
 
-def test_a_validation_that_is_worse_than_at_the_start_is_told_once(config: Config) -> None:
+def test_a_validation_that_is_worse_than_at_the_start_is_reported_once(config: Config) -> None:
     found = warned(config, (0, validation(0.8)), (3, validation(0.85)), (6, validation(0.86)), (9, validation(0.7)))
     assert list(found) == [3]
     (text,) = found[3]
@@ -63,7 +63,7 @@ def test_a_validation_that_is_worse_than_at_the_start_is_told_once(config: Confi
     assert "copying" not in text
 
 
-def test_one_that_is_worse_than_persistence_is_told_besides(config: Config) -> None:
+def test_one_that_is_worse_than_persistence_is_reported_too(config: Config) -> None:
     found = warned(config, (0, validation(0.8)), (3, validation(0.85)), (6, validation(1.34)), (9, validation(1.4)))
     assert list(found) == [3, 6]
     assert "copying the last frame would be better" in found[6][0]
@@ -80,17 +80,17 @@ def test_a_start_that_was_no_better_than_persistence_is_not_compared_with_it(con
     assert "copying" not in warned(config, (0, validation(1.3)), (3, validation(1.5)))[3][0]
 
 
-def test_the_last_validation_is_told_again(config: Config) -> None:
+def test_the_last_validation_is_reported_again(config: Config) -> None:
     assert list(warned(config, (0, validation(0.8)), (50, validation(0.9)), (100, validation(0.9)))) == [50, 100]
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), None])
-def test_an_error_that_is_not_finite_is_told(config: Config, value: float | None) -> None:
+def test_an_error_that_is_not_finite_is_reported(config: Config, value: float | None) -> None:
     found = warned(config, (0, validation(0.8)), (3, {**validation(0.7), "error_over_persistence": value}))
     assert "not a finite number" in found[3][0]
 
 
-def test_a_loss_that_rises_far_above_its_lowest_is_told_between_validations(config: Config) -> None:
+def test_a_loss_that_rises_far_above_its_lowest_is_reported_between_validations(config: Config) -> None:
     watch = Watch(config)
     losses = [0.3, 0.5, 0.3, 0.4, 0.3] * 4 + [0.9] * 20
     found = {step: texts for step, loss in enumerate(losses) if (texts := watch("train", step, {"loss": loss}))}
@@ -99,7 +99,7 @@ def test_a_loss_that_rises_far_above_its_lowest_is_told_between_validations(conf
     assert "the loss is 0.7, and was 0.3 (medians of 10 rows)" in found[step][0]
 
 
-def test_a_single_loss_that_is_high_or_missing_is_not_told(config: Config) -> None:
+def test_a_single_loss_that_is_high_or_missing_is_not_reported(config: Config) -> None:
     watch = Watch(config)
     losses = [0.3, 0.5, None, float("nan"), 9.0] * 10
     assert not any(watch("train", step, {"loss": loss}) for step, loss in enumerate(losses))
@@ -132,7 +132,7 @@ def test_a_run_that_diverges_says_so_and_its_report_does_too(make_diverging, rep
     assert "before training" in (run / "report.html").read_text()
 
 
-def test_a_run_that_goes_on_says_what_the_whole_one_says(make_diverging, reporter, tmp_path: Path) -> None:
+def test_a_resumed_run_reports_the_same_as_an_uninterrupted_one(make_diverging, reporter, tmp_path: Path) -> None:
     whole = train(make_diverging(run_dir=str(tmp_path / "whole")), reporter)
     config = make_diverging(run_dir=str(tmp_path / "halves"))
     with pytest.MonkeyPatch.context() as patch:

@@ -73,7 +73,7 @@ def test_each_process_writes_under_a_name_of_its_own(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("*.npz"))) == len(list(tmp_path.glob("*.png"))) == 2
 
 
-def test_a_full_disk_is_told_and_not_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_is_reported_and_not_raised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: Any, **__: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -102,7 +102,7 @@ def test_on_a_cpu_the_hosts_clock_counts(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_a_cuda_device_tells_what_it_waited() -> None:
+def test_the_idle_time_of_a_cuda_device_is_measured() -> None:
     watch = stopwatch_for(torch.device("cuda"))
     with watch.running():
         time.sleep(0.05)
