@@ -12,8 +12,8 @@ from vjepa2_ac.cli.options import Commands, as_local, as_path, read_config
 def add_encode(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add `encode` to a parser."""
     text = (
-        "Run the frozen encoder once over all frames that the clips of a config need, and cache the latents. Stopping it"
-        " costs the few episodes in progress at most: the same command goes on. Several processes"
+        "Run the frozen encoder once over all frames that the clips of a config need, and cache the latents."
+        " Stopping it costs the few episodes in progress at most: the same command goes on. Several processes"
         " (torchrun) share the work."
     )
     parser = commands.add_parser("encode", help=text.split(".", maxsplit=1)[0] + ".", description=text)

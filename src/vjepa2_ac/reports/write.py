@@ -30,15 +30,10 @@ class Evaluated:
 def evaluate_subject(
     subject: str, asked: EvaluationOptions | None = None, *, stage: Callable[[str], Progress] | None = None
 ) -> Evaluated:
-    """Measure a run or a model on held-out episodes; write metrics.json, report and figure. Cheap failures first.
-
-    Args:
-        subject: The folder of a run; or a model, as in `model.base`.
-        asked: The options.
-        stage: Returns a progress bar for a part of the work, by its title.
+    """Measure as `measure_subject` does, and write metrics.json, report and figure.
 
     Raises:
-        InputError: The subject, the data, or a model to compare with cannot be used; the split is empty.
+        InputError: As `measure_subject`; or the folder cannot be written.
     """
     measured = measure_subject(subject, asked, stage=stage)
     return Evaluated(measured.evaluation, measured.checkpoint, _written(measured.evaluation, measured.folder))
