@@ -232,8 +232,8 @@ def test_batches_for_a_device_are_pinned_by_the_loader(
     assert_same(found, expected)
     assert all(any(batch.frames is one for one in pinning.pinned) for batch in found)
     assert all(any(batch.states is one for one in pinning.pinned) for batch in found)
-    assert cuda.told.count("side 1: to device") == 2 * 3
-    assert "side 1: to pinned memory" not in cuda.told, "that is the loader's work"
+    assert cuda.calls.count("side 1: to device") == 2 * 3
+    assert "side 1: to pinned memory" not in cuda.calls, "that is the loader's work"
     main = threading.current_thread().name
     assert (main in pinning.threads) == (not workers), "beside the workers, a thread of its own does it"
 

@@ -54,11 +54,11 @@ def test_a_batch_fetched_ahead_is_copied_at_once_and_comes_in_its_turn(cuda: Rec
     batches = batches_of(rows, recorded_copies(cuda))
     first = next(batches)
     assert rows.fetched == 1
-    cuda.told.clear()
+    cuda.calls.clear()
     prefetch_next(batches)
     prefetch_next(batches)  # one is enough
     assert rows.fetched == 2
-    assert cuda.told == [*TO_DEVICE * 2, "side 1: event 2"]
+    assert cuda.calls == [*TO_DEVICE * 2, "side 1: event 2"]
     second = next(batches)
     assert rows.fetched == 2
     assert [one.starts for one in (first, second, *batches)] == [(0,), (1,), (2,)]
@@ -66,9 +66,9 @@ def test_a_batch_fetched_ahead_is_copied_at_once_and_comes_in_its_turn(cuda: Rec
 
 def test_the_copy_on_the_device_is_given_once_and_the_batch_stays(cuda: RecordingCuda) -> None:
     given = next(batches_of(Rows(3), recorded_copies(cuda)))
-    cuda.told.clear()
+    cuda.calls.clear()
     there = given.on_device()
-    assert cuda.told == ["computing: waits for event 1", *["memory in use by computing"] * 2]
+    assert cuda.calls == ["computing: waits for event 1", *["memory in use by computing"] * 2]
     assert torch.equal(there.states, given.states)
     assert there.states is not given.states
     assert there.starts == given.starts

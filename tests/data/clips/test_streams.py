@@ -47,29 +47,29 @@ def test_a_copy_to_the_device_is_on_its_way_at_once_and_only_computing_waits_for
     cuda = RecordingCuda()
     given = batch()
     taken = recorded_copies(cuda).to_device.start(given.mapped)
-    assert cuda.told == ["side 1: to device"] * 6 + ["side 1: event 1"]
-    cuda.told.clear()
+    assert cuda.calls == ["side 1: to device"] * 6 + ["side 1: event 1"]
+    cuda.calls.clear()
     assert_equal(taken(), given)
-    assert cuda.told == [f"{COMPUTING}: waits for event 1"] + [f"memory in use by {COMPUTING}"] * 6
+    assert cuda.calls == [f"{COMPUTING}: waits for event 1"] + [f"memory in use by {COMPUTING}"] * 6
 
 
 def test_what_is_not_pinned_is_pinned_first() -> None:
     cuda, tensor = RecordingCuda(), torch.ones(2)
     recorded_copies(cuda).to_device.start(lambda copy: copy(tensor))
-    assert cuda.told[:2] == ["side 1: to pinned memory", "side 1: to device"]
+    assert cuda.calls[:2] == ["side 1: to pinned memory", "side 1: to device"]
 
 
 def test_a_copy_from_the_device_starts_when_it_is_computed_and_is_waited_for_alone() -> None:
     cuda = RecordingCuda()
     given = StoredLatents(torch.ones(2, 3, 4), torch.ones(2, 3))
     taken = recorded_copies(cuda).to_host.start(given.mapped)
-    assert cuda.told == [
+    assert cuda.calls == [
         f"{COMPUTING}: event 1", "side 2: waits for event 1",
         *["memory in use by side 2", "side 2: to pinned memory"] * 2, "side 2: event 2",
     ]  # fmt: skip
-    cuda.told.clear()
+    cuda.calls.clear()
     assert_equal(taken(), given)
-    assert cuda.told == ["host: waits for event 2"]
+    assert cuda.calls == ["host: waits for event 2"]
 
 
 def test_on_a_cpu_nothing_is_copied() -> None:
