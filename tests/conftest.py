@@ -14,11 +14,13 @@ import missing
 CHECKED = [
     "vjepa2_ac.geometry",
     "vjepa2_ac.media",
-    "vjepa2_ac.data.clips",
+    "vjepa2_ac.data.clips.actions",
+    "vjepa2_ac.data.clips.augmentation",
+    "vjepa2_ac.data.clips.clip_reader",
+    "vjepa2_ac.data.clips.transforms",
     "vjepa2_ac.planning",
     "vjepa2_ac.evaluation.action_use",
-    "vjepa2_ac.evaluation.intervals",
-    "vjepa2_ac.simulation.world",
+    "vjepa2_ac.simulation.world.kinematics",
 ]
 ABSENT = missing.absent(os.environ)
 if missing.SHAPES not in ABSENT:

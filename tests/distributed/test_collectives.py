@@ -89,7 +89,7 @@ def test_two_processes_stopped_and_gone_on_as_one_make_the_run_of_one(without_dr
 
 def test_two_nodes_of_torchrun_make_the_run_of_one_process(without_dropout, reporter, tmp_path) -> None:
     whole = train(without_dropout("whole", training__accumulation=2), reporter)
-    without_dropout("nodes", training__accumulation=1, data__workers=1)
+    without_dropout("nodes", training__accumulation=1)
     port = free_port()
     nodes = []
     for node in range(2):
