@@ -64,8 +64,7 @@ def test_a_run_that_leads_elsewhere_says_so_before_it_goes_there(
         raise InputError(where="here", found="the end")
 
     monkeypatch.setattr(contacts, contact)
-    for chooses in ("vjepa2_ac.runs.checkpoint_selection", "vjepa2_ac.evaluation.request"):  # the run has none
-        monkeypatch.setattr(f"{chooses}.select_checkpoint", lambda *_: None)
+    monkeypatch.setattr("vjepa2_ac.runs.checkpoint_selection.select_checkpoint", lambda *_: None)  # the run has none
     assert main([str(run) if word == "RUN" else word for word in command]) == 2
     for line in LINES:
         assert f"{run} names a place elsewhere: {line}" in said[0]

@@ -122,7 +122,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.evaluation.request import settle
 
     asked = _asked(options)
-    for subject, how in asked.items():  # wrong words are told before what takes seconds is imported
+    for subject, how in asked:  # wrong words are told before what takes seconds is imported
         settle(subject, how)
         require_subject(subject, how.checkpoint)
 
@@ -132,7 +132,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     from vjepa2_ac.reports.write import evaluate_subject
 
     evaluations = []
-    for subject, how in asked.items():
+    for subject, how in asked:
         say_places_elsewhere(subject)
         with Stages() as stages:
             measured = evaluate_subject(subject, how, stage=stages)
@@ -147,7 +147,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         console.print(spread(evaluations))
 
 
-def _asked(options: argparse.Namespace) -> dict[str, EvaluationOptions]:
+def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
     """Return what is asked of each subject."""
     from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 
@@ -173,10 +173,10 @@ def _asked(options: argparse.Namespace) -> dict[str, EvaluationOptions]:
         calibrate=options.calibrate,
         planning=(*(options.planning or ()), *options.overrides),
     )
-    return {
-        subject: replace(every, out=options.out / Path(subject).name if options.out and several else options.out)
+    return [
+        (subject, replace(every, out=options.out / Path(subject).name if options.out and several else options.out))
         for subject in options.subjects
-    }
+    ]
 
 
 def _require_planning(options: argparse.Namespace) -> None:

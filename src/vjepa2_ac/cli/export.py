@@ -28,11 +28,11 @@ def add_export(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
+    from vjepa2_ac.runs.checkpoint_selection import require_listed
     from vjepa2_ac.runs.folder import read_run_config
 
     read_run_config(options.run)  # wrong words are told before what takes seconds is imported
-    select_checkpoint(options.run, options.checkpoint)
+    require_listed(options.run, options.checkpoint)
 
     from vjepa2_ac.console.progress import console
     from vjepa2_ac.export.export import export_run

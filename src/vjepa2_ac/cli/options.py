@@ -44,9 +44,9 @@ def command(
 def say_places_elsewhere(subject: str) -> None:
     """Print the addresses that the config of a run names, before any of them is contacted; nothing for a model."""
     from vjepa2_ac.console.progress import console
-    from vjepa2_ac.runs.folder import CONFIG, places_elsewhere, read_run_config
+    from vjepa2_ac.runs.folder import is_run, places_elsewhere, read_run_config
 
-    if (Path(subject) / CONFIG).is_file() and os.environ.get("RANK", "0") == "0":  # one of several processes
+    if is_run(subject) and os.environ.get("RANK", "0") == "0":  # one of several processes
         for place in places_elsewhere(read_run_config(Path(subject))):
             console.print(f"{subject} names a place elsewhere: {place}")
 
@@ -92,7 +92,7 @@ def require_subject(subject: str, checkpoint: str | None = None) -> None:
         InputError: There is no such run, checkpoint or model.
     """
     from vjepa2_ac.model.base_model import find_base
-    from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
+    from vjepa2_ac.runs.checkpoint_selection import require_listed
     from vjepa2_ac.runs.folder import is_run, read_run_config
 
     if not is_run(subject):
@@ -100,7 +100,19 @@ def require_subject(subject: str, checkpoint: str | None = None) -> None:
         return
     read_run_config(Path(subject))
     if checkpoint is not None:
-        select_checkpoint(Path(subject), checkpoint)
+        require_listed(Path(subject), checkpoint)
+
+
+def require_to_plan(options: argparse.Namespace) -> None:
+    """Refuse a model, a checkpoint or settings that cannot be planned with, before what takes seconds is imported.
+
+    Raises:
+        InputError: One of them is wrong or not there.
+    """
+    from vjepa2_ac.planning.settings import planning_settings
+
+    planning_settings(options.subject, config=options.config, overrides=options.overrides)
+    require_subject(options.subject, options.checkpoint)
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -15,7 +15,7 @@ from vjepa2_ac.cli.options import (
     as_path,
     command,
     require_overrides,
-    require_subject,
+    require_to_plan,
     say_places_elsewhere,
     whole_number,
 )
@@ -88,14 +88,13 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _plan(options: argparse.Namespace) -> int:
-    from vjepa2_ac.planning.settings import planning_settings
     from vjepa2_ac.storage import user_can_write
 
     # Wrong words are told before what takes seconds is imported.
     require_overrides(options.overrides, fix="Numbers of --state or --extrinsics go in one word: --state 0.4,0,0.3,...")
     state, extrinsics = _state(options), _extrinsics(options)
-    require_subject(options.subject, options.checkpoint)
-    planning_settings(options.subject, config=options.config, overrides=options.overrides)
+    durations = _durations(options.durations, len(options.goal)) if options.durations else ()
+    require_to_plan(options)
     with user_can_write(options.out):
         options.out.mkdir(parents=True, exist_ok=True)
     images = _images(options)
@@ -109,7 +108,6 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.planning.summary import summarize
     from vjepa2_ac.reports.figures.plan import PLAN_IMAGE, plot_plan
 
-    durations = _durations(options.durations, len(options.goal)) if options.durations else ()
     question = PlanRequest(images.start, state, images.goals, durations, images.mask)
     say_places_elsewhere(options.subject)
     steering = load_to_plan(
@@ -139,8 +137,6 @@ def _state(options: argparse.Namespace) -> np.ndarray:
 
     state = _numbers(options.state, "--state")
     require_pose(state, where="--state")
-    if options.durations:
-        _durations(options.durations, len(options.goal))
     return state
 
 

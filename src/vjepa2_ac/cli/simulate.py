@@ -14,7 +14,7 @@ from vjepa2_ac.cli.options import (
     as_path,
     command,
     count,
-    require_subject,
+    require_to_plan,
     whole_number,
 )
 from vjepa2_ac.errors import InputError
@@ -149,7 +149,6 @@ def _record(options: argparse.Namespace) -> int:
 
 
 def _steer(options: argparse.Namespace) -> int:
-    from vjepa2_ac.planning.settings import planning_settings
     from vjepa2_ac.runs.folder import is_run
     from vjepa2_ac.simulation.world.domains import named_domain
 
@@ -157,8 +156,7 @@ def _steer(options: argparse.Namespace) -> int:
     if options.domain == "random":
         raise InputError(where="--domain random", found="a model that steers", needed="A or B")
     named_domain(options.domain)
-    planning_settings(options.subject, config=options.config, overrides=options.overrides)
-    require_subject(options.subject, options.checkpoint)
+    require_to_plan(options)
 
     from vjepa2_ac.console.closed_loop import contest_notes, contest_table
     from vjepa2_ac.console.evaluation import Stages

@@ -55,7 +55,7 @@ def check_launch(config: Config, environment: Mapping[str, str] = os.environ) ->
     for name, way in _OTHER_WAYS.items():
         if _is_set(environment, name):
             raise _refusal(way, "processes that share clips, or weights by FSDP2", "Start it without that")
-    if not _is_set(environment, "ACCELERATE_USE_FSDP"):
+    if not shares_weights(environment):
         return
     version = environment.get("FSDP_VERSION", "1")
     if version != "2":

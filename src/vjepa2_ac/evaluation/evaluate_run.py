@@ -33,6 +33,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.loading import TrainedRun, load_run
 from vjepa2_ac.runs.metrics_log import read_metrics_log, warnings_of
@@ -67,6 +68,8 @@ def measure_subject(
     """
     asked = asked or EvaluationOptions()
     config, planning, folder = settle(subject, asked)
+    if is_run(subject):
+        select_checkpoint(Path(subject), asked.checkpoint)
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try_writing_at(folder)

@@ -10,7 +10,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, config_from
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_score.protocol import FRAMES
-from vjepa2_ac.runs.checkpoint_selection import NEWEST, select_checkpoint
+from vjepa2_ac.runs.checkpoint_selection import NEWEST
 from vjepa2_ac.runs.folder import is_run, read_run_config
 from vjepa2_ac.runs.relative_paths import DATA, with_paths_from_start
 
@@ -61,7 +61,6 @@ def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
     if is_run(subject):
         config, needed = read_run_config(Path(subject)), [DATA] if asked.data is None else []
         config = with_paths_from_start(config, Path(subject), needed=needed)
-        select_checkpoint(Path(subject), asked.checkpoint)
         if asked.data is None:
             return config, asked.out or Path(subject)
         config = config.model_copy(update={"data": asked.data.data})

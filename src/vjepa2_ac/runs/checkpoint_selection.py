@@ -55,6 +55,17 @@ def select_checkpoint(run: Path, by: str = NEWEST) -> SelectedCheckpoint:
     return SelectedCheckpoint(path, by)
 
 
+def require_listed(run: Path, by: str = NEWEST) -> None:
+    """Refuse a checkpoint that is not there, without reading any: whether it is whole is checked when it is loaded.
+
+    Raises:
+        InputError: There is no such checkpoint.
+    """
+    there = {str(step_of(path.name)) for path in listed(run / CHECKPOINTS)}
+    if not there or (by not in {NEWEST, BEST} and by not in there):
+        select_checkpoint(run, by)  # says what there is
+
+
 def _best_step(newest: Path) -> int:
     step = written_state(newest).best_step
     if step is None:

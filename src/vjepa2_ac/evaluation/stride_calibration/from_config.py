@@ -13,7 +13,7 @@ from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibrate_model, require_learned
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.runs.folder import CONFIG
+from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
 
 
@@ -60,7 +60,7 @@ def load_named(config: Config, model: str | None) -> WorldModel:
     Raises:
         InputError: There is none, it cannot be read, or it is randomly initialized.
     """
-    if model is not None and (Path(model) / CONFIG).is_file():
+    if model is not None and is_run(model):
         return load_run(Path(model)).world_model
     chosen = config.model if model is None else config.model.model_copy(update={"base": model, "random": None})
     require_learned(chosen)

@@ -239,10 +239,9 @@ def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile
     _, parquet = _library(str(opened))
     paths = [file.metadata.schema.column(number).path + "." for number in range(file.metadata.num_columns)]
     places = [number for number, path in enumerate(paths) if any(path.startswith(f"{name}.") for name in columns)]
-    light = parquet.ParquetFile(opened, metadata=file.metadata, buffer_size=_BUFFER_BYTES, pre_buffer=False)
-    for group in range(file.metadata.num_row_groups):
-        for _ in light.reader.iter_batches(0, row_groups=[group], column_indices=places, use_threads=False):
-            break
+    with parquet.ParquetFile(opened, metadata=file.metadata, buffer_size=_BUFFER_BYTES, pre_buffer=False) as light:
+        for group in range(file.metadata.num_row_groups):
+            next(light.reader.iter_batches(0, row_groups=[group], column_indices=places, use_threads=False), None)
 
 
 def _require_sane_groups(file: parquet.ParquetFile, path: str) -> None:
