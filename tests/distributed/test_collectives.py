@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +10,7 @@ import pytest
 import torch
 
 from paths import ROOT
-from ranks import finish, free_port, start_rank
+from ranks import Rank, finish, free_port, start_rank
 from same_run import metrics, trained_weights
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.clips.loader import training_loader
@@ -94,14 +92,9 @@ def test_two_nodes_of_torchrun_make_the_run_of_one_process(without_dropout, repo
     nodes = []
     for node in range(2):
         launcher = ["--nnodes=2", f"--node-rank={node}", "--nproc-per-node=1", "--local-addr=127.0.0.1"]
-        launcher += ["--rdzv-backend=c10d", f"--rdzv-endpoint=127.0.0.1:{port}"]
-        command = ["-m", "vjepa2_ac.cli", "train", str(tmp_path / "nodes.yaml")]
-        nodes.append(
-            subprocess.Popen(
-                [sys.executable, "-m", "torch.distributed.run", *launcher, *command],
-                env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-            )
-        )  # fmt: skip
+        launcher += ["--rdzv-backend=c10d", f"--rdzv-endpoint=127.0.0.1:{port}", "-m", "vjepa2_ac.cli"]
+        words = [str(ROOT / "tests/support/torchrun_forked.py"), *launcher, "train", str(tmp_path / "nodes.yaml")]
+        nodes.append(Rank(words, {**os.environ, "OMP_NUM_THREADS": "1"}))
     finish(nodes)
     assert read_state(newest_checkpoint(tmp_path / "nodes/checkpoints")).processes == 2
     assert_equal_up_to_rounding(whole, tmp_path / "nodes")

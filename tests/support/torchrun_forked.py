@@ -1,0 +1,20 @@
+"""`torchrun … -m vjepa2_ac.cli …`, whose workers are forked where torchrun would start Python anew: they are there at once."""
+
+import sys
+
+from torch.distributed.launcher.api import elastic_launch
+from torch.distributed.run import config_from_args, parse_args
+
+from vjepa2_ac.cli import main
+
+
+def run() -> None:
+    """Launch as torchrun does, with its own options and agent."""
+    options = parse_args(sys.argv[1:])
+    config, _, _ = config_from_args(options)
+    config.start_method = "fork"
+    elastic_launch(config, main)(options.training_script_args)
+
+
+if __name__ == "__main__":
+    run()
