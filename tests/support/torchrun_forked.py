@@ -1,4 +1,4 @@
-"""`torchrun … -m vjepa2_ac.cli …`, whose workers are forked where torchrun would start Python anew: they are there at once."""
+"""`torchrun … -m vjepa2_ac.cli …` with workers that are forked: torchrun would start Python anew for each."""
 
 import sys
 
