@@ -8,11 +8,12 @@ _MOST_CHARACTERS = 8_000  # of a part of a message: quoted input may have any le
 _CONTROL = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})  # some control terminals; lone surrogates cannot be encoded
 
 
-class InputError(Exception):
-    """User input that cannot be used: where it is, what was found, what was needed, and how to fix it.
+class UserError(Exception):
+    """What the user has to know and can change: where it is, what was found, what was needed, and how to fix it.
 
     The command line prints the message without a traceback and exits with status 2. Quoted input is untrusted: control
-    characters are escaped, and long parts are cut.
+    characters are escaped, and long parts are cut. It is raised as one of its two kinds, which are never mistaken for
+    one another: handlers of broken data catch an `InputError`, and what cannot be reached passes them.
 
     Args:
         where: A config key, file, episode or command that the user can look at.
@@ -32,7 +33,19 @@ class InputError(Exception):
         return (_rebuild, (type(self), self.where, self.found, self.needed, self.fix))
 
 
-def _rebuild(kind: type[InputError], where: str, found: str, needed: str, fix: str) -> InputError:
+class InputError(UserError):
+    """Input that cannot be used: a file, an episode, a config, a command line."""
+
+
+class UnreachableError(UserError):
+    """Data cannot be reached now. This says nothing about the data itself."""
+
+
+class RefusedError(UnreachableError):
+    """A server or a disk refuses permanently: no permission, no such bucket."""
+
+
+def _rebuild(kind: type[UserError], where: str, found: str, needed: str, fix: str) -> UserError:
     return kind(where=where, found=found, needed=needed, fix=fix)
 
 

@@ -16,8 +16,7 @@ from vjepa2_ac.encoding.batching import Chunks, Encoded
 from vjepa2_ac.encoding.disk_space import FRAMES_AT_ONCE
 from vjepa2_ac.encoding.prefetch import FramesToEncode, Part, Unreadable, prefetched
 from vjepa2_ac.episode import Episode, EpisodeInfo, StoredLatents
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.errors import InputError, UnreachableError
 
 CHUNK = 4
 

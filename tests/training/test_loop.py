@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from vjepa2_ac.episode import Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.runs.checkpoint import CheckpointClock, checkpoint_name, newest_checkpoint, read_state
+from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
@@ -280,6 +282,21 @@ def test_workers_and_logging_may_change_within_a_run(make_config, reporter) -> N
     train(make_config(), reporter)
     train(make_config(data__workers=1, checkpoint__keep=2, training__log_every=5), reporter)
     assert any("Going on from" in note for note in reporter.notes)
+
+
+def test_a_run_goes_on_with_data_that_were_moved_and_with_no_others(
+    make_config, reporter, tmp_path, data_folder
+) -> None:
+    folder = train(make_config(training__steps=2), reporter)
+    for name in ("moved", "others"):
+        shutil.copytree(data_folder, tmp_path / name)  # with the times of the files
+    train(make_config(training__steps=2, data__path=str(tmp_path / "moved")), reporter)
+    assert read_run_config(folder).data.path == str(tmp_path / "moved"), "whoever evaluates it finds the data"
+    next((tmp_path / "others").rglob("*.tfrecord*")).touch()
+    others = make_config(training__steps=2, data__path=str(tmp_path / "others"))
+    with pytest.raises(InputError, match=r"others: other episodes or files than the run has seen.*moved\."):
+        train(others, type(reporter)())
+    train(others, type(reporter)(), allow_config_change=True)
 
 
 def test_a_folder_with_other_things_in_it_is_left_alone(make_config, reporter, tmp_path) -> None:

@@ -22,7 +22,7 @@ from vjepa2_ac.cli.options import Handler, Parser, parsed
 from vjepa2_ac.cli.plan import add_plan
 from vjepa2_ac.cli.simulate import add_simulate
 from vjepa2_ac.cli.train import add_train
-from vjepa2_ac.errors import InputError, in_words, is_out_of_memory, printable
+from vjepa2_ac.errors import InputError, UserError, in_words, is_out_of_memory, printable
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,7 +46,7 @@ def _run(arguments: Sequence[str] | None) -> int:
     try:
         _require_working_directory()
         return handler(options) or 0
-    except (InputError, OSError, MemoryError) as error:  # a full disk, a path that is no path: the message names it
+    except (UserError, OSError, MemoryError) as error:  # a full disk, a path that is no path: the message names it
         _complain(in_words(error))
         return 2
     except ModuleNotFoundError as error:  # one that every installation has: those of extras are errors of their own

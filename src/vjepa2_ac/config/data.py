@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
+from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.section import OFF, Local, Place, PositiveInt, Section, Share
 from vjepa2_ac.config.sources import RAW_CAMERAS, LeRobotFields, RawDroidOptions, RldsFields
 from vjepa2_ac.places import is_url
@@ -43,7 +44,7 @@ class IdleConfig(Section):
     ranges: Place | None = None
     """For published: a JSON file, local or a URL, of {"recording_folderpath--file_path": [[start, end), ...]}. Episodes
     that it does not name count as idle."""
-    keep_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    keep_share: Annotated[float, Field(ge=0.0, le=1.0), Affects.LATENTS | Affects.RUN] = 0.0
     """Share of the idle windows that are kept: a world model should see stillness too."""
     velocity_change_rad_s: Annotated[float, Field(gt=0.0)] = 1e-3
     """For commands: a step is idle if no commanded joint velocity changes by this much."""
@@ -106,86 +107,90 @@ class DiskCacheConfig(Section):
 class DataConfig(Section):
     """The data set, and the clips made of it."""
 
-    source: Literal["rlds", "droid_raw", "lerobot", "npz", "latents"] = "rlds"
+    source: Annotated[
+        Literal["rlds", "droid_raw", "lerobot", "npz", "latents"],
+        Affects.INDEX | Affects.IDLE | Affects.LATENTS | Affects.RUN,
+    ] = "rlds"
     """Form of the data set. rlds: TFRecord shards with a dataset_info.json, as TFDS writes them. droid_raw: DROID's
     folders with trajectory.h5 and MP4. lerobot: LeRobotDataset v2.1 or v3.0. npz: a folder of .npz episodes. latents: a
     latent cache alone, without the data set that it was made from."""
-    path: Place
-    """Folder of the data set: on this machine, or a URL such as gs://bucket/folder or hf://datasets/owner/name."""
+    path: Annotated[Place, Affects.NOTHING]
+    """Folder of the data set: on this machine, or a URL such as gs://bucket/folder or hf://datasets/owner/name. A run
+    goes on with a folder that was moved, for it is known by what it holds."""
     fields: RldsFields = RldsFields()
     """For rlds: names of the features."""
     droid_raw: RawDroidOptions = RawDroidOptions()
     """For droid_raw: which steps are used."""
     lerobot: LeRobotFields = LeRobotFields()
     """For lerobot: names and conventions of the columns."""
-    camera: _CameraName | tuple[_CameraName, ...] | None = None
+    camera: Annotated[_CameraName | tuple[_CameraName, ...] | None, Affects.INDEX | Affects.CLIPS] = None
     """Which camera the model sees; of several, one is drawn for each clip. null: the source's first, for DROID the left
     exterior camera, which the released weights saw. rlds, lerobot: a name in `cameras`. droid_raw: left, right, wrist,
     ext1, ext2 or a serial number. npz: the name of an array of frames."""
-    states: Literal["pose", "vector"] = "pose"
+    states: Annotated[Literal["pose", "vector"], Affects.INDEX | Affects.CLIPS] = "pose"
     """Kind of state. pose: 7 numbers, position, rotation and gripper, which the released weights know. vector: the
     source's own numbers, unchanged, of any width, for other robots: two arms, joints, a mobile base."""
-    actions: Literal["difference", "recorded"] = "difference"
+    actions: Annotated[Literal["difference", "recorded"], Affects.INDEX | Affects.CLIPS] = "difference"
     """difference: the change from a state to the next one; of vectors, the plain difference. recorded: the commands in
     the source, of any width; for vectors only."""
-    join_actions: Literal["sum", "mean", "last"] | None = None
+    join_actions: Annotated[Literal["sum", "mean", "last"] | None, Affects.MEASURED | Affects.RUN] = None
     """How the recorded commands of a model step's control steps become one action. sum: deltas. mean: velocities. last:
     absolute targets. Must be given unless `stride` is 1."""
-    frames: Annotated[int, Field(ge=2, le=256)] = 16
+    frames: Annotated[int, Field(ge=2, le=256), Affects.CLIPS] = 16
     """Frames of a clip, one per model step."""
-    stride: PositiveInt | Literal["auto"] = 4
+    stride: Annotated[PositiveInt | Literal["auto"], Affects.CLIPS | Affects.PLAN] = 4
     """Control steps per model step. Unsettled for the released weights: 4, 8 and 15 are candidates. auto: before the
     first step the model chooses among `stride_candidates` by its prediction error over persistence."""
-    start_every: PositiveInt = 1
+    start_every: Annotated[PositiveInt, Affects.LATENTS | Affects.RUN] = 1
     """Clips start at multiples of this many control steps, counted from the first step of their episode that
     `data.idle` keeps. With the stride's own number, only every stride-th frame is ever needed: a small latent cache."""
-    stride_candidates: Annotated[tuple[PositiveInt, ...], Field(min_length=1)] | None = None
+    stride_candidates: Annotated[Annotated[tuple[PositiveInt, ...], Field(min_length=1)] | None, Affects.RUN] = None
     """Strides that `auto` and `data calibrate` evaluate; null: 4, 8, 15 at 15 control steps per second, scaled to
     others."""
-    validation_share: Share = 0.05
+    validation_share: Annotated[Share, Affects.RUN] = 0.05
     """Share of the episodes held out for validation, chosen by a hash of the episode's identity."""
-    test_share: Share = 0.05
+    test_share: Annotated[Share, Affects.RUN] = 0.05
     """Share of the episodes held out for `evaluate`, likewise; never seen in training nor in validation."""
-    split_by: Annotated[str, Field(max_length=500), AfterValidator(_split_by)] | None = None
+    split_by: Annotated[Annotated[str, Field(max_length=500), AfterValidator(_split_by)] | None, Affects.RUN] = None
     """What keeps related episodes in one split, so that training reveals nothing about held-out ones: a field (lab, day
     or folder, as the identity says; task, scene, building, operator or day where the data set does), or a regular
     expression with one group, which is searched in the identity. null: each episode is drawn independently."""
-    outcome: Literal["all", "success", "failure"] = "all"
+    outcome: Annotated[Literal["all", "success", "failure"], Affects.INDEX | Affects.RUN] = "all"
     """Which demonstrations are used, if the data set records success and failure."""
-    idle: IdleConfig = IdleConfig()
+    idle: Annotated[IdleConfig, Affects.IDLE | Affects.LATENTS | Affects.RUN] = IdleConfig()
     """Which steps are excluded because the robot stands still."""
-    short_episodes: Literal["skip", "error"] = "skip"
+    short_episodes: Annotated[Literal["skip", "error"], Affects.RUN] = "skip"
     """What to do with episodes shorter than a clip: skip them and report how many, or stop."""
-    broken_episodes: Literal["error", "skip"] = "error"
+    broken_episodes: Annotated[Literal["error", "skip"], Affects.NOTHING] = "error"
     """What to do with an episode that cannot be read: stop and name it, or leave its clips out, name and count it, and
     stop when more than 1 % of the episodes are broken."""
-    exclude: tuple[str, ...] = ()
+    exclude: Annotated[tuple[str, ...], Affects.NOTHING] = ()
     """Identities of episodes to leave out, as errors name them."""
-    pose_frame: Literal["base", "camera"] = "base"
+    pose_frame: Annotated[Literal["base", "camera"], Affects.INDEX | Affects.CLIPS] = "base"
     """Frame of the poses: the robot's base (the released recipe), or the camera, where its extrinsics are known."""
-    crop: Literal["released", "square", "letterbox"] = "released"
+    crop: Annotated[Literal["released", "square", "letterbox"], Affects.CLIPS | Affects.PLAN] = "released"
     """How a frame that is not square is cropped. released: its centre, 1.35 times as wide as high at most, squashed.
     square: its central square (upstream's evaluation). letterbox: all of it, with black bars."""
-    augment: AugmentConfig = AugmentConfig()
+    augment: Annotated[AugmentConfig, Affects.RUN] = AugmentConfig()
     """Random changes of training clips."""
-    cache: Annotated[Literal["off", "auto", "require"], OFF] = "off"
+    cache: Annotated[Literal["off", "auto", "require"], OFF, Affects.RUN] = "off"
     """Whether the frozen encoder's latents are cached on disk, so that each frame is encoded once. off: no. auto: those
     that are not there yet are encoded before the first step. require: refuse to start where they are not there."""
-    cache_dtype: Literal["bf16", "fp32", "int8"] = "bf16"
+    cache_dtype: Annotated[Literal["bf16", "fp32", "int8"], Affects.LATENTS | Affects.RUN] = "bf16"
     """Storage type of latents: bf16; fp32, which takes twice as much room; int8 with a scale per token, half."""
-    cache_dir: Local | None = None
+    cache_dir: Annotated[Local | None, Affects.NOTHING] = None
     """Folder for latent caches, one folder in it for each; null: `latents` in the folder of `disk_cache`."""
-    check_crc: Literal["once", "always", "never"] = "once"
+    check_crc: Annotated[Literal["once", "always", "never"], Affects.NOTHING] = "once"
     """When the CRC-32C of a local TFRecord's data is checked: the first time that it is read on this machine, every
     time, or never. The CRC of a record's length is always checked. Likewise the CRC-32 of cached latents, frame by
     frame; once is then once for each process."""
-    disk_cache: DiskCacheConfig = DiskCacheConfig()
+    disk_cache: Annotated[DiskCacheConfig, Affects.NOTHING] = DiskCacheConfig()
     """The cache on this machine."""
-    workers: Annotated[int, Field(ge=0, le=256)] = 4
+    workers: Annotated[int, Field(ge=0, le=256), Affects.NOTHING] = 4
     """Loader processes; 0 loads in the training process. The data does not depend on it."""
-    prefetch: PositiveInt = 2
+    prefetch: Annotated[PositiveInt, Affects.NOTHING] = 2
     """Batches that each loader process prefetches."""
-    connections: Annotated[int, Field(ge=1, le=256)] = 16
+    connections: Annotated[int, Field(ge=1, le=256), Affects.NOTHING] = 16
     """Concurrent reads per process, for remote data."""
 
     @model_validator(mode="after")
@@ -247,6 +252,12 @@ class DataConfig(Section):
             first = {"droid_raw": RAW_CAMERAS[0], "npz": "frames", "latents": "all"}
             return (first[self.source],) if self.known_cameras is None else self.known_cameras[:1]
         return (self.camera,) if isinstance(self.camera, str) else self.camera
+
+    @property
+    def own_section(self) -> dict[str, Section]:
+        """The section of this form of data, by its name; none where it has no knobs of its own."""
+        name = {"rlds": "fields", "droid_raw": "droid_raw", "lerobot": "lerobot"}.get(self.source)
+        return {} if name is None else {name: getattr(self, name)}
 
     @property
     def takes_latents(self) -> bool:

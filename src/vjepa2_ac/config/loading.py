@@ -67,7 +67,15 @@ def config_as_dict(config: Config) -> dict[str, Any]:
 
 def config_as_flat_dict(config: Config) -> dict[str, Any]:
     """Return the resolved config by dotted keys, which is what trackers take."""
-    return _flatten(config_as_dict(config))
+    return flat(config_as_dict(config))
+
+
+def flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested values by their dotted keys."""
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return found
 
 
 def config_as_yaml(config: Config) -> str:
@@ -133,13 +141,3 @@ def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> 
             )
         values = inner
     values[keys[-1]] = value
-
-
-def _flatten(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, dict):
-            flat |= _flatten(value, f"{prefix}{key}.")
-        else:
-            flat[prefix + key] = value
-    return flat

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field, model_validator
 
 from vjepa2_ac import places
+from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.section import PositiveInt, Section, Share
 
 # Far beyond every such model (released: width 1408, depth 40, 1.3 billion weights): a file may claim any size.
@@ -101,18 +102,18 @@ class ModelSizes(Section):
 class ModelConfig(Section):
     """Which world model to start from."""
 
-    base: Annotated[str, AfterValidator(places.of_a_model)] | None = None
+    base: Annotated[Annotated[str, AfterValidator(places.of_a_model)] | None, Affects.RUN] = None
     """The model to adapt: the official `.pt`, a folder written by `save_pretrained`, or `builtin:sim-tiny` (the tiny
     model of the demo, which comes with the package)."""
-    random: ModelSizes | None = None
+    random: Annotated[ModelSizes | None, Affects.RUN] = None
     """Instead of `base`: a fresh model of these sizes; with `adapter.kind: none` that is training from scratch."""
-    random_start: Literal["persistence", "released"] = "persistence"
+    random_start: Annotated[Literal["persistence", "released"], Affects.RUN] = "persistence"
     """Initialisation of a `random` model: close to copying the last frame, or as in the released recipe."""
-    sizes: ModelSizes = ModelSizes()
+    sizes: Annotated[ModelSizes, Affects.RUN | Affects.PLAN] = ModelSizes()
     """What an official `.pt` does not contain: image size and heads. Everything else is read from its tensors."""
-    dtype: Literal["float32", "bfloat16"] = "bfloat16"
+    dtype: Annotated[Literal["float32", "bfloat16"], Affects.LATENTS | Affects.RUN | Affects.PLAN] = "bfloat16"
     """Type of the frozen weights; trained weights are always float32. Planning computes in it."""
-    encode_chunk: PositiveInt = 16
+    encode_chunk: Annotated[PositiveInt, Affects.RUN] = 16
     """Frames that go through the encoder at once: bounds its memory."""
 
     @model_validator(mode="after")

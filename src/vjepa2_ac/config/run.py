@@ -8,6 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from vjepa2_ac import places
 from vjepa2_ac.config.data import DataConfig
+from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.config.section import Section
@@ -26,25 +27,25 @@ def _run_folder(path: str) -> str:
 class Config(Section):
     """A complete run."""
 
-    run_dir: Annotated[str, AfterValidator(_run_folder)]
+    run_dir: Annotated[str, AfterValidator(_run_folder), Affects.NOTHING]
     """Folder of the run, on this machine: resolved config, checkpoints, metrics. `checkpoint.remote` keeps a copy."""
-    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    seed: Annotated[int, Field(ge=0, lt=2**31), Affects.RUN | Affects.PLAN] = 0
     """Decides the order of clips, fresh weights and dropout."""
     data: DataConfig
     """The data set, and the clips made of it."""
     model: ModelConfig
     """Which world model to start from."""
-    adapter: AdapterConfig = AdapterConfig()
+    adapter: Annotated[AdapterConfig, Affects.RUN] = AdapterConfig()
     """What is trained."""
-    training: TrainingConfig = TrainingConfig()
+    training: Annotated[TrainingConfig, Affects.RUN] = TrainingConfig()
     """How the weights change."""
-    validation: ValidationConfig = ValidationConfig()
+    validation: Annotated[ValidationConfig, Affects.RUN] = ValidationConfig()
     """Validation before the first step and during training."""
-    checkpoint: CheckpointConfig = CheckpointConfig()
+    checkpoint: Annotated[CheckpointConfig, Affects.NOTHING] = CheckpointConfig()
     """Checkpoints, here and elsewhere."""
-    tracking: TrackingConfig = TrackingConfig()
+    tracking: Annotated[TrackingConfig, Affects.NOTHING] = TrackingConfig()
     """Where metrics go."""
-    planning: PlanningConfig = PlanningConfig()
+    planning: Annotated[PlanningConfig, Affects.PLAN] = PlanningConfig()
     """How a robot is controlled afterwards; training does not use it."""
 
     @model_validator(mode="after")

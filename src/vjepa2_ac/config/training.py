@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.section import OFF, Place, PositiveInt, Section
 
 
@@ -50,7 +51,7 @@ class TrainingConfig(Section):
     """AdamW's decay rates of the running moments."""
     max_grad_norm: Annotated[float, Field(gt=0.0)] | None = 1.0
     """Gradients are clipped to this norm; null: never (the released recipe)."""
-    precision: Literal["bf16", "fp16", "fp32"] = "bf16"
+    precision: Annotated[Literal["bf16", "fp16", "fp32"], Affects.LATENTS | Affects.RUN] = "bf16"
     """Arithmetic of the networks (autocast). bf16 needs compute capability 8.0 on CUDA (Ampere). fp16 scales the loss,
     and needs CUDA."""
     gradient_checkpointing: bool = False
@@ -64,11 +65,11 @@ class TrainingConfig(Section):
     attention: Literal["auto", "per_step"] = "auto"
     """auto: FlexAttention in training steps on CUDA, which is compiled for each size of a batch. per_step: one plain
     attention for each model step, which compiles nothing. The same losses and gradients to rounding."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: Annotated[Literal["auto", "cpu", "cuda"], Affects.RUN | Affects.PLAN] = "auto"
     """auto: CUDA where there is one."""
-    allow_weak_base: bool = False
+    allow_weak_base: Annotated[bool, Affects.NOTHING] = False
     """Train even if the base is no better than persistence (copy the last frame) on the validation clips."""
-    log_every: PositiveInt = 10
+    log_every: Annotated[PositiveInt, Affects.NOTHING] = 10
     """Optimizer steps between lines in metrics.jsonl."""
 
     @model_validator(mode="after")

@@ -18,7 +18,6 @@ from vjepa2_ac.data.clips.transforms import view
 from vjepa2_ac.encoding.disk_space import FRAMES_AT_ONCE
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
 
 _PREFETCHED_PARTS = 2  # per thread: one in progress, and one ready
 
@@ -98,8 +97,6 @@ class _Task:
             frames = recording.read_frames(wanted.steps[self.first : upto].tolist())
             frames = view(frames, self.source.dataset.config.crop)
             return Part(wanted, recording, frames, _small(frames, self.source.side), upto >= len(wanted.steps))
-        except UnreachableError:
-            raise
         except InputError as error:
             return Unreadable(wanted, error)
 
@@ -124,8 +121,6 @@ class _Recording:
             if self._episode is None:
                 try:
                     self._episode = self._open()
-                except UnreachableError:
-                    raise
                 except InputError as error:
                     self._episode = error
         if isinstance(self._episode, InputError):

@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.config.effects import Affects, mark_of, names_that_affect
 from vjepa2_ac.config.loading import config_from, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import literal
 from vjepa2_ac.runs.folder import CONFIG, is_run
 
-# Settings that planning uses; the others are of training, and changing them here would do nothing.
-RELEVANT_KEYS = ("planning.", "seed", "data.crop", "data.stride", "model.dtype", "model.sizes.", "training.device")
 _ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
 
 
@@ -61,11 +60,13 @@ def _of_model(subject: str, config: str | Path | None, overrides: Sequence[str],
 
 def _require_relevant(overrides: Sequence[str]) -> None:
     for override in overrides:
-        key = override.partition("=")[0]
-        is_relevant = any(key == known or (known.endswith(".") and key.startswith(known)) for known in RELEVANT_KEYS)
-        if key.split(".")[0] in Config.model_fields and not is_relevant:  # of others the config says what is wrong
+        try:
+            is_relevant = Affects.PLAN in mark_of(override.partition("=")[0], Config)
+        except KeyError:  # the config says what is wrong
+            continue
+        if not is_relevant:
             raise InputError(
                 where=f"override {override}",
                 found="a setting that planning does not use",
-                needed=f"one of {', '.join(known + '…' * known.endswith('.') for known in RELEVANT_KEYS)}",
+                needed=f"one of {', '.join(names_that_affect(Affects.PLAN, Config))}",
             )

@@ -58,6 +58,7 @@ class RunState:
     best_error: Annotated[float, Field(allow_inf_nan=False)] | None = None
     measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.best_checkpoint`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
+    data: str | None = None  # the fingerprint of the episodes
 
     def measured(self, error: float) -> RunState:
         """Return the state after a validation at its step: changed only if it was better than all before."""

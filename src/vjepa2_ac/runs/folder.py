@@ -26,6 +26,7 @@ import sys
 from pathlib import Path
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.config.effects import Affects, mark_of
 from vjepa2_ac.config.loading import changed_keys, config_as_dict, config_as_flat_dict, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import is_url, literal
@@ -50,26 +51,6 @@ NOT_FINITE = "not_finite"  # each process writes its own, on the disk that it se
 _OWN = (
     *(LOCK, CONFIG, ENVIRONMENT, CALIBRATION, RUN_ID, METRICS),
     *(CHECKPOINTS, HELD, TENSORBOARD, WANDB, NOT_FINITE),
-)
-
-# Settings that may change between two starts of one run. They do not change what is computed, but for those by which a
-# broken episode is left out: data.exclude changes the order of the clips that are still to come, data.broken_episodes
-# leaves gaps in it.
-_FREE_TO_CHANGE = (
-    "run_dir",
-    "data.workers",
-    "data.prefetch",
-    "data.connections",
-    "data.disk_cache.",
-    "data.cache_dir",
-    "data.check_crc",
-    "data.exclude",
-    "data.broken_episodes",
-    "checkpoint.",
-    "tracking.",
-    "planning.",
-    "training.log_every",
-    "training.allow_weak_base",
 )
 
 
@@ -117,7 +98,9 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     start = {"seed": config.seed, "folder": str(Path.cwd()), **environment()}
     if (changes := config_changes(config)) and allow_config_change:
         start["config_changes"] = changes
-    if allow_config_change or not (folder / CONFIG).exists():  # first of all files: it makes the folder a run's
+    is_new = not (folder / CONFIG).exists()
+    if is_new or allow_config_change or read_run_config(folder).data.path != config.data.path:  # the data were moved
+        # First of all files: it makes the folder a run's.
         write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     path = folder / ENVIRONMENT
     starts = _earlier_starts(path)
@@ -224,7 +207,8 @@ def _setting(config: Config, dotted_key: str) -> str:
 
 
 def _refuse_another_config(folder: Path, config: Config) -> None:
-    differing = [key for key in changed_keys(read_run_config(folder), config) if not key.startswith(_FREE_TO_CHANGE)]
+    changed = changed_keys(read_run_config(folder), config)
+    differing = [key for key in changed if Affects.RUN in mark_of(key, Config)]
     if differing:
         raise InputError(
             where=str(folder),

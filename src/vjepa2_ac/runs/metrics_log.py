@@ -16,7 +16,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.runs.folder import METRICS
 from vjepa2_ac.runs.slow_disk import warn_if_stalled
 from vjepa2_ac.runs.trackers import Trackers
@@ -75,7 +75,7 @@ class MetricsLog:
         error = self._sync()
         try:
             yield
-        except InputError as other:
+        except UserError as other:
             if error is None:
                 raise
             raise _unwritable(self.path, error, f"{other.where}: {other.found}") from other

@@ -5,8 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from vjepa2_ac.errors import pip_install
-from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.errors import UnreachableError, pip_install
 
 
 def require_library(module: str, *, where: str, called: str, extra: str) -> Any:

@@ -2,8 +2,7 @@
 
 A path is local, or a URL such as `gs://bucket/folder` (see `remote`). A missing or truncated file is an error of the
 file. A network failure is not: it is retried, and finally raises an `UnreachableError`; nor is an error of the
-operating system (see `unreadable`). An UnreachableError is an InputError that must never be counted as a broken
-episode: code that turns InputErrors into problems must let it pass first.
+operating system (see `unreadable`). Handlers of broken episodes catch an `InputError`, which this is not.
 """
 
 from __future__ import annotations
@@ -17,10 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UnreachableError, UserError
 from vjepa2_ac.places import is_url
 from vjepa2_ac.storage import remote
-from vjepa2_ac.storage.remote import UnreachableError
 
 _HASH_CHUNK_BYTES = 1 << 20
 _ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG})
@@ -120,7 +118,7 @@ def open_to_read(path: str | Path) -> ByteReader:
     return remote.open_to_read(str(path)) if is_url(path) else Path(path).open("rb")
 
 
-def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -> InputError:
+def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -> UserError:
     """Return the error of a file that is missing, truncated, or refused by the operating system.
 
     The last (no permission, too many open files, a disk that went away) is temporary and says nothing about the file's

@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from vjepa2_ac.errors import RefusedError, UnreachableError
 from vjepa2_ac.places import is_url
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.reading import join
-from vjepa2_ac.storage.remote import RefusedError, UnreachableError
 from vjepa2_ac.storage.writing import atomic_writer, try_writing_at
 
 _AWAY = frozenset({

@@ -8,22 +8,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.loading import config_as_flat_dict
+from vjepa2_ac.config.effects import Affects, knobs_that_affect
+from vjepa2_ac.config.loading import flat
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import validation_windows
 from vjepa2_ac.runs.checkpoint import RunState
 
-# The location of the data is ignored, and so are the settings that select held-out clips: the clips are compared.
-_DECIDE = (
-    *("frames", "stride", "camera", "states", "actions", "join_actions", "pose_frame", "crop"),
-    *("fields.", "lerobot.", "droid_raw."),
-)
-
 
 def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
     """Return what determines the measurements of a validation, by readable names."""
-    decide = tuple(f"data.{key}" for key in _DECIDE)
-    settings = {key: json.dumps(value) for key, value in config_as_flat_dict(config).items() if key.startswith(decide)}
+    decide = flat(knobs_that_affect(Affects.MEASURED, config))
+    settings = {key: json.dumps(value) for key, value in decide.items()}
     windows = validation_windows(dataset, "validation", clips=config.validation.clips)
     clips = [(dataset.table.identity(episode), int(start)) for episode, start in windows]
     return {**settings, "its clips": hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}
@@ -32,10 +27,10 @@ def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
 def best_so_far(state: RunState, now: Mapping[str, str], note: Callable[[str], None]) -> RunState:
     """Return the state to resume from: a best error of other measurements is dropped, with a message.
 
-    States of earlier versions do not record what they were measured on, and are accepted.
+    What a state of an earlier version does not record, or records beyond what matters now, is accepted.
     """
     before = state.measured_on
-    differing = [] if before is None else sorted(key for key in {*before, *now} if before.get(key) != now.get(key))
+    differing = sorted(key for key in (before or {}).keys() & now if before and before[key] != now[key])
     state = replace(state, measured_on=dict(now))
     if not differing or state.best_error is None:
         return state

@@ -37,7 +37,7 @@ from vjepa2_ac.training.monitoring.stopwatch import stopwatch_for
 from vjepa2_ac.training.monitoring.throughput import Throughput, TimedBatches
 from vjepa2_ac.training.optim import require_optimizer
 from vjepa2_ac.training.reporter import NullMetricsLog, NullReporter, Reporter
-from vjepa2_ac.training.resume import refuse_if_overtaken
+from vjepa2_ac.training.resume import refuse_if_overtaken, require_same_data
 from vjepa2_ac.training.setup import Run, batches_from, save_checkpoint, set_up
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.validation import refuse_weak_base, validate, validate_if_due, validation_metrics
@@ -100,6 +100,8 @@ def _train(
     run: Run, lock: RunLock, remote: Remote | None, reporter: Reporter, *, check_only: bool, allow_config_change: bool
 ) -> Path:
     config, folder, writes = run.config, Path(run.config.run_dir), run.accelerator.is_main_process
+    if writes and not allow_config_change:
+        require_same_data(config, run.dataset, run.state)
     first = validate(run, reporter) if run.state.step == 0 else None
     if first is not None:
         refuse_weak_base(run, first, reporter)

@@ -12,6 +12,7 @@ from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.index.index_cache import fingerprints_of
 from vjepa2_ac.distributed.collectives import broadcast_object, broadcast_tensors, require_same
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import load_trained
@@ -27,7 +28,7 @@ from vjepa2_ac.runs.checkpoint import (
     read_state,
     step_of,
 )
-from vjepa2_ac.runs.folder import CHECKPOINTS, run_id
+from vjepa2_ac.runs.folder import CHECKPOINTS, CONFIG, read_run_config, run_id
 from vjepa2_ac.runs.torch_file import read_torch
 from vjepa2_ac.training.optim import load_moments
 
@@ -123,6 +124,29 @@ def restore_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
             where="--resume", found=found, needed=needed, fix="Delete this checkpoint, to use an older one"
         )
     scaler.load_state_dict(dict(state.loss_scale))
+
+
+def require_same_data(config: Config, dataset: Dataset, state: RunState) -> None:
+    """Refuse to go on with another data set than the one that the run began with.
+
+    At the place where it began the data may have changed, which is reported; elsewhere they must be the same.
+
+    Raises:
+        InputError: They are others, or an earlier version did not note which they were.
+    """
+    folder = Path(config.run_dir)
+    if not state.step or not (folder / CONFIG).is_file():
+        return
+    began_with = read_run_config(folder).data.path
+    if began_with == config.data.path or state.data in fingerprints_of(dataset.table):
+        return
+    raise InputError(
+        where=f"data.path: {config.data.path}",
+        found="other episodes or files than the run has seen" if state.data else "a run that did not note its data",
+        needed=f"the data set that was at {began_with}",
+        fix="Set data.path to where that is now (its files keep names, sizes and times when they are moved); where the"
+        " change is meant, add --allow-config-change",
+    )
 
 
 def report_data_changes(dataset: Dataset, state: RunState, note: Callable[[str], None]) -> None:

@@ -17,6 +17,7 @@ from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import training_loader, validation_batches
 from vjepa2_ac.data.clips.prefetch import Batches
 from vjepa2_ac.data.clips.streams import Copies, copies_for
+from vjepa2_ac.data.index.index_cache import fingerprints_of
 from vjepa2_ac.data.inspection.duplicates import find_duplicates
 from vjepa2_ac.distributed.collectives import all_gather_object, broadcast_object
 from vjepa2_ac.distributed.device import PRECISIONS
@@ -215,6 +216,7 @@ def save_checkpoint(run: Run, folder: Path) -> None:
         run.state,
         broken=broken,
         windows=len(run.dataset.windows("train")),
+        data=fingerprints_of(run.dataset.table)[0],
         clips_per_step=run.clips_per_step,
         clips_asked=run.config.training.batch_size * run.config.training.accumulation,
         processes=run.accelerator.num_processes,

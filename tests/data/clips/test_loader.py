@@ -29,9 +29,8 @@ from vjepa2_ac.data.clips.loader import clip_at, collate, training_loader, valid
 from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.data.sources.rlds.tfrecord import index_records
 from vjepa2_ac.episode import Batch, Episode
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.geometry import actions_from_states, apply_action, matrices_from_euler, states_in_camera_frame
-from vjepa2_ac.storage.remote import UnreachableError
 
 Names = list[tuple[str, int]]
 

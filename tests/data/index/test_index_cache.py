@@ -13,7 +13,7 @@ import pytest
 from vjepa2_ac import storage
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
-from vjepa2_ac.data.index.index_cache import cache_folder, get_or_build
+from vjepa2_ac.data.index.index_cache import IndexKeys, cache_folder, fingerprints_of, get_or_build, record_usage
 from vjepa2_ac.episode import EpisodeInfo
 
 TABLE = EpisodeTable.of(
@@ -23,6 +23,9 @@ TABLE = EpisodeTable.of(
 )
 
 
+KEYS = IndexKeys.of({"files": 3}, "/data/set")
+
+
 def ids(table: EpisodeTable) -> list[str]:
     return [info.id for info in table]
 
@@ -30,14 +33,39 @@ def ids(table: EpisodeTable) -> list[str]:
 def test_a_table_is_built_once(tmp_path: Path) -> None:
     config, built = DiskCacheConfig(dir=str(tmp_path)), []
     for _ in range(2):
-        table = get_or_build(config, "a", lambda: built.append(1) or TABLE)
+        table = get_or_build(config, KEYS, "/data/set", lambda: built.append(1) or TABLE)
         assert (ids(table), table.problems) == (ids(TABLE), TABLE.problems)
     assert built == [1]
 
 
+def test_an_index_of_a_folder_is_found_wherever_it_is_moved_and_its_problems_are_there(tmp_path: Path) -> None:
+    config = DiskCacheConfig(dir=str(tmp_path))
+    broken = EpisodeTable.of([EpisodeInfo("one", 3)], problems=[EpisodeProblem("bad", "/data/set/a.npz: x", "damaged")])
+    get_or_build(config, KEYS, "/data/set", lambda: broken)
+    moved = IndexKeys.of({"files": 3}, "/mnt/set")
+    table = get_or_build(config, moved, "/mnt/set", lambda: pytest.fail("built again"))
+    assert [problem.where for problem in table.problems] == ["/mnt/set/a.npz: x"]
+    assert fingerprints_of(table)[0] == KEYS.now == moved.now
+    assert IndexKeys.of({"files": 4}, "/data/set").now != KEYS.now
+    assert IndexKeys.of({"files": 3}, "/data/set", named="other/success").now != KEYS.now
+    far = IndexKeys.of({"files": 3}, "gs://a/set")
+    assert far.now == far.before != IndexKeys.of({"files": 3}, "gs://b/set").now, "servers say little of versions"
+
+
+def test_an_index_of_an_earlier_version_is_found_and_so_is_what_was_made_by_its_key(tmp_path: Path) -> None:
+    config, old = DiskCacheConfig(dir=str(tmp_path)), IndexKeys(KEYS.before, KEYS.before)
+    get_or_build(config, old, "/data/set", lambda: TABLE)
+    table = get_or_build(config, KEYS, "/data/set", lambda: pytest.fail("built again"))
+    assert fingerprints_of(table) == (KEYS.now, KEYS.before)
+    moved = get_or_build(config, IndexKeys.of({"files": 3}, "/mnt"), "/mnt", lambda: pytest.fail("built again"))
+    assert fingerprints_of(moved) == (KEYS.now, KEYS.before), "also when it has moved since"
+    with record_usage(rebuild=True):
+        assert ids(get_or_build(config, KEYS, "/data/set", lambda: TABLE)) == ids(TABLE)
+
+
 def test_whatever_is_damaged_the_table_is_built_again(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     config, chance = DiskCacheConfig(dir=str(tmp_path)), random.Random(0)  # noqa: S311 - no secret
-    whole = get_or_build(config, "a", lambda: TABLE).to_bytes()
+    whole = get_or_build(config, KEYS, "/data/set", lambda: TABLE).to_bytes()
     [path] = (tmp_path / "index").iterdir()
     content = path.read_bytes()
     with caplog.at_level(logging.CRITICAL):
@@ -46,7 +74,10 @@ def test_whatever_is_damaged_the_table_is_built_again(tmp_path: Path, caplog: py
             damaged[chance.randrange(len(damaged))] ^= 1 << chance.randrange(8)
             path.write_bytes(damaged[: len(damaged) if chance.random() < 0.9 else chance.randrange(len(damaged))])
             built: list[int] = []
-            assert get_or_build(config, "a", lambda built=built: built.append(1) or TABLE).to_bytes() == whole
+            assert (
+                get_or_build(config, KEYS, "/data/set", lambda built=built: built.append(1) or TABLE).to_bytes()
+                == whole
+            )
             assert built == [1]
             assert path.read_bytes() == content
 
@@ -58,7 +89,7 @@ def test_a_folder_that_cannot_be_written_costs_a_warning(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(storage, "write_atomically", refuse)
-    assert len(get_or_build(DiskCacheConfig(dir=str(tmp_path)), "a", lambda: TABLE)) == 5
+    assert len(get_or_build(DiskCacheConfig(dir=str(tmp_path)), KEYS, "/data/set", lambda: TABLE)) == 5
     assert "No space left on device" in caplog.text
 
 

@@ -19,7 +19,7 @@ from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.step_ranges import StepSelection
 from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
-from vjepa2_ac.data.index.index_cache import get_or_build
+from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.duplicates import Duplicates, find_duplicates
@@ -177,5 +177,5 @@ def test_an_index_of_another_form_is_built_again_and_the_key_of_the_data_stays(
     keys = set()
     for form in (FORMAT, FORMAT, FORMAT + 1):
         monkeypatch.setattr("vjepa2_ac.data.index.index_cache.FORMAT", form)
-        keys.add(get_or_build(config, "a", lambda: built.append(1) or table).texts["index"])
+        keys.add(get_or_build(config, IndexKeys("a", "a"), "", lambda: built.append(1) or table).texts["index"])
     assert (len(built), keys) == (2, {"a"})

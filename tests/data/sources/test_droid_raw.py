@@ -17,9 +17,8 @@ from recordings import write_mp4, write_raw_droid
 from synthetic import draw_frame, synthetic_episode, synthetic_states
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.geometry import actions_from_states
-from vjepa2_ac.storage.remote import UnreachableError
 
 STEPS, SIZE = 24, (72, 128)
 LEFT, RIGHT, WRIST = "23404442", "29838012", "16787047"

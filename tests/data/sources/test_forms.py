@@ -5,6 +5,7 @@ import itertools
 import os
 import shutil
 import tempfile
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,16 +14,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gcs import Gcs
 from lerobot_sets import STATE, Recorded, write_v21, write_v30
 from recordings import write_raw_droid
 from synthetic import draw_frame, synthetic_episode
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import training_loader
+from vjepa2_ac.data.inspection.excerpts import excerpts_of
+from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
 from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.episode import Batch
-from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.storage.remote import retries
 
 LENGTHS = (14, 17, 15, 12)
 SIZE = (36, 64)
@@ -66,10 +71,13 @@ def forms(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def opened(forms: Path, form: str, **knobs: Any) -> Dataset:
+def data_config(form: str, path: str, **knobs: Any) -> DataConfig:
     chosen = {"frames": 3, "stride": 2, "workers": 0, "validation_share": 0.0, "test_share": 0.0} | knobs
-    path = forms / form / ("1.0.0" if form == "rlds" else "")
-    return open_dataset(DataConfig(source=form.split("_v", maxsplit=1)[0], path=str(path), **chosen))
+    return DataConfig(source=form.split("_v", maxsplit=1)[0], path=path, **chosen)
+
+
+def opened(forms: Path, form: str, **knobs: Any) -> Dataset:
+    return open_dataset(data_config(form, str(forms / form / ("1.0.0" if form == "rlds" else "")), **knobs))
 
 
 def clips(dataset: Dataset, count: int) -> tuple[list[tuple[int, int]], list[Batch]]:
@@ -159,6 +167,52 @@ def test_a_file_that_the_system_refuses_is_named_and_its_episode_not_called_brok
             with pytest.raises(UnreachableError, match=f"{os.strerror(errno.EACCES)}.*permissions"):
                 action()
     assert len(opened(tmp_path, form, disk_cache=new).table) == len(LENGTHS)
+
+
+Seam = tuple[str, ...]
+
+
+def seam() -> Seam:
+    """Return the functions of ours that want something of the network just now, from the outermost to the innermost."""
+    calls = [frame for frame in traceback.extract_stack() if "/vjepa2_ac/" in frame.filename]
+    return tuple(call.name for call in calls if "/storage/remote/" not in call.filename)
+
+
+def use_in_every_way(dataset: Dataset) -> None:
+    """Read clips, sample episodes and measure them, as training, `data check` and `data inspect` do."""
+    clips(dataset, 2)
+    assert list(excerpts_of(dataset))
+    inspect_dataset(dataset)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_what_cannot_be_reached_arrives_from_every_seam(
+    forms: Path, form: str, gcs: Gcs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever fails, and wherever: the error arrives as what it is, and no episode is called broken."""
+    gcs.upload(forms / form, f"robots/{form}")
+    usual, seams, failing = retries.with_retries, dict.fromkeys(()), [None]
+
+    def asked(where: str, *given: Any, **named: Any) -> Any:
+        here = seam()
+        if here == failing[0]:
+            raise UnreachableError(where=where, found="gone")
+        seams.setdefault(here)
+        return usual(where, *given, **named)
+
+    monkeypatch.setattr(retries, "with_retries", asked)
+    knobs = {"idle": MOTION, "broken_episodes": "skip", "connections": 2}
+
+    def use(number: int) -> None:
+        cache = {"dir": str(tmp_path / f"cache{number}"), "limit_gb": 0.0}
+        path = f"gs://robots/{form}{'/1.0.0' if form == 'rlds' else ''}"
+        use_in_every_way(open_dataset(data_config(form, path, disk_cache=cache, **knobs)))
+
+    use(0)
+    assert len(seams) > 3
+    for number, failing[0] in enumerate(list(seams), start=1):
+        with pytest.raises(UnreachableError, match=r"^gs://robots.*gone"):
+            use(number)
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -16,8 +16,8 @@ from lerobot_sets import CAMERAS, STATE, Recorded, change_info, numbers_of, reco
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError, retries
+from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.storage.remote import retries
 
 LENGTHS = (12, 13, 14, 15, 16)
 
@@ -166,7 +166,7 @@ def test_a_gated_data_set_says_how_to_log_in(hub: Hub, tmp_path: Path, monkeypat
     for token in (None, "hf_wrong"):
         if token is not None:
             monkeypatch.setenv("HF_TOKEN", token)
-        with pytest.raises(InputError, match=r"hf://datasets/lab/closed.*hf auth login.*HF_TOKEN"):
+        with pytest.raises(UnreachableError, match=r"hf://datasets/lab/closed.*hf auth login.*HF_TOKEN"):
             source_of("closed", tmp_path).infos()
     monkeypatch.setenv("HF_TOKEN", "hf_right")
     assert len(source_of("closed", tmp_path).infos()) == 1

@@ -22,8 +22,7 @@ from vjepa2_ac.data.sources.rlds.tfrecord import (
     write_record,
 )
 from vjepa2_ac.episode import Episode
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.errors import InputError, UnreachableError
 
 SHARD = r"GET /download/.*tfrecord"
 URL = "gs://robots/droid/1.0.0"
@@ -262,13 +261,13 @@ def test_a_network_that_stays_away_is_named_and_breaks_no_episode(
 def test_a_bucket_or_a_permission_that_is_missing_is_named(
     droid: Path, far: Callable[..., RldsSource], gcs: Gcs
 ) -> None:
-    with pytest.raises(InputError, match="no bucket nobody"):
+    with pytest.raises(UnreachableError, match="no bucket nobody"):
         RldsSource(DataConfig(path="gs://nobody/droid")).infos()
     source = far(droid)
     with pytest.raises(InputError, match=r"gs://robots/droid.*did you mean gs://robots/droid/1\.0\.0\?"):
         RldsSource(DataConfig(path="gs://robots/droid")).infos()
     gcs.fail_next(403, times=1000)
-    with pytest.raises(InputError, match=r"gs://robots/droid/1\.0\.0.*permission"):
+    with pytest.raises(UnreachableError, match=r"gs://robots/droid/1\.0\.0.*permission"):
         source.infos()
 
 

@@ -11,12 +11,12 @@ from gcs import Failure, Gcs
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state, write_checkpoint
 from vjepa2_ac.runs.folder import check_run_folder
 from vjepa2_ac.runs.lock import RunLock
 from vjepa2_ac.runs.mirror.open_remote import Remote, open_remote
-from vjepa2_ac.storage.remote import UnreachableError, filesystems
+from vjepa2_ac.storage.remote import filesystems
 
 PLACE = "gs://bucket/run"
 NOTHING: Callable[[str], None] = [].append

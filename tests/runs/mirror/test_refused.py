@@ -12,11 +12,11 @@ import pytest
 from gcs import Gcs
 from vjepa2_ac import storage
 from vjepa2_ac.config import CheckpointConfig
+from vjepa2_ac.errors import RefusedError, UnreachableError
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, write_checkpoint
 from vjepa2_ac.runs.mirror.background_sync import Mirror
 from vjepa2_ac.runs.mirror.remote_checkpoints import RemoteCheckpoints, complete
 from vjepa2_ac.storage import transfer
-from vjepa2_ac.storage.remote import RefusedError, UnreachableError
 
 WEIGHTS, MOMENTS = 10_000, 20_000
 

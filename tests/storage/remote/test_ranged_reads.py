@@ -13,8 +13,7 @@ import pytest
 
 from gcs import Failure, Gcs
 from vjepa2_ac import storage
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import remote
+from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.storage.remote import retries
 
 DATA = bytes(range(256)) * 400
@@ -65,7 +64,7 @@ def test_a_server_that_does_not_answer_is_asked_again(gcs: Gcs, file: str, monke
     gcs.fail_next("hang", match="/download/")
     assert storage.read_range(file, 0, 5) == DATA[:5]
     gcs.fail_next("hang", times=2, match="/download/")
-    with pytest.raises(remote.UnreachableError, match=r"2 attempts over \d s; the last: time-out"):
+    with pytest.raises(UnreachableError, match=r"2 attempts over \d s; the last: time-out"):
         storage.read_range(file, 0, 5)
 
 
@@ -77,7 +76,7 @@ def test_attempts_are_counted_and_the_error_says_where_and_why(
 ) -> None:
     gcs.fail_next(failure, times=100, match="/download/")
     begin = time.monotonic()
-    with pytest.raises(remote.UnreachableError, match=rf"^{file}: not reached in 5 attempts.*{words}.*Check the net"):
+    with pytest.raises(UnreachableError, match=rf"^{file}: not reached in 5 attempts.*{words}.*Check the net"):
         storage.read_range(file, 0, 5)
     assert time.monotonic() - begin < 2
     attempts = 5 if failure != "reset" else 10  # aiohttp asks again at once where a connection in use before was cut
@@ -87,7 +86,7 @@ def test_attempts_are_counted_and_the_error_says_where_and_why(
 @pytest.mark.parametrize("status", [401, 403])
 def test_missing_permission_is_said_at_once_with_the_way_to_log_in(gcs: Gcs, file: str, status: int) -> None:
     gcs.fail_next(status, times=100)
-    with pytest.raises(remote.UnreachableError, match=rf"no permission \(HTTP {status}.*gcloud auth application-def"):
+    with pytest.raises(UnreachableError, match=rf"no permission \(HTTP {status}.*gcloud auth application-def"):
         storage.read_range(file, 0, 5)
     assert len(gcs.requests) == 1
 
@@ -107,7 +106,7 @@ def test_an_absent_file_is_absent_and_not_asked_for_again(gcs: Gcs, file: str) -
 @pytest.mark.usefixtures("gcs")
 def test_a_bucket_that_does_not_exist_is_named() -> None:
     for action in (storage.exists, storage.list_names, storage.read_bytes, storage.open_to_read):
-        with pytest.raises(remote.UnreachableError, match=r"there is no bucket nobodys. Check its name"):
+        with pytest.raises(UnreachableError, match=r"there is no bucket nobodys. Check its name"):
             action("gs://nobodys/folder/file")
 
 
@@ -189,9 +188,9 @@ def test_a_worker_process_reads_on_its_own(file: str) -> None:
 
 
 def test_an_unreachable_error_survives_the_trip_from_a_worker() -> None:
-    error = remote.UnreachableError(where="gs://a", found="nothing", fix="Wait")
+    error = UnreachableError(where="gs://a", found="nothing", fix="Wait")
     copy = pickle.loads(pickle.dumps(error))  # noqa: S301 - our own
-    assert (type(copy), str(copy)) == (remote.UnreachableError, str(error))
+    assert (type(copy), str(copy)) == (UnreachableError, str(error))
 
 
 def test_a_url_that_nothing_reads_is_named() -> None:

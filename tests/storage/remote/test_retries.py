@@ -6,7 +6,8 @@ import time
 import pytest
 from google.auth.exceptions import RefreshError
 
-from vjepa2_ac.storage.remote import UnreachableError, retries
+from vjepa2_ac.errors import UnreachableError
+from vjepa2_ac.storage.remote import retries
 from vjepa2_ac.storage.remote.retries import RetryPolicy, with_retries
 
 AT_ONCE = RetryPolicy(attempts=3, first_wait_s=0.0, longest_wait_s=0.0)

@@ -8,6 +8,7 @@ from fsspec import AbstractFileSystem, register_implementation
 
 from gcs import Failure, Gcs
 from vjepa2_ac import storage
+from vjepa2_ac.errors import RefusedError, UnreachableError
 from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.remote import filesystems, retries, uploads
 
@@ -81,9 +82,9 @@ def test_an_upload_that_stalls_is_cut_off_and_begun_again(
     bucket.fail_next("hang", match="POST /upload/")
     storage.upload(source, PLACE)
     bucket.fail_next("hang", times=2, match="POST /upload/")
-    with pytest.raises(remote.UnreachableError, match="2 attempts over") as raised:
+    with pytest.raises(UnreachableError, match="2 attempts over") as raised:
         storage.upload(source, PLACE)
-    assert not isinstance(raised.value, remote.RefusedError)
+    assert not isinstance(raised.value, RefusedError)
 
 
 def test_a_large_file_has_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,7 +100,7 @@ def test_a_large_file_has_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 )
 def test_a_refusal_is_not_tried_again(bucket: Gcs, tmp_path: Path, failure: int, words: str) -> None:
     bucket.fail_next(failure, times=9)
-    with pytest.raises(remote.RefusedError, match=words):
+    with pytest.raises(RefusedError, match=words):
         storage.upload(source_of(tmp_path, SMALL), PLACE)
     assert len(bucket.requests) == 1
 
@@ -111,7 +112,7 @@ def test_a_bucket_that_does_not_exist_is_named(tmp_path: Path) -> None:
         lambda: storage.file_sizes("gs://other/run"),
         lambda: storage.try_writing("gs://other/run"),
     ):
-        with pytest.raises(remote.RefusedError, match="there is no bucket other"):
+        with pytest.raises(RefusedError, match="there is no bucket other"):
             action()
 
 
@@ -167,7 +168,7 @@ def test_a_folder_of_this_machine_that_cannot_be_written_is_refused(tmp_path: Pa
         lambda: storage.upload(source_of(tmp_path, SMALL), str(tmp_path / "file/inner/a")),
         lambda: storage.try_writing("/proc/none"),
     ):
-        with pytest.raises(remote.RefusedError, match="cannot be written"):
+        with pytest.raises(RefusedError, match="cannot be written"):
             action()
 
 
@@ -180,7 +181,7 @@ class OnlyRead(AbstractFileSystem):
 
 def test_what_can_only_be_read_is_refused(tmp_path: Path) -> None:
     register_implementation("only-read", OnlyRead, clobber=True)
-    with pytest.raises(remote.RefusedError, match="only-read:// cannot be written"):
+    with pytest.raises(RefusedError, match="only-read:// cannot be written"):
         storage.upload(source_of(tmp_path, SMALL), "only-read://place/file")
 
 

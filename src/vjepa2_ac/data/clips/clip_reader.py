@@ -16,7 +16,6 @@ from vjepa2_ac.data.filters.exclusion import with_way_out
 from vjepa2_ac.episode import Augmentation, Batch, Clip, Episode, StoredLatents, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import states_in_camera_frame
-from vjepa2_ac.storage.remote import UnreachableError
 
 Augment = Callable[[int, int], Augmentation | None]  # from the height and width of a clip's frames
 
@@ -48,8 +47,6 @@ def clip_at(
     """
     try:
         return read_clip(dataset, ClipRequest(episode, start, camera, augmentation))
-    except UnreachableError:
-        raise  # the network's fault, not the episode's
     except InputError as error:
         raise with_way_out(error, [dataset.table.identity(episode)]) from None
 

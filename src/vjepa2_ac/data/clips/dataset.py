@@ -24,7 +24,6 @@ from vjepa2_ac.data.sources.latents.source import LatentSource
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.episode import POSE_WIDTHS, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
@@ -159,8 +158,6 @@ class Dataset:
         for episode in self.episodes[:_MOST_EPISODES_READ].tolist():
             try:
                 return widths_of(self.source.read(episode))
-            except UnreachableError:
-                raise
             except InputError as error:
                 first_error = first_error or error
         raise first_error or ValueError("a data set without episodes")
@@ -171,8 +168,6 @@ class Dataset:
         Raises:
             InputError: The error with a fix; or, too many are broken by now.
         """
-        if isinstance(error, UnreachableError):
-            raise error  # the network's fault, not the episode's
         name = self.table.identity(episode)
         if self.config.broken_episodes == "error":
             raise with_way_out(error, [name]) from None

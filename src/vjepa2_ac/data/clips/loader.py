@@ -33,8 +33,7 @@ from vjepa2_ac.data.filters.exclusion import named
 from vjepa2_ac.data.filters.step_ranges import drawn
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.episode import Augmentation, Batch, Clip, Skipped
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
+from vjepa2_ac.errors import InputError, UserError
 
 CLIPS_WORTH_WORKERS = 256  # starting workers takes longer than reading fewer validation clips
 
@@ -173,7 +172,7 @@ class _Clips(TorchDataset[MicroBatch]):
     dataset: Dataset
     requests: _Requests
 
-    def __getitems__(self, positions: list[int]) -> MicroBatch | InputError:
+    def __getitems__(self, positions: list[int]) -> MicroBatch | UserError:
         """Return a micro-batch, or its error: DataLoader would change an error that is raised."""
         before = storage.bytes_fetched()
         try:
@@ -184,7 +183,7 @@ class _Clips(TorchDataset[MicroBatch]):
             if not clips:
                 return MicroBatch(no_clips(self.dataset.config.frames, self.dataset.widths, fetched), skipped)
             return MicroBatch(collate(clips, fetched), skipped)
-        except InputError as error:
+        except UserError as error:
             return error
 
     def _read(self, positions: list[int]) -> list[Clip | Skipped]:
@@ -202,8 +201,6 @@ class _Clips(TorchDataset[MicroBatch]):
             )
         try:
             return read_clip(self.dataset, request)
-        except UnreachableError:
-            raise  # the network's fault, not the episode's
         except InputError as error:
             return Skipped(self.dataset.table.identity(request.episode), str(error))
 
@@ -219,7 +216,7 @@ def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int, copies
 
 def _read(
     clips: _Clips, positions: Iterator[list[int]], workers: int, *, pinned: bool
-) -> Generator[MicroBatch | InputError, None, None]:
+) -> Generator[MicroBatch | UserError, None, None]:
     # A fork server has no threads: a plain fork may hang in OpenMP or CUDA, and Python warns of it.
     context = multiprocessing.get_context("forkserver") if workers else None
     if context is not None:

@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 from vjepa2_ac.data.clips.streams import Copies
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.episode import Batch, Skipped
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Batches(Iterator[Batch]):
     """
 
     def __init__(
-        self, rows: Generator[MicroBatch | InputError, None, None], broken: BrokenEpisodes, copies: Copies
+        self, rows: Generator[MicroBatch | UserError, None, None], broken: BrokenEpisodes, copies: Copies
     ) -> None:
         self._rows, self._broken, self._copies = rows, broken, copies
         self._prefetched: Exception | _Fetched | None = None
@@ -84,7 +84,7 @@ class Batches(Iterator[Batch]):
     def _fetched(self) -> Exception | _Fetched:
         try:
             row = next(self._rows)
-            if isinstance(row, InputError):
+            if isinstance(row, UserError):
                 return row
             on_device = _take_once(self._copies.to_device.start(row.batch.mapped)) if self._copies.overlap else None
         except Exception as error:  # also the end of the rows

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import logging
@@ -15,14 +14,14 @@ from jaxtyping import Int32
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.filters.idle_rules import kept_ranges
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable, NotATableError
-from vjepa2_ac.data.index.index_cache import get_or_make, key_of
+from vjepa2_ac.data.index.index_cache import fingerprints_of, get_or_make, key_of
 from vjepa2_ac.episode import EpisodeSource, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.arrays import read_arrays
-from vjepa2_ac.storage.remote import UnreachableError
 from vjepa2_ac.storage.structured import json_object, record_of, shown
 
 logger = logging.getLogger(__name__)
@@ -108,11 +107,10 @@ def find_ranges(
     Raises:
         InputError: The list of ranges cannot be read or belongs to another data set; or the rule fits no episode.
     """
-    parts: dict[str, object] = {
-        "found": "idle ranges",
-        "table": fingerprint_of(table),
-        "data": _knobs_that_matter(config),
-    }
+    knobs = knobs_that_affect(Affects.IDLE, config)
+    if storage.is_url(config.path):  # its fingerprint is what it was, and so is this key
+        knobs["path"] = config.path
+    parts: dict[str, object] = {"found": "idle ranges", "table": fingerprints_of(table)[0], "data": knobs}
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
         return _cached(config, parts | {"list": _version(path)}, lambda: _published(path, table))
@@ -129,8 +127,6 @@ def _computed(source: EpisodeSource, table: EpisodeTable, config: DataConfig, pr
     def look(place: int) -> Found:
         try:
             return kept_ranges(source.read(place), config.idle)
-        except UnreachableError:
-            raise
         except InputError as error:
             return as_problem(error, table.identity(place))
 
@@ -207,25 +203,6 @@ def _checked(ranges: object, name: str, steps: int, path: str) -> list[tuple[int
             fix="Name the list of this version of the data set, or set data.idle.rule: commands or motion",
         )
     return pairs
-
-
-def fingerprint_of(table: EpisodeTable) -> str:
-    """Return everything that the episodes depend on: the key of their index, or without an index, the known facts."""
-    if "index" in table.texts:
-        return table.texts["index"]
-    digest = hashlib.sha256(json.dumps(dict(table.texts)).encode())
-    columns = {name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)}
-    for name, column in sorted({**columns, **table.locators}.items()):
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(column).data)
-    return digest.hexdigest()
-
-
-def _knobs_that_matter(config: DataConfig) -> dict[str, object]:
-    knobs = {"source", "path", "fields", "droid_raw", "lerobot"}
-    return config.model_dump(include=knobs, exclude={"fields": {"action"}, "lerobot": {"action"}}) | {
-        "idle": config.idle.model_dump(exclude={"keep_share"})
-    }
 
 
 def _version(path: str) -> list[object]:

@@ -14,6 +14,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
+import numpy as np
+
 from vjepa2_ac import places, storage
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable, NotATableError
@@ -26,6 +28,7 @@ T = TypeVar("T")
 _CACHE = "VJEPA2_AC_CACHE"
 _VERSION = 3  # of the cache: another number makes all of it be rebuilt
 _CRC_BYTES = 4
+_PLACE, _BEFORE = "place", "index before"  # among the texts of a table
 
 
 @dataclass
@@ -72,20 +75,79 @@ def key_of(parts: Mapping[str, object]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def get_or_build(config: DiskCacheConfig, key: str, build: Callable[[], EpisodeTable]) -> EpisodeTable:
+@dataclass(frozen=True)
+class IndexKeys:
+    """The keys of an index: what else is cached of these episodes depends on one of them.
+
+    A folder of this machine is known by what it holds, wherever it lies: `now`. At a URL the place counts, too, for
+    servers say little of versions. Earlier versions always counted it: what they cached is found under `before`.
+    """
+
+    now: str
+    before: str
+
+    @classmethod
+    def of(cls, parts: Mapping[str, object], place: str, *, named: str = "") -> IndexKeys:
+        """Return the keys of a data set at a place.
+
+        Args:
+            parts: Its files, and how they are read.
+            place: Its folder.
+            named: An episode's identity, where that depends on the name of the folder.
+        """
+        before = key_of({**parts, "path": storage.absolute(place)})
+        return cls(before if storage.is_url(place) else key_of({**parts, "named": named}), before)
+
+
+def fingerprints_of(table: EpisodeTable) -> tuple[str, ...]:
+    """Return everything that the episodes depend on, as one text; then those that earlier versions gave them.
+
+    It is the key of their index, or without an index, the known facts.
+    """
+    if "index" in table.texts:
+        return tuple(dict.fromkeys(table.texts[key] for key in ("index", _BEFORE) if key in table.texts))
+    digest = hashlib.sha256(json.dumps(dict(table.texts)).encode())
+    columns = {name: column for name, column in vars(table).items() if isinstance(column, np.ndarray)}
+    for name, column in sorted({**columns, **table.locators}.items()):
+        digest.update(name.encode())
+        digest.update(np.ascontiguousarray(column).data)
+    return (digest.hexdigest(),)
+
+
+def get_or_build(
+    config: DiskCacheConfig, keys: IndexKeys, place: str, build: Callable[[], EpisodeTable]
+) -> EpisodeTable:
     """Return the table cached under a key; build and cache it if it is missing or damaged.
 
-    The key is among the table's `texts`, as `index`: other cached results of these episodes depend on it. The format of
-    the table is part of the file's name, not of the key: an index in another format is rebuilt, while latent caches
-    and fetched data of the same files stay valid.
+    The keys are among the table's `texts`. The format of the table is part of the file's name, not of the key: an index
+    in another format is rebuilt, while latent caches and fetched data of the same files stay valid. Problems name files
+    where they lay when they were found: as far as that was in `place`, they name them where they lie now.
     """
 
     def build_marked() -> EpisodeTable:
-        table = build()
-        return replace(table, texts={**table.texts, "index": key})
+        former = _index_file(config, f"{keys.before}.table{FORMAT}")
+        if keys.before != keys.now and former.exists() and not _is_rebuilt():
+            with contextlib.suppress(OSError, NotATableError):
+                return marked(EpisodeTable.from_bytes(_checked(former.read_bytes())))
+        return marked(build())
 
-    name = f"{key}.table{FORMAT}"
-    return get_or_make(config, name, build_marked, to_bytes=EpisodeTable.to_bytes, from_bytes=EpisodeTable.from_bytes)
+    def marked(table: EpisodeTable) -> EpisodeTable:
+        texts = {"index": keys.now, _BEFORE: keys.before, _PLACE: storage.absolute(place)}
+        return replace(table, texts={**table.texts, **texts})
+
+    name = f"{keys.now}.table{FORMAT}"
+    table = get_or_make(config, name, build_marked, to_bytes=EpisodeTable.to_bytes, from_bytes=EpisodeTable.from_bytes)
+    return _at(table, storage.absolute(place))
+
+
+def _at(table: EpisodeTable, place: str) -> EpisodeTable:
+    """Return the table of a data set that was moved, with its problems where they are now."""
+    former = table.texts.get(_PLACE, place)
+    if former == place:
+        return table
+    return replace(
+        table, problems=tuple(replace(one, where=one.where.replace(former, place, 1)) for one in table.problems)
+    )
 
 
 def get_or_make(
@@ -100,7 +162,7 @@ def get_or_make(
 
     It is damaged if its CRC is wrong, or `from_bytes` raises NotATableError.
     """
-    path = cache_folder(config) / "index" / f"{key}.index"
+    path = _index_file(config, key)
     watch = _watch.get()
     if watch is not None:
         watch.files.append(path)
@@ -118,6 +180,15 @@ def get_or_make(
     except OSError as error:
         logger.warning("%s: cannot be written (%s); the index will be built again next time", path, error)
     return made
+
+
+def _index_file(config: DiskCacheConfig, key: str) -> Path:
+    return cache_folder(config) / "index" / f"{key}.index"
+
+
+def _is_rebuilt() -> bool:
+    watch = _watch.get()
+    return watch is not None and watch.rebuild
 
 
 def _checked(file: bytes) -> bytes:

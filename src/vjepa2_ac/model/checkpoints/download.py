@@ -12,9 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from vjepa2_ac import storage
-from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
-from vjepa2_ac.storage.remote.retries import RefusedError, RetryPolicy, with_retries
+from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
+from vjepa2_ac.storage.remote.retries import RetryPolicy, with_retries
 
 logger = logging.getLogger(__name__)
 

@@ -15,11 +15,11 @@ from pathlib import Path
 from types import TracebackType
 
 from vjepa2_ac.config import CheckpointConfig
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import RefusedError, UnreachableError, UserError
 from vjepa2_ac.runs.folder import CHECKPOINTS
 from vjepa2_ac.runs.mirror.remote_checkpoints import RemoteCheckpoints
 from vjepa2_ac.runs.mirror.upload import ForeignRunError, OvertakenError, RemoteUpdate
-from vjepa2_ac.storage.remote import RefusedError, UnreachableError, quietly
+from vjepa2_ac.storage.remote import quietly
 
 logger = logging.getLogger(__name__)
 
@@ -140,7 +140,7 @@ class Mirror:
                 " stop one of the two",
                 self._place, error,
             )  # fmt: skip
-        except (InputError, OSError) as error:
+        except (UserError, OSError) as error:
             log = logger.info if self._outage_reported else logger.warning
             log(
                 "checkpoint.remote is not up to date: %s. Training continues; next attempt in %g minutes",

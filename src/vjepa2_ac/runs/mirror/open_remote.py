@@ -11,14 +11,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, step_of, written_state
 from vjepa2_ac.runs.folder import CHECKPOINTS
 from vjepa2_ac.runs.mirror.background_sync import Mirror, reason_of
 from vjepa2_ac.runs.mirror.fetch import fetch_newest
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.storage import is_url, place, try_writing
-from vjepa2_ac.storage.remote import RefusedError, UnreachableError, quietly
+from vjepa2_ac.storage.remote import quietly
 
 logger = logging.getLogger(__name__)
 

@@ -18,7 +18,6 @@ from vjepa2_ac.runs.checkpoint import STATE, find_damage, step_of
 from vjepa2_ac.runs.folder import CHECKPOINTS
 from vjepa2_ac.runs.manifest import MANIFEST, named_files
 from vjepa2_ac.storage import download, file_sizes, join, read_bounded, remove, remove_folder, upload
-from vjepa2_ac.storage.remote import UnreachableError
 from vjepa2_ac.storage.structured import MOST_BYTES, read_json_object
 
 SENDING = ".sending.json"
@@ -56,8 +55,6 @@ class RemoteCheckpoints:
         """Return the run of a checkpoint; None if unknown."""
         try:
             state = read_json_object(self._path(name, STATE), allow_nan=True)
-        except UnreachableError:
-            raise
         except (FileNotFoundError, InputError):
             return None
         return str(state.get("run_id", ""))
@@ -99,8 +96,6 @@ class RemoteCheckpoints:
             manifest = read_bounded(self._path(name, MANIFEST), MOST_BYTES)
             for path in named_files(manifest):
                 download(self._path(name, path), folder / path)
-        except UnreachableError:
-            raise
         except FileNotFoundError as error:
             return f"a file is missing ({error})"
         except InputError as error:

@@ -93,7 +93,7 @@ def run_episode(
         keep_frames: Whether the result holds the camera images.
 
     Raises:
-        UnreachableError: The problem's own start or goal cannot be reached.
+        OutOfReachError: The problem's own start or goal cannot be reached.
         ValueError: No steps, an action that is not 7 finite numbers, or a block to be moved but an arm without one.
     """
     if min(steps, stride) < 1:

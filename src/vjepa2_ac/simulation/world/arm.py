@@ -88,7 +88,7 @@ class SimulatedArm:
         """Put the flange at a pose, at once.
 
         Raises:
-            UnreachableError: No joint angles lead there.
+            OutOfReachError: No joint angles lead there.
         """
         rest = rest_joints(self.domain)
         self.set_joints(inverse_kinematics(state[:6], self.joints, rest=rest), float(state[6]))
@@ -105,7 +105,7 @@ class SimulatedArm:
         """Move the flange towards a state for some control steps and return the measured state.
 
         Raises:
-            UnreachableError: No joint angles lead there.
+            OutOfReachError: No joint angles lead there.
         """
         goal = inverse_kinematics(target[:6], self.joints, rest=rest_joints(self.domain))
         return self.command_joints(goal, float(target[6]), control_steps)

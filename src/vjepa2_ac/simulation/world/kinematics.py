@@ -68,7 +68,7 @@ def inverse_kinematics(
     smooth path of poses, each started at the previous solution, gives a smooth path of joints.
 
     Raises:
-        UnreachableError: The pose was not reached from `start`, nor from `rest`.
+        OutOfReachError: The pose was not reached from `start`, nor from `rest`.
     """
     rotation = matrices_from_euler(pose[3:])
     for first in (start, rest):

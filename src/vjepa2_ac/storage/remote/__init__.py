@@ -11,14 +11,12 @@ from vjepa2_ac.storage.remote.ranged_reads import (
     read_range,
     read_ranges,
 )
-from vjepa2_ac.storage.remote.retries import RefusedError, RetryPolicy, UnreachableError, quietly
+from vjepa2_ac.storage.remote.retries import RetryPolicy, quietly
 from vjepa2_ac.storage.remote.uploads import file_sizes, remove_file, upload_file
 
 __all__ = [
     "Entry",
-    "RefusedError",
     "RetryPolicy",
-    "UnreachableError",
     "bytes_fetched",
     "exists",
     "file_size",

@@ -13,10 +13,10 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeVar
 
+from vjepa2_ac.errors import UnreachableError
 from vjepa2_ac.storage.remote import retries
 from vjepa2_ac.storage.remote.buffered_file import RangedFile
 from vjepa2_ac.storage.remote.filesystems import GOOGLE, ask, is_asynchronous, login_hint, size_of
-from vjepa2_ac.storage.remote.retries import UnreachableError
 
 _T = TypeVar("_T")
 

@@ -14,7 +14,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import TypeVar
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import RefusedError, UnreachableError, UserError
 
 logger = logging.getLogger(__name__)
 
@@ -60,14 +60,6 @@ class RetryPolicy:
 DEFAULT = RetryPolicy()  # fails within a minute on immediate errors, within five on no answer
 
 
-class UnreachableError(InputError):
-    """Data cannot be reached now. This says nothing about the data itself: never treat it as broken."""
-
-
-class RefusedError(UnreachableError):
-    """A server or a disk refuses permanently: no permission, no such bucket."""
-
-
 def with_retries(
     where: str,
     action: Callable[[float], _T],
@@ -89,7 +81,7 @@ def with_retries(
             from the last one that came farther.
 
     Raises:
-        InputError: The action raised it.
+        InputError: The action raised it, as it may any `UserError`.
         OSError: There is no such file, or it is a folder, or the other way round.
         UnreachableError: What failed did not pass in time; a RefusedError where permission is missing, or it does not
             pass.
@@ -98,7 +90,7 @@ def with_retries(
     while True:
         try:
             return action(policy.timeout_s)
-        except (*_ABSENT, InputError):
+        except (*_ABSENT, UserError):
             raise
         except Exception as error:
             if not _comes_from_outside(error):

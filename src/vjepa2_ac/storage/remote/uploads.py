@@ -10,9 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
+from vjepa2_ac.errors import RefusedError
 from vjepa2_ac.storage.remote import retries
 from vjepa2_ac.storage.remote.filesystems import discard, login_hint, send, sizes_below
-from vjepa2_ac.storage.remote.retries import RefusedError, RetryPolicy
+from vjepa2_ac.storage.remote.retries import RetryPolicy
 
 _T = TypeVar("_T")
 

@@ -12,10 +12,11 @@ from jaxtyping import Int, UInt8
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
-from vjepa2_ac.data.index.index_cache import get_or_build, key_of
+from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build, key_of
 from vjepa2_ac.data.index.labels import labels_of
 from vjepa2_ac.data.index.packed_text import pack_texts, text_of
 from vjepa2_ac.data.index.state_hash import hash_of_states
@@ -35,7 +36,6 @@ from vjepa2_ac.data.sources.validation import require_plausible
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import count_frames, read_frames
-from vjepa2_ac.storage.remote import UnreachableError
 from vjepa2_ac.storage.structured import json_object
 
 logger = logging.getLogger(__name__)
@@ -134,9 +134,19 @@ class RawDroidSource:
         listed: Sequence[EpisodeFolder | str] = folders
         if not storage.is_url(self._root):
             listed = [list_episode(self._root, folder) for folder in folders]
-        knobs = {"cameras": config.cameras, "droid_raw": config.droid_raw, "pose_frame": config.pose_frame}
-        key = key_of({"source": "droid_raw", "path": storage.absolute(self._root), **knobs, "listed": listed})
-        return get_or_build(config.disk_cache, key, lambda: self._scan_all(folders, progress))
+        own = knobs_that_affect(Affects.INDEX, config.droid_raw)
+        keys = IndexKeys.of(
+            {
+                "source": "droid_raw",
+                "cameras": config.cameras,
+                "droid_raw": " ".join(f"{name}={value!r}" for name, value in own.items()),
+                "pose_frame": config.pose_frame,
+                "listed": listed,
+            },
+            self._root,
+            named=identity_of(self._root, folders[0]),
+        )
+        return get_or_build(config.disk_cache, keys, self._root, lambda: self._scan_all(folders, progress))
 
     def _scan_all(self, folders: list[str], progress: Progress | None) -> EpisodeTable:
         done = 0
@@ -180,8 +190,6 @@ class RawDroidSource:
             serials = tuple(metadata.serial(camera) for camera in self._config.cameras)
             place = replace(place, pictures=self._counted(place, listed, serials))
             states = self._trajectory(place, serials).states
-        except UnreachableError:
-            raise  # the network's fault, not the episode's
         except InputError as error:
             return as_problem(error, identity)
         success = success_of(identity) if metadata.success is None else metadata.success

@@ -9,16 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from vjepa2_ac.config import DataConfig
-from vjepa2_ac.data.filters.idle_ranges import fingerprint_of
-from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.sources.latents.dtypes import DTYPES, CacheType
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import shown
 
 NORMALISATION = 1  # of pixels, in `transforms.pixels_to_input`, and of features: increase it when one of them changes
 
-# Checked when a cache is used alone. The rest identifies its data set, and how that was read.
-OF_CLIPS = ("data.crop", "data.states", "data.actions", "data.idle", "data.frames", "data.stride", "data.start_every")
+_OF_THE_FRAMES = {"source", "camera", "pose_frame", "cache_dtype"}  # the other knobs are of clips
 OF_ENCODING = ("encoder", "image_size", "patch_size", "normalisation", "model.dtype", "training.precision")
 
 
@@ -92,8 +90,14 @@ class CacheKey:
         return differing
 
 
-def key_of_cache(config: DataConfig, table: EpisodeTable, encoding: Encoding) -> CacheKey:
-    """Return the cache key of an open data set, whose stride is a number."""
+def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> CacheKey:
+    """Return the cache key of an open data set, whose stride is a number.
+
+    Args:
+        config: How its clips are made.
+        fingerprint: Of its episodes.
+        encoding: How frames become latents.
+    """
     return CacheKey({
         "format": 1,
         **encoding.parts,
@@ -101,27 +105,19 @@ def key_of_cache(config: DataConfig, table: EpisodeTable, encoding: Encoding) ->
         "data.cache_dtype": config.cache_dtype,
         "data.camera": list(config.cameras),
         "data.pose_frame": config.pose_frame,
-        "data set": {"source": config.source, "episodes": fingerprint_of(table), **_reading(config)},
+        "data set": {
+            "source": config.source,
+            "episodes": fingerprint,
+            **{name: knobs_that_affect(Affects.LATENTS, section) for name, section in config.own_section.items()},
+        },
     })  # fmt: skip
 
 
 def clip_parts(config: DataConfig) -> dict[str, Any]:
-    """Return the parts that determine which frames and other data clips need."""
-    return {
-        "data.crop": config.crop,
-        "data.states": config.states,
-        "data.actions": config.actions,
-        "data.idle": config.idle.model_dump(mode="json"),
-        "data.frames": config.frames,
-        "data.stride": config.model_stride,
-        "data.start_every": config.start_every,
-    }
-
-
-def _reading(config: DataConfig) -> dict[str, Any]:
-    """Return the knobs for reading this form of data set."""
-    section = {"rlds": "fields", "droid_raw": "droid_raw", "lerobot": "lerobot"}.get(config.source)
-    return {} if section is None else {section: getattr(config, section).model_dump(mode="json")}
+    """Return the parts that determine which frames and other data clips need: checked when a cache is used alone."""
+    sections = {"fields", "droid_raw", "lerobot"}
+    knobs = knobs_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
+    return {f"data.{name}": knobs[name] for name in sorted(knobs.keys() - _OF_THE_FRAMES - sections)}
 
 
 def _differences(name: str, here: Any, there: Any) -> list[str]:

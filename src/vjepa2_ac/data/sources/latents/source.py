@@ -14,7 +14,7 @@ from jaxtyping import Int, UInt8
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
-from vjepa2_ac.data.sources.latents.cache_key import OF_CLIPS, clip_parts
+from vjepa2_ac.data.sources.latents.cache_key import clip_parts
 from vjepa2_ac.data.sources.latents.episode_file import EpisodeFile
 from vjepa2_ac.data.sources.latents.manifest import (
     KEPT,
@@ -177,7 +177,8 @@ class LatentSource:
 
     def _require_fit(self, manifest: Manifest) -> None:
         """Refuse a cache of other clips than the config's; name the differences."""
-        differing = manifest.cache_key.differences(clip_parts(self._config), OF_CLIPS)
+        parts = clip_parts(self._config)
+        differing = manifest.cache_key.differences(parts, parts)
         for camera in () if self._config.camera is None else self._config.cameras:
             if camera not in manifest.cameras:
                 differing.append(f"data.camera: {', '.join(manifest.cameras)}, not {camera}")

@@ -20,7 +20,6 @@ from vjepa2_ac.data.sources.lerobot.info import DatasetInfo
 from vjepa2_ac.data.sources.validation import zero_steps
 from vjepa2_ac.episode import EpisodeInfo, Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
 
 Check = Callable[[EpisodeRow], EpisodeContent]  # reads an episode's rows
 
@@ -132,8 +131,6 @@ def row_of(table: EpisodeTable, place: int) -> EpisodeRow:
 def _checked(row: EpisodeRow, check: Check) -> tuple[EpisodeRow, InputError | None]:
     try:
         content = check(row)
-    except UnreachableError:  # not an error of the episode
-        raise
     except InputError as error:
         return row, error
     success = row.success if content.success is None else content.success

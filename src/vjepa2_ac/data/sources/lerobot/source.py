@@ -5,16 +5,17 @@ from __future__ import annotations
 import logging
 import threading
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
 from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
 from vjepa2_ac.data.cache.disk_cache import fetched_data
 from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.index.index_cache import get_or_build, key_of
+from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.sources.lerobot.episode_list import (
     EpisodeRow,
     StatisticsColumns,
@@ -145,19 +146,23 @@ class LeRobotSource:
             if info.features[key].dtype == "video":
                 files |= list_by_template(info.root, info.video_path or "", key, connections=self._connections)
         vector = {"vector": wanted_columns(config)} if config.states == "vector" else {}
-        self._version = key_of(
+        fields = knobs_that_affect(Affects.INDEX, config.lerobot)
+        fields.pop("action")  # where it matters, it is among the columns
+        index = IndexKeys.of(
             {
                 **vector,
                 "source": "lerobot",
-                "path": storage.absolute(config.path),
-                "fields": config.lerobot.model_dump(exclude={"action"}),
+                "fields": fields,
                 "keys": keys,
                 "outcome": self._is_far and config.outcome != "all",
                 "info": repr(replace(info, root="")),
                 "files": fingerprint(tables, files),
-            }
+            },
+            config.path,
         )
-        return get_or_build(config.disk_cache, self._version, lambda: self._built(list(tables), files, keys, progress))
+        self._version = index.now
+        build = partial(self._built, list(tables), files, keys, progress)
+        return get_or_build(config.disk_cache, index, config.path, build)
 
     def _built(
         self, tables: list[str], files: dict[str, FileInfo], keys: list[str], progress: Progress | None

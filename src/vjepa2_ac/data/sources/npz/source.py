@@ -18,14 +18,13 @@ from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
 from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
-from vjepa2_ac.data.index.index_cache import get_or_build, key_of
+from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.index.labels import labels_of
 from vjepa2_ac.data.index.state_hash import hash_of_states
 from vjepa2_ac.data.sources.listing import in_parallel, walk, within
 from vjepa2_ac.data.sources.npz.npz_episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_frames
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
@@ -104,9 +103,10 @@ class NpzSource:
         knobs: dict[str, object] = {"cameras": config.cameras, "pose_frame": config.pose_frame}
         if config.states == "vector":
             knobs |= {"states": config.states, "actions": config.actions}
-        self._version = key_of({"source": "npz", "path": storage.absolute(self._root), **knobs, "listed": listed})
+        keys = IndexKeys.of({"source": "npz", **knobs, "listed": listed}, self._root)
+        self._version = keys.now
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
-        return get_or_build(config.disk_cache, self._version, lambda: self._scan_all(ids, progress))
+        return get_or_build(config.disk_cache, keys, self._root, lambda: self._scan_all(ids, progress))
 
     def _scan_all(self, ids: list[str], progress: Progress | None) -> EpisodeTable:
         counter = itertools.count(1)
@@ -144,8 +144,6 @@ class NpzSource:
         try:
             path = self._path(identity)
             return read_episode(self._opened(path), path, self._config.cameras, self._config)
-        except UnreachableError:
-            raise  # the network's fault, not the episode's
         except InputError as error:
             return as_problem(error, identity)
 

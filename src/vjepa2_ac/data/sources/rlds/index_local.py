@@ -28,7 +28,6 @@ from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, RecordSpan, requi
 from vjepa2_ac.data.sources.rlds.wire_format import Read
 from vjepa2_ac.episode import EpisodeInfo, Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
@@ -81,8 +80,6 @@ def scan_shard(read: Read, shard: Shard, examine: Examine) -> Iterator[Found]:
             return
         try:
             span = span_at(read(offset, HEADER_BYTES), shard.path, number, offset, shard.size)
-        except UnreachableError:
-            raise  # not an error of the record
         except InputError as error:
             yield as_problem(error, _place(shard, number))
             yield from _missing(shard, number + 1, f"cannot be found behind the damage at byte {offset}")

@@ -43,7 +43,6 @@ from vjepa2_ac.data.sources.rlds.wire_format import (
 from vjepa2_ac.data.sources.validation import zero_steps
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
 
 logger = logging.getLogger(__name__)
 
@@ -112,8 +111,6 @@ def learn_layout(shards: Sequence[Shard], config: DataConfig, cameras: Sequence[
     def first_record(shard: Shard) -> tuple[ExampleRecord, int] | InputError:
         try:
             return _whole_record(shard, config, cameras)
-        except UnreachableError:
-            raise  # not an error of the record
         except InputError as error:
             return error
 
@@ -197,8 +194,6 @@ def _examine(read: Read, span: RecordSpan, config: DataConfig, layout: RecordLay
         steps = num_steps_of(record, config) if steps is None else steps
         if steps == 0:
             raise zero_steps(f"{span} ({name})")
-    except UnreachableError:
-        raise  # not an error of the record
     except InputError as error:
         return as_problem(error, name)
     return ScannedEpisode(info_of(name, steps), span)

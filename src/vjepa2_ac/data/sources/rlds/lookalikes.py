@@ -23,7 +23,6 @@ from vjepa2_ac.data.sources.rlds.features import states_of
 from vjepa2_ac.data.sources.rlds.range_reader import RemoteFile
 from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.remote import UnreachableError
 
 _WINDOW = 1 << 16
 _LENGTH_BYTES = 5  # lengths that grow with a name: of text, list, feature, entry of the map, and all of them
@@ -45,8 +44,6 @@ def hashes_of_lookalikes(
         try:
             record = ExampleRecord(RemoteFile(shard, window=_WINDOW), span)
             return hash_of_states(states_of(record, config, int(table.num_steps[index]), str(span)))
-        except UnreachableError:
-            raise  # not an error of the record
         except InputError:
             return UNKNOWN  # reported when the episode is read
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard
 from vjepa2_ac.data.sources.rlds.wire_format import Read
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UserError
 
 
 @contextmanager
@@ -41,6 +41,6 @@ def open_shard(shard: Shard) -> Iterator[Read]:
         os.close(handle)
 
 
-def unreadable(shard: Shard, error: OSError) -> InputError:
+def unreadable(shard: Shard, error: OSError) -> UserError:
     """Return the error of a file that the system refuses to read."""
     return storage.unreadable(shard.path, error, needed="a TFRecord file")

@@ -9,8 +9,9 @@ from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.index.index_cache import cache_folder, get_or_build, key_of
+from vjepa2_ac.data.index.index_cache import IndexKeys, cache_folder, get_or_build
 from vjepa2_ac.data.sources.rlds.crc_marks import CrcMarks
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard, find_shards
 from vjepa2_ac.data.sources.rlds.example import ExampleRecord
@@ -171,27 +172,27 @@ class RldsSource:
     def _look(self, progress: Progress | None) -> _Opened:
         config, fields = self._config, self._config.fields
         shards = tuple(find_shards(config.path))
-        key = key_of({
+        parts = {
             **({"vector": features_of_steps(config)} if config.states == "vector" else {}),
             "source": "rlds",
-            "path": storage.absolute(config.path),
-            "state": fields.state,
-            "identity": fields.identity,
+            **knobs_that_affect(Affects.INDEX, fields),
             "cameras": self._features(),
             "shards": [(shard.name, shard.episodes, shard.size, shard.version) for shard in shards],
-        })  # fmt: skip
+        }
+        parts.pop("action")  # where it matters, it is among the features
+        keys = IndexKeys.of(parts, config.path)
 
         make = index_remote if storage.is_url(config.path) else index_local
 
         def build() -> EpisodeTable:
             return make(shards, config, self._features(), threads=config.connections, progress=progress)
 
-        table = get_or_build(config.disk_cache, key, build)
+        table = get_or_build(config.disk_cache, keys, config.path, build)
         return _Opened(
             shards,
             replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)}),
-            CrcMarks(cache_folder(config.disk_cache) / "index" / f"{key}.checked"),
-            RemoteCache.of(config.disk_cache, key),
+            CrcMarks(cache_folder(config.disk_cache) / "index" / f"{keys.now}.checked"),
+            RemoteCache.of(config.disk_cache, keys.now),
         )
 
 

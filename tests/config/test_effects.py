@@ -1,0 +1,269 @@
+"""Each knob says what it affects; when it changes, that becomes another one, and nothing else does."""
+
+import shutil
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+import pytest
+from pydantic import BaseModel
+
+from copied_sets import WRITERS
+from run_fixtures import TINY
+from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.config.effects import Affects, knobs_that_affect, mark_of, marks_of, names_that_affect
+from vjepa2_ac.config.loading import changed_keys, config_as_yaml, parse_config
+from vjepa2_ac.config.section import Section
+from vjepa2_ac.data.filters import idle_ranges
+from vjepa2_ac.data.index.episode_table import EpisodeInfo, EpisodeTable
+from vjepa2_ac.data.index.index_cache import IndexKeys, key_of
+from vjepa2_ac.data.sources.latents.cache_key import Encoding, key_of_cache
+from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.encoding.batch import encoding_of
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.settings import planning_settings
+from vjepa2_ac.runs.folder import check_run_folder
+
+KNOBS = sorted(marks_of(Config))
+# What cannot be guessed from a knob's type, or must exist in the data set.
+OTHERS = {
+    "data.camera": {"npz": "pixels", "rlds": "wrist_left", "lerobot": "wrist_left", "droid_raw": "right"},
+    "data.path": "elsewhere",
+    "data.augment.crop_scale": (0.5, 1.0),
+    "data.stride_candidates": (2, 3),
+    "planning.budget_s": 1.0,
+    "data.idle.ranges": "ranges.json",
+    "data.fields.cameras": {"exterior_1_left": "steps/observation/exterior_image_2_left"},
+    "data.lerobot.state": ("observation.state.gripper_position", "observation.state.cartesian_position"),
+    "data.lerobot.action": ("observation.state.gripper_position",),
+    "data.fields.action": ("steps/action_dict/joint_velocity",),
+    "data.lerobot.cameras": {
+        "exterior_1_left": "observation.images.exterior_1_left", "wrist": "observation.images.exterior_1_left"
+    },
+    "data.lerobot.select": (6, 5, 4, 3, 2, 1, 0),
+    "data.lerobot.fps": 7.0,
+}  # fmt: skip
+ONLY_REMOTE = {"data.outcome"}  # where reading the episodes costs something
+
+
+class Found(Exception):  # noqa: N818 - it carries what was asked for
+    """A key, found where it is about to be used."""
+
+
+def literals(annotation: Any) -> list[Any]:
+    if get_origin(annotation) is Literal:
+        return list(get_args(annotation))
+    return [one for inner in get_args(annotation) for one in literals(inner)]
+
+
+def another(value: Any, annotation: Any) -> Any:
+    """Return another value of the kind of this one."""
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, int | float):
+        return value + 1 if isinstance(value, int) else value / 2 or 0.5
+    options = [one for one in literals(annotation) if one != value]
+    if isinstance(value, tuple) and value and isinstance(value[0], float):
+        return (value[0] / 2, *value[1:])
+    if isinstance(value, tuple):
+        return value[:-1] or tuple(options[:1]) or ("else",)
+    if isinstance(value, dict):
+        return {**value, "else": 3}
+    return options[-1] if options else "else"
+
+
+def with_other(section: BaseModel, key: str, whole: str, source: str) -> BaseModel:
+    """Return a section in which one knob has another value; what does not fit to it stays."""
+    name, _, rest = key.partition(".")
+    value, field = getattr(section, name), type(section).model_fields[name]
+    if rest:
+        inner = value if value is not None else next(one for one in get_args(field.annotation) if one)()
+        return section.model_copy(update={name: with_other(inner, rest, whole, source)})
+    given = OTHERS.get(whole, another(value, field.annotation))
+    return section.model_copy(update={name: given[source] if whole == "data.camera" else given})
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    root = tmp_path_factory.mktemp("sets")
+    return {name: write(root / name, [0, 1]) for name, write in WRITERS.items()}
+
+
+def recorded_by(source: str) -> dict[str, Any]:
+    """Return the knobs of vectors and the commands recorded with them."""
+    action = {"lerobot": {"action": ["action.joint_velocity"]}} if source == "lerobot" else {}
+    return {"states": "vector", "actions": "recorded", "join_actions": "last", **action}
+
+
+def config_of(source: str, path: str | Path, run_dir: Path, **data: Any) -> Config:
+    data = {"source": source, "path": str(path), "frames": 3, "workers": 0, "idle": {"rule": "none"}, **data}
+    return parse_config({"run_dir": str(run_dir), "data": data, "model": {"base": "base"}}, where="")
+
+
+@cache
+def world_model() -> WorldModel:
+    return WorldModel.random(ModelSizes.model_validate(TINY), seed=0)
+
+
+@pytest.fixture
+def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str | None]]:
+    """Return the keys by which index, idle ranges and latents of a config are looked for; None: the data refuse it."""
+
+    def stop(_: Any, keys: Any, *__: Any) -> None:
+        raise Found(keys)
+
+    for source in WRITERS:
+        monkeypatch.setattr(f"vjepa2_ac.data.sources.{source}.source.get_or_build", stop)
+    monkeypatch.setattr(idle_ranges, "_cached", stop)
+
+    def found(action: Callable[[], Any]) -> Any:
+        with pytest.raises(Found) as caught:
+            action()
+        return caught.value.args[0]
+
+    def keys(config: Config) -> dict[str, str | None]:
+        try:
+            index: IndexKeys = found(lambda: open_source(config.data).infos())
+        except InputError:
+            return dict.fromkeys(("index", "idle", "latents"))
+        table = EpisodeTable.of([EpisodeInfo("one", 9, None)], texts={"index": index.now})
+        ranges = found(lambda: idle_ranges.find_ranges(open_source(config.data), table, config.data, None))
+        latents = key_of_cache(config.data, index.now, encoding_of(world_model(), config))
+        return {"index": index.now, "idle": key_of(ranges), "latents": latents.digest}
+
+    return keys
+
+
+def test_a_knob_that_does_not_say_what_it_affects_is_an_error() -> None:
+    class Forgotten(Section):
+        batch: Annotated[int, Affects.RUN] = 1
+        workers: int = 1
+
+    with pytest.raises(TypeError, match=r"workers: say what it affects"):
+        marks_of(Forgotten)
+
+
+@pytest.mark.parametrize("states", ["pose", "vector"])
+@pytest.mark.parametrize("source", WRITERS)
+def test_a_knob_that_changes_makes_strangers_of_what_it_affects_and_of_nothing_else(
+    source: str, states: str, sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path
+) -> None:
+    if (source, states) == ("droid_raw", "vector"):
+        pytest.skip("raw DROID has poses")
+    config = config_of(source, sets[source], tmp_path, **(recorded_by(source) if states == "vector" else {}))
+    usual, own = keys_of(config), {f"data.{name}" for name in config.data.own_section}
+    assert None not in usual.values()
+    marks, changed = marks_of(Config), {}
+    foreign = {"data.fields", "data.droid_raw", "data.lerobot"} - own
+    for key in KNOBS:
+        if key.startswith(tuple(foreign)) or key in {"data.source", "data.path"} | ONLY_REMOTE:
+            continue
+        found = keys_of(with_other(config, key, key, source))
+        if None in found.values():  # refused, not mistaken
+            continue
+        changed[key] = {name for name in usual if found[name] != usual[name]}
+        mark = marks[key]
+        told = {"index"} if Affects.INDEX in mark else set()
+        told |= {"idle"} if Affects.INDEX in mark or Affects.IDLE in mark else set()
+        told |= {"latents"} if Affects.INDEX in mark or Affects.LATENTS in mark else set()
+        if key.startswith(tuple(own)) or "index" in changed[key] or Affects.INDEX not in mark:
+            assert changed[key] <= told, key
+        if Affects.INDEX not in mark:  # a form of data may not have what the others index by
+            assert changed[key] >= told, key
+    assert {key for key, what in changed.items() if "index" in what}
+    assert len(changed) > 90
+
+
+def test_each_knob_that_is_said_to_matter_to_an_index_does_in_one_form_of_data(
+    sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path
+) -> None:
+    matters = set()
+    for source in WRITERS:
+        for recorded in ({}, recorded_by(source)):
+            if source == "droid_raw" and recorded:
+                continue
+            config = config_of(source, sets[source], tmp_path, **recorded)
+            usual = keys_of(config)
+            for key, mark in marks_of(Config).items():
+                if Affects.INDEX in mark:
+                    found = keys_of(with_other(config, key, key, source))
+                    matters |= {key} if found["index"] != usual["index"] else set()
+    said = {key for key, mark in marks_of(Config).items() if Affects.INDEX in mark}
+    assert said - matters == ONLY_REMOTE
+
+
+@pytest.mark.parametrize("source", WRITERS)
+def test_a_data_set_that_was_moved_is_the_same_and_one_that_changed_is_another(
+    source: str, sets: dict[str, Path], keys_of: Callable[[Config], dict[str, str | None]], tmp_path: Path
+) -> None:
+    shutil.copytree(sets[source], tmp_path / "moved", copy_function=shutil.copy2)
+    here, there = (config_of(source, path, tmp_path) for path in (sets[source], tmp_path / "moved"))
+    assert keys_of(there) == keys_of(here)
+    largest = max((tmp_path / "moved").rglob("*.*"), key=lambda path: path.stat().st_size)
+    largest.touch()
+    assert keys_of(there)["index"] != keys_of(here)["index"]
+
+
+@pytest.mark.parametrize(
+    ("source", "latents", "idle"),
+    [
+        ("npz", "8733bf13f17bdb7d18f7c91f4dced507", "01d97e62723a44195379ef084c2f9fd1"),
+        ("rlds", "266875e071205b8bbdffa719239ca168", "64bb797f637370c1d7e99f023a6dac43"),
+        ("lerobot", "8a7568c9ab2312810c135537668964cf", "761010c91690ec93fa54fbf426d6282b"),
+        ("droid_raw", "53364cf8f0b2bfffb2ab632019693358", "8ba9de77fe6d7ec27d8e3b18cdfe82b2"),
+    ],
+)
+def test_keys_are_those_of_the_versions_before_knobs_were_marked(
+    source: str, latents: str, idle: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Days of encoding and hours of reading are found under these keys."""
+    data = config_of(source, "gs://b/set", tmp_path, idle={"rule": "motion"}).data
+    encoding = Encoding("e", 256, 16, 256, 1408, "bfloat16", "bf16")
+    assert key_of_cache(data, "f", encoding).digest == latents
+    monkeypatch.setattr(idle_ranges, "_cached", lambda _, parts, __: key_of(parts))
+    table = EpisodeTable.of([EpisodeInfo("one", 9)], texts={"index": "f"})
+    assert idle_ranges.find_ranges(None, table, data, None) == idle
+
+
+def test_a_run_goes_on_only_where_no_knob_that_decides_it_has_changed(tmp_path: Path) -> None:
+    config = config_of("rlds", tmp_path, tmp_path / "run")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/config.yaml").write_text(config_as_yaml(config))
+    check_run_folder(config)
+    for key in KNOBS:
+        other = with_other(config, key, key, "rlds")
+        if key == "run_dir" or not changed_keys(config, other):
+            continue
+        if Affects.RUN in marks_of(Config)[key]:
+            with pytest.raises(InputError, match=f"differs in .*{key.partition('.')[0]}"):
+                check_run_folder(other)
+        else:
+            check_run_folder(other)
+
+
+def test_planning_takes_the_knobs_that_affect_a_decision_and_names_them() -> None:
+    assert names_that_affect(Affects.PLAN, Config) == [
+        "seed", "data.stride", "data.crop", "model.sizes.…", "model.dtype", "training.device", "planning.…",
+    ]  # fmt: skip
+    for key, mark in marks_of(Config).items():
+        if Affects.PLAN not in mark:
+            with pytest.raises(InputError, match=r"planning does not use.*model\.sizes\.…, model\.dtype"):
+                planning_settings("model.pt", overrides=[f"{key}=1"])
+
+
+def test_a_mark_of_a_section_holds_for_its_knobs_and_a_value_has_that_of_its_knob() -> None:
+    assert mark_of("tracking.project", Config) == Affects.NOTHING
+    assert mark_of("data.fields.cameras.left", Config) == mark_of("data.fields.cameras", Config) == Affects.EPISODES
+    assert mark_of("training", Config) == Affects.RUN | Affects.LATENTS | Affects.PLAN
+    with pytest.raises(KeyError):
+        mark_of("nothing.of.the.kind", Config)
+
+
+def test_the_knobs_that_affect_something_are_given_with_their_values(tmp_path: Path) -> None:
+    config = config_of("rlds", tmp_path, tmp_path)
+    found = knobs_that_affect(Affects.PLAN, config)
+    assert sorted(found) == ["data", "model", "planning", "seed", "training"]
+    assert found["training"] == {"device": "auto"}
+    assert found["data"] == {"stride": 4, "crop": "released"}
