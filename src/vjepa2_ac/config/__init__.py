@@ -5,7 +5,16 @@ from vjepa2_ac.config.model import AdapterConfig, EncoderSizes, ModelConfig, Mod
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.config.run import Config
 from vjepa2_ac.config.section import Section
-from vjepa2_ac.config.sources import LeRobotFields, RawDroidOptions, RldsFields
+from vjepa2_ac.config.sources import (
+    LatentsData,
+    LeRobotData,
+    LeRobotFields,
+    NpzData,
+    RawDroidData,
+    RawDroidOptions,
+    RldsData,
+    RldsFields,
+)
 from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
 
 __all__ = [
@@ -18,13 +27,18 @@ __all__ = [
     "EncoderSizes",
     "EnergyConfig",
     "IdleConfig",
+    "LatentsData",
+    "LeRobotData",
     "LeRobotFields",
     "LimitsConfig",
     "ModelConfig",
     "ModelSizes",
+    "NpzData",
     "PlanningConfig",
     "PredictorSizes",
+    "RawDroidData",
     "RawDroidOptions",
+    "RldsData",
     "RldsFields",
     "Section",
     "TrackingConfig",

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, GetCoreSchemaHandler, model_validator
+from pydantic_core import CoreSchema, core_schema
 
 from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.section import OFF, Local, Place, PositiveInt, Section, Share
-from vjepa2_ac.config.sources import RAW_CAMERAS, LeRobotFields, RawDroidOptions, RldsFields
 from vjepa2_ac.places import is_url
 
 # A serial number is a name, also where YAML takes it for a number.
@@ -104,25 +104,31 @@ class DiskCacheConfig(Section):
     """Frames beyond this size are removed, least recently used first; 0: none are cached. Indexes do not count."""
 
 
-class DataConfig(Section):
-    """The data set, and the clips made of it."""
+def source_of(values: Any) -> str:
+    """Return the form of the data of a config, or of the values of one: RLDS unless it says another."""
+    found = values.get("source", "rlds") if isinstance(values, dict) else getattr(values, "source", "")
+    return str(found)
 
-    source: Annotated[
-        Literal["rlds", "droid_raw", "lerobot", "npz", "latents"],
-        Affects.INDEX | Affects.IDLE | Affects.LATENTS | Affects.RUN,
-    ] = "rlds"
-    """Form of the data set. rlds: TFRecord shards with a dataset_info.json, as TFDS writes them. droid_raw: DROID's
-    folders with trajectory.h5 and MP4. lerobot: LeRobotDataset v2.1 or v3.0. npz: a folder of .npz episodes. latents: a
-    latent cache alone, without the data set that it was made from."""
+
+class DataConfig(Section):
+    """The data set, and the clips made of it: one subclass for each form of data, told apart by `source`.
+
+    A subclass has the default of its `source`, a section for its own knobs where it has some, and its abilities.
+    """
+
+    kinds: ClassVar[dict[str, type[DataConfig]]] = {}  # of the forms that there are, by the name of their source
+    reader: ClassVar[str]  # the class that reads the episodes, as module:class; imported when the data are opened
+    is_cache: ClassVar[bool] = False  # of latents: no frames, one stride, on this machine
+    has_camera_poses: ClassVar[bool] = True
+    has_vectors: ClassVar[bool] = True  # states may be other numbers than a pose
+    same_identity_fix: ClassVar[str] = ""  # the way out where two episodes are named alike
+    gripper_fix: ClassVar[str] = "write 1 - gripper"  # the way out where the gripper is inverted
+
+    source: Annotated[str, Affects.INDEX | Affects.IDLE | Affects.LATENTS | Affects.RUN]
+    """Form of the data set."""
     path: Annotated[Place, Affects.NOTHING]
     """Folder of the data set: on this machine, or a URL such as gs://bucket/folder or hf://datasets/owner/name. A run
     goes on with a folder that was moved, for it is known by what it holds."""
-    fields: RldsFields = RldsFields()
-    """For rlds: names of the features."""
-    droid_raw: RawDroidOptions = RawDroidOptions()
-    """For droid_raw: which steps are used."""
-    lerobot: LeRobotFields = LeRobotFields()
-    """For lerobot: names and conventions of the columns."""
     camera: Annotated[_CameraName | tuple[_CameraName, ...] | None, Affects.INDEX | Affects.CLIPS] = None
     """Which camera the model sees; of several, one is drawn for each clip. null: the source's first, for DROID the left
     exterior camera, which the released weights saw. rlds, lerobot: a name in `cameras`. droid_raw: left, right, wrist,
@@ -193,6 +199,23 @@ class DataConfig(Section):
     connections: Annotated[int, Field(ge=1, le=256), Affects.NOTHING] = 16
     """Concurrent reads per process, for remote data."""
 
+    def __new__(cls, **values: Any) -> DataConfig:
+        """Make the config of the form of data that `source` names; of RLDS where it is not given."""
+        return super().__new__(cls.kinds.get(source_of(values), cls) if cls is DataConfig else cls)
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **_: Any) -> None:
+        """Take part in the union."""
+        DataConfig.kinds[cls.model_fields["source"].default] = cls
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Be the union of all forms of data where any is allowed."""
+        if Section not in cls.__bases__ or not cls.kinds:
+            return handler(source)
+        kinds = {name: handler.generate_schema(kind) for name, kind in cls.kinds.items()}
+        return core_schema.tagged_union_schema(kinds, source_of)
+
     @model_validator(mode="after")
     def _parts_fit(self) -> DataConfig:
         known = self.known_cameras
@@ -203,30 +226,26 @@ class DataConfig(Section):
                 raise ValueError(
                     f"camera {camera!r} is not one of the cameras of source {self.source}: {', '.join(known)}"
                 )
-        if self.source == "latents" and isinstance(self.stride, str):
+        if self.is_cache and isinstance(self.stride, str):
             raise ValueError("stride auto: a latent cache has one stride; give its number")
-        if self.source == "latents" and (self.cache != "off" or is_url(self.path)):
-            raise ValueError("source latents is itself a cache, in a folder on this machine: set cache: off")
-        if self.augment.is_on and (self.source == "latents" or self.cache != "off"):
+        if self.is_cache and (self.cache != "off" or is_url(self.path)):
+            raise ValueError(f"source {self.source} is itself a cache, in a folder on this machine: set cache: off")
+        if self.augment.is_on and self.takes_latents:
             raise ValueError("augment changes frames, and latents that are cached are of unchanged ones: choose one")
         if self.validation_share + self.test_share >= 1.0:
             raise ValueError("validation_share and test_share leave nothing to train on")
-        if self.pose_frame == "camera" and self.source in {"rlds", "lerobot"}:
+        if self.pose_frame == "camera" and not self.has_camera_poses:
             raise ValueError(f"pose_frame camera needs camera poses, which a source of {self.source} does not have")
         return self
 
     @model_validator(mode="after")
     def _vectors_fit(self) -> DataConfig:
-        pose_only = {
-            "source droid_raw": self.source == "droid_raw",
+        of_poses = {
+            f"source {self.source}": not self.has_vectors,
             "pose_frame camera": self.pose_frame == "camera",
             "idle.rule motion": self.idle.rule == "motion",
-            "fields.gripper": self.fields.gripper != "closedness",
-            "lerobot.rotation": self.lerobot.rotation != "euler_xyz",
-            "lerobot.gripper_open and gripper_closed": (self.lerobot.gripper_open, self.lerobot.gripper_closed)
-            != (0, 1),
         }
-        asked = [name for name, is_asked in pose_only.items() if is_asked]
+        asked = [*(name for name, is_asked in of_poses.items() if is_asked), *self.own_knobs_of_poses]
         if self.states == "vector" and asked:
             raise ValueError(f"{', '.join(asked)}: a matter of poses, and states is vector")
         if self.actions == "recorded" and self.states == "pose":
@@ -243,26 +262,50 @@ class DataConfig(Section):
     @property
     def known_cameras(self) -> tuple[str, ...] | None:
         """The cameras known from the config, or None if only the data set knows them."""
-        return {"rlds": tuple(self.fields.cameras), "lerobot": tuple(self.lerobot.cameras)}.get(self.source)
+        return None
+
+    @property
+    def offered_cameras(self) -> tuple[str, ...]:
+        """The cameras that a person may choose from, as far as they are known."""
+        return self.known_cameras or self.cameras
+
+    @property
+    def first_camera(self) -> str:
+        """The camera that the model sees unless `camera` names others."""
+        raise NotImplementedError
+
+    @property
+    def own_knobs_of_poses(self) -> list[str]:
+        """The knobs of its own that are set and have a meaning for poses only."""
+        return []
 
     @property
     def cameras(self) -> tuple[str, ...]:
         """The cameras that clips are drawn from, one or more."""
         if self.camera is None:
-            first = {"droid_raw": RAW_CAMERAS[0], "npz": "frames", "latents": "all"}
-            return (first[self.source],) if self.known_cameras is None else self.known_cameras[:1]
+            return (self.first_camera,)
         return (self.camera,) if isinstance(self.camera, str) else self.camera
+
+    def as_kind(self, source: str, **changes: Any) -> DataConfig:
+        """Return the config of another form of data with these knobs, as far as it has them, and changes; unchecked."""
+        same = {name: getattr(self, name) for name in DataConfig.model_fields}
+        return self.kinds[source].model_construct(**{**same, "source": source, **changes})
+
+    @classmethod
+    def own_sections(cls) -> dict[str, type[Section]]:
+        """Return the sections that this form of data has and others have not."""
+        own = [(name, one.annotation) for name, one in cls.model_fields.items() if name not in DataConfig.model_fields]
+        return {name: kind for name, kind in own if isinstance(kind, type) and issubclass(kind, Section)}
 
     @property
     def own_section(self) -> dict[str, Section]:
-        """The section of this form of data, by its name; none where it has no knobs of its own."""
-        name = {"rlds": "fields", "droid_raw": "droid_raw", "lerobot": "lerobot"}.get(self.source)
-        return {} if name is None else {name: getattr(self, name)}
+        """The knobs of this form of data, by the name of their section."""
+        return {name: getattr(self, name) for name in self.own_sections()}
 
     @property
     def takes_latents(self) -> bool:
         """Whether clips come from a latent cache, so that the encoder is not needed beside the predictor."""
-        return self.source == "latents" or self.cache != "off"
+        return self.is_cache or self.cache != "off"
 
     @property
     def clip_steps(self) -> int:
@@ -293,3 +336,17 @@ class DataConfig(Section):
     def with_stride(self, stride: int) -> DataConfig:
         """Return the config with a calibrated stride."""
         return self.model_copy(update={"stride": stride})
+
+
+def without_sections_of_others(values: Any) -> Any:
+    """Drop, from the values of a data section, those of other forms of data with their defaults.
+
+    Earlier versions wrote them for each run. A cache is used in place of any form: there all are dropped.
+    """
+    kind = DataConfig.kinds.get(source_of(values))
+    if not isinstance(values, dict) or kind is None:
+        return values
+    others = {name: one for other in DataConfig.kinds.values() for name, one in other.own_sections().items()}
+    foreign = {name: one for name, one in others.items() if name in values and name not in kind.model_fields}
+    unused = {name for name, one in foreign.items() if kind.is_cache or values[name] == one().model_dump(mode="json")}
+    return {name: value for name, value in values.items() if name not in unused}

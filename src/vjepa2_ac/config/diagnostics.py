@@ -11,7 +11,8 @@ from typing import Any, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, DataConfig
+from vjepa2_ac.config.data import source_of
 from vjepa2_ac.storage.structured import message_of
 
 _ROUNDS = 20  # more than the number of rules about several values
@@ -81,11 +82,12 @@ def wrong_values(values: Mapping[str, Any], error: ValidationError) -> list[str]
 def all_keys(section: type[BaseModel] = Config, prefix: str = "") -> list[str]:
     """Return the dotted keys of a section and those in it."""
     keys = []
-    for name, info in section.model_fields.items():
-        keys.append(prefix + name)
-        if inner := _section_of(info.annotation):
-            keys += all_keys(inner, f"{prefix}{name}.")
-    return keys
+    for kind in _kinds_of(section).values() or (section,):
+        for name, info in kind.model_fields.items():
+            keys.append(prefix + name)
+            if inner := _section_of(info.annotation):
+                keys += all_keys(inner, f"{prefix}{name}.")
+    return list(dict.fromkeys(keys))
 
 
 def _messages_of(details: Sequence[Any]) -> list[str]:
@@ -105,6 +107,11 @@ def _messages_of(details: Sequence[Any]) -> list[str]:
 
 def _explain(detail: Any) -> str:
     path = ".".join(_places(detail["loc"]))
+    if detail["type"] == "union_tag_invalid":
+        kinds = [repr(kind) for kind in _kinds_of(_section_at(detail["loc"]))]
+        return f"{path}.source: Input should be {' or '.join(kinds)} (found {source_of(detail['input'])!r})"
+    if detail["type"] == "extra_forbidden" and (owner := _owner_of(detail["loc"])):
+        return f"{path}: a section of source {owner}, and this is source {detail['loc'][-2]}"
     if detail["type"] == "extra_forbidden":
         meant = _probably_meant(detail["loc"])
         hint = f"did you mean {meant}?" if meant else f"known here: {', '.join(_keys_at(detail['loc'][:-1]))}"
@@ -119,8 +126,19 @@ def _explain(detail: Any) -> str:
 def _places(location: Sequence[Any]) -> list[str]:
     """Return the keys and item numbers that lead to a value, without pydantic's names of union members."""
     union = _union_of(location)
-    kept = location if union is None else (*union, *location[len(union) + 1 :])
+    kept = _untagged(location if union is None else (*union, *location[len(union) + 1 :]))
     return [part if len(part := str(one)) <= _LONGEST_KEY else f"{part[:_LONGEST_KEY]}…" for one in kept]
+
+
+def _untagged(location: Sequence[Any]) -> list[Any]:
+    """Return a location without the forms of data, which pydantic names in it, but no file does."""
+    return [one for depth, one in enumerate(location) if one not in _kinds_of(_section_at(location[:depth]))]
+
+
+def _owner_of(location: Sequence[Any]) -> str | None:
+    """Return the form of data that an unknown section belongs to."""
+    around = _kinds_of(_section_at(location[:-2])) if len(location) > 1 else {}
+    return next((name for name, kind in around.items() if location[-1] in kind.model_fields), None)
 
 
 def _union_of(location: Sequence[Any]) -> tuple[Any, ...] | None:
@@ -135,7 +153,7 @@ def _union_of(location: Sequence[Any]) -> tuple[Any, ...] | None:
 
 def _probably_meant(location: Sequence[Any]) -> str | None:
     """Return the key that an unknown one probably stands for; with its section if that differs."""
-    name, here = str(location[-1]), "".join(f"{part}." for part in location[:-1])
+    name, here = str(location[-1]), "".join(f"{part}." for part in _untagged(location)[:-1])
     known = [key.removeprefix(here) for key, names in _ALSO_CALLED.items() if name in names]
     close = difflib.get_close_matches(name, _keys_at(location[:-1]), n=1)
     elsewhere = [key for key in all_keys() if key.split(".")[-1] == name]
@@ -149,7 +167,9 @@ def _is_about(detail: Any, names: Iterable[str]) -> bool:
 
 def _take_out(values: dict[str, Any], detail: Any) -> set[str]:
     """Remove an invalid value; return the names of the values that are changed by that."""
-    location, names = [str(part) for part in detail["loc"]], set[str]()
+    location, names = [str(part) for part in _untagged(detail["loc"])], set[str]()
+    if detail["type"] == "union_tag_invalid":
+        return _delete(values, [*location, "source"], whole=False)
     if detail["type"] == "missing" and isinstance(detail["loc"][-1], int):
         return _delete(values, location[:-1], whole=False)
     if detail["type"] == "missing":
@@ -194,10 +214,20 @@ def _stand_in(values: dict[str, Any], taken: set[str]) -> None:
 def _section_at(location: Iterable[Any]) -> type[BaseModel] | None:
     section: type[BaseModel] | None = Config
     for part in location:
-        if section is None or part not in section.model_fields:
+        kinds = _kinds_of(section)
+        if part in kinds:
+            section = kinds[part]
+            continue
+        known = [one for one in (section, *kinds.values()) if one is not None and part in one.model_fields]
+        if not known:
             return None
-        section = _section_of(section.model_fields[part].annotation)
+        section = _section_of(known[0].model_fields[part].annotation)
     return section
+
+
+def _kinds_of(section: type[BaseModel] | None) -> Mapping[str, type[BaseModel]]:
+    """Return the forms of data where any may stand."""
+    return DataConfig.kinds if section is DataConfig else {}
 
 
 def _section_of(annotation: Any) -> type[BaseModel] | None:

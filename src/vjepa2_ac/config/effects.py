@@ -93,6 +93,7 @@ def _marks(section: type[BaseModel], outer: Affects | None, prefix: str) -> Iter
         mark = _mark_of(field)
         mark = outer if mark is None else mark
         inner = _sections_in(field.annotation)
+        inner = [kind for one in inner for kind in [*getattr(one, "kinds", {}).values()] or [one]]
         for one in inner:
             yield from _marks(one, mark, f"{prefix}{name}.")
         if not inner and mark is None:

@@ -13,6 +13,7 @@ import yaml  # to write: `storage.structured` reads
 from pydantic import ValidationError
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.config.data import without_sections_of_others
 from vjepa2_ac.config.diagnostics import wrong_values
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import parse_yaml, require_shallow
@@ -45,6 +46,8 @@ def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
         InputError: Names every key that is wrong, all at once.
     """
     require_shallow(dict(values), where=where)
+    if "data" in values:
+        values = {**values, "data": without_sections_of_others(values["data"])}
     try:
         return Config.model_validate_json(json.dumps(values))
     except ValidationError as error:

@@ -12,6 +12,7 @@ from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.config.section import Section
+from vjepa2_ac.config.sources import RldsData  # noqa: F401 - all forms of data
 from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
 
 
@@ -64,7 +65,7 @@ class Config(Section):
         if self.training.cuda_graph and (self.training.precision == "fp16" or self.adapter.dropout):
             raise ValueError("training.cuda_graph needs adapter.dropout 0, and bf16 or fp32")
         sizes = self.model.random or self.model.sizes
-        if sizes.predictor.use_extrinsics and self.data.source in {"rlds", "lerobot"}:
+        if sizes.predictor.use_extrinsics and not self.data.has_camera_poses:
             raise ValueError(
                 f"predictor.use_extrinsics needs camera poses, which a data.source of {self.data.source} does not have"
             )

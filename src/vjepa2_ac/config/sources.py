@@ -1,11 +1,12 @@
-"""Source knobs: where each form of data stores what the model needs."""
+"""Source knobs: the forms of data, where each stores what the model needs, and what each can."""
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from vjepa2_ac.config.data import DataConfig
 from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.section import Section
 
@@ -93,3 +94,123 @@ class LeRobotFields(Section):
         if self.gripper_open == self.gripper_closed:
             raise ValueError("gripper_open and gripper_closed are the same number")
         return self
+
+
+_KIND = Affects.INDEX | Affects.IDLE | Affects.LATENTS | Affects.RUN
+
+
+class RldsData(DataConfig):
+    """TFRecord shards with a dataset_info.json, as TFDS writes them."""
+
+    reader: ClassVar[str] = "vjepa2_ac.data.sources.rlds.source:RldsSource"
+    has_camera_poses: ClassVar[bool] = False
+    gripper_fix: ClassVar[str] = "set data.fields.gripper to the other convention"
+    same_identity_fix: ClassVar[str] = "Add a feature to data.fields.identity that differs between them"
+
+    source: Annotated[Literal["rlds"], _KIND] = "rlds"
+    """rlds: TFRecord shards with a dataset_info.json, as TFDS writes them."""
+    fields: RldsFields = RldsFields()
+    """Names of the features."""
+
+    @property
+    def known_cameras(self) -> tuple[str, ...]:
+        """Those that have a feature."""
+        return tuple(self.fields.cameras)
+
+    @property
+    def first_camera(self) -> str:
+        """DROID's is the left exterior one, which the released weights saw."""
+        return self.known_cameras[0]
+
+    @property
+    def own_knobs_of_poses(self) -> list[str]:
+        """The gripper's convention."""
+        return ["fields.gripper"] if self.fields.gripper != "closedness" else []
+
+
+class RawDroidData(DataConfig):
+    """DROID's own folders."""
+
+    reader: ClassVar[str] = "vjepa2_ac.data.sources.droid_raw.source:RawDroidSource"
+    has_vectors: ClassVar[bool] = False
+
+    source: Annotated[Literal["droid_raw"], _KIND] = "droid_raw"
+    """droid_raw: DROID's folders with trajectory.h5 and MP4."""
+    droid_raw: RawDroidOptions = RawDroidOptions()
+    """Which steps are used."""
+
+    @property
+    def offered_cameras(self) -> tuple[str, ...]:
+        """By their place on the robot; or by a serial number."""
+        return RAW_CAMERAS
+
+    @property
+    def first_camera(self) -> str:
+        """The left exterior one."""
+        return RAW_CAMERAS[0]
+
+
+class LeRobotData(DataConfig):
+    """A LeRobotDataset v2.1 or v3.0."""
+
+    reader: ClassVar[str] = "vjepa2_ac.data.sources.lerobot.source:LeRobotSource"
+    gripper_fix: ClassVar[str] = "exchange data.lerobot.gripper_open and gripper_closed"
+    has_camera_poses: ClassVar[bool] = False
+
+    source: Annotated[Literal["lerobot"], _KIND] = "lerobot"
+    """lerobot: LeRobotDataset v2.1 or v3.0."""
+    lerobot: LeRobotFields = LeRobotFields()
+    """Names and conventions of the columns."""
+
+    @property
+    def known_cameras(self) -> tuple[str, ...]:
+        """Those that have a video."""
+        return tuple(self.lerobot.cameras)
+
+    @property
+    def first_camera(self) -> str:
+        """The first that has a video."""
+        return self.known_cameras[0]
+
+    @property
+    def own_knobs_of_poses(self) -> list[str]:
+        """Conventions of rotation and gripper."""
+        gripper = (self.lerobot.gripper_open, self.lerobot.gripper_closed)
+        asked = {
+            "lerobot.rotation": self.lerobot.rotation != "euler_xyz",
+            "lerobot.gripper_open and gripper_closed": gripper != (0, 1),
+        }
+        return [name for name, is_asked in asked.items() if is_asked]
+
+
+class NpzData(DataConfig):
+    """A folder of .npz episodes."""
+
+    reader: ClassVar[str] = "vjepa2_ac.data.sources.npz.source:NpzSource"
+
+    source: Annotated[Literal["npz"], _KIND] = "npz"
+    """npz: a folder of .npz episodes."""
+
+    @property
+    def first_camera(self) -> str:
+        """The array of that name."""
+        return "frames"
+
+
+class LatentsData(DataConfig):
+    """A latent cache alone."""
+
+    reader: ClassVar[str] = "vjepa2_ac.data.sources.latents.source:LatentSource"
+    is_cache: ClassVar[bool] = True
+    gripper_fix: ClassVar[str] = "change the convention of the data set that the cache was made from"
+
+    source: Annotated[Literal["latents"], _KIND] = "latents"
+    """latents: a latent cache alone, without the data set that it was made from."""
+
+    @property
+    def first_camera(self) -> str:
+        """All that were encoded."""
+        return "all"
+
+
+DataConfig.model_rebuild(force=True)  # the union of these

@@ -52,7 +52,7 @@ def warn_if_shared_memory_is_small(
     if not config.data.workers:
         return
     clip = batch_of_frames
-    if batch_of_frames.latents is None and dataset.config.source == "latents":
+    if batch_of_frames.latents is None and dataset.config.is_cache:
         clip = next(validation_batches(dataset, "train", clips=_MOST_CLIPS_READ, batch_size=1))
     text = small_shared_memory(config, clip.nbytes, processes)
     if text is not None:

@@ -71,7 +71,7 @@ def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Conf
     Raises:
         InputError: Names what differs.
     """
-    if dataset.config.source == "latents":  # else the weights need not be hashed
+    if dataset.config.is_cache:  # else the weights need not be hashed
         require_encoding(dataset, encoding_of(world_model, config))
 
 

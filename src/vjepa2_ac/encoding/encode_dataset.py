@@ -86,7 +86,7 @@ def require_encodable(config: Config) -> None:
         InputError: The data are a cache, the stride is not known, or clips are augmented.
     """
     data = config.data
-    if data.source == "latents":
+    if data.is_cache:
         raise InputError(where="data.source", found="latents: they are encoded already", needed="a data set of frames")
     if data.stride == "auto":
         raise InputError(

@@ -47,7 +47,7 @@ def with_latents(
     Raises:
         InputError: The cache is another encoder's, is required and missing, or cannot be made.
     """
-    if config.data.source == "latents" or config.data.cache == "off":
+    if config.data.is_cache or config.data.cache == "off":
         require_same_encoder(model, dataset, config)
         return dataset
     writer = writer_for(config, dataset, model)
@@ -74,7 +74,7 @@ def with_latents_if_there(config: Config, dataset: Dataset, model: WorldModel) -
     Raises:
         InputError: The data set is itself a cache, of another encoder.
     """
-    if config.data.source == "latents" or config.data.cache == "off":
+    if config.data.is_cache or config.data.cache == "off":
         require_same_encoder(model, dataset, config)
         return dataset
     writer = writer_for(config, dataset, model)

@@ -84,7 +84,7 @@ def measure_subject(
     require_widths(world_model, dataset.widths, where=subject)
     through_cache = with_latents_if_there(config, dataset, world_model)
     contenders, notes = _contenders(subject, config, run, world_model, asked)
-    if through_cache.config.source == "latents" and not asked.calibrate:
+    if through_cache.config.is_cache and not asked.calibrate:
         world_model.set_encoder_aside()
     for each in contenders:  # the encoder of the first one is enough
         if isinstance(each.model, WorldModel):

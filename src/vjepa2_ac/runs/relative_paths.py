@@ -64,7 +64,7 @@ def _seen_from_start(config: Config, run: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     flat = config_as_flat_dict(config)
     for key in _PATHS:
-        unread = key == RANGES and config.data.source == "latents"  # there it is only a name, part of the cache's key
+        unread = key == RANGES and config.data.is_cache  # there it is only a name, part of the cache's key
         if unread or not _leads_nowhere(flat[key]):
             continue
         there = next((start / flat[key] for start in start_folders(run) if (start / flat[key]).exists()), None)

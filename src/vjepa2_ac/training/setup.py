@@ -72,7 +72,7 @@ class Run:
     @property
     def encodes(self) -> bool:
         """Whether clips are frames that go through the encoder, not latents of a cache."""
-        return self.dataset.config.source != "latents"
+        return not self.dataset.config.is_cache
 
     @cached_property
     def trained(self) -> list[nn.Parameter]:
@@ -157,7 +157,7 @@ def set_up(
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
     world_model.set_attention(config.training.attention)
     world_model.set_compiled("with gradients" if config.training.compile == "blocks" else "never")
-    if dataset.config.source == "latents":
+    if dataset.config.is_cache:
         world_model.set_encoder_aside()
     world_model.to(accelerator.device)
     optimizer = make_optimizer(world_model, config.training)

@@ -158,8 +158,7 @@ def test_a_latent_cache_knows_the_groups_and_serves_any_grouping(tmp_path: Path)
     write_npz(tmp_path / "set", range(8), scene=lambda place: f"room {place % 3}")
     plain = config_of(source="npz", path=str(tmp_path / "set"), disk_cache={"dir": str(tmp_path / "cache")})
     folder = write_cache(open_dataset(plain))
-    changes = {"source": "latents", "path": str(folder), "split_by": "scene"}
-    assert groups_of(open_dataset(plain.model_copy(update=changes))) == 3
+    assert groups_of(open_dataset(plain.as_kind("latents", path=str(folder), split_by="scene"))) == 3
 
 
 def test_check_says_how_many_groups_there_are_and_inspect_counts_the_splits_of_the_clips(tmp_path: Path) -> None:

@@ -229,7 +229,7 @@ def test_every_form_is_encoded_whole(forms: Path, form: str, tmp_path: Path) -> 
     manifest = encode_config(config, lambda _: None, out=tmp_path / "latents").manifest
     assert manifest is not None
     assert (manifest.encoded, manifest.frames, dict(manifest.broken)) == (len(LENGTHS), sum(LENGTHS), {})
-    through = data.model_copy(update={"source": "latents", "path": str(tmp_path / "latents"), "camera": None})
+    through = data.as_kind("latents", path=str(tmp_path / "latents"), camera=None)
     expected_order, expected = clips(opened(forms, form), 8)
     order, found = clips(open_dataset(through), 8)
     assert order == expected_order

@@ -78,7 +78,7 @@ class Dataset:
         Raises:
             InputError: The data is a latent cache, which has the frames of one stride only.
         """
-        if self.config.source == "latents" and stride != self.config.stride:
+        if self.config.is_cache and stride != self.config.stride:
             raise InputError(
                 where=self.config.path,
                 found=f"latents that were encoded for clips at stride {self.config.stride}",
@@ -223,8 +223,8 @@ def through_latents(dataset: Dataset, folder: Path) -> Dataset:
     Raises:
         InputError: The cache lacks episodes or is damaged.
     """
-    changes = {"source": "latents", "path": str(folder), "cache": "off", "camera": dataset.config.cameras}
-    source = LatentSource(dataset.config.model_copy(update=changes))
+    config = dataset.config.as_kind("latents", path=str(folder), cache="off", camera=dataset.config.cameras)
+    source = LatentSource(config)
     return _of_latents(replace(dataset, source=source, table=source.infos()), source)
 
 
@@ -292,8 +292,6 @@ def _require_distinct(table: EpisodeTable, taking_part: Bool[np.ndarray, " episo
                 where=f"data.path: {config.path}",
                 found=f"episodes {first} and {second} have the same identity: {table.identity(first)}",
                 needed="episodes that can be told apart: the split is a hash of the identity",
-                fix="Add a feature to data.fields.identity that differs between them"
-                if config.source == "rlds"
-                else "",
+                fix=config.same_identity_fix,
             )
             raise with_way_out(error, [table.identity(first)], skippable=False)

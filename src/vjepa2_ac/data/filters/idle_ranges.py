@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int32
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import DataConfig, LeRobotFields, RawDroidOptions, RldsFields
 from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.filters.idle_rules import kept_ranges
@@ -107,7 +107,7 @@ def find_ranges(
     Raises:
         InputError: The list of ranges cannot be read or belongs to another data set; or the rule fits no episode.
     """
-    knobs = knobs_that_affect(Affects.IDLE, config)
+    knobs = _sections_as_written_before() | knobs_that_affect(Affects.IDLE, config)
     if storage.is_url(config.path):  # its fingerprint is what it was, and so is this key
         knobs["path"] = config.path
     parts: dict[str, object] = {"found": "idle ranges", "table": fingerprints_of(table)[0], "data": knobs}
@@ -203,6 +203,12 @@ def _checked(ranges: object, name: str, steps: int, path: str) -> list[tuple[int
             fix="Name the list of this version of the data set, or set data.idle.rule: commands or motion",
         )
     return pairs
+
+
+def _sections_as_written_before() -> dict[str, object]:
+    """Return the knobs of the other forms of data, which earlier versions had in each config, and so in this key."""
+    sections = {"fields": RldsFields(), "droid_raw": RawDroidOptions(), "lerobot": LeRobotFields()}
+    return {name: knobs_that_affect(Affects.IDLE, section) for name, section in sections.items()}
 
 
 def _version(path: str) -> list[object]:

@@ -20,7 +20,7 @@ def excerpt_findings(dataset: Dataset) -> Iterator[Finding]:
     Raises:
         InputError: An episode cannot be read, and `data.broken_episodes` does not skip it.
     """
-    if dataset.config.source == "latents":
+    if dataset.config.is_cache:
         yield Finding("ok", "agreement", "not looked at in a latent cache: check the data set that it was made from")
         return
     is_far = storage.is_url(dataset.config.path)

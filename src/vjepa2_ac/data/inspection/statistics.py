@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.config.sources import RAW_CAMERAS
 from vjepa2_ac.data.clips.dataset import Dataset, Removed
 from vjepa2_ac.data.clips.windows import in_split, spread
 from vjepa2_ac.data.filters.idle_rules import idle_by_motion
@@ -96,8 +95,7 @@ class Inspection:
     @property
     def cameras(self) -> tuple[str, ...]:
         """The available cameras, as far as the config knows them."""
-        known = self.config.known_cameras
-        return known if known is not None else RAW_CAMERAS if self.config.source == "droid_raw" else self.config.cameras
+        return self.config.offered_cameras
 
     @property
     def is_pose(self) -> bool:
@@ -210,7 +208,7 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
 def sample_of(dataset: Dataset, count: int) -> list[int]:
     """Return at most `count` of the used episodes: a random draw that is always the same."""
     # A latent cache has only the episodes that clips come from.
-    members = dataset.starts.episodes if dataset.config.source == "latents" else dataset.episodes
+    members = dataset.starts.episodes if dataset.config.is_cache else dataset.episodes
     members = members[np.argsort(dataset.table.id_hash[members], kind="stable")]
     return [int(members[place]) for place in spread(len(members), count)]
 

@@ -1,29 +1,15 @@
-"""The registry of sources: which class reads which form of data."""
+"""The registry of sources: each form of data names the class that reads it."""
 
 from __future__ import annotations
+
+import importlib
 
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.episode import EpisodeSource
 
 
 def open_source(config: DataConfig) -> EpisodeSource:
-    """Return the source that `data.source` names; nothing is read yet."""
-    if config.source == "rlds":
-        from vjepa2_ac.data.sources.rlds.source import RldsSource
-
-        return RldsSource(config)
-    if config.source == "droid_raw":
-        from vjepa2_ac.data.sources.droid_raw.source import RawDroidSource
-
-        return RawDroidSource(config)
-    if config.source == "lerobot":
-        from vjepa2_ac.data.sources.lerobot.source import LeRobotSource
-
-        return LeRobotSource(config)
-    if config.source == "latents":
-        from vjepa2_ac.data.sources.latents.source import LatentSource
-
-        return LatentSource(config)
-    from vjepa2_ac.data.sources.npz.source import NpzSource
-
-    return NpzSource(config)
+    """Return the source of the data; nothing is read yet, and no other form's libraries are imported."""
+    module, _, name = config.reader.partition(":")
+    source: EpisodeSource = getattr(importlib.import_module(module), name)(config)
+    return source

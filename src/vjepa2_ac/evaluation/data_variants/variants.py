@@ -49,22 +49,13 @@ def variants_of(config: DataConfig, shifts: Sequence[int]) -> list[Variant]:
         for axis, name in enumerate("xy"):
             repair = f"negate {name}, with the rotation (as of a mirror)"
             found.append(Variant(f"{name} negated", repair, partial(_with_mirrored_states, axis=axis)))
-        found.append(Variant("the gripper inverted", _GRIPPER[config.source], _with_gripper_inverted))
-    if config.source != "latents":
+        found.append(Variant("the gripper inverted", config.gripper_fix, _with_gripper_inverted))
+    if not config.is_cache:
         repair = "exchange red and blue (OpenCV reads and writes BGR) where the data is written"
         found.append(Variant("red and blue exchanged", repair, _with_channels_exchanged, changes_frames=True))
         repair = "flip the frames, left to right, where the data is written"
         found.append(Variant("frames mirrored", repair, _with_mirrored_frames, changes_frames=True))
     return found
-
-
-_GRIPPER = {
-    "rlds": "set data.fields.gripper to the other convention",
-    "lerobot": "exchange data.lerobot.gripper_open and gripper_closed",
-    "droid_raw": "write 1 - gripper",
-    "npz": "write 1 - gripper",
-    "latents": "change the convention of the data set that the cache was made from",
-}
 
 
 def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarray, "steps 7"]:

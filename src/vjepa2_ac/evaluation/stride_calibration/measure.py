@@ -306,7 +306,7 @@ def calibrate_model(
     Raises:
         InputError: As `calibrate`; or the data is a latent cache.
     """
-    if dataset.config.source == "latents":
+    if dataset.config.is_cache:
         raise InputError(
             where=f"data.path: {dataset.config.path}",
             found=f"latents that were encoded for clips at stride {dataset.config.stride}",

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Int, UInt8
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import RawDroidData
 from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
@@ -73,7 +73,7 @@ class RawDroidSource:
     An MP4 holds one frame per control step, in order, whatever rate its header states, and may lack the last step's.
     """
 
-    def __init__(self, config: DataConfig) -> None:
+    def __init__(self, config: RawDroidData) -> None:
         self._config = config
         self._root = config.path
         self._files = EpisodeFiles(config)

@@ -115,9 +115,8 @@ def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> Ca
 
 def clip_parts(config: DataConfig) -> dict[str, Any]:
     """Return the parts that determine which frames and other data clips need: checked when a cache is used alone."""
-    sections = {"fields", "droid_raw", "lerobot"}
     knobs = knobs_that_affect(Affects.LATENTS, config) | {"stride": config.model_stride}
-    return {f"data.{name}": knobs[name] for name in sorted(knobs.keys() - _OF_THE_FRAMES - sections)}
+    return {f"data.{name}": knobs[name] for name in sorted(knobs.keys() - _OF_THE_FRAMES - config.own_section.keys())}
 
 
 def _differences(name: str, here: Any, there: Any) -> list[str]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, missing
 from vjepa2_ac.data.sources.lerobot.parquet import EPISODE
 from vjepa2_ac.data.sources.lerobot.row_cache import Columns
@@ -29,7 +29,7 @@ class EpisodeContent:
     commands: Float[np.ndarray, "steps action_dim"] | None = None
 
 
-def wanted_columns(config: DataConfig) -> list[str]:
+def wanted_columns(config: LeRobotData) -> list[str]:
     """Return the columns that are read if a file has them."""
     fields = config.lerobot
     optional = [name for name in (fields.joint_velocity, fields.success) if name is not None]
@@ -37,7 +37,7 @@ def wanted_columns(config: DataConfig) -> list[str]:
     return [EPISODE, FRAME, TIME, *fields.state, *commands, *optional]
 
 
-def content_of(rows: Columns, length: int, info: DatasetInfo, config: DataConfig, where: str) -> EpisodeContent:
+def content_of(rows: Columns, length: int, info: DatasetInfo, config: LeRobotData, where: str) -> EpisodeContent:
     """Return the data in the rows of an episode.
 
     Args:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import DataConfig, LeRobotFields
+from vjepa2_ac.config import LeRobotData, LeRobotFields
 from vjepa2_ac.data.sources.lerobot.path_templates import require_template
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import read_json_object
@@ -59,7 +59,7 @@ class DatasetInfo:
         """The file."""
         return storage.join(self.root, INFO)
 
-    def require_mapping(self, config: DataConfig) -> None:
+    def require_mapping(self, config: LeRobotData) -> None:
         """Check that the data set has what `data.lerobot` and `data.camera` name, before anything large is read.
 
         Raises:

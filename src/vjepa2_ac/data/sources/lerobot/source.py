@@ -9,7 +9,7 @@ from functools import cached_property, partial
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
 from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
@@ -49,7 +49,7 @@ class LeRobotSource:
     frames are fetched and decoded on request.
     """
 
-    def __init__(self, config: DataConfig) -> None:
+    def __init__(self, config: LeRobotData) -> None:
         self._config = config
         self._lock = threading.RLock()
 

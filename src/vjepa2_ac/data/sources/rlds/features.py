@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.config import DataConfig, RldsFields
+from vjepa2_ac.config import RldsData, RldsFields
 from vjepa2_ac.data.sources.rlds.example import ExampleRecord
 from vjepa2_ac.data.sources.validation import require_finite, require_plausible, zero_steps
 from vjepa2_ac.episode import STATE_DIM, EpisodeInfo
@@ -34,12 +34,12 @@ def info_of(identity: str, num_steps: int) -> EpisodeInfo:
     return EpisodeInfo(id=identity, num_steps=num_steps, success=success)
 
 
-def features_of_steps(config: DataConfig) -> tuple[str, ...]:
+def features_of_steps(config: RldsData) -> tuple[str, ...]:
     """Return the features of states and recorded actions."""
     return config.fields.state + (config.fields.action if config.actions == "recorded" else ())
 
 
-def num_steps_of(record: ExampleRecord, config: DataConfig) -> int:
+def num_steps_of(record: ExampleRecord, config: RldsData) -> int:
     """Count the steps by their first flag; without it by the states, if these are poses.
 
     Raises:
@@ -52,9 +52,7 @@ def num_steps_of(record: ExampleRecord, config: DataConfig) -> int:
     return sum(len(record.floats(name)) for name in config.fields.state) // STATE_DIM
 
 
-def states_of(
-    record: ExampleRecord, config: DataConfig, steps: int, where: str
-) -> Float[np.ndarray, "steps state_dim"]:
+def states_of(record: ExampleRecord, config: RldsData, steps: int, where: str) -> Float[np.ndarray, "steps state_dim"]:
     """Return the measured states (legend: `vjepa2_ac.episode`), checked for plausibility.
 
     Raises:
@@ -80,7 +78,7 @@ def states_of(
 
 
 def commands_of(
-    record: ExampleRecord, config: DataConfig, steps: int, where: str
+    record: ExampleRecord, config: RldsData, steps: int, where: str
 ) -> Float[np.ndarray, "steps action_dim"] | None:
     """Return the recorded actions, if `data.actions` requests them.
 

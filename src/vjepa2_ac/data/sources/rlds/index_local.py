@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import RldsData
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
@@ -46,7 +46,7 @@ Examine = Callable[[Read, RecordSpan], Found]
 
 
 def index_local(
-    shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str], *, threads: int, progress: Progress | None
+    shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], *, threads: int, progress: Progress | None
 ) -> EpisodeTable:
     """Return every episode of local shards; its states are checked, of its images only the presence.
 
@@ -163,7 +163,7 @@ def place_of(span: RecordSpan) -> str:
     return f"{span.path.replace(chr(92), '/').rsplit('/', 1)[-1]}: record {span.number}"
 
 
-def _examine(read: Read, span: RecordSpan, config: DataConfig, cameras: Sequence[str]) -> Found:
+def _examine(read: Read, span: RecordSpan, config: RldsData, cameras: Sequence[str]) -> Found:
     """Check identity, steps, states and the presence of the images."""
     name = place_of(span)
     record = ExampleRecord(read, span)

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
-from vjepa2_ac.config import DataConfig, RldsFields
+from vjepa2_ac.config import RldsData, RldsFields
 from vjepa2_ac.data.filters.broken_episodes import as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard
@@ -74,7 +74,7 @@ class RecordLayout:
 
 
 def index_remote(
-    shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str], *, threads: int, progress: Progress | None
+    shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], *, threads: int, progress: Progress | None
 ) -> EpisodeTable:
     """Return every episode of shards behind a URL, by identity and number of steps.
 
@@ -101,7 +101,7 @@ def index_remote(
     return replace(table, state_hash=hashes_of_lookalikes(table, shards, config, threads=threads))
 
 
-def learn_layout(shards: Sequence[Shard], config: DataConfig, cameras: Sequence[str]) -> RecordLayout:
+def learn_layout(shards: Sequence[Shard], config: RldsData, cameras: Sequence[str]) -> RecordLayout:
     """Check the first record of a few shards as thoroughly as a local one.
 
     Raises:
@@ -130,7 +130,7 @@ def learn_layout(shards: Sequence[Shard], config: DataConfig, cameras: Sequence[
     return RecordLayout(step_bytes, window)
 
 
-def _whole_record(shard: Shard, config: DataConfig, cameras: Sequence[str]) -> tuple[ExampleRecord, int]:
+def _whole_record(shard: Shard, config: RldsData, cameras: Sequence[str]) -> tuple[ExampleRecord, int]:
     read = RemoteFile(shard, window=_SAMPLE_WINDOW)
     span = span_at(read(0, HEADER_BYTES), shard.path, 0, 0, shard.size)
     record = ExampleRecord(read, span)
@@ -184,7 +184,7 @@ def _cost_s(record: ExampleRecord, fields: RldsFields, telling: Iterable[str], w
     return max(1, reads) * _ASSUMED_LATENCY_S + FEWEST_IN_FLIGHT * shared_s
 
 
-def _examine(read: Read, span: RecordSpan, config: DataConfig, layout: RecordLayout) -> Found:
+def _examine(read: Read, span: RecordSpan, config: RldsData, layout: RecordLayout) -> Found:
     """Read the record's head; if needed its end, with the head of the next; then the features between."""
     name = place_of(span)
     try:

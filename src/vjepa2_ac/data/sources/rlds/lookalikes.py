@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from jaxtyping import Int64, UInt64
 
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import RldsData
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
 from vjepa2_ac.data.sources.rlds.dataset_info import Shard
@@ -29,7 +29,7 @@ _LENGTH_BYTES = 5  # lengths that grow with a name: of text, list, feature, entr
 
 
 def hashes_of_lookalikes(
-    table: EpisodeTable, shards: Sequence[Shard], config: DataConfig, *, threads: int
+    table: EpisodeTable, shards: Sequence[Shard], config: RldsData, *, threads: int
 ) -> UInt64[np.ndarray, " episodes"]:
     """Return the state hash of every record that could be a copy of another; `UNKNOWN` for the others.
 

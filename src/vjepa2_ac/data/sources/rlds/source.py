@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, cache_folder, get_or_build
@@ -59,7 +59,7 @@ class RldsSource:
     complete records, every time, and checks their CRC.
     """
 
-    def __init__(self, config: DataConfig) -> None:
+    def __init__(self, config: RldsData) -> None:
         self._config = config
         self._known: _Opened | None = None
         self._opening = threading.Lock()
@@ -202,7 +202,7 @@ def _place_of(opened: _Opened, index: int) -> tuple[Shard, RecordSpan]:
     return shard, RecordSpan(path=shard.path, number=at["record"], offset=at["offset"], length=at["length"])
 
 
-def _require_as_indexed(record: ExampleRecord, info: EpisodeInfo, config: DataConfig, where: str) -> None:
+def _require_as_indexed(record: ExampleRecord, info: EpisodeInfo, config: RldsData, where: str) -> None:
     """Refuse a record that does not match the index."""
     found = info_of(identity_of(record, config.fields), num_steps_of(record, config))
     if found != info:
