@@ -58,7 +58,7 @@ RATE_HZ, STRIDE = 15, 4
 PAST_WARM_UP = 1001  # a step at which the learning rate is what it mostly is
 QUICK = {
     "encoder_layers": 1, "predictor_layers": 1, "width": 128, "latent_dim": 128, "image_size": 64, "frames": [4],
-    "episodes": 6, "test_episodes": 2, "domains": ["random"], "repeats": 1, "precision": "fp32",
+    "episodes": 2, "test_episodes": 2, "domains": ["random"], "repeats": 1, "precision": "fp32",
 }  # fmt: skip
 
 

@@ -38,7 +38,7 @@ from vjepa2_ac.training.loss import prediction_losses
 # Tolerances: of losses in the first quarter, of all of them over what 1e-7 of the weights does, of bfloat16.
 EARLY, OF_NOISE, ROLLOUT = 1e-4, 3.0, 0.05
 PLAIN = "dense"
-QUICK = {"steps": 12}
+QUICK = {"steps": 8}
 _NOISE = 1e-7  # of the weights, relative
 _ROLLOUT_STEPS, _KNOWN_CLIPS, _LEARNING_RATE = 16, 8, 1e-4
 

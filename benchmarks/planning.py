@@ -46,8 +46,8 @@ from timing import Turns, about, add_options, introduction, prepare, profiled, r
 from vjepa2_ac.training.monitoring.throughput import matmul_speed
 
 QUICK = {
-    "layers": 1, "width": 128, "latent_dim": 128, "image_size": 32, "samples": 6, "iterations": 2, "at_once": [4, 1],
-    "horizon": [3], "repeats": 1, "threads": 1,
+    "layers": 1, "width": 128, "latent_dim": 128, "image_size": 32, "samples": 6, "iterations": 2, "at_once": [4, 2],
+    "horizon": [2], "repeats": 1, "warm_up": 0, "threads": 1,
 }  # fmt: skip
 _ON_CPU = {"layers": 2, "samples": 8, "iterations": 2, "horizon": [2, 4], "at_once": [8], "dtype": ["float32"]}
 _ON_CUDA = {"layers": 24, "samples": 800, "iterations": 10, "horizon": [1, 2], "at_once": [64], "dtype": ["bfloat16"]}

@@ -1,5 +1,6 @@
 """What every test can use: checked shapes, the shared reference data, tiny settings."""
 
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,6 +36,17 @@ from run_fixtures import base_folder, data_folder, make_config, nursery, reporte
 def pytest_report_header() -> list[str]:
     """Say what is not tested here."""
     return [missing.WITHOUT[name] for name in ABSENT]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Look for no garbage while all is imported, and never again in what is there then: half a second each time."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture(scope="session")

@@ -37,7 +37,7 @@ def run_without(*missing: str, folder: Path, **environment: str) -> subprocess.C
     inherited = {key: value for key, value in os.environ.items() if key not in {"CI", "PYTEST_CURRENT_TEST"}}
     return subprocess.run(
         [sys.executable, "-m", "pytest", "-rs", "-p", "no:cacheprovider", "--import-mode=importlib", str(tests)],
-        env=inherited | {"PYTHONPATH": path, **environment},
+        env=inherited | {"PYTHONPATH": path, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", **environment},
         cwd=folder, capture_output=True, text=True, timeout=120, check=False,
     )  # fmt: skip
 

@@ -35,6 +35,7 @@ counts for all others, which are alike.
 from __future__ import annotations
 
 import argparse
+import gc
 import json
 import sys
 import warnings
@@ -85,6 +86,7 @@ def rows(options: argparse.Namespace, machine: Machine) -> Iterator[tuple[dict[s
     """Yield what was counted for each setting."""
     import work
 
+    gc.freeze()  # no look for garbage goes through what was imported
     if options.work != "train":
         works = work.encoding(options) if options.work == "encode" else work.planning(options)
         for one in works:
@@ -100,8 +102,6 @@ def rows(options: argparse.Namespace, machine: Machine) -> Iterator[tuple[dict[s
 
 def measured(work: Work, machine: Machine, *, with_places: bool) -> tuple[dict[str, Any], Count]:
     """Do a piece of work, and return what it took; with places, operations of the backward pass know theirs."""
-    import gc
-
     import torch
     from count import Count
 

@@ -91,8 +91,8 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         cells, prepare, measure = modules.cells, modules.prepare, modules.measure
         patch.setattr(cells, "STEPS", 2)
         patch.setattr(cells, "TRAINING", cells.TRAINING.model_copy(update={"warmup_steps": 1, "batch_size": 2}))
-        for module in (cells, measure):
-            patch.setattr(module, "PLANNING", cells.PLANNING.model_copy(update={"samples": 12, "iterations": 1}))
+        few = cells.PLANNING.model_copy(update={"samples": 12, "iterations": 1})
+        patch.setattr(measure, "planner", partial(measure.planner, config=few))
         patch.setattr(measure, "CLIPS", 6)
         patch.setattr(measure, "base_model", lambda *_: prepare.BUILTIN)
         patch.setattr(prepare, "record_dataset", partial(record_dataset, steps=14))
@@ -104,7 +104,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
             (prepare.data_a(modules.folder), "A"),
             (prepare.data_shifted(modules.folder, "look"), "look"),
         ):
-            prepare._record(data, domain, 14, 3)
+            prepare._record(data, domain, 11, 3)
             prepare.encode(data, prepare.BUILTIN)
         yield modules
     for name in names:

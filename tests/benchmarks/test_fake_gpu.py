@@ -46,7 +46,7 @@ def told(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
         "augmented": ["train", "--quick", "--source", "pixels", "--attention", "dense", "--augment"],
         "encode": ["encode", "--quick"],
         "plan": ["plan", "--quick", "--adapter"],
-        "wide": ["train", "--layers", "6", "--frames", "8", "--batch", "1", "--checkpointing", "off", "on"],
+        "wide": ["train", "--layers", "4", "--frames", "8", "--batch", "1", "--checkpointing", "off", "on"],
     }
     given = [[*arguments, "--json", str(out / name)] for name, arguments in runs.items()]
     command = [sys.executable, str(ROOT / "tests" / "support" / "fake_gpu_facts.py"), str(FOLDER), json.dumps(given)]

@@ -34,8 +34,8 @@ def test_quick_benchmark_of_a_decision_completes_without_the_official_code(
     assert f"official: skipped, for there is no {tmp_path}" in printed
     assert "aten::addmm" in printed
     lines = DECISION.findall(printed)
-    ways = ["plain", "ours/4", "ours/1", "ours/4+adapter"]
-    assert [(horizon, way) for horizon, way, *_ in lines] == [("3", way) for way in ways]
+    ways = ["plain", "ours/4", "ours/2", "ours/4+adapter"]
+    assert [(horizon, way) for horizon, way, *_ in lines] == [("2", way) for way in ways]
     for _, _, seconds, least, mfu, of_plain, of_official in lines:
         assert 0 < float(least) <= float(seconds) < 60
         assert 0 < float(mfu) < 150
@@ -53,7 +53,7 @@ def test_decisions_with_compiled_blocks_are_timed_beside_those_without(
     planning.main(["--quick", "--no-memory", "--official", str(tmp_path), "--compile"])
     ways = [way for _, way, *_ in DECISION.findall(capsys.readouterr().out)]
     assert ways == [
-        "plain", "ours/4", "ours/4+compiled", "ours/1", "ours/1+compiled", "ours/4+adapter", "ours/4+adapter+compiled",
+        "plain", "ours/4", "ours/4+compiled", "ours/2", "ours/2+compiled", "ours/4+adapter", "ours/4+adapter+compiled",
     ]  # fmt: skip
     assert counters["stats"]["unique_graphs"]
 
@@ -65,8 +65,8 @@ def test_decisions_in_8_bits_are_timed_and_say_what_they_cost(
     planning.main(["--quick", "--no-memory", "--no-adapter", "--official", str(tmp_path), "--quantize", "int8"])
     printed = capsys.readouterr().out
     ways = [way for _, way, *_ in DECISION.findall(printed)]
-    assert ways == ["plain", "ours/4", "ours/4+int8", "ours/1", "ours/1+int8"]
-    changes = re.findall(r"ours/[41]\+int8 .*\[the plan's energy: changes by (\S+)%", printed)
+    assert ways == ["plain", "ours/4", "ours/4+int8", "ours/2", "ours/2+int8"]
+    changes = re.findall(r"ours/[42]\+int8 .*\[the plan's energy: changes by (\S+)%", printed)
     assert len(changes) == 2
     assert all(abs(float(change)) < 10 for change in changes)
 
@@ -116,15 +116,15 @@ def test_what_becomes_of_an_adapter_must_decide_as_the_others_do(
         expected = r"ours/4\+adapter: actions differ by .*: NO RATIO"
     printed = capsys.readouterr().out
     assert re.search(expected, printed)
-    assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/1"]
+    assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/2"]
 
 
 def test_an_adapter_is_float32_over_a_base_of_the_type_that_is_timed(planning: Any, tmp_path: Path) -> None:
     decisions = sys.modules["planning_variants"]
     bench = decisions.Bench(planning.parse(["--quick", "--official", str(tmp_path)]), "bfloat16")
     way = decisions.Way.ours(4, adapter=True)
-    assert bench.difference(way, 3).is_none
-    bench.decision(way, 3)()
+    assert bench.difference(way, 2).is_none
+    bench.decision(way, 2)()
     types = {".lora_" in name: one.dtype for name, one in bench.adapted.predictor.named_parameters()}
     assert types == {True: torch.float32, False: torch.bfloat16}
     assert not any(one.requires_grad for one in bench.adapted.parameters())
@@ -145,8 +145,8 @@ def test_a_decision_that_fails_is_a_row_and_memory_of_the_others_follows(
     with pytest.raises(SystemExit, match="1 of 9 rows failed"):
         planning.main(["--quick", "--official", str(tmp_path), "--no-adapter", "--json", str(file)])
     printed = capsys.readouterr().out
-    assert re.search(r"^ +3  plain +failed: IndexError: pop from empty list$", printed, re.MULTILINE)
-    assert re.findall(r"^ +3  (\S+) +1\.25$", printed, re.MULTILINE) == ["plain", "ours/4", "ours/1"]
+    assert re.search(r"^ +2  plain +failed: IndexError: pop from empty list$", printed, re.MULTILINE)
+    assert re.findall(r"^ +2  (\S+) +1\.25$", printed, re.MULTILINE) == ["plain", "ours/4", "ours/2"]
     found = json.loads(file.read_text())["rows"]
     assert [row["measured"] for row in found] == ["same actions"] * 3 + ["time"] * 3 + ["memory"] * 3
     assert [row["ratio_to_plain"] for row in found[3:6]] == [None] * 3
@@ -169,7 +169,7 @@ def test_no_ratio_is_printed_to_a_decision_that_comes_out_otherwise(
     printed = capsys.readouterr().out
     assert re.search(r"plain: actions differ by .*: NO RATIO", printed)
     assert [(way, of_plain) for _, way, _, _, _, of_plain, _ in DECISION.findall(printed)] == [
-        ("ours/4", "-"), ("ours/1", "-"), ("ours/4+adapter", "-"),
+        ("ours/4", "-"), ("ours/2", "-"), ("ours/4+adapter", "-"),
     ]  # fmt: skip
 
 
@@ -203,7 +203,7 @@ def test_no_ratio_is_printed_to_a_notebook_that_plans_otherwise(
     planning.main(["--quick", "--no-memory", "--official", str(tmp_path)])
     printed = capsys.readouterr().out
     assert re.search(r"official: actions differ by .*: NO RATIO", printed)
-    assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/1", "ours/4+adapter"]
+    assert [way for _, way, *_ in DECISION.findall(printed)] == ["plain", "ours/4", "ours/2", "ours/4+adapter"]
 
 
 def test_a_decision_is_counted_and_timed_in_the_type_and_towards_the_goal_that_were_asked_for(
@@ -212,17 +212,17 @@ def test_a_decision_is_counted_and_timed_in_the_type_and_towards_the_goal_that_w
     decisions = sys.modules["planning_variants"]
     options = planning.parse(["--quick", "--official", str(tmp_path)])
     bench = decisions.Bench(options, "bfloat16")
-    for horizon in (1, 3):
+    for horizon in (1, 2):
         cost = decisions.WorldModelCost(bench.model, bench._scene, bench._goal(horizon), decisions.EnergyConfig())
         with torch.no_grad():
             assert float(cost(torch.tensor(decisions.WANTED).expand(1, horizon, -1))) < 1e-5
             assert float(cost(torch.zeros(1, horizon, 7))) > 1e-3
     assert bench.model.predictor.dtype == torch.float32  # until all were compared
-    plan = bench.decision(decisions.Way.ours(2), 3)()
+    plan = bench.decision(decisions.Way.ours(2), 2)()
     assert bench.model.predictor.dtype == torch.bfloat16
-    assert len(plan.actions) == 3
+    assert len(plan.actions) == 2
     assert plan.evaluations == bench.sequences
-    assert bench.flops(3) == bench.sequences * decisions.plan_flops(bench.sizes, 3)
+    assert bench.flops(2) == bench.sequences * decisions.plan_flops(bench.sizes, 2)
 
 
 def test_weights_are_drawn_on_the_device_and_nobody_takes_their_fingerprints(

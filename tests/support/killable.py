@@ -7,6 +7,7 @@ has one thread; it forks a child per start, which runs the command line as any p
 from __future__ import annotations
 
 import atexit
+import gc
 import json
 import os
 import runpy
@@ -128,6 +129,7 @@ def _serve() -> None:
     from vjepa2_ac.cli import main
 
     torch.set_num_threads(1)
+    gc.freeze()  # no child looks for garbage in what is there, nor copies it so
     for line in sys.stdin:
         wish = json.loads(line)
         if "wait" in wish:

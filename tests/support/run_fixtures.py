@@ -10,7 +10,6 @@ from killable import Nursery
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
-from vjepa2_ac.model.network.world_model import WorldModel
 
 TINY = {
     "image_size": 32,
@@ -51,6 +50,7 @@ def data_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def base_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from vjepa2_ac.config import ModelSizes
+    from vjepa2_ac.model.network.world_model import WorldModel
 
     folder = tmp_path_factory.mktemp("base") / "model"
     WorldModel.random(ModelSizes.model_validate(TINY), seed=3).save_pretrained(folder)
