@@ -30,7 +30,7 @@ if missing.SHAPES not in ABSENT:
 import gcs as gcs_server  # noqa: E402 - the hook comes first
 from data_fixtures import droid, spoiled  # noqa: E402, F401 - fixtures for every folder
 from paths import ROOT  # noqa: E402
-from run_fixtures import base_folder, data_folder, make_config, nursery, reporter  # noqa: E402, F401
+from run_fixtures import base_folder, data_folder, make_config, nursery, one_thread, reporter, whole_run  # noqa: E402, F401
 
 
 def pytest_report_header() -> list[str]:
@@ -105,10 +105,5 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _one_thread() -> Iterator[None]:
-    """Tiny tensors are slower on many threads, and bits depend on their number."""
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+    with one_thread():
+        yield

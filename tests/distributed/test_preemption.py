@@ -6,7 +6,6 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 
 import psutil
 import pytest
@@ -52,14 +51,9 @@ def signalled_reporter(reporter, at: int, number: int):
     return reporter
 
 
-@pytest.fixture
-def whole(make_config, reporter, tmp_path) -> Path:
-    return train(make_config(run_dir=str(tmp_path / "whole")), type(reporter)())
-
-
 @pytest.mark.parametrize(("number", "at"), [(signal.SIGTERM, 3), (signal.SIGINT, 1), (signal.SIGUSR1, 4)])
 def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
-    make_config, reporter, tmp_path, whole, number, at
+    make_config, reporter, tmp_path, whole_run, number, at
 ) -> None:
     config = make_config(run_dir=str(tmp_path / "stopped"), checkpoint__keep_best=False)
     with pytest.raises(StoppedError, match=f"{signal.Signals(number).name}: stopped after step {at}"):
@@ -67,7 +61,7 @@ def test_a_run_that_was_asked_to_stop_goes_on_as_if_it_had_not(
     assert read_state(newest_checkpoint(tmp_path / "stopped/checkpoints")).step == at
     train(config, reporter)
     assert reporter.steps[0] == at + 1
-    assert_same_run(whole, tmp_path / "stopped")
+    assert_same_run(whole_run, tmp_path / "stopped")
 
 
 def test_a_run_asked_to_stop_after_its_last_step_is_done(make_config, reporter) -> None:

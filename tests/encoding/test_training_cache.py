@@ -46,7 +46,7 @@ KINDS = {
 def test_training_on_an_exact_cache_is_training_on_the_fly_bit_for_bit(
     make_config, reporter, tmp_path, changes
 ) -> None:
-    changes = changes | {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches"), "training__steps": 4}
+    changes = changes | {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches"), "training__steps": 3}
     on_the_fly = make_config(run_dir=str(tmp_path / "fly"), **changes)
     train(on_the_fly, reporter)
     folder = encoded(on_the_fly)
@@ -60,7 +60,7 @@ def test_training_on_an_exact_cache_is_training_on_the_fly_bit_for_bit(
 def test_training_on_a_rounded_cache_differs_by_what_is_rounded_off(
     make_config, reporter, tmp_path, kind, most
 ) -> None:
-    changes = {"data__cache_dtype": kind, "data__cache_dir": str(tmp_path / "caches"), "training__steps": 3}
+    changes = {"data__cache_dtype": kind, "data__cache_dir": str(tmp_path / "caches"), "training__steps": 2}
     on_the_fly = make_config(run_dir=str(tmp_path / "fly"), **changes)
     train(on_the_fly, reporter)
     folder = encoded(on_the_fly)
@@ -71,11 +71,9 @@ def test_training_on_a_rounded_cache_differs_by_what_is_rounded_off(
     assert all(0 < abs(one / other - 1) < most for one, other in losses)
 
 
-def test_a_run_on_frames_is_resumed_on_a_cache(make_config, reporter, tmp_path) -> None:
+def test_a_run_on_frames_is_resumed_on_a_cache(make_config, reporter, tmp_path, whole_run) -> None:
     changes = {"data__cache_dtype": "fp32", "data__cache_dir": str(tmp_path / "caches")}
-    whole = make_config(run_dir=str(tmp_path / "whole"), **changes)
-    train(whole, reporter)
-    encoded(whole)
+    encoded(make_config(**changes))
     dying = type(reporter)()
 
     def die_at_three(step: int, seen: object) -> None:
@@ -88,7 +86,7 @@ def test_a_run_on_frames_is_resumed_on_a_cache(make_config, reporter, tmp_path) 
         train(make_config(run_dir=str(tmp_path / "broken"), **changes), dying)
     cached = make_config(run_dir=str(tmp_path / "broken"), **(changes | {"data__cache": "require"}))
     train(cached, reporter, allow_config_change=True)
-    assert_same_run(tmp_path / "whole", tmp_path / "broken")
+    assert_same_run(whole_run, tmp_path / "broken")
 
 
 def test_a_cache_of_another_encoder_stops_a_run_before_the_first_step(make_config, reporter, tmp_path) -> None:

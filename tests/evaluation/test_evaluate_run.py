@@ -1,6 +1,7 @@
 """Runs and models are evaluated on their own or other data, against others; invalid input is refused early."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ import pytest
 import yaml
 
 from latent_sets import encode_for
+from run_fixtures import one_thread
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
@@ -17,7 +19,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.reports.write import evaluate_subject
+from vjepa2_ac.reports.write import Evaluated, evaluate_subject
 from vjepa2_ac.training.loop import train
 
 PROBES = ProbeOptions(sensitivity_clips=3, samples=6, landscape_clips=1, nodes=3, examples=1)
@@ -66,6 +68,13 @@ def asked(**changes: Any) -> EvaluationOptions:
     return EvaluationOptions(**({"clips": 5, "probes": PROBES} | changes))
 
 
+@pytest.fixture(scope="module")
+def measured(config: Config) -> Evaluated:
+    """The run's evaluation, which is in its folder, too: to be read only."""
+    with one_thread():
+        return evaluate_subject(config.run_dir, asked())
+
+
 def written(config: Config, folder: Path, **data: object) -> str:
     """Write a config, its data changed, and return its path."""
     values = config_as_dict(config)
@@ -83,12 +92,11 @@ def figures_of(folder: Path | str) -> dict[str, Any]:
     return json.loads((Path(folder) / "metrics.json").read_text())
 
 
-def test_a_run_is_measured_against_its_base_with_everything_that_belongs_to_it(run: str) -> None:
-    found = evaluate_subject(run, asked())
-    evaluation = found.evaluation
+def test_a_run_is_measured_against_its_base_with_everything_that_belongs_to_it(measured: Evaluated) -> None:
+    evaluation = measured.evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     assert (evaluation.base, evaluation.trained) == ("base", "adapter")
-    assert [path.name for path in found.files] == ["evaluation.png", "metrics.json", "report.html"]
+    assert [path.name for path in measured.files] == ["evaluation.png", "metrics.json", "report.html"]
     assert evaluation.about.checkpoint == "step-00000002 (the newest)"
     assert (evaluation.about.stride, evaluation.about.frames) == (2, 4)
     assert evaluation.about.seconds_per_step == pytest.approx(2 / 15)
@@ -99,8 +107,8 @@ def test_a_run_is_measured_against_its_base_with_everything_that_belongs_to_it(r
     assert evaluation.examples[0].frames.shape == (4, 32, 32, 3)
 
 
+@pytest.mark.usefixtures("measured")
 def test_figures_depend_on_neither_the_batch_size_nor_the_workers(config: Config, run: str, tmp_path: Path) -> None:
-    evaluate_subject(run, asked(out=tmp_path / "a"))
     changed = config.model_copy(update={"validation": config.validation.model_copy(update={"batch_size": 2})})
     path = Path(run) / "config.yaml"
     before = path.read_text()
@@ -109,7 +117,7 @@ def test_figures_depend_on_neither_the_batch_size_nor_the_workers(config: Config
         evaluate_subject(run, asked(out=tmp_path / "b"))
     finally:
         path.write_text(before)
-    one, other = figures_of(tmp_path / "a"), figures_of(tmp_path / "b")
+    one, other = figures_of(run), figures_of(tmp_path / "b")
     for name in ("base", "adapter"):
         assert rollout(one, name) == pytest.approx(rollout(other, name), rel=1e-5)
         ranks = [metrics["models"][name]["sensitivity"]["rankings"][0]["rank_by_clip"] for metrics in (one, other)]
@@ -117,6 +125,7 @@ def test_figures_depend_on_neither_the_batch_size_nor_the_workers(config: Config
     assert one["clips"] == other["clips"]
 
 
+@pytest.mark.usefixtures("measured")
 def test_a_model_is_measured_on_the_data_of_a_config_and_equals_the_base_of_a_run(
     config: Config, run: str, tmp_path: Path, base_folder: Path
 ) -> None:
@@ -127,8 +136,7 @@ def test_a_model_is_measured_on_the_data_of_a_config_and_equals_the_base_of_a_ru
     assert list(of_model["models"]) == ["model"]
     assert of_model["base"] is None
     assert of_model["about"]["checkpoint"] == ""
-    evaluate_subject(run, asked(out=tmp_path / "run"))
-    assert rollout(of_model, "model") == pytest.approx(rollout(figures_of(tmp_path / "run"), "base"), rel=1e-5)
+    assert rollout(of_model, "model") == pytest.approx(rollout(figures_of(run), "base"), rel=1e-5)
 
 
 def test_others_are_measured_on_the_same_latents(run: str, tmp_path: Path, base_folder: Path) -> None:
@@ -149,6 +157,7 @@ def test_another_encoder_cannot_be_measured_on_these_latents(run: str, tmp_path:
         evaluate_subject(run, asked(against=(str(tmp_path / "other"),)))
 
 
+@pytest.mark.usefixtures("measured")
 def test_a_cache_gives_the_figures_of_the_frames_and_frames_of_its_own(
     config: Config, run: str, tmp_path: Path
 ) -> None:
@@ -158,10 +167,9 @@ def test_a_cache_gives_the_figures_of_the_frames_and_frames_of_its_own(
         open_dataset(config.data),
     )
     path = written(config, tmp_path, cache="require", cache_dtype="fp32")
-    assert main(["evaluate", run, "--out", str(tmp_path / "fly"), "--clips", "5", *QUICK]) == 0
     found = main(["evaluate", run, "--data", path, "--out", str(tmp_path / "cached"), "--clips", "5", *QUICK])
     assert found == 0
-    fly, cached = figures_of(tmp_path / "fly"), figures_of(tmp_path / "cached")
+    fly, cached = figures_of(run), figures_of(tmp_path / "cached")
     assert fly["models"] == cached["models"]
     assert fly["clips"] == cached["clips"]
 
@@ -173,10 +181,10 @@ def test_strides_are_calibrated_where_it_is_asked_for(run: str, tmp_path: Path) 
     assert calibration["strides"]
 
 
+@pytest.mark.usefixtures("measured")
 def test_compare_prints_a_row_for_each_run(run: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    evaluate_subject(run, asked())
-    evaluate_subject(run, asked(out=tmp_path / "again"))
-    capsys.readouterr()
+    (tmp_path / "again").mkdir()
+    shutil.copy(Path(run) / "metrics.json", tmp_path / "again")
     assert main(["compare", run, str(tmp_path / "again"), "--out", str(tmp_path / "plot.png")]) == 0
     printed = capsys.readouterr().out
     assert "gain over run" in printed

@@ -3,6 +3,7 @@
 import errno
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from paths import GOLDEN
+from run_fixtures import SilentReporter, one_thread, tiny_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
@@ -49,17 +51,34 @@ EVALUATED = {
 }
 
 
-@pytest.fixture
-def trained(make_config: Callable[..., Any], reporter: Any) -> Callable[..., Path]:
-    """Train for two steps at a rate that moves the weights; return the folder of the run."""
+Trained = Callable[..., Path]
+QUICK = ["--clips", "4", "--sensitivity-clips", "2", "--samples", "4", "--landscapes", "1", "--nodes", "3"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_folder: Path) -> Trained:
+    """Train for two steps at a rate that moves the weights; return the folder of the run, to be read only.
+
+    Who asks for the same settings again gets the same folder.
+    """
+    runs: dict[str, Path] = {}
 
     def make(**changes: object) -> Path:
         settings = {"training__steps": 2, "training__accumulation": 1, "training__learning_rate": 0.05}
-        config = make_config(**{**settings, "validation__every": 2, **changes})
-        train(config, reporter)
-        return Path(config.run_dir)
+        settings |= {"validation__every": 2, **changes}
+        if (name := json.dumps(settings, sort_keys=True)) not in runs:
+            config = tiny_config(tmp_path_factory.mktemp("trained") / "run", data_folder, base_folder, **settings)
+            with one_thread():
+                runs[name] = train(config, SilentReporter())
+        return runs[name]
 
     return make
+
+
+@pytest.fixture
+def copied(trained: Trained, tmp_path: Path) -> Trained:
+    """As `trained`, but a copy, which a test may change."""
+    return lambda **changes: shutil.copytree(trained(**changes), tmp_path / "run")
 
 
 def predictions(model: WorldModel) -> Tensor:
@@ -151,9 +170,9 @@ def poison(path: Path) -> str:
     ],
 )
 def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(
-    trained, tmp_path: Path, form: Any, alpha: float, reported: str
+    copied, tmp_path: Path, form: Any, alpha: float, reported: str
 ) -> None:
-    run = trained()
+    run = copied()
     rewrite_adapter(run, lora_alpha=alpha)
     with pytest.raises(InputError, match=reported):
         export_run(run, tmp_path / "out", form)
@@ -164,8 +183,8 @@ def test_an_adapter_that_spoils_its_base_is_refused_and_leaves_nothing(
     ("kind", "file"),
     [("lora", "adapter_model.safetensors"), ("lora", "pissa_start.safetensors"), ("none", "predictor.safetensors")],
 )
-def test_a_trained_weight_that_is_not_finite_is_named(trained, tmp_path: Path, kind: str, file: str) -> None:
-    run = trained(adapter__kind=kind, **({"adapter__init": "pissa"} if file.startswith("pissa") else {}))
+def test_a_trained_weight_that_is_not_finite_is_named(copied, tmp_path: Path, kind: str, file: str) -> None:
+    run = copied(adapter__kind=kind, **({"adapter__init": "pissa"} if file.startswith("pissa") else {}))
     checkpoint = load_run(run).checkpoint
     name = poison(checkpoint / "adapter" / file)
     write_manifest(checkpoint)
@@ -241,8 +260,8 @@ def test_the_code_of_the_card_runs(trained, tmp_path: Path) -> None:
     assert isinstance(names["predictor"], peft.PeftModel)
 
 
-def test_the_card_shows_what_was_measured(trained, tmp_path: Path) -> None:
-    run = trained()
+def test_the_card_shows_what_was_measured(copied, tmp_path: Path) -> None:
+    run = copied()
     (run / METRICS_FILE).write_text(json.dumps(EVALUATED))
     (run / PLOT).write_bytes(b"a picture")
     export_run(run, tmp_path / "hub", "hub")
@@ -256,9 +275,9 @@ def test_the_card_shows_what_was_measured(trained, tmp_path: Path) -> None:
     assert "somewhere" not in (tmp_path / "hub" / METRICS_FILE).read_text(), "a path of this machine"
 
 
-def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(trained, tmp_path: Path) -> None:
-    run = trained(checkpoint__every=1)
-    assert main(["evaluate", str(run), "--clips", "4"]) == 0
+def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(copied, tmp_path: Path) -> None:
+    run = copied(checkpoint__every=1)
+    assert main(["evaluate", str(run), *QUICK]) == 0
     measured = json.loads((run / METRICS_FILE).read_text())
     about = measured["about"]
     old = about["checkpoint_path"].replace("step-00000002", "step-00000001")
@@ -270,9 +289,9 @@ def test_the_card_takes_what_evaluate_writes_and_says_of_which_checkpoint(traine
     assert "model-index" not in card, "results of another checkpoint are not those of this adapter"
 
 
-def test_what_was_measured_are_results_on_the_hub(trained, tmp_path: Path) -> None:
-    run = trained()
-    assert main(["evaluate", str(run), "--clips", "4"]) == 0
+def test_what_was_measured_are_results_on_the_hub(copied, tmp_path: Path) -> None:
+    run = copied()
+    assert main(["evaluate", str(run), *QUICK]) == 0
     measured = json.loads((run / METRICS_FILE).read_text())
     assert main(["export", str(run), str(tmp_path / "hub"), "--to", "hub"]) == 0
     (entry,) = ModelCard.load(tmp_path / "hub" / CARD).data.to_dict()["model-index"]
@@ -282,15 +301,15 @@ def test_what_was_measured_are_results_on_the_hub(trained, tmp_path: Path) -> No
 
 
 def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is_asked_for(
-    trained, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    copied, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = trained(training__steps=4, checkpoint__every=1)
+    run = copied(training__steps=4, checkpoint__every=1)
     newest = load_run(run).checkpoint
     state = json.loads((newest / "state.json").read_text())
     (newest / "state.json").write_text(json.dumps({**state, "best_step": 2}))
     write_manifest(newest)
     for asked, step, words in [("best", 2, "step-00000002 (the best)"), ("1", 1, "step-00000001 (as asked for)")]:
-        assert main(["evaluate", str(run), "--clips", "4", "--checkpoint", asked]) == 0
+        assert main(["evaluate", str(run), *QUICK, "--checkpoint", asked]) == 0
         measured = json.loads((run / METRICS_FILE).read_text())
         assert measured["about"]["checkpoint_path"] == str(run / "checkpoints" / f"step-{step:08d}")
         assert measured["about"]["checkpoint"] == words
@@ -311,8 +330,8 @@ def weights_of(run: Path, step: int) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("content", ["{", "[]", "{}", '{"format": 2}', '{"format": 1, "verdict": 3}'])
-def test_a_damaged_evaluation_is_named_and_nothing_is_written(trained, tmp_path: Path, content: str) -> None:
-    run = trained()
+def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: Path, content: str) -> None:
+    run = copied()
     (run / METRICS_FILE).write_text(content)
     with pytest.raises(InputError, match=r"metrics\.json.*vjepa2-ac evaluate"):
         export_run(run, tmp_path / "hub", "hub")
@@ -354,8 +373,8 @@ def test_a_place_that_cannot_be_written_is_refused_before_work_begins(tmp_path: 
 
 
 @pytest.mark.parametrize("form", ["merged", "official", "hub"])
-def test_a_run_without_a_checkpoint_is_refused(trained, tmp_path: Path, form: Any) -> None:
-    run = trained()
+def test_a_run_without_a_checkpoint_is_refused(copied, tmp_path: Path, form: Any) -> None:
+    run = copied()
     (run / "checkpoints").rename(run / "elsewhere")
     with pytest.raises(InputError, match="without a whole checkpoint"):
         export_run(run, tmp_path / "out", form)

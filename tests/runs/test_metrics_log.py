@@ -115,7 +115,7 @@ def test_a_run_that_cannot_write_its_record_writes_its_checkpoint_and_says_of_wh
 
 
 def test_where_a_checkpoint_makes_room_the_run_goes_on_and_its_record_is_whole(
-    make_config, reporter, tmp_path, monkeypatch
+    make_config, reporter, tmp_path, monkeypatch, whole_run
 ) -> None:
     disk, save = FullDisk(monkeypatch), loop.save_checkpoint
 
@@ -123,10 +123,9 @@ def test_where_a_checkpoint_makes_room_the_run_goes_on_and_its_record_is_whole(
         save(*arguments)
         disk.is_full = False
 
-    train(make_config(run_dir=str(tmp_path / "whole")), type(reporter)())
     monkeypatch.setattr(loop, "save_checkpoint", make_room)
     train(make_config(), full_from(disk, reporter, 3))
-    assert_same_run(tmp_path / "whole", tmp_path / "run")
+    assert_same_run(whole_run, tmp_path / "run")
 
 
 def test_where_neither_record_nor_checkpoint_can_be_written_both_are_named(tmp_path: Path, monkeypatch) -> None:

@@ -1,7 +1,9 @@
 """Tiny world models, and inputs that fit them."""
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import pytest
 import torch
@@ -32,21 +34,31 @@ def sizes() -> ModelSizes:
 
 @pytest.fixture
 def model() -> WorldModel:
-    return WorldModel.random(SIZES, seed=0)
+    return tiny_model()
 
 
 @pytest.fixture
 def fresh() -> Callable[..., WorldModel]:
     """Make the model of the fixture `model` once more, or one of another seed or type."""
-
-    def make(seed: int = 0, dtype: torch.dtype = torch.float32) -> WorldModel:
-        return WorldModel.random(SIZES, seed=seed, dtype=dtype)
-
-    return make
+    return tiny_model
 
 
 @pytest.fixture
 def inputs() -> Inputs:
+    return tiny_inputs()
+
+
+def tiny_model(seed: int = 0, dtype: torch.dtype = torch.float32) -> WorldModel:
+    """Return a model of one's own: a copy of what is drawn once for each seed and type."""
+    return copy.deepcopy(_drawn(seed, dtype))
+
+
+@cache
+def _drawn(seed: int, dtype: torch.dtype) -> WorldModel:
+    return WorldModel.random(SIZES, seed=seed, dtype=dtype)
+
+
+def tiny_inputs() -> Inputs:
     generator = torch.Generator().manual_seed(1)
     draw = lambda *shape: torch.randn(*shape, generator=generator)  # noqa: E731
     return Inputs(draw(2, 4, 3, 48, 48), draw(2, 4, 9, 24), draw(2, 4, 7), draw(2, 4, 7))

@@ -1,6 +1,7 @@
 """A tiny run on synthetic episodes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,6 +18,17 @@ TINY = {
     "encoder": {"width": 24, "depth": 1, "heads": 2, "mlp_ratio": 2.0},
     "predictor": {"width": 24, "depth": 2, "heads": 2},
 }
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Tiny tensors are slower on many threads, and bits depend on their number."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 class SilentReporter:
@@ -66,36 +78,53 @@ def nursery() -> Nursery:
 MakeConfig = Callable[..., Config]
 
 
+def tiny_config(run_dir: Path, data_folder: Path, base_folder: Path, **changes: object) -> Config:
+    """Return a config of a tiny LoRA run; dotted keys, with two underscores for a dot, change it."""
+    values: dict[str, object] = {
+        "run_dir": str(run_dir),
+        "data": {
+            "path": str(data_folder), "frames": 4, "stride": 2, "validation_share": 0.3, "test_share": 0.2,
+            "workers": 0,
+        },
+        "model": {"base": str(base_folder), "dtype": "float32"},
+        "adapter": {"rank": 4, "alpha": 8},
+        "training": {
+            "steps": 6, "batch_size": 2, "accumulation": 2, "learning_rate": 1e-3, "warmup_steps": 1,
+            "precision": "fp32", "device": "cpu", "log_every": 1, "allow_weak_base": True,
+        },
+        "validation": {"every": 3, "clips": 4, "batch_size": 2},
+        "checkpoint": {"every": 2, "keep": 5},
+        "tracking": {"tensorboard": False},
+    }  # fmt: skip
+    for key, value in changes.items():
+        *sections, name = key.split("__")
+        inner = values
+        for section in sections:
+            inner = inner.setdefault(section, {})  # type: ignore[assignment]
+        inner[name] = value
+    return parse_config(values, where="test")
+
+
 @pytest.fixture
 def make_config(tmp_path: Path, data_folder: Path, base_folder: Path) -> MakeConfig:
     """Return a config of a tiny LoRA run; dotted keys change it."""
 
     def make(**changes: object) -> Config:
-        values: dict[str, object] = {
-            "run_dir": str(tmp_path / "run"),
-            "data": {
-                "path": str(data_folder), "frames": 4, "stride": 2, "validation_share": 0.3, "test_share": 0.2,
-                "workers": 0,
-            },
-            "model": {"base": str(base_folder), "dtype": "float32"},
-            "adapter": {"rank": 4, "alpha": 8},
-            "training": {
-                "steps": 6, "batch_size": 2, "accumulation": 2, "learning_rate": 1e-3, "warmup_steps": 1,
-                "precision": "fp32", "device": "cpu", "log_every": 1, "allow_weak_base": True,
-            },
-            "validation": {"every": 3, "clips": 4, "batch_size": 2},
-            "checkpoint": {"every": 2, "keep": 5},
-            "tracking": {"tensorboard": False},
-        }  # fmt: skip
-        for key, value in changes.items():
-            *sections, name = key.split("__")
-            inner = values
-            for section in sections:
-                inner = inner.setdefault(section, {})  # type: ignore[assignment]
-            inner[name] = value
-        return parse_config(values, where="test")
+        return tiny_config(
+            **{"run_dir": tmp_path / "run", "data_folder": data_folder, "base_folder": base_folder, **changes}
+        )
 
     return make
+
+
+@pytest.fixture(scope="session")
+def whole_run(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_folder: Path) -> Path:
+    """The folder of the run of `make_config()`, which nothing disturbed: one for all tests, to be read only."""
+    from vjepa2_ac.training.loop import train
+
+    config = tiny_config(tmp_path_factory.mktemp("whole") / "run", data_folder, base_folder)
+    with one_thread():
+        return train(config, SilentReporter())
 
 
 @pytest.fixture

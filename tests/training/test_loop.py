@@ -45,13 +45,14 @@ def dying_reporter(reporter, last_step: int):
 
 
 @pytest.mark.parametrize("died_at", [1, 3, 4])
-def test_a_run_that_died_and_went_on_equals_the_one_that_did_not(make_config, reporter, tmp_path, died_at) -> None:
-    train(make_config(run_dir=str(tmp_path / "whole")), reporter)
+def test_a_run_that_died_and_went_on_equals_the_one_that_did_not(
+    make_config, reporter, tmp_path, whole_run, died_at
+) -> None:
     config = make_config(run_dir=str(tmp_path / "broken"))
     with pytest.raises(KilledError):
         train(config, dying_reporter(type(reporter)(), died_at))
     train(config, reporter)
-    assert_same_run(tmp_path / "whole", tmp_path / "broken")
+    assert_same_run(whole_run, tmp_path / "broken")
 
 
 KINDS = {
@@ -85,16 +86,13 @@ def test_the_number_of_loader_workers_changes_nothing(make_config, reporter, tmp
     assert_same_run(tmp_path / "none", tmp_path / "two")
 
 
-def test_how_often_a_run_is_measured_and_saved_changes_nothing(make_config, reporter, tmp_path) -> None:
-    train(make_config(run_dir=str(tmp_path / "seldom"), validation__every=6, checkpoint__every=6), reporter)
+def test_how_often_a_run_is_measured_and_saved_changes_nothing(make_config, reporter, tmp_path, whole_run) -> None:
     often = make_config(run_dir=str(tmp_path / "often"), validation__every=1, checkpoint__every_minutes=1e-9)
     train(often, reporter)
-    assert len(list((tmp_path / "often/checkpoints").iterdir())) > len(
-        list((tmp_path / "seldom/checkpoints").iterdir())
-    )
+    assert len(list((tmp_path / "often/checkpoints").iterdir())) > len(list((whole_run / "checkpoints").iterdir()))
     rows = {(row["kind"], row["step"]): row for row in metrics(tmp_path / "often")}
-    assert all(rows[row["kind"], row["step"]] == row for row in metrics(tmp_path / "seldom"))
-    one, other = trained_weights(tmp_path / "seldom"), trained_weights(tmp_path / "often")
+    assert all(rows[row["kind"], row["step"]] == row for row in metrics(whole_run))
+    one, other = trained_weights(whole_run), trained_weights(tmp_path / "often")
     assert all(torch.equal(one[key], other[key]) for key in one)
 
 
@@ -126,8 +124,8 @@ def test_the_best_by_validation_is_written_kept_and_remembered(make_config, repo
 
 
 def test_another_seed_is_another_run(make_config, reporter, tmp_path) -> None:
-    train(make_config(run_dir=str(tmp_path / "a"), training__steps=2), reporter)
-    train(make_config(run_dir=str(tmp_path / "b"), training__steps=2, seed=1), reporter)
+    train(make_config(run_dir=str(tmp_path / "a"), training__steps=1), reporter)
+    train(make_config(run_dir=str(tmp_path / "b"), training__steps=1, seed=1), reporter)
     assert metrics(tmp_path / "a") != metrics(tmp_path / "b")
 
 
@@ -158,34 +156,31 @@ def test_checkpointing_of_activations_changes_no_gradient(make_config, reporter)
     assert one_step(checkpointing=False) == one_step(checkpointing=True)
 
 
-def test_only_the_adapter_moves(make_config, reporter) -> None:
+def test_only_the_adapter_moves(make_config, whole_run) -> None:
     config = make_config()
     before = load_base(config.model, seed=config.seed)
-    train(config, reporter)
-    after = load_run(Path(config.run_dir)).world_model
+    after = load_run(whole_run).world_model
     assert after.encoder_fingerprint() == before.encoder_fingerprint()
     assert after.predictor_fingerprint() == before.predictor_fingerprint()
-    assert any(value.abs().max() > 0 for key, value in trained_weights(Path(config.run_dir)).items() if "lora_B" in key)
+    assert any(value.abs().max() > 0 for key, value in trained_weights(whole_run).items() if "lora_B" in key)
 
 
-def test_the_base_is_not_written(make_config, reporter) -> None:
-    config = make_config()
-    train(config, reporter)
-    checkpoint = newest_checkpoint(Path(config.run_dir) / "checkpoints")
+def test_the_base_is_not_written(whole_run) -> None:
+    checkpoint = newest_checkpoint(whole_run / "checkpoints")
     names = {path.name for path in checkpoint.rglob("*") if path.is_file()}
     assert "adapter_model.safetensors" in names
-    assert all("lora_" in key for key in trained_weights(Path(config.run_dir)))
+    assert all("lora_" in key for key in trained_weights(whole_run))
 
 
 def test_training_lowers_the_loss(make_config, reporter) -> None:
     config = make_config(
-        training__steps=60, training__accumulation=1, training__learning_rate=5e-3, adapter__rank=16,
+        training__steps=24, training__accumulation=1, training__learning_rate=5e-3, adapter__rank=16,
         adapter__targets=["q", "k", "v", "o", "fc1", "fc2", "predictor_embed", "predictor_proj"],
-        validation__every=60, checkpoint__every=60,
+        validation__every=24, checkpoint__every=24,
     )  # fmt: skip
     train(config, reporter)
     validations = [row for row in metrics(Path(config.run_dir)) if row["kind"] == "validation"]
-    assert [row["step"] for row in validations] == [0, 60]
+    assert [row["step"] for row in validations] == [0, 24]
     assert validations[-1]["error_over_persistence"] < 0.8 * validations[0]["error_over_persistence"]
 
 
@@ -220,15 +215,15 @@ def test_a_loss_that_is_not_finite_stops_before_the_weights_move(make_config, re
 
 
 def test_a_folder_of_another_config_is_refused_and_names_the_key(make_config, reporter) -> None:
-    train(make_config(), reporter)
+    train(make_config(training__steps=1), reporter)
     with pytest.raises(InputError, match=r"training\.learning_rate"):
-        train(make_config(training__learning_rate=2e-3), reporter)
+        train(make_config(training__steps=1, training__learning_rate=2e-3), reporter)
 
 
 def test_episodes_cannot_change_their_split_within_a_run(make_config, reporter) -> None:
-    train(make_config(training__steps=2), reporter)
+    train(make_config(training__steps=1), reporter)
     with pytest.raises(InputError, match=r"it differs in data\.split_by"):
-        train(make_config(training__steps=2, data__split_by=r"episode_(\d+)"), reporter)
+        train(make_config(training__steps=1, data__split_by=r"episode_(\d+)"), reporter)
 
 
 def test_copies_in_other_splits_are_reported_before_the_first_step(make_config, reporter, tmp_path) -> None:
@@ -279,8 +274,8 @@ def test_moments_of_another_optimizer_are_refused_before_the_first_step(make_con
 
 
 def test_workers_and_logging_may_change_within_a_run(make_config, reporter) -> None:
-    train(make_config(), reporter)
-    train(make_config(data__workers=1, checkpoint__keep=2, training__log_every=5), reporter)
+    train(make_config(training__steps=2), reporter)
+    train(make_config(training__steps=2, data__workers=1, checkpoint__keep=2, training__log_every=5), reporter)
     assert any("Going on from" in note for note in reporter.notes)
 
 
@@ -314,7 +309,7 @@ def test_cuda_that_is_asked_for_and_absent_is_an_error(make_config, reporter) ->
 
 
 def test_a_run_notes_its_config_and_versions(make_config, reporter) -> None:
-    config = make_config()
+    config = make_config(training__steps=1)
     folder = train(config, reporter)
     assert (folder / "config.yaml").read_text() == config_as_yaml(config)
     start = json.loads((folder / "environment.json").read_text())[0]

@@ -14,7 +14,7 @@ from vector_sets import write_vectors
 from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.request import EvaluationOptions
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
 from vjepa2_ac.export.export import export_run
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -28,6 +28,8 @@ from vjepa2_ac.training.loop import train
 
 MakeConfig = Callable[..., Config]
 HEADS = ["action_encoder", "state_encoder"]
+PROBES = ProbeOptions(sensitivity_clips=2, samples=4, landscape_clips=1, nodes=3, examples=1)
+QUICK = EvaluationOptions(split="validation", clips=4, probes=PROBES)
 ROBOTS = {"14/14": Widths(14, 14), "8/7": Widths(8, 7), "7/8": Widths(7, 8)}
 
 
@@ -65,7 +67,7 @@ def test_from_recordings_to_a_model_of_its_own(
     run = load_run(folder)
     assert widths_of_model(run.world_model.sizes) == widths
 
-    evaluation = evaluate_subject(str(folder), EvaluationOptions(split="validation", clips=4)).evaluation
+    evaluation = evaluate_subject(str(folder), QUICK).evaluation
     assert list(evaluation.models) == ["adapter" if kind == "lora" else "model"]
     metrics = metrics_as_dict(evaluation)
     assert "no base to compare with" in metrics["verdict"]
@@ -89,7 +91,7 @@ def test_from_recordings_to_a_model_of_its_own(
 
 
 def test_a_run_with_new_heads_resumes_bit_for_bit(make_robot: MakeConfig, reporter: Any, tmp_path: Path) -> None:
-    whole, stopped = ({"run_dir": str(tmp_path / name)} for name in ("whole", "stopped"))
+    whole, stopped = ({"run_dir": str(tmp_path / name), "training__steps": 4} for name in ("whole", "stopped"))
     train(make_robot(**whole), type(reporter)())
 
     class Interrupts(type(reporter)):  # type: ignore[misc]
@@ -126,7 +128,7 @@ def test_what_it_learnt_is_a_base_that_the_same_robot_trains_on(
     folder = train(make_robot(training__steps=1, training__allow_weak_base=True, **second), again)
     assert not any("initialised anew" in note for note in again.notes)
     assert any("state encoder: the base's own" in note for note in again.notes)
-    evaluation = evaluate_subject(str(folder), EvaluationOptions(split="validation", clips=4)).evaluation
+    evaluation = evaluate_subject(str(folder), QUICK).evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     results = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), clips=4).results
     assert [one.moved_cm for one in results] == [None, None]
@@ -158,7 +160,7 @@ def test_vectors_as_wide_as_poses_keep_the_heads_and_must_prove_themselves(
         train(make_robot(widths, adapter__modules_to_save=[]), reporter)
     assert [note for note in reporter.notes if "encoder: the base's own" in note]
     folder = train(make_robot(widths, training__allow_weak_base=True, training__steps=1), reporter)
-    evaluation = evaluate_subject(str(folder), EvaluationOptions(split="validation", clips=4)).evaluation
+    evaluation = evaluate_subject(str(folder), QUICK).evaluation
     assert list(evaluation.models) == ["base", "adapter"]
     assert export_run(folder, tmp_path / "official.pt", "official").path.is_file()
 
@@ -172,7 +174,7 @@ def test_a_model_of_one_robot_is_not_measured_on_another(make_robot: MakeConfig,
     changed["data"]["path"] = str(tmp_path / "other")
     path.write_text(yaml.safe_dump(changed))
     with pytest.raises(InputError, match=r"states of 8 and actions of 8 numbers\. needed: 14 and 14") as caught:
-        evaluate_subject(str(folder), EvaluationOptions(split="validation", clips=4))
+        evaluate_subject(str(folder), QUICK)
     assert str(folder) in str(caught.value)
 
 

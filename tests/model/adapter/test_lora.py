@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from model_fixtures import tiny_inputs, tiny_model
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import add_adapter, has_adapter, load_trained, save_trained, trainable_report
@@ -58,6 +59,22 @@ def train(model: WorldModel, inputs, steps: int = 3) -> None:
         (predicted - inputs.latents[:, 1:]).abs().mean().backward()
         optimizer.step()
     model.eval()
+
+
+@pytest.fixture(scope="module")
+def trained() -> Callable[..., WorldModel]:
+    """Return a model of one's own that was adapted and trained: a copy of what is trained once for each kind."""
+    made: dict[tuple[str, torch.dtype], WorldModel] = {}
+
+    def make(config: AdapterConfig, dtype: torch.dtype = torch.float32) -> WorldModel:
+        kind = config.model_dump_json(), dtype
+        if kind not in made:
+            made[kind] = tiny_model(dtype=dtype)
+            add_adapter(made[kind], config, seed=0)
+            train(made[kind], tiny_inputs())
+        return copy.deepcopy(made[kind])
+
+    return make
 
 
 def copies(model: WorldModel) -> dict[str, Tensor]:
@@ -252,13 +269,11 @@ def test_the_report_counts_whatever_is_trained(model: WorldModel, method: str, e
 @both_types
 @both_kinds
 def test_switched_off_it_is_the_base_and_switched_on_what_it_was(
-    fresh: Fresh, inputs, config: AdapterConfig, dtype: torch.dtype
+    fresh: Fresh, trained: Fresh, inputs, config: AdapterConfig, dtype: torch.dtype
 ) -> None:
-    model = fresh(dtype=dtype)
+    model = trained(config, dtype)
     base = predict(fresh(dtype=torch.float32 if config.kind == "none" else dtype), inputs)
-    add_adapter(model, config, seed=0)
-    train(model, inputs)
-    before, adapted, trained = copies(model), predict(model, inputs), trainable_report(model).trained
+    before, adapted, count = copies(model), predict(model, inputs), trainable_report(model).trained
     with base_only(model):
         switched_off = predict(model, inputs)
     rounding = 0.05 if (config.kind, dtype) == ("none", torch.bfloat16) else 0  # float32 arithmetic on rounded weights
@@ -266,7 +281,7 @@ def test_switched_off_it_is_the_base_and_switched_on_what_it_was(
     assert not torch.allclose(adapted, base, atol=0.05)
     assert torch.equal(predict(model, inputs), adapted)
     assert all(torch.equal(value, before[name]) for name, value in model.named_parameters())
-    assert trainable_report(model).trained == trained
+    assert trainable_report(model).trained == count
 
 
 def test_a_model_that_was_not_adapted_is_its_own_base(model: WorldModel, inputs) -> None:
@@ -288,11 +303,9 @@ def test_looking_at_the_base_does_not_thaw_a_frozen_adapter(fresh: Fresh, tmp_pa
 @both_types
 @both_kinds
 def test_saved_and_loaded_it_is_the_same(
-    fresh: Fresh, inputs, tmp_path: Path, config: AdapterConfig, dtype: torch.dtype
+    fresh: Fresh, trained: Fresh, inputs, tmp_path: Path, config: AdapterConfig, dtype: torch.dtype
 ) -> None:
-    model, other = fresh(dtype=dtype), fresh(dtype=dtype)
-    add_adapter(model, config, seed=0)
-    train(model, inputs)
+    model, other = trained(config, dtype), fresh(dtype=dtype)
     save_trained(model, tmp_path)
     load_trained(other, tmp_path)
     assert torch.equal(predict(other, inputs), predict(model, inputs))
@@ -310,11 +323,9 @@ def test_a_loaded_adapter_predicts_without_dropout(fresh: Fresh, inputs, tmp_pat
 
 @both_kinds
 def test_loaded_into_the_adapter_that_is_on_it_is_not_wrapped_twice(
-    fresh: Fresh, inputs, tmp_path: Path, config: AdapterConfig
+    fresh: Fresh, trained: Fresh, inputs, tmp_path: Path, config: AdapterConfig
 ) -> None:
-    model, resumed = fresh(), fresh()
-    add_adapter(model, config, seed=0)
-    train(model, inputs)
+    model, resumed = trained(config), fresh()
     save_trained(model, tmp_path)
     add_adapter(resumed, config, seed=1)
     names = [name for name, _ in resumed.named_parameters()]
@@ -339,11 +350,9 @@ def test_an_adapter_fits_its_base_in_another_type(fresh: Fresh, inputs, tmp_path
 @both_types
 @both_kinds
 def test_merged_it_predicts_the_same_and_is_a_plain_model_again(
-    fresh: Fresh, inputs, tmp_path: Path, config: AdapterConfig, dtype: torch.dtype
+    trained: Fresh, inputs, tmp_path: Path, config: AdapterConfig, dtype: torch.dtype
 ) -> None:
-    model = fresh(dtype=dtype)
-    add_adapter(model, config, seed=0)
-    train(model, inputs)
+    model = trained(config, dtype)
     adapted = predict(model, inputs)
     merge_adapter(model)
     rounding = 1e-5 if dtype == torch.float32 else 0.15
@@ -367,11 +376,8 @@ def test_merging_in_bfloat16_rounds_once(fresh: Fresh, inputs) -> None:
 
 
 @both_kinds
-def test_merging_under_autocast_is_merging(fresh: Fresh, inputs, config: AdapterConfig) -> None:
-    model = fresh()
-    add_adapter(model, config, seed=0)
-    train(model, inputs)
-    other = copy.deepcopy(model)
+def test_merging_under_autocast_is_merging(trained: Fresh, config: AdapterConfig) -> None:
+    model, other = trained(config), trained(config)
     merge_adapter(model)
     with torch.autocast("cpu", torch.bfloat16):
         merge_adapter(other)
@@ -393,10 +399,11 @@ def test_a_model_is_adapted_once(model: WorldModel) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of the libraries' own loaders
 @every_method
-def test_plain_peft_loads_it_on_the_predictor(model: WorldModel, inputs, tmp_path: Path, config: AdapterConfig) -> None:
-    model.save_pretrained(tmp_path / "base")
-    add_adapter(model, config, seed=0)
-    train(model, inputs)
+def test_plain_peft_loads_it_on_the_predictor(
+    fresh: Fresh, trained: Fresh, inputs, tmp_path: Path, config: AdapterConfig
+) -> None:
+    fresh().save_pretrained(tmp_path / "base")
+    model = trained(config)
     save_trained(model, tmp_path / "adapter")
     predictor = ActionConditionedPredictor.from_pretrained(tmp_path / "base" / "predictor")
     plain = peft.PeftModel.from_pretrained(predictor, str(tmp_path / "adapter"))

@@ -42,18 +42,6 @@ def _signals_are_not_ignored():
     signal.signal(signal.SIGTERM, before)
 
 
-@pytest.fixture
-def whole(make_config: MakeConfig, reporter, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run that nobody stopped: the same one for all tests."""
-    if not _whole:
-        folder = tmp_path_factory.mktemp("whole") / "run"
-        _whole.append(train(make_config(run_dir=str(folder)), type(reporter)()))
-    return _whole[0]
-
-
-_whole: list[Path] = []
-
-
 def mirrored(make_config: MakeConfig, tmp_path: Path, machine: str, **changes: object) -> Config:
     return make_config(
         run_dir=str(tmp_path / machine), checkpoint__remote=PLACE, checkpoint__remote_every_minutes=0.0, **changes
@@ -84,22 +72,22 @@ def stop_after(step: int, config: Config, reporter) -> None:
 
 
 def test_after_preemption_a_fresh_machine_goes_on_as_if_nothing_had_happened(
-    make_config: MakeConfig, reporter, tmp_path: Path, whole: Path
+    make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path
 ) -> None:
     stop_after(3, mirrored(make_config, tmp_path, "one"), reporter)
     assert there()[-1] == checkpoint_name(3), "sent before the process ends"
     shutil.rmtree(tmp_path / "one")
     train(mirrored(make_config, tmp_path, "two"), reporter)
     assert reporter.steps == [4, 5, 6]
-    assert_same_run(whole, tmp_path / "two")
+    assert_same_run(whole_run, tmp_path / "two")
     assert there()[-1] == checkpoint_name(6)
     train(mirrored(make_config, tmp_path, "three"), reporter)
     assert reporter.steps == [4, 5, 6], "a run that is done is done everywhere"
-    assert_same_run(whole, tmp_path / "three")
+    assert_same_run(whole_run, tmp_path / "three")
 
 
 def test_a_machine_killed_while_sending_leaves_the_last_complete_checkpoint_to_the_next(
-    make_config: MakeConfig, reporter, tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch
+    make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     second_is_there, fourth_is_on_its_way, dead = threading.Event(), threading.Event(), threading.Event()
 
@@ -127,11 +115,11 @@ def test_a_machine_killed_while_sending_leaves_the_last_complete_checkpoint_to_t
     assert there() == [checkpoint_name(2)]
     train(mirrored(make_config, tmp_path, "two", checkpoint__keep_best=False), reporter)
     assert reporter.steps == [3, 4, 5, 6]
-    assert_same_run(whole, tmp_path / "two")
+    assert_same_run(whole_run, tmp_path / "two")
 
 
 def test_a_damaged_checkpoint_there_costs_the_steps_after_the_one_before(
-    gcs: Gcs, make_config: MakeConfig, reporter, tmp_path: Path, whole: Path, caplog: pytest.LogCaptureFixture
+    gcs: Gcs, make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     stop_after(3, mirrored(make_config, tmp_path, "one", checkpoint__keep_best=False), reporter)
     stop_after(5, mirrored(make_config, tmp_path, "one", checkpoint__keep_best=False), reporter)
@@ -139,17 +127,17 @@ def test_a_damaged_checkpoint_there_costs_the_steps_after_the_one_before(
     train(mirrored(make_config, tmp_path, "two", checkpoint__keep_best=False), reporter)
     assert reporter.steps[0] in {4, 5}  # 4, too, may have been sent
     assert f"{checkpoint_name(5)}: optimizer.pt is damaged" in caplog.text
-    assert_same_run(whole, tmp_path / "two")
+    assert_same_run(whole_run, tmp_path / "two")
 
 
 def test_a_place_that_is_down_for_the_whole_run_costs_warnings_and_no_step(
-    gcs: Gcs, make_config: MakeConfig, reporter, tmp_path: Path, whole: Path, caplog: pytest.LogCaptureFixture
+    gcs: Gcs, make_config: MakeConfig, reporter, tmp_path: Path, whole_run: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     gcs.fail_next(503, times=10_000)
     caplog.clear()
     train(mirrored(make_config, tmp_path, "one"), reporter)
     assert reporter.steps == [1, 2, 3, 4, 5, 6]
-    assert_same_run(whole, tmp_path / "one")
+    assert_same_run(whole_run, tmp_path / "one")
     warnings = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
     assert len(warnings) == 2
     assert "HTTP 503" in warnings[0]

@@ -24,6 +24,7 @@ _DASHES = ("-", "--", ":")  # after all colours
 # What people call things is shown as it is: a dollar sign begins no formula.
 _STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False}
 _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
+_SHAPE = 1.3  # width over height of what there is for the filmstrip
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
@@ -107,25 +108,37 @@ def _reach(value: Estimate) -> tuple[float, float]:
 
 
 def _filmstrip(figure: Any, example: Example, seconds_per_step: float) -> None:
-    """Draw one clip: the first frame and some later ones, and below each the error map of a prediction."""
+    """Draw one clip: the first frame and some later ones, and below each the error map of a prediction.
+
+    All tiles, each of size 1, lie in one pair of axes: drawing so many axes would take longer than all else.
+    """
     horizons = np.unique(np.linspace(1, len(example.true_colours) - 1, num=4).round().astype(int))
-    grid = figure.subplots(1 + len(example.errors), 1 + len(horizons), squeeze=False)
-    figure.suptitle("One held-out clip, and the error of each patch (brighter is worse)", x=0.02, ha="left", fontsize=9)
+    columns, rows = 1 + len(horizons), 1 + len(example.errors)
+    right, down = max(1.06, 1.1 * _SHAPE * rows / columns), max(1.1, 1.06 * columns / rows / _SHAPE)  # to the next tile
+    frames = example.true_colours if example.frames is None else example.frames
     largest = max(float(errors.max()) for errors in example.errors.values())
-    for axes in grid.ravel():
-        axes.set_axis_off()
+    figure.suptitle("One held-out clip, and the error of each patch (brighter is worse)", x=0.02, ha="left", fontsize=9)
+    axes = figure.subplots()
     for column, time in enumerate([0, *horizons]):
-        grid[0][column].imshow(example.true_colours[time] if example.frames is None else example.frames[time])
-        grid[0][column].set_title("now" if time == 0 else f"+{time * seconds_per_step:.2f} s", fontsize=8)
+        axes.imshow(frames[time], extent=_tile(right * column, 0.0))
+        title = "now" if time == 0 else f"+{time * seconds_per_step:.2f} s"
+        axes.text(right * column + 0.5, -0.08, title, ha="center", fontsize=8)
     for row, (name, errors) in enumerate(example.errors.items(), start=1):
-        grid[row][0].text(0.5, 0.5, f"{name}\nerror", ha="center", va="center", transform=grid[row][0].transAxes)
+        axes.text(0.5, down * row + 0.5, f"{name}\nerror", ha="center", va="center")
         for column, time in enumerate(horizons, start=1):
-            frame = example.true_colours[time] if example.frames is None else example.frames[time]
-            _overlay(grid[row][column], frame, errors[time - 1], largest)
+            _overlay(axes, _tile(right * column, down * row), frames[time], errors[time - 1], largest)
+    axes.set_axis_off()
+    side = (right - 1) / 2
+    axes.set(xlim=(-side, right * columns - side), ylim=(down * (rows - 1) + 1, -0.3))
 
 
-def _overlay(axes: Any, frame: UInt8[np.ndarray, "size size 3"], errors: Any, largest: float) -> None:
-    size = len(frame)
-    axes.imshow(frame.mean(axis=-1), cmap="gray", vmin=-100, vmax=255)
-    axes.imshow(errors, cmap="inferno", vmin=0, vmax=largest, alpha=0.65, extent=(0, size, size, 0))
-    axes.set(xlim=(0, size), ylim=(size, 0))
+def _tile(left: float, top: float) -> tuple[float, float, float, float]:
+    """Return where a tile lies: left, right, bottom, top."""
+    return left, left + 1, top + 1, top
+
+
+def _overlay(
+    axes: Any, place: tuple[float, ...], frame: UInt8[np.ndarray, "size size 3"], errors: Any, largest: float
+) -> None:
+    axes.imshow(frame.mean(axis=-1), cmap="gray", vmin=-100, vmax=255, extent=place)
+    axes.imshow(errors, cmap="inferno", vmin=0, vmax=largest, alpha=0.65, extent=place)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any
 
 import yaml
@@ -40,7 +41,7 @@ def parse_yaml(text: str, *, where: str) -> Any:
         InputError: It is not YAML, or not within the bounds; names line and column.
     """
     try:
-        node = _Composed(text).get_single_node()
+        node = _composed(text)
         return None if node is None else _Values().of(node)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -53,6 +54,12 @@ def parse_yaml(text: str, *, where: str) -> Any:
         place = f"{where}: line {text.count(chr(10), 0, error.position) + 1}"
         found = f"not YAML: the control character {chr(error.character)!r}"
         raise InputError(where=place, found=found, needed="text") from None
+
+
+@lru_cache(maxsize=4)
+def _composed(text: str) -> Node | None:
+    """Return a document as nodes, which nobody changes: a command reads the config of its run several times."""
+    return _Composed(text).get_single_node()
 
 
 class _Composed(Reader, Scanner, Parser, Composer, BaseResolver):
