@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vjepa2_ac.data.clips.transforms import pixels_to_input
+from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.metrics import Predictor
 from vjepa2_ac.evaluation.result import Errors, Example
@@ -71,7 +72,7 @@ def make_example(
     nothing = true[:1].expand_as(true[1:])
 
     def errors(values: Tensor) -> Float[np.ndarray, "horizon grid grid"]:
-        of_patch = (values - true[1:]).abs().mean(dim=-1)
+        of_patch = absolute_difference(values, true[1:]).mean(dim=-1)
         return rearrange(of_patch, "horizon (h w) -> horizon h w", h=grid).numpy()
 
     colours = Colours(true)
