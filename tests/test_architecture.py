@@ -45,8 +45,9 @@ ORDERS: dict[str, list[str]] = {
     ],
     "evaluation": [
         "intervals",
+        "metrics",
         "result",
-        "estimates metrics strata",
+        "estimates measure strata",
         "action_use",
         "action_score",
         "request",

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.metrics import Predictor
+from vjepa2_ac.evaluation.measure import Predictor
 
 
 @dataclass(frozen=True)
