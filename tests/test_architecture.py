@@ -16,7 +16,7 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 # A room imports only what stands before it; those in one line do not know each other. A folder has its own order.
 ORDERS: dict[str, list[str]] = {
     "": [
-        "__init__ errors places output episode geometry",
+        "__init__ errors places output episode geometry distances",
         "storage",
         "config",
         "media",
@@ -45,8 +45,9 @@ ORDERS: dict[str, list[str]] = {
     ],
     "evaluation": [
         "intervals",
+        "metrics",
         "result",
-        "estimates metrics strata",
+        "estimates measure strata",
         "action_use",
         "action_score",
         "request",

@@ -7,7 +7,7 @@ import subprocess
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -21,7 +21,8 @@ from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.clips.loader import validation_batches
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
-from vjepa2_ac.evaluation.metrics import PredictionErrors, prediction_errors
+from vjepa2_ac.evaluation.measure import prediction_errors
+from vjepa2_ac.evaluation.result import PredictionErrors, Way
 from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -156,10 +157,7 @@ def _forgetting(model: WorldModel, folder: Path, config: Config) -> dict[str, An
     with base_only(model):
         off = held_out(model, config)
     base = held_out(load_base(config.model, seed=0), config)
-    same = all(
-        np.array_equal(getattr(off, name), getattr(base, name))
-        for name in ("rollout", "one_step", "one_step_zero_actions")
-    )
+    same = all(np.array_equal(off.arrays[kind], base.arrays[kind]) for kind in base.arrays)
     return {"on": _as_dict(on), "off": _as_dict(off), "off_is_base_bit_for_bit": same}
 
 
@@ -177,12 +175,13 @@ def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
 
 def _as_dict(errors: PredictionErrors) -> dict[str, Any]:
     """Return ratios to persistence, and the sums by episode that intervals are made of."""
-    nothing = errors.one_step_persistence.sum()
+    one_step = {way: errors.of("teacher_forced", way=way).mean(axis=1).sum() for way in get_args(Way)}
+    rolled, nothing = (errors.of("rollout", way=way).sum(axis=0) for way in ("true", "persistence"))
     return {
-        "rollout_over_persistence": (errors.rollout.sum(axis=0) / errors.persistence.sum(axis=0)).tolist(),
-        "one_step": float(errors.one_step.sum() / nothing),
-        "one_step_zero_actions": float(errors.one_step_zero_actions.sum() / nothing),
-        "one_step_shuffled_actions": float(errors.one_step_shuffled_actions.sum() / nothing),
+        "rollout_over_persistence": (rolled / nothing).tolist(),
+        "one_step": float(one_step["true"] / one_step["persistence"]),
+        "one_step_zero_actions": float(one_step["zero"] / one_step["persistence"]),
+        "one_step_shuffled_actions": float(one_step["shuffled"] / one_step["persistence"]),
         "clips": len(errors.episode_ids),
         "episodes": len(set(errors.episode_ids)),
     }

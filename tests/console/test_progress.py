@@ -17,7 +17,8 @@ from vjepa2_ac.console import progress as console_module
 from vjepa2_ac.console.progress import ProgressBar
 from vjepa2_ac.console.training import ConsoleReporter
 from vjepa2_ac.data.inspection.finding import Finding
-from vjepa2_ac.evaluation.metrics import PredictionErrors
+from vjepa2_ac.evaluation.measure import VALIDATED
+from vjepa2_ac.evaluation.result import PredictionErrors
 
 PACKAGE = Path(vjepa2_ac.__file__).parent
 FIGURES = {"loss": 0.51234, "samples_per_second": 1.5, "data_wait_share": 0.1}
@@ -36,10 +37,9 @@ def shown_on(monkeypatch: pytest.MonkeyPatch, *, terminal: bool) -> io.StringIO:
 
 def errors() -> PredictionErrors:
     ones = np.ones((4, 3))
-    return PredictionErrors(
-        rollout=ones * 0.5, persistence=ones, one_step=ones[:, 0] * 0.25, one_step_zero_actions=ones[:, 0],
-        one_step_shuffled_actions=ones[:, 0], one_step_persistence=ones[:, 0], episode_ids=("a", "b", "c", "d"),
-    )  # fmt: skip
+    better = {("true", "rollout"): 0.5, ("true", "teacher_forced"): 0.25}
+    arrays = {(way, mode, "l1"): ones * better.get((way, mode), 1.0) for way, mode in VALIDATED}
+    return PredictionErrors(("a", "b", "c", "d"), arrays)
 
 
 def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,7 +58,7 @@ def evaluations() -> list[Table]:
 
 
 def comparisons() -> list[Table]:
-    columns = ("4.00 s ahead", "gain over first", "gain over its base", "one step", "shuffled", "rank", "Action Score")
+    columns = ("4.00 s ahead", "gain over first", "gain over its base", "one step", "shuffled", "rank", "4.00 s, L2")
     rows = {name: (SHARE,) * len(columns) for name in ("first", "a/run/with/a/name/that/does/not/end/anywhere/near")}
     return [comparison_table(Comparison("L1 error over persistence", columns, rows, np.arange(1.0), {}, ()))]
 

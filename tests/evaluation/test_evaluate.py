@@ -21,8 +21,9 @@ from vjepa2_ac.evaluation.estimates import (
 )
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
 from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.evaluation.metrics import L2, METRICS
 from vjepa2_ac.evaluation.request import ProbeOptions
-from vjepa2_ac.evaluation.result import METRICS, MODES, Errors, Evaluation, Predicted, Stratum
+from vjepa2_ac.evaluation.result import MODES, Evaluation, PredictionErrors, Stratum
 from vjepa2_ac.evaluation.verdict import improvement, uses_actions, verdict
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, about, again, clips_batch
@@ -37,6 +38,10 @@ def evaluated(trained: object, base: object | None = None, *, size: int = 4, **c
     return evaluate(contenders, again(batch, size), about(**changes), probes=PROBES)
 
 
+def pair_of(found: Evaluation) -> tuple[PredictionErrors, PredictionErrors]:
+    return found.models["adapter"].errors, found.models["base"].errors
+
+
 @pytest.fixture(scope="module")
 def oracle() -> Evaluation:
     return evaluated(Oracle(), Copier())
@@ -45,9 +50,9 @@ def oracle() -> Evaluation:
 def test_a_perfect_predictor_scores_zero_in_every_metric(oracle: Evaluation) -> None:
     for mode in MODES:
         for metric in METRICS:
-            for one in over_persistence(oracle, "adapter", mode, metric):
+            for one in over_persistence(oracle.models["adapter"].errors, mode, metric):
                 assert one.value == pytest.approx(0.0, abs=1e-5)
-    assert [one.value for one in gain_over(oracle, "adapter", "base")] == pytest.approx([1.0] * (TIME - 1))
+    assert [one.value for one in gain_over(*pair_of(oracle))] == pytest.approx([1.0] * (TIME - 1))
     assert "100% better than the base" in verdict(oracle)
     assert uses_actions(oracle)
 
@@ -55,7 +60,7 @@ def test_a_perfect_predictor_scores_zero_in_every_metric(oracle: Evaluation) -> 
 def test_persistence_scores_exactly_one_relative_to_itself_in_every_metric(oracle: Evaluation) -> None:
     for mode in MODES:
         for metric in METRICS:
-            assert {(r.value, r.low, r.high) for r in over_persistence(oracle, "base", mode, metric)} == {
+            assert {(r.value, r.low, r.high) for r in over_persistence(oracle.models["base"].errors, mode, metric)} == {
                 (1.0, 1.0, 1.0)
             }
 
@@ -70,7 +75,7 @@ def test_a_model_that_ignores_actions_has_no_sensitivity_and_the_rank_of_chance(
         assert {k: share.value for k, share in ranking.top.items()} == pytest.approx(
             {k: ranking.chance_of_top(k) for k in ranking.top}
         )
-    assert gap_of_actions(found, "adapter", "shuffled") == Estimate(0.0, 0.0, 0.0)
+    assert gap_of_actions(found.models["adapter"].errors, "shuffled") == Estimate(0.0, 0.0, 0.0)
     assert not uses_actions(found)
     assert "does NOT clearly use the actions" in verdict(found)
 
@@ -85,12 +90,13 @@ def test_an_oracle_ranks_the_true_action_first(oracle: Evaluation) -> None:
 
 def test_a_difference_is_what_is_computed_by_hand() -> None:
     found = evaluated(Halfway(), Copier())
-    assert [one.value for one in over_persistence(found, "adapter", "teacher_forced")] == pytest.approx([0.5] * 4)
-    assert [one.value for one in over_persistence(found, "adapter", "rollout", "l2")] == pytest.approx([0.25] * 4)
-    gains = gain_over(found, "adapter", "base")
+    errors, base = pair_of(found)
+    assert [one.value for one in over_persistence(errors, "teacher_forced")] == pytest.approx([0.5] * 4)
+    assert [one.value for one in over_persistence(errors, "rollout", L2)] == pytest.approx([0.25] * 4)
+    gains = gain_over(errors, base)
     assert [(one.low, one.value, one.high) for one in gains] == [pytest.approx((0.5, 0.5, 0.5))] * 4
-    differences = difference_to(found, "adapter", "base", "teacher_forced")
-    nothing = mean_error(found, "persistence", "teacher_forced")
+    differences = difference_to(errors, base, "teacher_forced")
+    nothing = mean_error(errors, "teacher_forced", way="persistence")
     assert [one.value for one in differences] == pytest.approx([-one.value / 2 for one in nothing])
     last = improvement(found, 4)
     assert last is not None
@@ -98,26 +104,26 @@ def test_a_difference_is_what_is_computed_by_hand() -> None:
 
 
 def test_wrong_actions_give_the_errors_that_they_give(oracle: Evaluation) -> None:
-    zero = over_persistence(oracle, "adapter", "teacher_forced", actions="zero")
+    errors = oracle.models["adapter"].errors
+    zero = over_persistence(errors, "teacher_forced", way="zero")
     assert [one.value for one in zero] == pytest.approx([1.0] * (TIME - 1), rel=1e-5), "nothing done, nothing moves"
     batch = clips_batch()
     others = batch.actions[[1, *range(11)]]
     expected = (others - batch.actions)[..., :DIM].abs().mean(dim=(0, 2)) * 100
-    shuffled = mean_error(oracle, "adapter", "teacher_forced", actions="shuffled")
+    shuffled = mean_error(errors, "teacher_forced", way="shuffled")
     assert [one.value for one in shuffled] == pytest.approx(expected.tolist(), rel=1e-4)
 
 
 def test_a_part_counts_its_own_steps_only(oracle: Evaluation) -> None:
     first = np.zeros((12, TIME - 1), bool)
     first[:, 0] = True
-    nothing = oracle.persistence.teacher_forced.l1
+    errors, base = pair_of(oracle)
+    nothing = errors.of("teacher_forced", way="persistence")
     made_up = np.where(first, 2 * nothing, nothing / 4)
-    errors = Errors(made_up, made_up, made_up)
-    model = replace(oracle.models["adapter"], true=Predicted(errors, errors))
-    changed = replace(oracle, models={**oracle.models, "adapter": model})
+    errors = replace(errors, arrays={**errors.arrays, ("true", "teacher_forced", "l1"): made_up})
     for part, value in ((Stratum("first", "motion", first), 2.0), (Stratum("rest", "motion", ~first), 0.25)):
-        assert stratum_over_persistence(changed, part, "adapter").value == pytest.approx(value)
-        assert stratum_gain(changed, part, "adapter", "base").value == pytest.approx(1 - value)
+        assert stratum_over_persistence(errors, part).value == pytest.approx(value)
+        assert stratum_gain(errors, base, part).value == pytest.approx(1 - value)
 
 
 def test_figures_depend_on_neither_the_size_of_a_batch_nor_on_what_is_measured_beside(oracle: Evaluation) -> None:
@@ -168,8 +174,8 @@ def test_steps_are_split_by_motion_and_size_and_each_is_in_one_part_of_each_kind
     idle = next(part for part in found.strata if part.name == "idle")
     assert idle.steps[:, :2].all()
     moving = next(part for part in found.strata if part.name == "moving")
-    assert stratum_over_persistence(found, moving, "adapter").value == pytest.approx(0.5, abs=1e-3)
-    assert stratum_gain(found, moving, "adapter", "base").value == pytest.approx(0.5, abs=1e-3)
+    assert stratum_over_persistence(found.models["adapter"].errors, moving).value == pytest.approx(0.5, abs=1e-3)
+    assert stratum_gain(*pair_of(found), moving).value == pytest.approx(0.5, abs=1e-3)
     sizes = [found.clips.action_size[part.steps] for part in found.strata if part.kind == "action size"]
     assert all(small.max() <= large.min() for small, large in pairwise(sizes))
 
@@ -264,5 +270,5 @@ def test_nothing_but_errors_is_measured_where_nothing_else_is_asked_for() -> Non
     assert found.models["model"].sensitivity is None
     assert found.models["model"].landscapes is None
     assert found.examples == ()
-    assert one_step_over_persistence(found, "model").value == pytest.approx(0.0, abs=1e-5)
+    assert one_step_over_persistence(found.models["model"].errors).value == pytest.approx(0.0, abs=1e-5)
     assert (TOKENS, DIM) == (4, 6)

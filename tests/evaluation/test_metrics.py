@@ -1,85 +1,105 @@
-"""Errors equal those computed by hand; shuffled actions are those of the clip before, for any batch size."""
+"""A metric that joins the list appears in every output; whether more of it is better is known there."""
 
-import numpy as np
+import json
+from pathlib import Path
+
 import pytest
-import torch
 
-from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.metrics import (
-    distances,
-    measured,
-    one_step_ratios,
-    persistence_of,
-    prediction_errors,
-    ratios_by_horizon,
-    with_other_actions,
-)
-from worlds import TIME, Copier, Oracle, clips_batch, in_batches, rows
+from vjepa2_ac.console.evaluation import comparison_table, evaluation_tables
+from vjepa2_ac.console.progress import PlainConsole
+from vjepa2_ac.evaluation import metrics as the_list
+from vjepa2_ac.evaluation.evaluate import Contender, evaluate
+from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
+from vjepa2_ac.evaluation.request import ProbeOptions
+from vjepa2_ac.evaluation.result import MODES, Evaluation
+from vjepa2_ac.evaluation.verdict import verdict
+from vjepa2_ac.reports.comparison import compare
+from vjepa2_ac.reports.html.page import report_page
+from vjepa2_ac.reports.metrics_json import METRICS_FILE, metrics_as_dict, read_metrics, write_metrics
+from worlds import Copier, Halfway, Oracle, about, again, clips_batch
 
-
-def test_an_oracle_scores_zero_and_needs_the_true_actions() -> None:
-    errors = prediction_errors(Oracle(), in_batches(clips_batch(), 4))
-    assert [r.value for r in ratios_by_horizon(errors)] == pytest.approx([0.0] * (TIME - 1), abs=1e-6)
-    one_step = one_step_ratios(errors)
-    assert one_step["true"].value == pytest.approx(0.0, abs=1e-6)
-    assert one_step["zero"].value == pytest.approx(1.0, rel=1e-6)
-    assert one_step["shuffled"].value > 0.8
+LARGER = Metric("agreement", "agreement", "1 / (1 + L1)", lambda *pair: 1 / (1 + L1.of(*pair)), smaller_is_better=False)
+SMALLER = Metric("height", "height", "1 / (1 + L1), taken for an error", LARGER.of)
+PROBES = ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0)
 
 
-def test_persistence_is_exactly_one_relative_to_itself_and_blind_to_actions() -> None:
-    errors = prediction_errors(Copier(), in_batches(clips_batch(), 4))
-    assert all((r.value, r.low, r.high) == (1.0, 1.0, 1.0) for r in ratios_by_horizon(errors))
-    assert {r.value for r in one_step_ratios(errors).values()} == {1.0}
+def evaluated(trained: object, base: object, *more: Metric) -> Evaluation:
+    contenders = [Contender("base", "base", base), Contender("adapter", "trained", trained)]  # type: ignore[arg-type]
+    return evaluate(contenders, again(clips_batch()), about(), metrics=(*METRICS, *more), probes=PROBES)
 
 
-def test_distances_equal_a_case_computed_by_hand() -> None:
-    predicted = torch.tensor([[[[1.0, 0.0], [0.0, 2.0]]]])
-    true = torch.tensor([[[[0.0, 1.0], [0.0, 1.0]]]])
-    found = distances(predicted, true)
-    assert found.l1.tolist() == [[(1 + 1 + 0 + 1) / 4]]
-    assert found.l2.tolist() == [[(1 + 1 + 0 + 1) / 4]]
-    assert found.cosine[0, 0] == pytest.approx((1 + 0) / 2), "at a right angle, and in line"
-    assert distances(predicted * 3, predicted).cosine[0, 0] == pytest.approx(0.0, abs=1e-6), "length does not matter"
-    assert distances(predicted * 3, predicted).l2.tolist() == [[(4 + 16) / 4]], "squared, no root"
+def shown(evaluation: Evaluation) -> str:
+    console = PlainConsole(width=200)
+    with console.capture() as capture:
+        console.print(*evaluation_tables(evaluation))
+    return capture.get()
 
 
-def test_errors_by_horizon_equal_a_case_computed_by_hand() -> None:
-    latents = torch.zeros(1, 3, 2, 2)
-    latents[0, 1] = 1.0
-    latents[0, 2] = torch.tensor([[3.0, 3.0], [5.0, 5.0]])
-    batch = LatentBatch(latents, torch.zeros(1, 3, 7), torch.zeros(1, 2, 7), None, ("e",), (0,))
-    found = measured(Copier(), batch, batch.actions)
-    assert found.rollout.l1.tolist() == [[1.0, 4.0]], "from the first frame"
-    assert found.teacher_forced.l1.tolist() == [[1.0, 3.0]], "from the frame before"
-    assert found.rollout.l2.tolist() == [[1.0, 17.0]]
-    nothing = persistence_of(batch)
-    assert nothing.rollout.l1.tolist() == found.rollout.l1.tolist()
-    assert nothing.teacher_forced.l2.tolist() == found.teacher_forced.l2.tolist()
-    errors = prediction_errors(Copier(), [batch])
-    assert errors.persistence.tolist() == [[1.0, 4.0]]
-    assert errors.one_step_persistence.tolist() == [(1.0 + 3.0) / 2]
-    assert errors.episode_ids == ("e",)
+def test_an_added_metric_appears_in_tables_report_json_verdict_and_comparison(tmp_path: Path) -> None:
+    found = evaluated(Halfway(), Copier(), LARGER)
+    assert "1.00 s, agreement (larger is better)" in shown(found)
+    html = report_page(found, verdict(found))
+    assert "Error over persistence, agreement (larger is better): 1 / (1 + L1)" in html
+    assert "agreement (larger is better) over persistence by horizon, open-loop rollout" in html
+    metrics = metrics_as_dict(found)
+    for mode in MODES:
+        of_one = metrics["models"]["adapter"][mode]["agreement"]
+        assert of_one.keys() == metrics["models"]["adapter"][mode]["l1"].keys()
+        assert all(gain["value"] > 0 for gain in of_one["gain_over_base"])
+        assert metrics["persistence"][mode]["agreement"][0]["value"] > 0
+    for name, one in (("with", found), ("without", evaluated(Halfway(), Copier()))):
+        (tmp_path / name).mkdir()
+        write_metrics(one, tmp_path / name / METRICS_FILE)
+    both = compare([tmp_path / "with", tmp_path / "without"], found.metrics)
+    column = both.columns.index("1.00 s, agreement (larger is better)")
+    with_it, without = (row[column] for row in both.rows.values())
+    assert isinstance(with_it, Estimate)
+    assert with_it.value > 1
+    assert without == ""
+    assert comparison_table(both).row_count == 2
+    assert [both.rows[name][both.columns.index("1.00 s, L2")].value for name in both.rows] == pytest.approx([0.25] * 2)  # type: ignore[union-attr]
 
 
-@pytest.mark.parametrize("size", [1, 3, 12])
-def test_other_actions_are_those_of_the_clip_before_whatever_the_batch(size: int) -> None:
-    batch = clips_batch()
-    others = torch.cat([tried for _, tried in with_other_actions(in_batches(batch, size))])
-    assert torch.equal(others, batch.actions[[1, *range(11)]]), "the first clip has those of the second"
+def test_more_is_better_where_a_metric_says_so() -> None:
+    better, worse = (evaluated(*pair, LARGER) for pair in ((Oracle(), Halfway()), (Copier(), Halfway())))
+    assert "another matter" not in verdict(better), "it agrees with L1"
+    assert "another matter" not in verdict(worse)
+    mistaken = verdict(evaluated(Oracle(), Halfway(), SMALLER))
+    assert "By height it is another matter: " in mistaken
+    assert "WORSE than the base (gain" in mistaken
+    assert "): NOT better." in mistaken
+    both = verdict(evaluated(Oracle(), Halfway(), SMALLER, Metric("h", "twin", "", SMALLER.of)))
+    assert "By height and twin it is another matter: " in both
 
 
-def test_a_clip_alone_gets_its_own_actions_backwards() -> None:
-    batch = rows(clips_batch(), [0])
-    [(_, others)] = list(with_other_actions([batch]))
-    assert torch.equal(others, batch.actions.flip(1))
+def test_a_ratio_is_on_the_side_that_the_metric_says() -> None:
+    low, high, unclear = Estimate(0.5, 0.4, 0.6), Estimate(1.5, 1.4, 1.6), Estimate(1.0, 0.9, 1.1)
+    assert [L1.side(one) for one in (low, high, unclear)] == [1, -1, 0]
+    assert [LARGER.side(one) for one in (low, high, unclear)] == [-1, 1, 0]
 
 
-def test_figures_do_not_depend_on_the_batch_size() -> None:
-    small, large = (prediction_errors(Oracle(), in_batches(clips_batch(), size)) for size in (1, 12))
-    for name in ("rollout", "persistence", "one_step", "one_step_zero_actions", "one_step_shuffled_actions"):
-        np.testing.assert_allclose(getattr(small, name), getattr(large, name), atol=1e-6)
+def test_the_list_is_what_is_measured_and_nothing_else() -> None:
+    found = evaluated(Halfway(), Copier())
+    names = [metric.name for metric in the_list.METRICS]
+    assert names[0] == "l1", "curves and the verdict are of this one"
+    assert len(set(names)) == len(names)
+    metrics = metrics_as_dict(found)
+    assert list(metrics["persistence"]["rollout"]) == list(metrics["models"]["adapter"]["rollout"]) == names
+    everything = json.dumps(metrics) + report_page(found, verdict(found)) + shown(found)
+    assert "cosine" not in everything.lower()
 
 
-def test_no_clips_are_an_error() -> None:
-    with pytest.raises(ValueError, match="no clips"):
-        prediction_errors(Copier(), [])
+def test_files_of_versions_that_measured_cosine_are_compared(tmp_path: Path) -> None:
+    for name in ("old", "new"):
+        (tmp_path / name).mkdir()
+        write_metrics(evaluated(Halfway(), Copier()), tmp_path / name / METRICS_FILE)
+    old = read_metrics(tmp_path / "old") | {"format": 1}
+    for part in (old["persistence"], *old["models"].values()):
+        for mode in MODES:
+            part[mode]["cosine"] = part[mode]["l2"]
+    (tmp_path / "old" / METRICS_FILE).write_text(json.dumps(old))
+    found = compare([tmp_path / "old", tmp_path / "new"])
+    (ahead, _, *one), (same, _, *other) = found.rows.values()  # but for the gain over the first run
+    assert (ahead, *one) == (same, *other)
+    assert not [column for column in found.columns if "cosine" in column]

@@ -329,7 +329,7 @@ def weights_of(run: Path, step: int) -> dict[str, Tensor]:
     return load_file(run / "checkpoints" / checkpoint_name(step) / "adapter" / "adapter_model.safetensors")
 
 
-@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"format": 2}', '{"format": 1, "verdict": 3}'])
+@pytest.mark.parametrize("content", ["{", "[]", "{}", '{"format": 3}', '{"format": 1, "verdict": 3}'])
 def test_a_damaged_evaluation_is_named_and_nothing_is_written(copied, tmp_path: Path, content: str) -> None:
     run = copied()
     (run / METRICS_FILE).write_text(content)

@@ -10,20 +10,24 @@ import numpy as np
 
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.intervals import mean_of
+from vjepa2_ac.evaluation.metrics import L1, L2
 from vjepa2_ac.evaluation.result import (
+    ACTIONS,
+    MODES,
     About,
     Clips,
-    Errors,
     Evaluation,
     Example,
     Landscape,
     Landscapes,
+    Mode,
     ModelResult,
-    Predicted,
+    PredictionErrors,
     Ranking,
     Sensitivity,
     Stratum,
     TrainingCurve,
+    Way,
 )
 
 ABOUT = About(
@@ -44,16 +48,19 @@ ABOUT = About(
 )
 
 
-def errors(rng: np.random.Generator, level: float, clips: int, horizon: int, episode_of: np.ndarray) -> Errors:
+def errors(rng: np.random.Generator, level: float, horizon: int, episode_of: np.ndarray) -> np.ndarray:
     """Return errors about a level that grow with the horizon and are alike within an episode."""
     of_episode = 1 + 0.1 * rng.standard_normal(episode_of.max() + 1)[episode_of][:, None]
     grown = np.linspace(1.0, 1.15, horizon)[None]
-    values = 0.35 * level * of_episode * grown * (1 + 0.04 * rng.standard_normal((clips, horizon)))
-    return Errors(l1=values, l2=values**2 * 1.6, cosine=values * 0.4)
+    return 0.35 * level * of_episode * grown * (1 + 0.04 * rng.standard_normal((len(episode_of), horizon)))
 
 
-def _predicted(rng: np.random.Generator, level: float, clips: int, horizon: int, episode_of: np.ndarray) -> Predicted:
-    return Predicted(*(errors(rng, level, clips, horizon, episode_of) for _ in range(2)))
+def _predicted(
+    rng: np.random.Generator, way: Way, level: float, horizon: int, episode_of: np.ndarray
+) -> dict[tuple[Way, Mode, str], np.ndarray]:
+    by_mode = {mode: errors(rng, level, horizon, episode_of) for mode in MODES}
+    of_l2 = {(way, mode, L2.name): values**2 * 1.6 for mode, values in by_mode.items()}
+    return {(way, mode, L1.name): values for mode, values in by_mode.items()} | of_l2
 
 
 def _sensitivity(rng: np.random.Generator, ids: tuple[str, ...], skill: float) -> Sensitivity:
@@ -120,26 +127,26 @@ def evaluation(
     ids = tuple(id_form.format(clip % episodes) for clip in range(clips))
     episode_of = np.arange(clips) % episodes
     names = [*(["base"] if with_base else []), *others, "adapter"]
-    nothing = _predicted(rng, 1.0, clips, horizon, episode_of)
+    nothing = _predicted(rng, "persistence", 1.0, horizon, episode_of)
     models = {}
     for place, name in enumerate(names):
         skill = (place + 1) / len(names)
         level = 1.1 - 0.4 * skill
-        predicted = [_predicted(rng, level * wrong, clips, horizon, episode_of) for wrong in (1.0, 1.1, 1.2)]
+        arrays = nothing
+        for actions, wrong in zip(ACTIONS, (1.0, 1.1, 1.2), strict=True):
+            arrays = arrays | _predicted(rng, actions, level * wrong, horizon, episode_of)
         models[name] = ModelResult(
             name,
             {"base": "base", "adapter": "trained"}.get(name, "other"),  # type: ignore[arg-type]
-            *predicted,
+            PredictionErrors(ids, arrays),
             _sensitivity(rng, ids, skill),
             _landscapes(rng, ids, 4 - 3 * skill),
         )
     size_of_action = rng.gamma(2.0, 2.0, size=(clips, horizon))
     moving = size_of_action > 1.5
-    base = models["base"].true.rollout.l1[:, -1] if with_base else None
     return Evaluation(
         about=replace(ABOUT, frames=frames),
         clips=Clips(ids, tuple(range(clips)), size_of_action, moving, "the flange moves 1.5 cm or more in a step"),
-        persistence=nothing,
         models=models,
         strata=(
             Stratum("moving", "motion", moving),
@@ -147,7 +154,7 @@ def evaluation(
             Stratum("0.0 to 3.0 cm", "action size", size_of_action < 3),
             Stratum("3.0 to 9.9 cm", "action size", size_of_action >= 3),
         ),
-        episodes=episode_scores(ids, models["adapter"].true.rollout.l1[:, -1], nothing.rollout.l1[:, -1], base),
+        episodes=episode_scores(models["adapter"].errors, models["base"].errors if with_base else None),
         examples=tuple(_example(rng, why, ids[0], frames, names, size) for why in ("best", "worst")),
         training=(
             TrainingCurve("train/loss", tuple(range(10, 810, 10)), tuple(0.4 + 0.3 * np.exp(-np.arange(80) / 20))),

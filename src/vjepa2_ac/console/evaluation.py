@@ -86,25 +86,21 @@ def _errors(evaluation: Evaluation) -> Table:
     table.add_column("persistence", justify="right")
     for name in evaluation.models:
         table.add_column(name, justify="right")
-    models, seconds, last = list(evaluation.models), evaluation.about.seconds_per_step, evaluation.horizon
-    columns = {name: over_persistence(evaluation, name, "rollout") for name in models}
+    seconds, last = evaluation.about.seconds_per_step, evaluation.horizon
+    models = [model.errors for model in evaluation.models.values()]
+    curves = [over_persistence(errors, "rollout") for errors in models]
     for h in range(1, last + 1):
         if h == last or h % -(-last // _MOST_HORIZONS) == 0 or h == 1:
-            _row(table, f"{h * seconds:.2f} s ahead", [columns[name][h - 1] for name in models])
-    _row(table, f"{last * seconds:.2f} s, L2", [over_persistence(evaluation, n, "rollout", "l2")[-1] for n in models])
-    _row(
-        table,
-        f"{last * seconds:.2f} s, cosine",
-        [over_persistence(evaluation, n, "rollout", "cosine")[-1] for n in models],
-    )
+            _row(table, f"{h * seconds:.2f} s ahead", [curve[h - 1] for curve in curves])
+    for metric in evaluation.metrics[1:]:
+        ratios = [over_persistence(errors, "rollout", metric)[-1] for errors in models]
+        _row(table, f"{last * seconds:.2f} s, {metric.heading}", ratios)
     table.add_section()
     for actions in ACTIONS:
-        ratios = [one_step_over_persistence(evaluation, name, actions=actions) for name in models]
-        _row(table, f"one step, {actions} actions", ratios)
+        _row(table, f"one step, {actions} actions", [one_step_over_persistence(errors, actions) for errors in models])
     table.add_section()
     for part in evaluation.strata:
-        ratios = [stratum_over_persistence(evaluation, part, name) for name in models]
-        _row(table, f"one step, {part.name}", ratios)
+        _row(table, f"one step, {part.name}", [stratum_over_persistence(errors, part) for errors in models])
     return table
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from vjepa2_ac.console.progress import EncodingBar, LateProgress, ProgressBar, console
-from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, ratios_by_horizon
+from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.result import ACTIONS, PredictionErrors
 
 _MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
 
@@ -48,12 +49,12 @@ class ConsoleReporter:
 
     def validated(self, step: int, errors: PredictionErrors) -> None:
         """Print a line of the validation's metrics."""
-        one_step = one_step_ratios(errors)
-        self._validation = f"error/persistence {one_step['true'].value:.3f}"
-        horizons = "  ".join(f"{h}: {r.value:.3f}" for h, r in enumerate(ratios_by_horizon(errors), start=1))
+        true, zero, shuffled = (one_step_over_persistence(errors, actions).value for actions in ACTIONS)
+        self._validation = f"error/persistence {true:.3f}"
+        horizons = "  ".join(f"{h}: {r.value:.3f}" for h, r in enumerate(over_persistence(errors, "rollout"), start=1))
         console.print(
-            f"validation at step {step}: one-step error/persistence {one_step['true'].value:.3f}"
-            f" (zero actions {one_step['zero'].value:.3f}, shuffled {one_step['shuffled'].value:.3f});"
+            f"validation at step {step}: one-step error/persistence {true:.3f}"
+            f" (zero actions {zero:.3f}, shuffled {shuffled:.3f});"
             f" rollout by horizon  {horizons}"
         )
 

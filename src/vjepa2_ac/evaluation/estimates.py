@@ -3,104 +3,80 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 
 from vjepa2_ac.evaluation.intervals import Estimate, bootstrapped, ratio
-from vjepa2_ac.evaluation.result import Actions, EpisodeScore, Errors, Evaluation, Metric, Mode, Stratum
+from vjepa2_ac.evaluation.metrics import L1, Metric
+from vjepa2_ac.evaluation.result import Actions, EpisodeScore, Mode, PredictionErrors, Stratum, Way
 
 Curve = tuple[Estimate, ...]  # at horizon 1, 2, ...; index h - 1
 
 
-def errors_of(evaluation: Evaluation, name: str, mode: Mode, actions: Actions = "true") -> Errors:
-    """Return the errors of a model, or of `persistence`."""
-    if name == "persistence":
-        return evaluation.persistence.of(mode)
-    return evaluation.models[name].with_actions(actions).of(mode)
+def mean_error(errors: PredictionErrors, mode: Mode, metric: Metric = L1, way: Way = "true") -> Curve:
+    """Return the mean error by horizon, of a model or of persistence."""
+    found = errors.of(mode, metric, way)
+    return bootstrapped(lambda sums: sums[0] / sums[1], np.stack([found, np.ones_like(found)]), errors.episode_ids)
 
 
-def mean_error(
-    evaluation: Evaluation, name: str, mode: Mode, metric: Metric = "l1", actions: Actions = "true"
-) -> Curve:
-    """Return the mean error by horizon, of a model or of `persistence`."""
-    errors = errors_of(evaluation, name, mode, actions).of(metric)
-    return bootstrapped(
-        lambda sums: sums[0] / sums[1], np.stack([errors, np.ones_like(errors)]), evaluation.clips.episode_ids
-    )
+def over_persistence(errors: PredictionErrors, mode: Mode, metric: Metric = L1, way: Way = "true") -> Curve:
+    """Return mean error over mean persistence error by horizon: 1 as good as doing nothing; of L1, 0 is perfect."""
+    pair = [errors.of(mode, metric, each) for each in (way, "persistence")]
+    return bootstrapped(lambda sums: sums[0] / sums[1], np.stack(pair), errors.episode_ids)
 
 
-def over_persistence(
-    evaluation: Evaluation, name: str, mode: Mode, metric: Metric = "l1", actions: Actions = "true"
-) -> Curve:
-    """Return mean error over mean persistence error by horizon: 0 perfect, 1 as good as doing nothing."""
-    errors = errors_of(evaluation, name, mode, actions).of(metric)
-    nothing = evaluation.persistence.of(mode).of(metric)
-    return bootstrapped(lambda sums: sums[0] / sums[1], np.stack([errors, nothing]), evaluation.clips.episode_ids)
-
-
-def one_step_over_persistence(
-    evaluation: Evaluation, name: str, metric: Metric = "l1", actions: Actions = "true"
-) -> Estimate:
+def one_step_over_persistence(errors: PredictionErrors, actions: Actions = "true") -> Estimate:
     """Return teacher-forced error over persistence, over all steps of the clips."""
-    errors = errors_of(evaluation, name, "teacher_forced", actions).of(metric).mean(axis=1)
-    nothing = evaluation.persistence.teacher_forced.of(metric).mean(axis=1)
-    return ratio(errors, nothing, evaluation.clips.episode_ids)
+    return ratio(_one_step(errors, actions), _one_step(errors, "persistence"), errors.episode_ids)
 
 
-def gain_over(evaluation: Evaluation, name: str, other: str, mode: Mode = "rollout", metric: Metric = "l1") -> Curve:
-    """Return the share by which a model's error is smaller than another's, by horizon, paired: 0.18 is 18 % better."""
-    pair = [errors_of(evaluation, each, mode).of(metric) for each in (name, other)]
-    return bootstrapped(lambda sums: 1 - sums[0] / sums[1], np.stack(pair), evaluation.clips.episode_ids)
+def gain_over(errors: PredictionErrors, others: PredictionErrors, mode: Mode = "rollout", metric: Metric = L1) -> Curve:
+    """Return the share by which a model is better than another, by horizon, paired by clip: 0.18 is 18 % better."""
+    pair = [each.of(mode, metric) for each in (errors, others)]
+    better = 1 if metric.smaller_is_better else -1
+    return bootstrapped(lambda sums: better * (1 - sums[0] / sums[1]), np.stack(pair), errors.episode_ids)
 
 
 def difference_to(
-    evaluation: Evaluation, name: str, other: str, mode: Mode = "rollout", metric: Metric = "l1"
+    errors: PredictionErrors, others: PredictionErrors, mode: Mode = "rollout", metric: Metric = L1
 ) -> Curve:
-    """Return mean error minus that of another model by horizon, paired by clip: below 0 is better."""
-    pair = [errors_of(evaluation, each, mode).of(metric) for each in (name, other)]
-    columns = np.stack([pair[0] - pair[1], np.ones_like(pair[0])])
-    return bootstrapped(lambda sums: sums[0] / sums[1], columns, evaluation.clips.episode_ids)
+    """Return mean error minus that of another model by horizon, paired by clip: of L1, below 0 is better."""
+    difference = errors.of(mode, metric) - others.of(mode, metric)
+    columns = np.stack([difference, np.ones_like(difference)])
+    return bootstrapped(lambda sums: sums[0] / sums[1], columns, errors.episode_ids)
 
 
-def cost_of_actions(evaluation: Evaluation, name: str, actions: Actions, metric: Metric = "l1") -> Estimate:
+def cost_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
     """Return the share by which the teacher-forced error grows with zero or shuffled actions, paired; 0: unused."""
-    given, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
-    grown = ratio(given.mean(axis=1), true.mean(axis=1), evaluation.clips.episode_ids)
+    grown = ratio(_one_step(errors, actions), _one_step(errors, "true"), errors.episode_ids)
     return Estimate(grown.value - 1, grown.low - 1, grown.high - 1)
 
 
-def gap_of_actions(evaluation: Evaluation, name: str, actions: Actions, metric: Metric = "l1") -> Estimate:
+def gap_of_actions(errors: PredictionErrors, actions: Actions) -> Estimate:
     """Return how much higher the teacher-forced error over persistence is with zero or shuffled actions, paired."""
-    given, true = (errors_of(evaluation, name, "teacher_forced", each).of(metric) for each in (actions, "true"))
-    nothing = evaluation.persistence.teacher_forced.of(metric)
-    return ratio((given - true).mean(axis=1), nothing.mean(axis=1), evaluation.clips.episode_ids)
+    given, true = (errors.of("teacher_forced", L1, each) for each in (actions, "true"))
+    return ratio((given - true).mean(axis=1), _one_step(errors, "persistence"), errors.episode_ids)
 
 
-def stratum_over_persistence(evaluation: Evaluation, stratum: Stratum, name: str, metric: Metric = "l1") -> Estimate:
+def stratum_over_persistence(errors: PredictionErrors, stratum: Stratum) -> Estimate:
     """Return teacher-forced error over persistence of the steps of a stratum; NaN where there are none."""
-    return _of_steps(evaluation, stratum, name, "persistence", metric)
+    return ratio(_of_steps(errors, stratum), _of_steps(errors, stratum, "persistence"), errors.episode_ids)
 
 
-def stratum_gain(evaluation: Evaluation, stratum: Stratum, name: str, other: str, metric: Metric = "l1") -> Estimate:
+def stratum_gain(errors: PredictionErrors, others: PredictionErrors, stratum: Stratum) -> Estimate:
     """Return the share by which the teacher-forced error is smaller than another model's in a stratum, paired."""
-    kept = _of_steps(evaluation, stratum, name, other, metric)
-    return Estimate(1 - kept.value, 1 - kept.high, 1 - kept.low)
+    left = ratio(_of_steps(errors, stratum), _of_steps(others, stratum), errors.episode_ids)
+    return Estimate(1 - left.value, 1 - left.high, 1 - left.low)
 
 
-def episode_scores(
-    evaluation_ids: tuple[str, ...],
-    trained: Float[np.ndarray, " clips"],
-    nothing: Float[np.ndarray, " clips"],
-    base: Float[np.ndarray, " clips"] | None,
-) -> tuple[EpisodeScore, ...]:
-    """Return the scores of each episode, best first by error over persistence."""
-    names, episode_of = np.unique(np.array(evaluation_ids), return_inverse=True)
+def episode_scores(errors: PredictionErrors, base: PredictionErrors | None) -> tuple[EpisodeScore, ...]:
+    """Return the scores of each episode at the last horizon of the rollout, best first by error over persistence."""
+    names, episode_of = np.unique(np.array(errors.episode_ids), return_inverse=True)
 
-    def total(values: np.ndarray) -> np.ndarray:
-        return np.bincount(episode_of, weights=values)
+    def total(of: PredictionErrors, way: Way = "true") -> np.ndarray:
+        return np.bincount(episode_of, weights=of.of("rollout", L1, way)[:, -1])
 
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = total(trained) / total(nothing)
-        gains = None if base is None else 1 - total(trained) / total(base)
+        ratios = total(errors) / total(errors, "persistence")
+        gains = None if base is None else 1 - total(errors) / total(base)
     counts = np.bincount(episode_of)
     scores = [
         EpisodeScore(str(name), int(counts[n]), float(ratios[n]), None if gains is None else float(gains[n]))
@@ -109,8 +85,11 @@ def episode_scores(
     return tuple(sorted(scores, key=lambda score: score.over_persistence))
 
 
-def _of_steps(evaluation: Evaluation, stratum: Stratum, name: str, other: str, metric: Metric) -> Estimate:
-    one, two = (
-        (errors_of(evaluation, each, "teacher_forced").of(metric) * stratum.steps).sum(axis=1) for each in (name, other)
-    )
-    return ratio(one, two, evaluation.clips.episode_ids)
+def _one_step(errors: PredictionErrors, way: Way) -> np.ndarray:
+    """Return the teacher-forced L1 error of each clip."""
+    return np.asarray(errors.of("teacher_forced", L1, way).mean(axis=1))
+
+
+def _of_steps(errors: PredictionErrors, stratum: Stratum, way: Way = "true") -> np.ndarray:
+    """Return the sum of each clip's teacher-forced L1 errors in a stratum."""
+    return np.asarray((errors.of("teacher_forced", L1, way) * stratum.steps).sum(axis=1))

@@ -18,19 +18,18 @@ from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, start_of
 from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sensitivity
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.examples import chosen_clips, make_example, predicted_rollout
-from vjepa2_ac.evaluation.metrics import Predictor, measured, persistence_of, with_other_actions
+from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, with_other_actions
+from vjepa2_ac.evaluation.metrics import METRICS, Metric
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
     About,
     Clips,
-    EpisodeScore,
-    Errors,
     Evaluation,
     Example,
     Landscapes,
     ModelResult,
     Plans,
-    Predicted,
+    PredictionErrors,
     Role,
     Sensitivity,
 )
@@ -67,6 +66,7 @@ def evaluate(
     clips: RepeatableClips,
     about: About,
     *,
+    metrics: tuple[Metric, ...] = METRICS,
     probes: ProbeOptions | None = None,
     stage: Callable[[str], Progress] | None = None,
 ) -> Evaluation:
@@ -76,6 +76,7 @@ def evaluate(
         contenders: In the order of the table; one of them has the role trained.
         clips: What to measure on.
         about: Description of the evaluation.
+        metrics: Of the errors; the first one is L1.
         probes: Options of the measurements beyond the errors.
         stage: Returns a progress bar for a part of the work, by its title.
 
@@ -83,7 +84,7 @@ def evaluate(
         ValueError: No clips; or too few frames for planning.
     """
     probes = probes or ProbeOptions()
-    seen = _collect(contenders, clips, probes, about, _bar(stage, "measuring"))
+    seen = _collect(contenders, clips, probes, about, metrics, _bar(stage, "measuring"))
     ids, seconds = tuple(seen.ids), about.seconds_per_step
     known = clips_of(seen.actions, ids, tuple(seen.firsts), is_pose=about.is_pose, seconds_per_step=seconds)
     pool = ActionPool(
@@ -94,8 +95,7 @@ def evaluate(
     )
     models: dict[str, ModelResult] = {}
     for contender in contenders:
-        true, zero, shuffled = (_joined(seen.errors[contender.name, kind]) for kind in ("true", "zero", "shuffled"))
-        result = ModelResult(contender.name, contender.role, true, zero, shuffled)
+        result = ModelResult(contender.name, contender.role, joined(seen.errors[contender.name]))
         with contender.switched():
             models[contender.name] = replace(
                 result,
@@ -103,20 +103,20 @@ def evaluate(
                 landscapes=_landscapes(contender, seen.starts, known, pool, probes, about, stage),
                 plans=_plans(contender, seen.planned, probes, stage),
             )
-    nothing = _joined(seen.persistence)
     evaluation = Evaluation(
         about=about,
         clips=known,
-        persistence=nothing,
         models=models,
         strata=strata_of(known, is_pose=about.is_pose),
         episodes=(),
         examples=(),
         planning=study_of(seen.planned, probes.planning) if seen.planned else None,
+        metrics=metrics,
     )
+    scores = episode_scores(evaluation.errors, evaluation.base_errors)
     examples = _examples(contenders, clips, evaluation, probes)
     notes = _left_out(probes, about, action_dim=seen.actions.shape[-1])
-    return replace(evaluation, episodes=_episodes(evaluation), examples=examples, notes=notes)
+    return replace(evaluation, episodes=scores, examples=examples, notes=notes)
 
 
 def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[str, ...]:
@@ -142,8 +142,7 @@ class _Seen:
     ids: list[str]
     firsts: list[int]
     actions: Float[np.ndarray, "clips horizon action_dim"]
-    errors: dict[tuple[str, str], list[Predicted]]  # by model and actions
-    persistence: list[Predicted]
+    errors: dict[str, list[PredictionErrors]]  # by model
     starts: list[RolloutStart]
     planned: list[PlanningStart] = field(default_factory=list)
 
@@ -153,19 +152,17 @@ def _collect(
     clips: RepeatableClips,
     probes: ProbeOptions,
     about: About,
+    metrics: Sequence[Metric],
     progress: Progress | None,
 ) -> _Seen:
-    seen = _Seen([], [], np.zeros((0, 0, 0)), {}, [], [])
+    seen = _Seen([], [], np.zeros((0, 0, 0)), {contender.name: [] for contender in contenders}, [])
     actions = []
     probed = set(spread(clips.count, probes.sensitivity_clips)) if probes.sensitivity_clips else set()
     planned = set(spread(clips.count, probes.planning_clips)) if probes.planning_clips and about.is_pose else set()
     for batch, others in with_other_actions(batch for batch, _ in clips.read(None)):
-        kinds = {"true": batch.actions, "zero": torch.zeros_like(batch.actions), "shuffled": others}
         for contender in contenders:
             with contender.switched():
-                for kind, given in kinds.items():
-                    seen.errors.setdefault((contender.name, kind), []).append(measured(contender.model, batch, given))
-        seen.persistence.append(persistence_of(batch))
+                seen.errors[contender.name].append(measured(contender.model, batch, ALL, metrics, others))
         first = len(seen.ids)
         for row in range(len(batch.starts)):
             if first + row in probed:
@@ -186,13 +183,6 @@ def _collect(
 def _largest_step(actions: Float[torch.Tensor, "time action_dim"], about: About) -> int:
     """Return the step of a clip with the largest action: for poses, by the translation."""
     return int((actions[:, :3] if about.is_pose else actions).norm(dim=-1).argmax())
-
-
-def _joined(parts: Sequence[Predicted]) -> Predicted:
-    def join(errors: Sequence[Errors]) -> Errors:
-        return Errors(*(np.concatenate([getattr(part, name) for part in errors]) for name in ("l1", "l2", "cosine")))
-
-    return Predicted(join([part.teacher_forced for part in parts]), join([part.rollout for part in parts]))
 
 
 def _sensitivity(
@@ -252,24 +242,12 @@ def _plans(
     return measure_plans(model, starts, probes.planning, _bar(stage, f"planning, {contender.name}"))
 
 
-def _episodes(evaluation: Evaluation) -> tuple[EpisodeScore, ...]:
-    base, models = evaluation.base, evaluation.models
-    return episode_scores(
-        evaluation.clips.episode_ids,
-        models[evaluation.trained].true.rollout.l1[:, -1],
-        evaluation.persistence.rollout.l1[:, -1],
-        None if base is None else models[base].true.rollout.l1[:, -1],
-    )
-
-
 def _examples(
     contenders: Sequence[Contender], clips: RepeatableClips, evaluation: Evaluation, probes: ProbeOptions
 ) -> tuple[Example, ...]:
     """Read the clips of the examples again: which ones these are is known only now."""
     known = evaluation.clips
-    trained = evaluation.models[evaluation.trained].true.rollout
-    moved = known.action_size.sum(axis=1)
-    chosen = chosen_clips(trained, evaluation.persistence.rollout, moved, probes.examples)
+    chosen = chosen_clips(evaluation.errors, known.action_size.sum(axis=1), probes.examples)
     if not chosen:
         return ()
     names = [(known.episode_ids[clip], known.starts[clip]) for clip in chosen]

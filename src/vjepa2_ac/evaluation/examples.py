@@ -12,22 +12,24 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vjepa2_ac.data.clips.transforms import pixels_to_input
+from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.metrics import Predictor
-from vjepa2_ac.evaluation.result import Errors, Example
+from vjepa2_ac.evaluation.measure import Predictor
+from vjepa2_ac.evaluation.metrics import L1
+from vjepa2_ac.evaluation.result import Example, PredictionErrors
 
 
-def chosen_clips(trained: Errors, nothing: Errors, moved: Float[np.ndarray, " clips"], count: int) -> dict[int, str]:
+def chosen_clips(errors: PredictionErrors, moved: Float[np.ndarray, " clips"], count: int) -> dict[int, str]:
     """Return which clips to show, and why: best, worst, median by L1 error over persistence, and most motion.
 
     Args:
-        trained: Rollout errors of the model.
-        nothing: Those of persistence.
+        errors: Of the model.
         moved: Distance that the robot moves in each clip.
         count: Number of clips, at most.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratios = trained.l1.mean(axis=1) / nothing.l1.mean(axis=1)
+        trained, nothing = (errors.of("rollout", L1, way).mean(axis=1) for way in ("true", "persistence"))
+        ratios = trained / nothing
     order = np.argsort(np.nan_to_num(ratios, nan=np.inf, posinf=np.inf), kind="stable")
     wanted = {
         "most motion": int(np.argmax(moved)),
@@ -71,7 +73,7 @@ def make_example(
     nothing = true[:1].expand_as(true[1:])
 
     def errors(values: Tensor) -> Float[np.ndarray, "horizon grid grid"]:
-        of_patch = (values - true[1:]).abs().mean(dim=-1)
+        of_patch = absolute_difference(values, true[1:]).mean(dim=-1)
         return rearrange(of_patch, "horizon (h w) -> horizon h w", h=grid).numpy()
 
     colours = Colours(true)

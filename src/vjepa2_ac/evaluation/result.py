@@ -1,9 +1,8 @@
 """Evaluation results: records of plain arrays, the input of estimates, tables and the report.
 
 Axes: clips in one fixed order; horizon 1 .. H model steps ahead (index h - 1; H is frames - 1). All errors compare
-layer-normalised latents: L1 is the mean absolute difference, L2 the mean *squared* difference (no root), cosine one
-minus the cosine similarity of a token, mean over tokens: 0 is perfect for each. Metrics with intervals are computed
-from these by `evaluation.estimates`, the verdict as text by `evaluation.verdict`.
+layer-normalised latents, by the metrics of `evaluation.metrics`. What has intervals is computed from these by
+`evaluation.estimates`, the verdict as text by `evaluation.verdict`.
 """
 
 from __future__ import annotations
@@ -17,13 +16,13 @@ from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
 
-Metric = Literal["l1", "l2", "cosine"]
 Mode = Literal["teacher_forced", "rollout"]
 Actions = Literal["true", "zero", "shuffled"]
+Way = Literal["true", "zero", "shuffled", "persistence"]  # of predicting: with which actions, or by copying a frame
 Role = Literal["base", "trained", "other"]
 
-METRICS: tuple[Metric, ...] = ("l1", "l2", "cosine")
 MODES: tuple[Mode, ...] = ("teacher_forced", "rollout")
 ACTIONS: tuple[Actions, ...] = ("true", "zero", "shuffled")
 
@@ -68,31 +67,19 @@ class Clips:
 
 
 @dataclass(frozen=True)
-class Errors:
-    """Errors of one kind of prediction; row i is clip i."""
+class PredictionErrors:
+    """The errors of one model and of persistence on some clips; row i of every array is clip i.
 
-    l1: Float[np.ndarray, "clips horizon"]
-    l2: Float[np.ndarray, "clips horizon"]  # mean squared difference
-    cosine: Float[np.ndarray, "clips horizon"]  # 1 - cosine similarity
-
-    def of(self, metric: Metric) -> Float[np.ndarray, "clips horizon"]:
-        """Return the errors of one metric."""
-        return {"l1": self.l1, "l2": self.l2, "cosine": self.cosine}[metric]
-
-
-@dataclass(frozen=True)
-class Predicted:
-    """Teacher-forced: frame h from the true frames before it. Rollout: from frame 0 alone, predictions fed back.
-
-    Of persistence: copying frame h - 1, and frame 0. Horizon 1 is the same in both.
+    Teacher-forced: frame h from the true frames before it. Rollout: from frame 0 alone, predictions fed back. Of
+    persistence: copying frame h - 1, and frame 0. Horizon 1 is the same in both.
     """
 
-    teacher_forced: Errors
-    rollout: Errors
+    episode_ids: tuple[str, ...]
+    arrays: Mapping[tuple[Way, Mode, str], Float[np.ndarray, "clips horizon"]]  # by way, mode and name of the metric
 
-    def of(self, mode: Mode) -> Errors:
-        """Return the errors of one mode."""
-        return self.teacher_forced if mode == "teacher_forced" else self.rollout
+    def of(self, mode: Mode, metric: Metric = L1, way: Way = "true") -> Float[np.ndarray, "clips horizon"]:
+        """Return the errors of one kind of prediction."""
+        return self.arrays[way, mode, metric.name]
 
 
 @dataclass(frozen=True)
@@ -192,16 +179,10 @@ class ModelResult:
 
     name: str  # base, adapter, model, or the name of another run
     role: Role
-    true: Predicted  # with the true actions
-    zero: Predicted  # with actions of zero
-    shuffled: Predicted  # with those of another clip
+    errors: PredictionErrors  # those of persistence are the same for all models, which share the encoder
     sensitivity: Sensitivity | None = None
     landscapes: Landscapes | None = None
     plans: Plans | None = None
-
-    def with_actions(self, actions: Actions) -> Predicted:
-        """Return the predictions with the true, zero or shuffled actions."""
-        return {"true": self.true, "zero": self.zero, "shuffled": self.shuffled}[actions]
 
 
 @dataclass(frozen=True)
@@ -251,7 +232,6 @@ class Evaluation:
 
     about: About
     clips: Clips
-    persistence: Predicted  # of copying a frame; the same for all models, which share the encoder
     models: Mapping[str, ModelResult]
     strata: tuple[Stratum, ...]
     episodes: tuple[EpisodeScore, ...]  # best first
@@ -260,6 +240,7 @@ class Evaluation:
     calibration: Mapping[str, Any] | None = None  # what `Calibration.as_dict` gives
     notes: tuple[str, ...] = ()  # for the reader: why there is no base, no landscape ...
     planning: PlanningStudy | None = None
+    metrics: tuple[Metric, ...] = METRICS  # of the errors
 
     @property
     def trained(self) -> str:
@@ -270,6 +251,16 @@ class Evaluation:
     def base(self) -> str | None:
         """The name of the base in `models`; None: there is none."""
         return next((name for name, model in self.models.items() if model.role == "base"), None)
+
+    @property
+    def errors(self) -> PredictionErrors:
+        """The errors of the evaluated model."""
+        return self.models[self.trained].errors
+
+    @property
+    def base_errors(self) -> PredictionErrors | None:
+        """The errors of the base; None: there is none."""
+        return None if self.base is None else self.models[self.base].errors
 
     @property
     def horizon(self) -> int:

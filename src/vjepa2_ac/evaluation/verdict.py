@@ -10,40 +10,39 @@ from vjepa2_ac.evaluation.action_score.metrics import differences_of, metrics_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.estimates import gain_over, gap_of_actions, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.intervals import Estimate
-from vjepa2_ac.evaluation.result import METRICS, Evaluation, Metric, Ranking
+from vjepa2_ac.evaluation.metrics import L1, Metric
+from vjepa2_ac.evaluation.result import Evaluation, Ranking
 
-_SIDES = {-1: "better", 0: "no clear difference", 1: "NOT better"}  # of an error over persistence
+_SIDES = {1: "better", 0: "no clear difference", -1: "NOT better"}  # of an error over persistence
 _NEARER = {-1: "nearer than", 0: "no clear difference to", 1: "FARTHER than"}  # of a difference
-_WORDS: dict[Metric, str] = {"l1": "L1", "l2": "L2", "cosine": "cosine"}
 
 
 def verdict(evaluation: Evaluation) -> str:
-    """Return whether training helped, at the longest horizon by L1, and where L2 and cosine disagree."""
-    error = over_persistence(evaluation, evaluation.trained, "rollout")[-1]
+    """Return whether training helped, at the longest horizon by L1, and where other metrics disagree."""
+    error = over_persistence(evaluation.errors, "rollout")[-1]
     ahead = f"{evaluation.seconds_ahead:.1f} s ahead"
-    absolute = f"Its error {ahead} is {_over_nothing(error)}."
+    absolute = f"Its error {ahead} is {_over_nothing(error, L1)}."
     parts = [f"{_compared(evaluation, ahead)}.", absolute, *_disagreements(evaluation), _actions(evaluation)]
     return " ".join(part for part in (*parts, _planned(evaluation), *evaluation.notes) if part)
 
 
 def improvement(evaluation: Evaluation, horizon: int) -> Estimate | None:
     """Return the share by which the trained model's error is below the base's at a horizon, paired; None: no base."""
-    if evaluation.base is None:
-        return None
-    return gain_over(evaluation, evaluation.trained, evaluation.base)[horizon - 1]
+    base = evaluation.base_errors
+    return None if base is None else gain_over(evaluation.errors, base)[horizon - 1]
 
 
 def uses_actions(evaluation: Evaluation) -> bool:
     """Return whether the true actions are clearly better than another clip's, and clearly rank first by energy."""
-    model = evaluation.models[evaluation.trained]
-    rankings = () if model.sensitivity is None else model.sensitivity.rankings
-    gap = gap_of_actions(evaluation, evaluation.trained, "shuffled")
+    sensitivity = evaluation.models[evaluation.trained].sensitivity
+    rankings = () if sensitivity is None else sensitivity.rankings
+    gap = gap_of_actions(evaluation.errors, "shuffled")
     return gap.side(of=0.0) == 1 and all(ranking.mean_rank.side(of=0.5) == -1 for ranking in rankings)
 
 
 def spread(evaluations: Sequence[Evaluation]) -> str:
     """Return as text how much the results of several runs differ, at the longest horizon."""
-    errors = [over_persistence(one, one.trained, "rollout")[-1].value for one in evaluations]
+    errors = [over_persistence(one.errors, "rollout")[-1].value for one in evaluations]
     gains = [gain.value for one in evaluations if (gain := improvement(one, one.horizon)) is not None]
     words = f"{len(evaluations)} runs: error over persistence {_mean_and_range(errors, '.3f')}"
     return words + (f"; better than the base by {_mean_and_range(gains, '.1%')}" if gains else "")
@@ -75,40 +74,37 @@ def _digits(gain: Estimate) -> str:
 
 
 def _disagreements(evaluation: Evaluation) -> tuple[str, ...]:
-    """Return a sentence on how L2 or cosine differ from L1: better, worse, or uncertain."""
+    """Return sentences on how other metrics differ from L1: better, worse, or uncertain."""
     found: dict[str, list[str]] = {}
-    for metric in METRICS[1:]:
+    for metric in evaluation.metrics[1:]:
         if words := _disagreement(evaluation, metric):
-            found.setdefault(" and ".join(words), []).append(_WORDS[metric])
+            found.setdefault(" and ".join(words), []).append(metric.label)
     return tuple(f"By {' and '.join(metrics)} it is another matter: {words}." for words, metrics in found.items())
 
 
 def _disagreement(evaluation: Evaluation, metric: Metric) -> list[str]:
-    words = []
-    if evaluation.base is not None:
-        by_l1, by_other = (
-            gain_over(evaluation, evaluation.trained, evaluation.base, metric=each)[-1] for each in ("l1", metric)
-        )
+    words, errors, base = [], evaluation.errors, evaluation.base_errors
+    if base is not None:
+        by_l1, by_other = (gain_over(errors, base, metric=each)[-1] for each in (L1, metric))
         if by_other.side(of=0.0) != by_l1.side(of=0.0):
             form = _digits(by_other)
             share = f"{abs(by_other.value):{form}}"
             how = {-1: f"{share} WORSE than", 0: "no clear difference to", 1: f"{share} better than"}
             words.append(f"{how[by_other.side(of=0.0)]} the base (gain {interval(by_other, form)})")
-    by_l1, by_other = (over_persistence(evaluation, evaluation.trained, "rollout", each)[-1] for each in ("l1", metric))
-    if by_other.side(of=1.0) != by_l1.side(of=1.0):
-        words.append(_over_nothing(by_other))
+    by_l1, by_other = (over_persistence(errors, "rollout", each)[-1] for each in (L1, metric))
+    if metric.side(by_other) != L1.side(by_l1):
+        words.append(_over_nothing(by_other, metric))
     return words
 
 
-def _over_nothing(error: Estimate) -> str:
-    return f"{error.value:.2f} of doing nothing ({interval(error, '.2f')}): {_SIDES[error.side(of=1.0)]}"
+def _over_nothing(error: Estimate, metric: Metric) -> str:
+    return f"{error.value:.2f} of doing nothing ({interval(error, '.2f')}): {_SIDES[metric.side(error)]}"
 
 
 def _actions(evaluation: Evaluation) -> str:
-    own, others = (
-        one_step_over_persistence(evaluation, evaluation.trained, actions=each).value for each in ("true", "shuffled")
-    )
-    gap = gap_of_actions(evaluation, evaluation.trained, "shuffled")
+    errors = evaluation.errors
+    own, others = (one_step_over_persistence(errors, actions).value for actions in ("true", "shuffled"))
+    gap = gap_of_actions(errors, "shuffled")
     words = "It uses the actions" if uses_actions(evaluation) else "It does NOT clearly use the actions"
     words += f": with another clip's its one-step error is {others:.2f} of doing nothing, with its own {own:.2f}"
     words += f" (difference: {interval(gap, '.2f')})"

@@ -13,6 +13,7 @@ from torch.nn.functional import cosine_similarity
 from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config.planning import EnergyConfig
+from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.goal import Goal
@@ -135,8 +136,8 @@ def distance(
     if kind == "cosine":
         by_token = 1 - cosine_similarity(predicted, wanted, dim=-1)
     else:
-        difference = predicted - wanted
-        by_token = (difference.abs() if kind == "l1" else difference.square()).mean(dim=-1)
+        by_number = absolute_difference if kind == "l1" else squared_difference
+        by_token = by_number(predicted, wanted).mean(dim=-1)
     if weights is None:
         return by_token.mean(dim=-1)
     return (by_token * (weights / weights.sum())).sum(dim=-1)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.intervals import Estimate, bootstrapped
+from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
 Cell = Estimate | str
@@ -33,8 +34,12 @@ class Comparison:
     notes: tuple[str, ...]
 
 
-def compare(folders: Sequence[Path]) -> Comparison:
+def compare(folders: Sequence[Path], metrics: Sequence[Metric] = METRICS) -> Comparison:
     """Compare runs; each is compared with the first one, paired by clip.
+
+    Args:
+        folders: Of the runs.
+        metrics: What the table shows; the cell of a run that was evaluated without one is empty.
 
     Raises:
         InputError: Fewer than two, one is named twice or was not evaluated, or they were measured on different clips.
@@ -46,7 +51,7 @@ def compare(folders: Sequence[Path]) -> Comparison:
             raise InputError(where=str(folder), found="a run that is named twice", needed="each run once")
     measured = {_name(folder, folders): read_metrics(folder) for folder in folders}
     try:
-        return _compared(measured, dict(zip(measured, folders, strict=True)))
+        return _compared(measured, dict(zip(measured, folders, strict=True)), metrics)
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         raise InputError(
             where=", ".join(str(folder / METRICS_FILE) for folder in folders),
@@ -60,7 +65,9 @@ def _name(folder: Path, folders: Sequence[Path]) -> str:
     return folder.resolve().name if len(alike) == 1 else str(folder)
 
 
-def _compared(measured: Mapping[str, dict[str, Any]], folders: Mapping[str, Path]) -> Comparison:
+def _compared(
+    measured: Mapping[str, dict[str, Any]], folders: Mapping[str, Path], shown: Sequence[Metric]
+) -> Comparison:
     names = list(measured)
     first = measured[names[0]]
     for name in names[1:]:
@@ -69,14 +76,19 @@ def _compared(measured: Mapping[str, dict[str, Any]], folders: Mapping[str, Path
     ids = [clip["episode"] for clip in clips["named"]]
     ahead = f"{(about['frames'] - 1) * about['seconds_per_step']:.2f} s"
     return Comparison(
-        title=f"L1 error over persistence on {clips['count']} {about['split']} clips of {clips['episodes']}"
+        title=f"{L1.label} error over persistence on {clips['count']} {about['split']} clips of {clips['episodes']}"
         f" episode{'s' * (clips['episodes'] != 1)}",
         columns=(
             *(f"{ahead} ahead", f"gain over {names[0]}", "gain over its base", "one step", "shuffled", "rank"),
+            *(f"{ahead}, {metric.heading}" for metric in shown[1:]),
             *(("Action Score", "plans end off, cm") if any(map(_plans, measured.values())) else ()),
         ),
         rows={
-            name: _row(metrics, first, ids) + (_planned(metrics) if any(map(_plans, measured.values())) else ())
+            name: (
+                *_row(metrics, first, ids),
+                *(_last_ratio(metrics, metric) for metric in shown[1:]),
+                *(_planned(metrics) if any(map(_plans, measured.values())) else ()),
+            )
             for name, metrics in measured.items()
         },
         seconds=about["seconds_per_step"] * np.arange(1, about["frames"]),
@@ -107,16 +119,21 @@ def _check_same_clips(one: dict[str, Any], other: dict[str, Any], first: Path, s
 
 def _row(metrics: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> tuple[Cell, ...]:
     model = metrics["models"][metrics["trained"]]
-    base_gain = model["rollout"]["l1"].get("gain_over_base")
+    base_gain = model["rollout"][L1.name].get("gain_over_base")
     sensitivity = model["sensitivity"]
     return (
-        _estimate(model["rollout"]["l1"]["over_persistence"][-1]),
+        _last_ratio(metrics, L1),
         "" if metrics is first else _gain(metrics, first, ids),
         "no base" if base_gain is None else _estimate(base_gain[-1]),
         _estimate(model["one_step_by_actions"]["true"]),
         f"{model['one_step_by_actions']['shuffled']['value']:.3f}",
         "" if sensitivity is None else f"{sensitivity['rankings'][0]['mean_rank']['value']:.3f}",
     )
+
+
+def _last_ratio(metrics: dict[str, Any], metric: Metric) -> Cell:
+    found = metrics["models"][metrics["trained"]]["rollout"].get(metric.name)
+    return "" if found is None else _estimate(found["over_persistence"][-1])
 
 
 def _plans(metrics: dict[str, Any]) -> dict[str, Any] | None:
@@ -145,7 +162,7 @@ def _last(metrics: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _curve(metrics: dict[str, Any]) -> tuple[Estimate, ...]:
-    return tuple(map(_estimate, metrics["models"][metrics["trained"]]["rollout"]["l1"]["over_persistence"]))
+    return tuple(map(_estimate, metrics["models"][metrics["trained"]]["rollout"][L1.name]["over_persistence"]))
 
 
 def _notes(measured: Mapping[str, dict[str, Any]], names: Sequence[str]) -> tuple[str, ...]:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +27,14 @@ from vjepa2_ac.evaluation.estimates import (
     stratum_gain,
     stratum_over_persistence,
 )
+from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
-    METRICS,
     MODES,
     Clips,
     EpisodeScore,
     Evaluation,
     Landscapes,
-    Metric,
     Mode,
     ModelResult,
     Sensitivity,
@@ -47,7 +47,8 @@ from vjepa2_ac.storage.structured import finite_or_none, json_text, read_json_ob
 
 METRICS_FILE = "metrics.json"
 _MOST_BYTES = 1 << 28  # landscapes are long
-FORMAT = 1  # incremented when a reader of the file would have to change
+FORMAT = 2  # incremented when a reader of the file would have to change
+_READABLE = (1, FORMAT)  # 1 had cosine beside l1 and l2
 
 
 def write_metrics(evaluation: Evaluation, path: Path) -> Path:
@@ -72,7 +73,7 @@ def read_metrics(folder: Path) -> dict[str, Any]:
         ) from None
     except OSError as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", fix=fix) from None
-    if metrics.get("format") != FORMAT:
+    if metrics.get("format") not in _READABLE:
         raise InputError(
             where=str(path), found=f"format {shown(metrics.get('format'))}", needed=f"format {FORMAT}", fix=fix
         )
@@ -89,10 +90,9 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "base": evaluation.base,
         "about": dataclasses.asdict(evaluation.about),
         "clips": _clips(evaluation.clips),
-        "persistence": {
-            mode: {metric: _curve(mean_error(evaluation, "persistence", mode, metric)) for metric in METRICS}
-            for mode in MODES
-        },
+        "persistence": _by_mode(
+            evaluation, lambda mode, metric: _curve(mean_error(evaluation.errors, mode, metric, "persistence"))
+        ),
         "models": {name: _model(evaluation, model) for name, model in evaluation.models.items()},
         "strata": {
             "moving_means": evaluation.clips.moving_means,
@@ -119,43 +119,47 @@ def _clips(clips: Clips) -> dict[str, Any]:
 def _model(evaluation: Evaluation, model: ModelResult) -> dict[str, Any]:
     return {
         "role": model.role,
-        **{mode: {metric: _errors(evaluation, model.name, mode, metric) for metric in METRICS} for mode in MODES},
+        **_by_mode(evaluation, partial(_errors, evaluation, model)),
         "one_step_by_actions": {
-            actions: one_step_over_persistence(evaluation, model.name, actions=actions).as_dict() for actions in ACTIONS
+            actions: one_step_over_persistence(model.errors, actions).as_dict() for actions in ACTIONS
         },
-        "gap_of_zero_actions": gap_of_actions(evaluation, model.name, "zero").as_dict(),
-        "gap_of_shuffled_actions": gap_of_actions(evaluation, model.name, "shuffled").as_dict(),
+        "gap_of_zero_actions": gap_of_actions(model.errors, "zero").as_dict(),
+        "gap_of_shuffled_actions": gap_of_actions(model.errors, "shuffled").as_dict(),
         "sensitivity": None if model.sensitivity is None else _sensitivity(model.sensitivity),
         "landscapes": None if model.landscapes is None else _landscapes(model.landscapes),
         "planning": plans_as_dict(evaluation, model.name),
     }
 
 
-def _errors(evaluation: Evaluation, name: str, mode: Mode, metric: Metric) -> dict[str, Any]:
+def _by_mode(evaluation: Evaluation, of: Callable[[Mode, Metric], Any]) -> dict[str, dict[str, Any]]:
+    return {mode: {metric.name: of(mode, metric) for metric in evaluation.metrics} for mode in MODES}
+
+
+def _errors(evaluation: Evaluation, model: ModelResult, mode: Mode, metric: Metric) -> dict[str, Any]:
     metrics = {
-        "error": _curve(mean_error(evaluation, name, mode, metric)),
-        "over_persistence": _curve(over_persistence(evaluation, name, mode, metric)),
-        "over_persistence_zero_actions": _curve(over_persistence(evaluation, name, mode, metric, "zero")),
-        "over_persistence_shuffled_actions": _curve(over_persistence(evaluation, name, mode, metric, "shuffled")),
+        "error": _curve(mean_error(model.errors, mode, metric)),
+        "over_persistence": _curve(over_persistence(model.errors, mode, metric)),
+        "over_persistence_zero_actions": _curve(over_persistence(model.errors, mode, metric, "zero")),
+        "over_persistence_shuffled_actions": _curve(over_persistence(model.errors, mode, metric, "shuffled")),
     }
-    if evaluation.base is not None and name != evaluation.base:
-        metrics["gain_over_base"] = _curve(gain_over(evaluation, name, evaluation.base, mode, metric))
-        metrics["difference_to_base"] = _curve(difference_to(evaluation, name, evaluation.base, mode, metric))
+    base = evaluation.base_errors
+    if base is not None and model.errors is not base:
+        metrics["gain_over_base"] = _curve(gain_over(model.errors, base, mode, metric))
+        metrics["difference_to_base"] = _curve(difference_to(model.errors, base, mode, metric))
     return metrics
 
 
 def _stratum(evaluation: Evaluation, stratum: Stratum) -> dict[str, Any]:
-    base = evaluation.base
-    others = [name for name in evaluation.models if base is not None and name != base]
+    errors, base = {name: model.errors for name, model in evaluation.models.items()}, evaluation.base_errors
     return {
         "name": stratum.name,
         "kind": stratum.kind,
         "steps": int(stratum.steps.sum()),
-        "over_persistence": {
-            name: stratum_over_persistence(evaluation, stratum, name).as_dict() for name in evaluation.models
-        },
+        "over_persistence": {name: stratum_over_persistence(one, stratum).as_dict() for name, one in errors.items()},
         "gain_over_base": {
-            name: stratum_gain(evaluation, stratum, name, base).as_dict() for name in others if base is not None
+            name: stratum_gain(one, base, stratum).as_dict()
+            for name, one in errors.items()
+            if base is not None and one is not base
         },
     }
 
@@ -221,8 +225,8 @@ def _landscapes(landscapes: Landscapes) -> dict[str, Any]:
 
 def _by_clip(evaluation: Evaluation) -> dict[str, Any]:
     """Return the rollout's L1 errors of every clip, which `compare` pairs between runs."""
-    models = {name: _rounded(model.true.rollout.l1) for name, model in evaluation.models.items()}
-    return {"persistence": _rounded(evaluation.persistence.rollout.l1), "models": models}
+    models = {name: _rounded(model.errors.of("rollout")) for name, model in evaluation.models.items()}
+    return {"persistence": _rounded(evaluation.errors.of("rollout", L1, "persistence")), "models": models}
 
 
 def _curve(curve: Curve) -> list[Mapping[str, float | None]]:

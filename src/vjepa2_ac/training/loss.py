@@ -9,14 +9,15 @@ from functools import partial
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import mse_loss, smooth_l1_loss
+from torch.nn.functional import smooth_l1_loss
 
 from vjepa2_ac.config import TrainingConfig
+from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 
-Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, a mean over all elements
+Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, number by number
 
 
 @dataclass(frozen=True)
@@ -61,15 +62,13 @@ class Objective(nn.Module):
 
 def distance_of(training: TrainingConfig) -> Distance:
     """Return the distance that `training.loss` names."""
-    if training.loss == "l1":
-        return mean_absolute_difference
-    if training.loss == "l2":
-        return mean_squared_difference
-    return partial(smooth_absolute_difference, beta=training.smooth_l1_beta)
+    if training.loss == "smooth_l1":
+        return partial(_smooth_difference, beta=training.smooth_l1_beta)
+    return absolute_difference if training.loss == "l1" else squared_difference
 
 
 def prediction_losses(
-    world_model: WorldModel, batch: LatentBatch, rollout_steps: int, distance: Distance | None = None
+    world_model: WorldModel, batch: LatentBatch, rollout_steps: int, distance: Distance = absolute_difference
 ) -> Losses:
     """Return both parts of the loss of one batch, without weights; the distance is L1 unless given.
 
@@ -80,7 +79,6 @@ def prediction_losses(
     Raises:
         ValueError: A rollout longer than the clip.
     """
-    distance = distance or mean_absolute_difference
     latents, actions, states, extrinsics = batch.latents, batch.actions, batch.states, batch.extrinsics
     if rollout_steps >= latents.shape[1]:
         raise ValueError(f"a rollout of {rollout_steps} steps needs {rollout_steps + 1} frames, got {latents.shape[1]}")
@@ -95,27 +93,13 @@ def prediction_losses(
         further = world_model.rollout(rolled, actions[:, rest], states[:, rest], camera, cache)
         rolled = torch.cat([rolled, further], dim=1)
     return Losses(
-        teacher_forcing=distance(forced, latents[:, 1:]),
-        rollout=distance(rolled, latents[:, 1 : rollout_steps + 1]),
+        teacher_forcing=distance(forced, latents[:, 1:]).mean(),
+        rollout=distance(rolled, latents[:, 1 : rollout_steps + 1]).mean(),
     )
 
 
-def mean_absolute_difference(
-    predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"]
-) -> Float[Tensor, ""]:
-    """Return the L1 distance, computed in float32."""
-    return (predicted.float() - true.float()).abs().mean()
-
-
-def mean_squared_difference(
-    predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"]
-) -> Float[Tensor, ""]:
-    """Return the squared L2 distance, computed in float32."""
-    return mse_loss(predicted.float(), true.float())
-
-
-def smooth_absolute_difference(
+def _smooth_difference(
     predicted: Float[Tensor, "batch time tokens dim"], true: Float[Tensor, "batch time tokens dim"], beta: float
-) -> Float[Tensor, ""]:
+) -> Float[Tensor, "batch time tokens dim"]:
     """Return d**2 / (2 * beta) where a difference d is below beta, and d - beta / 2 above, computed in float32."""
-    return smooth_l1_loss(predicted.float(), true.float(), beta=beta)
+    return smooth_l1_loss(predicted.float(), true.float(), reduction="none", beta=beta)

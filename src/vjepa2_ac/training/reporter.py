@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol, runtime_checkable
 
-from vjepa2_ac.evaluation.metrics import PredictionErrors
+from vjepa2_ac.evaluation.result import PredictionErrors
 
 
 @runtime_checkable

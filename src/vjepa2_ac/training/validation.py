@@ -6,7 +6,9 @@ from typing import Any
 
 from vjepa2_ac.data.clips.loader import validation_batches
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.metrics import PredictionErrors, one_step_ratios, prediction_errors, ratios_by_horizon
+from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.measure import prediction_errors
+from vjepa2_ac.evaluation.result import PredictionErrors
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.new_embodiment import NOT_ASKED
 from vjepa2_ac.training.reporter import NullMetricsLog, Reporter
@@ -31,11 +33,11 @@ def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter
 
 def validation_metrics(errors: PredictionErrors) -> dict[str, Any]:
     """Return what a validation writes into the metrics log."""
-    by_horizon, one_step = ratios_by_horizon(errors), one_step_ratios(errors)
+    by_horizon = over_persistence(errors, "rollout")
     return {
-        "error_over_persistence": one_step["true"].value,
-        "error_over_persistence_zero_actions": one_step["zero"].value,
-        "error_over_persistence_shuffled_actions": one_step["shuffled"].value,
+        "error_over_persistence": one_step_over_persistence(errors).value,
+        "error_over_persistence_zero_actions": one_step_over_persistence(errors, "zero").value,
+        "error_over_persistence_shuffled_actions": one_step_over_persistence(errors, "shuffled").value,
         "rollout_over_persistence": [r.value for r in by_horizon],
         "rollout_over_persistence_last": by_horizon[-1].value,
     }
@@ -64,7 +66,7 @@ def refuse_weak_base(run: Run, errors: PredictionErrors, reporter: Reporter) -> 
     Raises:
         InputError: It is not, and `training.allow_weak_base` is off.
     """
-    config, error = run.config, one_step_ratios(errors)["true"].value
+    config, error = run.config, one_step_over_persistence(errors).value
     if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:
         return
     if run.world_model.fresh_heads is not None:

@@ -115,7 +115,7 @@ def test_a_trained_model_plans_merged_and_its_errors_are_measured_unmerged(
         assert others is not None
         np.testing.assert_allclose(plans.one_step, others.one_step, rtol=0, atol=1e-5)
         np.testing.assert_allclose(plans.three_steps, others.three_steps, rtol=0, atol=1e-5)
-        assert (result.true.rollout.l1 == as_it_is[name].true.rollout.l1).all()
+        assert (result.errors.of("rollout") == as_it_is[name].errors.of("rollout")).all()
     trained, base = (found[name].plans for name in found if name != "base"), found["base"].plans
     assert base is not None
     assert all(plans is not None and (plans.one_step != base.one_step).any() for plans in trained)

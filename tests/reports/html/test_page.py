@@ -18,6 +18,7 @@ from PIL import Image
 from evaluation_results import evaluation
 from vjepa2_ac.evaluation.estimates import difference_to, gain_over, mean_error, over_persistence, stratum_gain
 from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.evaluation.metrics import L1, L2
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
 from vjepa2_ac.reports.html.charts import Line, line_chart, nice_axis
 from vjepa2_ac.reports.html.examples import MOST_EXAMPLES
@@ -116,14 +117,16 @@ def test_the_verdict_is_on_top() -> None:
 def test_each_cell_of_the_tables_by_horizon_is_the_estimate_of_its_row_and_column(mode) -> None:
     one, _, page = usual()
     words = {"rollout": "open-loop rollout", "teacher_forced": "teacher-forced"}[mode]
-    for metric, name in (("l1", "L1"), ("l2", "L2"), ("cosine", "cosine")):
+    trained = one.models["adapter"].errors
+    for metric, name in ((L1, "L1"), (L2, "L2")):
         head, *rows = table_of(page, f"{name} error over persistence by horizon, {words}")
         assert head[1:] == ["base", "runs/other", "adapter", "adapter, zero actions", "adapter, shuffled actions"]
-        columns = [over_persistence(one, each, mode, metric) for each in one.models]
-        columns += [over_persistence(one, "adapter", mode, metric, actions) for actions in ("zero", "shuffled")]
+        columns = [over_persistence(each.errors, mode, metric) for each in one.models.values()]
+        columns += [over_persistence(trained, mode, metric, actions) for actions in ("zero", "shuffled")]
         assert [row[1:] for row in rows] == [[plain(column[h]) for column in columns] for h in range(one.horizon)]
         head, *rows = table_of(page, f"{name} error by horizon, {words}")
-        means = [mean_error(one, each, mode, metric) for each in ("persistence", *one.models)]
+        means = [mean_error(trained, mode, metric, "persistence")]
+        means += [mean_error(each.errors, mode, metric) for each in one.models.values()]
         assert head[1:5] == ["persistence", "base", "runs/other", "adapter"]
         assert [row[1:5] for row in rows] == [[plain(column[h], 4) for column in means] for h in range(one.horizon)]
         assert [row[0] for row in rows] == ["1 (0.27\xa0s)", "2 (0.53\xa0s)", "3 (0.80\xa0s)"]
@@ -132,7 +135,8 @@ def test_each_cell_of_the_tables_by_horizon_is_the_estimate_of_its_row_and_colum
 def test_differences_to_the_base_are_those_of_the_pairs() -> None:
     one, _, page = usual()
     _, *rows = table_of(page, "adapter against base")
-    gain, difference = gain_over(one, "adapter", "base")[-1], difference_to(one, "adapter", "base")[-1]
+    pair = one.models["adapter"].errors, one.models["base"].errors
+    gain, difference = gain_over(*pair)[-1], difference_to(*pair)[-1]
     assert rows[-1][1] == f"+{percent(gain.value, 1)} [+{percent(gain.low, 1)}, +{percent(gain.high, 1)}]"
     assert rows[-1][2] == f"{signed(difference.value, 4)} [{signed(difference.low, 4)}, {signed(difference.high, 4)}]"
     assert difference.value < 0
@@ -141,7 +145,7 @@ def test_differences_to_the_base_are_those_of_the_pairs() -> None:
 def test_strata_ranks_landscapes_and_episodes_are_those_of_the_result() -> None:
     one, _, page = usual()
     _, moving, _idle = table_of(page, "One-step L1 error over persistence by motion")
-    gain = stratum_gain(one, one.strata[0], "adapter", "base")
+    gain = stratum_gain(one.models["adapter"].errors, one.models["base"].errors, one.strata[0])
     assert moving[:2] == ["moving", str(one.strata[0].steps.sum())]
     assert moving[-1].startswith(f"+{percent(gain.value, 1)} ")
     ranks = table_of(page, "How much predictions change with the action")
@@ -291,8 +295,11 @@ def test_one_episode_has_no_intervals_and_nothing_is_written_as_nan() -> None:
 
 def test_better_than_the_base_but_not_than_doing_nothing_is_no_success() -> None:
     one, _, _ = usual()
-    grown = replace(one.persistence, rollout=replace(one.persistence.rollout, l1=one.persistence.rollout.l1 / 3))
-    html = page_of(replace(one, persistence=grown))
+    kind, models = ("persistence", "rollout", "l1"), {}
+    for name, model in one.models.items():
+        arrays = {**model.errors.arrays, kind: model.errors.arrays[kind] / 3}
+        models[name] = replace(model, errors=replace(model.errors, arrays=arrays))
+    html = page_of(replace(one, models=models))
     assert "Better than the base, and worse than doing nothing." in html
     assert 'class="verdict unclear"' in html
 

@@ -91,7 +91,8 @@ def measured_parts(config: Config, sizes: ModelSizes) -> Measured:
             further = model.rollout(forced[:, :1], batch.actions[:, rest], batch.states[:, rest], later, cache)
         rolled = torch.cat([forced[:, :1], further], dim=1)
         with losing:
-            losses = distance(forced, batch.latents[:, 1:]), distance(rolled, batch.latents[:, 1 : steps + 1])
+            pairs = (forced, batch.latents[:, 1:]), (rolled, batch.latents[:, 1 : steps + 1])
+            losses = [distance(*pair).mean() for pair in pairs]
         measured = Measured(forcing.bytes, rolling.bytes, losing.bytes)
     assert all(loss.requires_grad for loss in losses)  # until here everything was needed
     return measured

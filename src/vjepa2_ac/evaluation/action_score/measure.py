@@ -19,7 +19,7 @@ from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_score.protocol import FRAMES, FRAMES_SEEN, SCORED, STEPS
 from vjepa2_ac.evaluation.action_use.one_step import clip_generator
-from vjepa2_ac.evaluation.metrics import Predictor
+from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import PlanningStudy, Plans
 from vjepa2_ac.planning.action_space import ActionSpace, pose_space
 from vjepa2_ac.planning.energy import distance

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.intervals import Estimate, mean_of
-from vjepa2_ac.evaluation.metrics import Predictor
+from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import Landscape, Landscapes
 
 _ROOM = 1.25  # extent of the grid relative to the largest true action

@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
-from vjepa2_ac.evaluation.metrics import Predictor
+from vjepa2_ac.evaluation.measure import Predictor
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class RolloutStart:
     @property
     def persistence(self) -> float:
         """The L1 error of predicting that nothing changes."""
-        return float((self.frame.float() - self.following.float()).abs().mean())
+        return float(absolute_difference(self.frame, self.following).mean())
 
     def generator(self, seed: int) -> np.random.Generator:
         """Return a random generator that depends only on the seed and this clip, not on those before it."""
@@ -81,8 +82,8 @@ def evaluate_actions(
     energies, changes = [], []
     for part in torch.from_numpy(actions.astype(np.float32)).to(start.action).split(at_once):  # type: ignore[no-untyped-call]  # torch
         predicted = _predict(model, start, part)
-        energies.append((predicted - start.following.float()).abs().mean(dim=(1, 2)))
-        changes.append((predicted - expected).abs().mean(dim=(1, 2)))
+        energies.append(absolute_difference(predicted, start.following).mean(dim=(1, 2)))
+        changes.append(absolute_difference(predicted, expected).mean(dim=(1, 2)))
     return EvaluatedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.intervals import mean_of, ratio
-from vjepa2_ac.evaluation.metrics import Predictor
+from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import Ranking, Sensitivity
 
 TOP = (1, 5, 10)

@@ -8,11 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
-import torch
-from jaxtyping import Float
 
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset
@@ -21,7 +18,7 @@ from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.evaluation.data_variants.variants import ChangedSource, RememberingSource, Variant, variants_of
 from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
-from vjepa2_ac.evaluation.metrics import Predictor, distances
+from vjepa2_ac.evaluation.measure import OneStepErrors, Predictor, one_step_errors
 
 FRAMES = 8  # of a clip, at most
 SHIFTS = (1, 2, 4, 8)  # control steps
@@ -113,38 +110,24 @@ def probe_variants(
     dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": min(dataset.config.frames, FRAMES)}))
     windows, shifts = _with_room(dataset, candidates, clips)
     variants = variants_of(dataset.config, shifts)
-    measured: list[list[_Errors]] = []
+    measured: list[list[OneStepErrors]] = []
     ids: list[str] = []
     for batch in batches_of(dataset, windows, batch_size=batch_size):
         latents = encode(batch)
         here = _of_batch(dataset, batch)
-        measured.append([_errors(model, latents), *(_under(one, model, encode, *here, latents) for one in variants)])
+        changed = [_under(one, model, encode, *here, latents) for one in variants]
+        measured.append([one_step_errors(model, latents), *changed])
         ids += batch.episode_ids
         if progress is not None:
             progress(len(ids), len(windows))
     plain, *others = [
-        _Errors(*map(np.concatenate, zip(*of_one, strict=True))) for of_one in zip(*measured, strict=True)
+        OneStepErrors(*map(np.concatenate, zip(*of_one, strict=True))) for of_one in zip(*measured, strict=True)
     ]
     results = [
         VariantResult(variant.name, variant.repair, ratio(*one, ids), ratio_difference(one, plain, ids))
         for variant, one in zip(variants, others, strict=True)
     ]
     return VariantProbe(ratio(*plain, ids), tuple(results), len(ids), len(set(ids)))
-
-
-class _Errors(NamedTuple):
-    """Of each clip; persistence differs if a variant changes the frames."""
-
-    one_step: Float[np.ndarray, " clips"]
-    persistence: Float[np.ndarray, " clips"]
-
-
-@torch.no_grad()
-def _errors(model: Predictor, batch: LatentBatch) -> _Errors:
-    latents, truth = batch.latents[:, :-1], batch.latents[:, 1:]
-    extrinsics = None if batch.extrinsics is None else batch.extrinsics[:, :-1]
-    predicted = model.predict(latents, batch.actions, batch.states[:, :-1], extrinsics)
-    return _Errors(distances(predicted, truth).l1.mean(axis=1), distances(latents, truth).l1.mean(axis=1))
 
 
 def _of_batch(dataset: Dataset, batch: Batch) -> tuple[Dataset, list[tuple[int, int]]]:
@@ -162,14 +145,14 @@ def _under(
     dataset: Dataset,
     windows: list[tuple[int, int]],
     plain: LatentBatch,
-) -> _Errors:
+) -> OneStepErrors:
     """Return the errors of the same clips under a variant; frames are encoded again only if it changes them."""
     source = ChangedSource(dataset.source, variant)
     changed = next(iter(batches_of(replace(dataset, source=source), windows, batch_size=len(windows))))
     if variant.changes_frames:
-        return _errors(model, encode(changed))
+        return one_step_errors(model, encode(changed))
     device = plain.states.device
-    return _errors(model, replace(plain, states=changed.states.to(device), actions=changed.actions.to(device)))
+    return one_step_errors(model, replace(plain, states=changed.states.to(device), actions=changed.actions.to(device)))
 
 
 def _with_room(

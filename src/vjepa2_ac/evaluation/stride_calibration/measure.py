@@ -25,7 +25,7 @@ from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
-from vjepa2_ac.evaluation.metrics import Predictor, one_step_errors
+from vjepa2_ac.evaluation.measure import Predictor, one_step_errors
 from vjepa2_ac.model.network.world_model import WorldModel
 
 FRAMES = 8  # of a clip at most: as the released weights were trained, and short enough for the widest stride
@@ -218,8 +218,7 @@ def _measure(
     model: Predictor, encode: Callable[[Batch], LatentBatch], batches: Iterator[Batch], *, is_pose: bool
 ) -> Iterator[_Measured]:
     for batch in batches:
-        with torch.no_grad():
-            errors, persistence = one_step_errors(model, encode(batch))
+        errors, persistence = one_step_errors(model, encode(batch))
         moved_cm = np.zeros(0)
         if is_pose:
             moved_cm = batch.actions[..., :3].norm(dim=-1).flatten().numpy().astype(np.float64) * 100

@@ -69,7 +69,7 @@ def _curves(axes: Any, evaluation: Evaluation) -> None:
     seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
     shown = seconds[:: -(-len(seconds) // 8)]
     for name, colour in _colours(evaluation).items():
-        ratios = over_persistence(evaluation, name, "rollout")
+        ratios = over_persistence(evaluation.models[name].errors, "rollout")
         axes.plot(seconds, [r.value for r in ratios], "o-", color=colour, label=name)
         axes.fill_between(
             seconds, [r.low for r in ratios], [r.high for r in ratios], color=colour, alpha=0.2, linewidth=0
@@ -83,10 +83,10 @@ def _curves(axes: Any, evaluation: Evaluation) -> None:
 def _use_of_actions(axes: Any, evaluation: Evaluation) -> None:
     width = 0.8 / len(evaluation.models)
     for i, (name, colour) in enumerate(_colours(evaluation).items()):
-        ratios = {actions: one_step_over_persistence(evaluation, name, actions=actions) for actions in ACTIONS}
+        ratios = [one_step_over_persistence(evaluation.models[name].errors, actions) for actions in ACTIONS]
         places = np.arange(len(ratios)) + (i - (len(evaluation.models) - 1) / 2) * width
-        values = [r.value for r in ratios.values()]
-        spread = np.array([_reach(r) for r in ratios.values()]).T
+        values = [r.value for r in ratios]
+        spread = np.array([_reach(r) for r in ratios]).T
         axes.bar(places, values, width, color=colour, yerr=spread, error_kw={"elinewidth": 1}, label=name)
     axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--")
     axes.set_xticks(range(3), ["true", "zero", "shuffled"])

@@ -73,8 +73,8 @@ def landscape_section(evaluation: Evaluation) -> ReportSection:
 def _costs(evaluation: Evaluation) -> Markup:
     rows = []
     for one in models_of(evaluation):
-        ratios = [value(one_step_over_persistence(evaluation, one.model, actions=actions)) for actions in ACTIONS]
-        costs = [share(cost_of_actions(evaluation, one.model, actions), with_sign=True) for actions in ACTIONS[1:]]
+        ratios = [value(one_step_over_persistence(one.model.errors, actions)) for actions in ACTIONS]
+        costs = [share(cost_of_actions(one.model.errors, actions), with_sign=True) for actions in ACTIONS[1:]]
         rows.append([one.label, *ratios, *costs])
     head = ["model", *(f"error with {actions} actions" for actions in ACTIONS)]
     head += [f"growth of the error with {actions} actions" for actions in ACTIONS[1:]]
@@ -118,9 +118,9 @@ def _top(ranking: Ranking, k: int) -> Markup:
 
 def _ranks(evaluation: Evaluation, place: int) -> Markup:
     measured = [
-        (one, model.sensitivity.rankings[place])
+        (one, sensitivity.rankings[place])
         for one in models_of(evaluation)
-        if (model := evaluation.models[one.model]).sensitivity is not None and place < len(model.sensitivity.rankings)
+        if (sensitivity := one.model.sensitivity) is not None and place < len(sensitivity.rankings)
     ]
     if not measured:
         return Markup()

@@ -14,7 +14,8 @@ from vjepa2_ac.evaluation.estimates import (
     stratum_over_persistence,
 )
 from vjepa2_ac.evaluation.intervals import Estimate
-from vjepa2_ac.evaluation.result import METRICS, MODES, Evaluation, Metric, Mode, Stratum
+from vjepa2_ac.evaluation.metrics import L1, Metric
+from vjepa2_ac.evaluation.result import MODES, Evaluation, Mode, ModelResult, PredictionErrors, Stratum, Way
 from vjepa2_ac.reports.html.charts import Axis, Line, axis_at, legend, line_chart, nice_axis
 from vjepa2_ac.reports.html.formatting import seconds
 from vjepa2_ac.reports.html.layout import (
@@ -34,11 +35,6 @@ from vjepa2_ac.reports.html.series import Series, models_of, persistence, wrong_
 
 _MODES = {"rollout": "open-loop rollout", "teacher_forced": "teacher-forced"}
 _MOTIONS = ("moving", "idle")
-_METRICS = {
-    "l1": "L1: mean absolute difference",
-    "l2": "L2: mean squared difference (of normalised latents twice the cosine error: equal ratios)",
-    "cosine": "cosine: one minus the cosine similarity",
-}
 _HOW = {
     "rollout": (
         "The model sees the first frame and the actions, and feeds its own predictions back. The dashed line at 1 is"
@@ -51,37 +47,31 @@ _HOW = {
     ),
 }
 
-CurveOf = Callable[[Evaluation, Series, Mode, Metric], Sequence[Estimate]]
+CurveOf = Callable[[PredictionErrors, Mode, Metric, Way], Sequence[Estimate]]  # of `evaluation.estimates`
 
 
 def error_section(evaluation: Evaluation) -> ReportSection:
     """Return the section on the error by horizon of every model, as curves and as numbers."""
     drawings = []
     for mode in reversed(MODES):
-        lines = [_line(evaluation, one, _ratios(evaluation, one, mode, "l1")) for one in models_of(evaluation)]
-        wrong = [_line(evaluation, one, _ratios(evaluation, one, mode, "l1")) for one in wrong_actions_of(evaluation)]
-        lines = [*(replace(line, low=None, high=None) for line in wrong), *lines]
+        wrong, right = (
+            [_line(evaluation, one, over_persistence(one.model.errors, mode, L1, one.way)) for one in shown]
+            for shown in (wrong_actions_of(evaluation), models_of(evaluation))
+        )
+        lines = [*(replace(line, low=None, high=None) for line in wrong), *right]
         y_axis = nice_axis("L1 error / persistence", [*_reached(lines), 1.0], from_zero=True)
         description = f"Error over persistence by horizon, {_MODES[mode]}: {_as_text(lines)}."
         chart = line_chart(description, lines, _time_axis(evaluation), y_axis, level=1.0)
         key = legend([Line("persistence (doing nothing)", (), (), "s-persistence"), *reversed(lines)])
         drawings.append(figure(f"Error by horizon, {_MODES[mode]}", joined(chart, key), _HOW[mode]))
-    tables = [_table(evaluation, mode, "l1", _ratios, "over persistence") for mode in reversed(MODES)]
-    absolute = [
-        folded(
-            f"The errors themselves, {_METRICS[metric]}",
-            *(_table(evaluation, mode, metric, _means, "") for mode in reversed(MODES)),
-        )
-        for metric in METRICS
-    ]
-    others = [
-        folded(
-            f"Error over persistence, {_METRICS[metric]}",
-            *(_table(evaluation, mode, metric, _ratios, "over persistence") for mode in reversed(MODES)),
-        )
-        for metric in METRICS[1:]
-    ]
-    return ReportSection("errors", "Error by horizon", joined(side_by_side(*drawings), *tables, *others, *absolute))
+    tables = _tables(evaluation, L1, over_persistence, "over persistence")
+    for metric in evaluation.metrics[1:]:
+        ratios = _tables(evaluation, metric, over_persistence, "over persistence")
+        tables.append(folded(f"Error over persistence, {metric.heading}: {metric.explanation}", *ratios))
+    for metric in evaluation.metrics:
+        means = _tables(evaluation, metric, mean_error, "")
+        tables.append(folded(f"The errors themselves, {metric.heading}: {metric.explanation}", *means))
+    return ReportSection("errors", "Error by horizon", joined(side_by_side(*drawings), *tables))
 
 
 def base_section(evaluation: Evaluation) -> ReportSection:
@@ -90,8 +80,9 @@ def base_section(evaluation: Evaluation) -> ReportSection:
     if evaluation.base is None:
         why = "There is no base model in this evaluation to compare with."
         return ReportSection("base", title, not_measured("Differences to the base", why))
-    compared = [one for one in models_of(evaluation) if one.model != evaluation.base]
-    lines = [_line(evaluation, one, gain_over(evaluation, one.model, evaluation.base)) for one in compared]
+    compared = [one for one in models_of(evaluation) if one.model.role != "base"]
+    base = evaluation.models[evaluation.base]
+    lines = [_line(evaluation, one, gain_over(one.model.errors, base.errors)) for one in compared]
     in_percent = [
         replace(line, y=[100 * y for y in line.y], low=_in_percent(line.low), high=_in_percent(line.high))
         for line in lines
@@ -104,7 +95,7 @@ def base_section(evaluation: Evaluation) -> ReportSection:
         " hard for both cancels out. Above 0 is better than the base; where the band includes 0, nothing is shown."
     )
     drawing = figure("Gain over the base by horizon, open-loop rollout", chart, how)
-    tables = [_compared_table(evaluation, one, evaluation.base) for one in compared]
+    tables = [_compared_table(evaluation, one.model, base) for one in compared]
     return ReportSection("base", title, joined(drawing, *tables))
 
 
@@ -131,33 +122,26 @@ def horizon_name(evaluation: Evaluation, horizon: int) -> str:
     return f"{horizon} ({seconds(horizon * evaluation.about.seconds_per_step)})"
 
 
-def _ratios(evaluation: Evaluation, one: Series, mode: Mode, metric: Metric) -> Sequence[Estimate]:
-    return over_persistence(evaluation, one.model, mode, metric, one.actions)
-
-
-def _means(evaluation: Evaluation, one: Series, mode: Mode, metric: Metric) -> Sequence[Estimate]:
-    return mean_error(evaluation, one.model, mode, metric, one.actions)
-
-
-def _table(evaluation: Evaluation, mode: Mode, metric: Metric, curve_of: CurveOf, over: str) -> Markup:
+def _tables(evaluation: Evaluation, metric: Metric, curve_of: CurveOf, over: str) -> list[Markup]:
+    """Return a table of the rollout and a teacher-forced one; of the errors themselves also persistence has some."""
     shown = (*models_of(evaluation), *wrong_actions_of(evaluation))
-    shown = shown if over else (persistence(), *shown)
-    columns = [curve_of(evaluation, one, mode, metric) for one in shown]
-    digits = 3 if over else 4
-    rows = [
-        [horizon_name(evaluation, h + 1), *(value(column[h], digits) for column in columns)]
-        for h in range(evaluation.horizon)
-    ]
-    name = _METRICS[metric].split(":")[0]
-    caption = f"{name} error {over}".strip() + f" by horizon, {_MODES[mode]} (no unit; value [95 % interval])"
-    return table(caption, ["model steps ahead", *(one.label for one in shown)], rows)
+    shown = shown if over else (persistence(evaluation), *shown)
+    tables = []
+    for mode in reversed(MODES):
+        columns = [curve_of(one.model.errors, mode, metric, one.way) for one in shown]
+        rows = [
+            [horizon_name(evaluation, h + 1), *(value(column[h], 3 if over else 4) for column in columns)]
+            for h in range(evaluation.horizon)
+        ]
+        name = f"{metric.heading} {'error' if metric.smaller_is_better else ''} {over}"
+        caption = f"{' '.join(name.split())} by horizon, {_MODES[mode]} (no unit; value [95 % interval])"
+        tables.append(table(caption, ["model steps ahead", *(one.label for one in shown)], rows))
+    return tables
 
 
-def _compared_table(evaluation: Evaluation, one: Series, base: str) -> Markup:
-    columns = [
-        (gain_over(evaluation, one.model, base, mode), difference_to(evaluation, one.model, base, mode))
-        for mode in reversed(MODES)
-    ]
+def _compared_table(evaluation: Evaluation, one: ModelResult, base: ModelResult) -> Markup:
+    pair = one.errors, base.errors
+    columns = [(gain_over(*pair, mode), difference_to(*pair, mode)) for mode in reversed(MODES)]
     rows = [
         [
             horizon_name(evaluation, h + 1),
@@ -169,22 +153,22 @@ def _compared_table(evaluation: Evaluation, one: Series, base: str) -> Markup:
     head = ["model steps ahead"] + [
         f"{what}, {_MODES[mode]}" for mode in reversed(MODES) for what in ("gain", "L1 difference")
     ]
-    caption = f"{one.label} against {base}, paired by clip (value [95 % interval]; a gain above 0 is better)"
+    caption = f"{one.name} against {base.name}, paired by clip (value [95 % interval]; a gain above 0 is better)"
     return table(caption, head, rows)
 
 
 def _strata_table(evaluation: Evaluation, kind: str, strata: Sequence[Stratum]) -> Markup:
     shown = models_of(evaluation)
-    base, trained = evaluation.base, evaluation.trained
+    base = evaluation.base_errors
     what = kind if kind == "motion" or evaluation.about.is_pose else "norm of the action"
     rows = []
     for stratum in strata:
-        cells = [value(stratum_over_persistence(evaluation, stratum, one.model)) for one in shown]
+        cells = [value(stratum_over_persistence(one.model.errors, stratum)) for one in shown]
         if base is not None:
-            cells.append(share(stratum_gain(evaluation, stratum, trained, base), with_sign=True))
+            cells.append(share(stratum_gain(evaluation.errors, base, stratum), with_sign=True))
         rows.append([stratum.name, str(int(stratum.steps.sum())), *cells])
     head = [what, "steps", *(one.label for one in shown)]
-    head += [f"gain of {trained} over {base}"] if base is not None else []
+    head += [f"gain of {evaluation.trained} over {evaluation.base}"] if base is not None else []
     return table(f"One-step L1 error over persistence by {kind} (value [95 % interval])", head, rows)
 
 

@@ -13,7 +13,6 @@ from vjepa2_ac.reports.html.formatting import decimal, seconds
 from vjepa2_ac.reports.html.images import colours_of, css_gradient, jpeg_urls, png_url
 from vjepa2_ac.reports.html.layout import ReportSection, not_measured, paragraph, scrolling, why_not
 from vjepa2_ac.reports.html.markup import Markup, element, joined
-from vjepa2_ac.reports.html.series import models_of
 
 MOST_EXAMPLES = 4
 MOST_FRAMES = 16  # of a clip in the animation
@@ -65,7 +64,7 @@ def examples_section(evaluation: Evaluation) -> ReportSection:
         why = why_not(evaluation, "example clips", "This evaluation made no example clips.")
         return ReportSection("pictures", title, not_measured("Example clips", why))
     photographs = jpeg_urls([list(_frames(example).values()) for example in examples], at_most=_BYTES)
-    models = tuple(one.model for one in models_of(evaluation))
+    models = tuple(evaluation.models)
     parts = []
     for number, (example, urls) in enumerate(zip(examples, photographs, strict=True)):
         shown = _Shown(number, example, models, evaluation.about.seconds_per_step, bool(urls))

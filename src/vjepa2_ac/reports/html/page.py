@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 from vjepa2_ac.evaluation.estimates import cost_of_actions, gain_over, over_persistence
+from vjepa2_ac.evaluation.metrics import L1
 from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.reports.html.actions import actions_section, landscape_section
 from vjepa2_ac.reports.html.errors import base_section, error_section, strata_section
@@ -110,15 +111,15 @@ def _header(evaluation: Evaluation, verdict: str) -> Markup:
 
 def _tiles(evaluation: Evaluation) -> Markup:
     """Return the most important metrics as tiles."""
-    trained, base = evaluation.trained, evaluation.base
+    errors, base = evaluation.errors, evaluation.base_errors
     ahead = f"{seconds(evaluation.seconds_ahead)} ahead, rollout, L1"
-    tiles = [("error over persistence", value(over_persistence(evaluation, trained, "rollout")[-1]), ahead)]
+    tiles = [("error over persistence", value(over_persistence(errors, "rollout")[-1]), ahead)]
     if base is not None:
-        gain = gain_over(evaluation, trained, base)[-1]
-        tiles.insert(0, (f"gain over the {base}", share(gain, with_sign=True), ahead))
-    cost = cost_of_actions(evaluation, trained, "shuffled")
+        gain = gain_over(errors, base)[-1]
+        tiles.insert(0, (f"gain over the {evaluation.base}", share(gain, with_sign=True), ahead))
+    cost = cost_of_actions(errors, "shuffled")
     tiles.append(("cost of another clip's actions", share(cost, with_sign=True), "growth of the one-step error"))
-    sensitivity = evaluation.models[trained].sensitivity
+    sensitivity = evaluation.models[evaluation.trained].sensitivity
     if sensitivity is not None and sensitivity.rankings:
         first = sensitivity.rankings[0]
         tiles.append(("mean rank of the true action", value(first.mean_rank), "0 is best, 0.5 is chance"))
@@ -131,13 +132,13 @@ def _tiles(evaluation: Evaluation) -> Markup:
 
 def _outcome(evaluation: Evaluation) -> tuple[str, str]:
     """Return a colour and a short text: whether training clearly helped, beside the base and beside doing nothing."""
-    nothing = over_persistence(evaluation, evaluation.trained, "rollout")[-1].side(1.0)
-    beside_nothing = {-1: "better than", 0: "not clearly different from", 1: "worse than"}[nothing] + " doing nothing"
-    if evaluation.base is None:
-        return _COLOURS[-nothing], f"{beside_nothing.capitalize()}."
-    gain = gain_over(evaluation, evaluation.trained, evaluation.base)[-1].side(0.0)
+    nothing, base = L1.side(over_persistence(evaluation.errors, "rollout")[-1]), evaluation.base_errors
+    beside_nothing = {1: "better than", 0: "not clearly different from", -1: "worse than"}[nothing] + " doing nothing"
+    if base is None:
+        return _COLOURS[nothing], f"{beside_nothing.capitalize()}."
+    gain = gain_over(evaluation.errors, base)[-1].side(0.0)
     words = {1: "Better than the base", 0: "Not clearly different from the base", -1: "Worse than the base"}[gain]
-    if nothing == -1:
+    if nothing == 1:
         return _COLOURS[gain], f"{words}."
     return _COLOURS[min(gain, 0)], f"{words}, and {beside_nothing}."
 

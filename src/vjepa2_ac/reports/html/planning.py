@@ -139,7 +139,7 @@ def _scatter(evaluation: Evaluation, study: PlanningStudy, axis: int) -> Markup:
 def _drawn(evaluation: Evaluation) -> Sequence[tuple[Series, Plans]]:
     """Return the models with their plans, the trained one last, so that it is drawn on top."""
     found = ways_of(evaluation)
-    return [(one, found[one.model]) for one in models_of(evaluation) if one.model in found]
+    return [(one, found[one.model.name]) for one in models_of(evaluation) if one.model.name in found]
 
 
 def _ends(values: Float[np.ndarray, "starts steps"]) -> list[float]:

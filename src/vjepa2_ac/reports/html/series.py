@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vjepa2_ac.evaluation.result import Actions, Evaluation
+from vjepa2_ac.evaluation.result import Evaluation, ModelResult, Way
 
 _OTHERS = 4  # colours for other runs, reused after these
 
@@ -13,15 +13,15 @@ _OTHERS = 4  # colours for other runs, reused after these
 class Series:
     """A measured way of predicting."""
 
-    model: str  # its name in the result, or persistence
-    actions: Actions
+    model: ModelResult
+    way: Way
     label: str
     style: str
 
 
-def persistence() -> Series:
-    """Return persistence."""
-    return Series("persistence", "true", "persistence", "s-persistence")
+def persistence(evaluation: Evaluation) -> Series:
+    """Return persistence, which every model was measured beside."""
+    return Series(evaluation.models[evaluation.trained], "persistence", "persistence", "s-persistence")
 
 
 def models_of(evaluation: Evaluation) -> tuple[Series, ...]:
@@ -29,15 +29,15 @@ def models_of(evaluation: Evaluation) -> tuple[Series, ...]:
     others = [name for name, model in evaluation.models.items() if model.role == "other"]
     styles = {"base": "s-base", "trained": "s-trained"}
     return tuple(
-        Series(name, "true", name, styles.get(model.role) or f"s-other{others.index(name) % _OTHERS}")
+        Series(model, "true", name, styles.get(model.role) or f"s-other{others.index(name) % _OTHERS}")
         for name, model in evaluation.models.items()
     )
 
 
 def wrong_actions_of(evaluation: Evaluation) -> tuple[Series, ...]:
     """Return the trained model, given other actions than the true ones."""
-    name = evaluation.trained
+    name, model = evaluation.trained, evaluation.models[evaluation.trained]
     return (
-        Series(name, "zero", f"{name}, zero actions", "s-zero"),
-        Series(name, "shuffled", f"{name}, shuffled actions", "s-shuffled"),
+        Series(model, "zero", f"{name}, zero actions", "s-zero"),
+        Series(model, "shuffled", f"{name}, shuffled actions", "s-shuffled"),
     )

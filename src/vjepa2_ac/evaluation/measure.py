@@ -1,0 +1,144 @@
+"""Measurement of predictions: errors between predicted and true latents, beside the error of persistence.
+
+All errors compare layer-normalised latents, per clip and model step. *Persistence* is the error of copying a frame that
+was seen. A ratio of 1 means: as good as doing nothing; 0: perfect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain, product
+from typing import NamedTuple, Protocol, get_args, runtime_checkable
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.metrics import L1, Metric
+from vjepa2_ac.evaluation.result import MODES, Mode, PredictionErrors, Way
+
+ALL: tuple[tuple[Way, Mode], ...] = tuple(product(get_args(Way), MODES))
+VALIDATED: tuple[tuple[Way, Mode], ...] = (  # rollouts, which take longest, with the true actions only
+    *(("true", mode) for mode in MODES),
+    *(("persistence", mode) for mode in MODES),
+    ("zero", "teacher_forced"),
+    ("shuffled", "teacher_forced"),
+)
+ONE_STEP: tuple[tuple[Way, Mode], ...] = (("true", "teacher_forced"), ("persistence", "teacher_forced"))
+
+
+@runtime_checkable
+class Predictor(Protocol):
+    """A predictor of latents: `WorldModel`, or an oracle in a test."""
+
+    def predict(
+        self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None
+    ) -> Float[Tensor, "batch time tokens dim"]:
+        """Return the prediction of each next frame from the true frames before it."""
+        ...
+
+    def rollout(
+        self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None
+    ) -> Float[Tensor, "batch horizon tokens dim"]:
+        """Return the frames after the context, each prediction fed back."""
+        ...
+
+
+@torch.no_grad()
+def measured(
+    model: Predictor,
+    batch: LatentBatch,
+    wanted: Sequence[tuple[Way, Mode]],
+    metrics: Sequence[Metric],
+    others: Float[Tensor, "batch time action_dim"] | None = None,
+) -> PredictionErrors:
+    """Return the errors of a model on a batch of clips.
+
+    Args:
+        model: The predictor.
+        batch: The clips.
+        wanted: The predictions to make.
+        metrics: By what they are measured.
+        others: The actions of other clips, if predictions with shuffled actions are wanted.
+    """
+    arrays: dict[tuple[Way, Mode, str], Float[np.ndarray, "clips horizon"]] = {}
+    for way, mode in wanted:
+        predicted = _prediction(model, batch, way, mode, others)
+        for metric in metrics:
+            found = metric.of(predicted, batch.latents[:, 1:])
+            arrays[way, mode, metric.name] = np.asarray(found.cpu().numpy(), dtype=np.float64)
+    return PredictionErrors(batch.episode_ids, arrays)
+
+
+def joined(parts: Sequence[PredictionErrors]) -> PredictionErrors:
+    """Return the errors of all clips of some batches.
+
+    Raises:
+        ValueError: No clips.
+    """
+    if not parts:
+        raise ValueError("no clips to measure on")
+    arrays = {key: np.concatenate([part.arrays[key] for part in parts]) for key in parts[0].arrays}
+    return PredictionErrors(tuple(name for part in parts for name in part.episode_ids), arrays)
+
+
+def prediction_errors(
+    model: Predictor, batches: Iterable[LatentBatch], metrics: Sequence[Metric] = (L1,)
+) -> PredictionErrors:
+    """Measure a model as a validation does, batch after batch, so that no latents are stored.
+
+    Raises:
+        ValueError: No clips.
+    """
+    pairs = with_other_actions(batches)
+    return joined([measured(model, batch, VALIDATED, metrics, others) for batch, others in pairs])
+
+
+class OneStepErrors(NamedTuple):
+    """The teacher-forced L1 error of each clip."""
+
+    one_step: Float[np.ndarray, " clips"]
+    persistence: Float[np.ndarray, " clips"]
+
+
+def one_step_errors(model: Predictor, batch: LatentBatch) -> OneStepErrors:
+    """Return the one-step error of a model on each clip, and that of persistence."""
+    found = measured(model, batch, ONE_STEP, (L1,))
+    return OneStepErrors(*(found.of("teacher_forced", L1, way).mean(axis=1) for way, _ in ONE_STEP))
+
+
+def with_other_actions(
+    batches: Iterable[LatentBatch],
+) -> Iterator[tuple[LatentBatch, Float[Tensor, "batch time action_dim"]]]:
+    """Yield each batch with other actions for its clips: those of the clip before, whatever the batch size.
+
+    The first clip gets those of the second; if it is alone, its own reversed.
+    """
+    rest = iter(batches)
+    head = [batch for _, batch in zip(range(1), rest, strict=False)]
+    if head and len(head[0].actions) == 1:
+        head += [batch for _, batch in zip(range(1), rest, strict=False)]
+    first_ones = [batch.actions for batch in head]
+    before = None
+    for batch in chain(head, rest):
+        if before is None:
+            known = torch.cat(first_ones)
+            before = known[1:2] if len(known) > 1 else known.flip(1)
+        yield batch, torch.cat([before, batch.actions[:-1]])
+        before = batch.actions[-1:]
+
+
+def _prediction(
+    model: Predictor, batch: LatentBatch, way: Way, mode: Mode, others: Tensor | None
+) -> Float[Tensor, "batch horizon tokens dim"]:
+    """Return the frames after the first as predicted; states are the true ones, whatever the actions."""
+    seen = batch.latents[:, :1] if mode == "rollout" else batch.latents[:, :-1]
+    if way == "persistence":
+        return seen.expand_as(batch.latents[:, 1:])
+    actions = {"true": batch.actions, "zero": torch.zeros_like(batch.actions)}
+    actions |= {} if others is None else {"shuffled": others}
+    extrinsics = None if batch.extrinsics is None else batch.extrinsics[:, :-1]
+    predict = model.rollout if mode == "rollout" else model.predict
+    return predict(seen, actions[way], batch.states[:, :-1], extrinsics)

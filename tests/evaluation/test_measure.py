@@ -1,0 +1,96 @@
+"""Errors equal those computed by hand; shuffled actions are those of the clip before, for any batch size."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn.functional import cosine_similarity, layer_norm
+
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.evaluate import Contender, evaluate
+from vjepa2_ac.evaluation.measure import ALL, VALIDATED, measured, prediction_errors, with_other_actions
+from vjepa2_ac.evaluation.metrics import L1, L2, METRICS
+from vjepa2_ac.evaluation.request import ProbeOptions
+from vjepa2_ac.evaluation.result import ACTIONS
+from worlds import TIME, Copier, Halfway, Oracle, about, again, clips_batch, in_batches, rows
+
+
+def test_an_oracle_scores_zero_and_needs_the_true_actions() -> None:
+    errors = prediction_errors(Oracle(), in_batches(clips_batch(), 4))
+    assert [r.value for r in over_persistence(errors, "rollout")] == pytest.approx([0.0] * (TIME - 1), abs=1e-6)
+    true, zero, shuffled = (one_step_over_persistence(errors, actions).value for actions in ACTIONS)
+    assert true == pytest.approx(0.0, abs=1e-6)
+    assert zero == pytest.approx(1.0, rel=1e-6)
+    assert shuffled > 0.8
+
+
+def test_persistence_is_exactly_one_relative_to_itself_and_blind_to_actions() -> None:
+    errors = prediction_errors(Copier(), in_batches(clips_batch(), 4))
+    assert all((r.value, r.low, r.high) == (1.0, 1.0, 1.0) for r in over_persistence(errors, "rollout"))
+    assert {one_step_over_persistence(errors, actions).value for actions in ACTIONS} == {1.0}
+
+
+def test_metrics_equal_a_case_computed_by_hand() -> None:
+    predicted = torch.tensor([[[[1.0, 0.0], [0.0, 2.0]]]])
+    true = torch.tensor([[[[0.0, 1.0], [0.0, 1.0]]]])
+    assert L1.of(predicted, true).tolist() == [[(1 + 1 + 0 + 1) / 4]]
+    assert L2.of(predicted, true).tolist() == [[(1 + 1 + 0 + 1) / 4]]
+    assert L2.of(predicted * 3, predicted).tolist() == [[(4 + 16) / 4]], "squared, no root"
+
+
+def test_of_normalised_latents_l2_is_twice_the_cosine_distance_which_is_no_metric_for_that() -> None:
+    one, other = (layer_norm(torch.randn(2, 3, 5, 256), (256,), eps=0.0) for _ in range(2))
+    cosine = (1 - cosine_similarity(one, other, dim=-1)).mean(dim=-1)
+    torch.testing.assert_close(L2.of(one, other), 2 * cosine)
+
+
+def test_errors_by_horizon_equal_a_case_computed_by_hand() -> None:
+    latents = torch.zeros(1, 3, 2, 2)
+    latents[0, 1] = 1.0
+    latents[0, 2] = torch.tensor([[3.0, 3.0], [5.0, 5.0]])
+    batch = LatentBatch(latents, torch.zeros(1, 3, 7), torch.zeros(1, 2, 7), None, ("e",), (0,))
+    found = measured(Copier(), batch, ALL, METRICS, batch.actions)
+    assert found.of("rollout").tolist() == [[1.0, 4.0]], "from the first frame"
+    assert found.of("teacher_forced").tolist() == [[1.0, 3.0]], "from the frame before"
+    assert found.of("rollout", L2).tolist() == [[1.0, 17.0]]
+    for (way, mode, metric), values in found.arrays.items():
+        assert values.tolist() == found.arrays["true", mode, metric].tolist(), way
+    assert found.episode_ids == ("e",)
+
+
+def test_a_validation_is_the_evaluation_of_the_same_clips_without_what_takes_longest() -> None:
+    errors = prediction_errors(Halfway(), in_batches(clips_batch(), 4))
+    assert errors.arrays.keys() == {(way, mode, "l1") for way, mode in VALIDATED}
+    assert ("zero", "rollout", "l1") not in errors.arrays
+    probes = ProbeOptions(sensitivity_clips=0, landscape_clips=0, examples=0)
+    found = evaluate([Contender("model", "trained", Halfway())], again(clips_batch()), about(), probes=probes)
+    whole = found.models["model"].errors
+    assert whole.episode_ids == errors.episode_ids
+    for kind, values in errors.arrays.items():
+        np.testing.assert_array_equal(values, whole.arrays[kind])
+    asked = prediction_errors(Halfway(), in_batches(clips_batch(), 4), METRICS)
+    assert {metric for _, _, metric in asked.arrays} == {"l1", "l2"}
+
+
+@pytest.mark.parametrize("size", [1, 3, 12])
+def test_other_actions_are_those_of_the_clip_before_whatever_the_batch(size: int) -> None:
+    batch = clips_batch()
+    others = torch.cat([tried for _, tried in with_other_actions(in_batches(batch, size))])
+    assert torch.equal(others, batch.actions[[1, *range(11)]]), "the first clip has those of the second"
+
+
+def test_a_clip_alone_gets_its_own_actions_backwards() -> None:
+    batch = rows(clips_batch(), [0])
+    [(_, others)] = list(with_other_actions([batch]))
+    assert torch.equal(others, batch.actions.flip(1))
+
+
+def test_figures_do_not_depend_on_the_batch_size() -> None:
+    small, large = (prediction_errors(Oracle(), in_batches(clips_batch(), size)) for size in (1, 12))
+    for kind in small.arrays:
+        np.testing.assert_allclose(small.arrays[kind], large.arrays[kind], atol=1e-6)
+
+
+def test_no_clips_are_an_error() -> None:
+    with pytest.raises(ValueError, match="no clips"):
+        prediction_errors(Copier(), [])
