@@ -17,6 +17,7 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 ORDERS: dict[str, list[str]] = {
     "": [
         "__init__ errors places output episode geometry distances",
+        "spaces",
         "storage",
         "config",
         "media",
@@ -33,7 +34,7 @@ ORDERS: dict[str, list[str]] = {
         "cli",
     ],
     "data": ["picture_file", "index", "cache filters", "sources", "clips", "inspection"],
-    "data.sources": ["listing validation", "rlds droid_raw lerobot npz latents", "registry"],
+    "data.sources": ["listing configured_spaces", "rlds droid_raw lerobot npz latents", "registry"],
     "model": [
         "finite sizes quiet_imports",
         "base_model",

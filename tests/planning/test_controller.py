@@ -321,5 +321,5 @@ def test_images_are_cropped_as_in_training() -> None:
 def test_a_model_whose_states_are_no_poses_is_refused() -> None:
     sizes = tiny_model().sizes
     vectors = sizes.model_copy(update={"predictor": sizes.predictor.model_copy(update={"state_dim": 8})})
-    with pytest.raises(InputError, match="no poses"):
+    with pytest.raises(InputError, match=r"states of 8 and actions of 7 numbers\. needed: 7 and 7"):
         controller(WorldModel.random(vectors, seed=0))

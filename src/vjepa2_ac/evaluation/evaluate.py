@@ -86,11 +86,11 @@ def evaluate(
     probes = probes or ProbeOptions()
     seen = _collect(contenders, clips, probes, about, metrics, _bar(stage, "measuring"))
     ids, seconds = tuple(seen.ids), about.seconds_per_step
-    known = clips_of(seen.actions, ids, tuple(seen.firsts), is_pose=about.is_pose, seconds_per_step=seconds)
+    known = clips_of(seen.actions, ids, tuple(seen.firsts), space=about.space, seconds_per_step=seconds)
     pool = ActionPool(
         actions=seen.actions.reshape(-1, seen.actions.shape[-1]),
         episode_ids=tuple(np.repeat(np.array(ids), seen.actions.shape[1]).tolist()),
-        is_pose=about.is_pose,
+        space=about.space,
         reach=probes.reach_cm / 100,
     )
     models: dict[str, ModelResult] = {}
@@ -107,7 +107,7 @@ def evaluate(
         about=about,
         clips=known,
         models=models,
-        strata=strata_of(known, is_pose=about.is_pose),
+        strata=strata_of(known, about.space),
         episodes=(),
         examples=(),
         planning=study_of(seen.planned, probes.planning) if seen.planned else None,
@@ -128,7 +128,7 @@ def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[s
         notes.append(_NOT_ASKED.format("--landscapes", "energy landscapes"))
     elif action_dim < 3:
         notes.append(_NO_LANDSCAPES.format(action_dim))
-    if probes.planning_clips and not about.is_pose:
+    if probes.planning_clips and about.space.position is None:
         notes.append(_NO_PLANS)
     if not probes.examples:
         notes.append(_NOT_ASKED.format("--examples", "example clips"))
@@ -158,7 +158,11 @@ def _collect(
     seen = _Seen([], [], np.zeros((0, 0, 0)), {contender.name: [] for contender in contenders}, [])
     actions = []
     probed = set(spread(clips.count, probes.sensitivity_clips)) if probes.sensitivity_clips else set()
-    planned = set(spread(clips.count, probes.planning_clips)) if probes.planning_clips and about.is_pose else set()
+    planned = (
+        set(spread(clips.count, probes.planning_clips))
+        if probes.planning_clips and about.space.position is not None
+        else set()
+    )
     for batch, others in with_other_actions(batch for batch, _ in clips.read(None)):
         for contender in contenders:
             with contender.switched():
@@ -182,7 +186,7 @@ def _collect(
 
 def _largest_step(actions: Float[torch.Tensor, "time action_dim"], about: About) -> int:
     """Return the step of a clip with the largest action: for poses, by the translation."""
-    return int((actions[:, :3] if about.is_pose else actions).norm(dim=-1).argmax())
+    return int(actions[:, about.space.sized].norm(dim=-1).argmax())
 
 
 def _sensitivity(
@@ -222,9 +226,9 @@ def _landscapes(
     return measure_landscapes(
         contender.model,
         chosen,
-        is_pose=about.is_pose,
+        space=about.space,
         nodes=probes.nodes,
-        reach=pool.reach if about.is_pose else 0.0,
+        reach=0.0 if about.space.position is None else pool.reach,
         at_once=probes.at_once,
         progress=_bar(stage, f"energy landscapes, {contender.name}"),
     )

@@ -13,8 +13,8 @@ from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.episode import Progress
-from vjepa2_ac.planning.action_space import ActionSpace, pose_space
 from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan, PlanStart, Stopped
+from vjepa2_ac.planning.search_space import SearchSpace, pose_space
 from vjepa2_ac.planning.solvers.base import EvaluatedPlans, Solver
 from vjepa2_ac.planning.solvers.cem import CemSolver
 from vjepa2_ac.planning.solvers.gradient import GradientSolver
@@ -33,7 +33,7 @@ class Planner:
     def __init__(
         self,
         config: PlanningConfig,
-        space: ActionSpace | None = None,
+        space: SearchSpace | None = None,
         clock: Clock = time.perf_counter,
         progress: Progress | None = None,
     ) -> None:

@@ -19,12 +19,20 @@ import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
+from vjepa2_ac.data.inspection.statistics import usual_changes
 from vjepa2_ac.distributed.collectives import all_reduce_max, broadcast_object, require_same
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.distributed.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import CheckpointClock
-from vjepa2_ac.runs.folder import CALIBRATION, check_run_folder, config_changes, open_run_folder, with_settled_stride
+from vjepa2_ac.runs.folder import (
+    CALIBRATION,
+    CHANGES,
+    check_run_folder,
+    config_changes,
+    open_run_folder,
+    with_settled_stride,
+)
 from vjepa2_ac.runs.lock import RunLock
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.runs.mirror.background_sync import Mirror, NoMirror
@@ -120,6 +128,9 @@ def _train(
         open_run_folder(config, run.state.run_id, allow_config_change=allow_config_change)
     if run.calibration is not None and writes:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
+    if writes and run.dataset.spaces.state.position is None and not (folder / CHANGES).exists():
+        usual = {"percentile": 99, "changes": usual_changes(run.dataset).tolist()}
+        write_atomically(folder / CHANGES, json.dumps(usual).encode())
     with _open_metrics_log(run, folder, reporter) as metrics_log:
         if first is not None:
             metrics_log.write("validation", 0, validation_metrics(first))

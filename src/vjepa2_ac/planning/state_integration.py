@@ -1,6 +1,7 @@
-"""Pose integration: poses after a sequence of actions, batched, on any device, and differentiable.
+"""State integration: states after a sequence of changes, batched, on any device, and differentiable.
 
-The same as `geometry.apply_action` (NumPy, SciPy), except that the gripper is limited to between open and closed.
+Of poses the same as `geometry.apply_action` (NumPy, SciPy), except that the gripper is limited to between open and
+closed. Vectors add.
 """
 
 from __future__ import annotations
@@ -8,6 +9,8 @@ from __future__ import annotations
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from vjepa2_ac.spaces import POSE, StateSpace
 
 _LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
 
@@ -20,18 +23,21 @@ def apply_actions(states: Float[Tensor, "*batch 7"], actions: Float[Tensor, "*ba
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.
     """
     with torch.autocast(states.device.type, enabled=False):
-        rotation = matrices_from_euler(actions[..., 3:6]) @ matrices_from_euler(states[..., 3:6])
-    gripper = (states[..., 6:] + actions[..., 6:]).clamp(0.0, 1.0)
-    return torch.cat([states[..., :3] + actions[..., :3], euler_from_matrices(rotation), gripper], dim=-1)
+        rotation = matrices_from_euler(actions[..., POSE.rotation]) @ matrices_from_euler(states[..., POSE.rotation])
+    position = states[..., POSE.position] + actions[..., POSE.position]
+    gripper = (states[..., -1:] + actions[..., -1:]).clamp(0.0, 1.0)
+    return torch.cat([position, euler_from_matrices(rotation), gripper], dim=-1)
 
 
 def states_along(
-    state: Float[Tensor, " 7"], actions: Float[Tensor, "samples steps 7"]
-) -> Float[Tensor, "samples steps+1 7"]:
-    """Return the states before and after every action, starting from one state."""
-    states = [state.expand(len(actions), -1)]
-    for step in range(actions.shape[1]):
-        states.append(apply_actions(states[-1], actions[:, step]))
+    state: Float[Tensor, " dim"], changes: Float[Tensor, "samples steps dim"], space: StateSpace = POSE
+) -> Float[Tensor, "samples steps+1 dim"]:
+    """Return the states before and after every change, starting from one state."""
+    if space.rotation is None:
+        return torch.cat([torch.zeros_like(changes[:, :1]), changes], dim=1).cumsum(dim=1) + state
+    states = [state.expand(len(changes), -1)]
+    for step in range(changes.shape[1]):
+        states.append(apply_actions(states[-1], changes[:, step]))
     return torch.stack(states, dim=1)
 
 
