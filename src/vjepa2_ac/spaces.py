@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
 
 REACH_M = 5.0  # larger positions are not in metres
 ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
@@ -36,6 +36,11 @@ class Space:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    @property
+    def is_pose(self) -> bool:
+        """Whether it has all parts of a pose in space: position, rotation and gripper."""
+        return self.gripper is not None and self.rotation is not None and self.position == slice(0, 3)
 
     @property
     def sized(self) -> slice:
@@ -69,8 +74,18 @@ class StateSpace(Space):
         return self.names if self.position is None else tuple(f"d{name}" for name in self.names)
 
     def differences(self, states: Float[np.ndarray, "time dim"]) -> Float[np.ndarray, "time-1 dim"]:
-        """Return the change from each state to the next; rotations as `geometry.actions_from_states`."""
-        return np.diff(states, axis=0) if self.rotation is None else actions_from_states(states)
+        """Return the change from each state to the next; of rotations R[t+1] @ R[t].T, as of poses.
+
+        Raises:
+            ValueError: Fewer than two states.
+        """
+        if len(states) < 2:
+            raise ValueError(f"a difference needs two states; got {len(states)}")
+        changes = np.diff(states, axis=0)
+        if self.rotation is not None:
+            rotations = matrices_from_euler(states[:, self.rotation])
+            changes[:, self.rotation] = euler_from_matrices(rotations[1:] @ rotations[:-1].swapaxes(-1, -2))
+        return changes
 
     def require_plausible(self, states: Float[np.ndarray, "steps dim"], where: str, *, fix: str = "") -> None:
         """Refuse states that no robot has: not finite; of poses, no metres, radians or closedness.

@@ -15,10 +15,10 @@ def plan_table(answer: PlanResult) -> Table:
     table = MetricsTable(f"Plan: {answer.decision.why}")
     space = answer.state_space
     rows = list(zip(answer.actions, answer.states[1:], strict=True))
-    if space.position is None or space.rotation is None or space.gripper is None:
+    if not space.is_pose:
         names, cells = ["number", "changes by", "then"], _of_vectors
     else:
-        turns = ["turn (degrees)"] * bool(answer.actions[:, space.rotation].any())
+        turns = ["turn (degrees)"] * bool(answer.actions[:, POSE.rotation].any())
         names = ["dx (cm)", "dy (cm)", "dz (cm)", *turns, "gripper", "then x, y, z (m)", "gripper"]
         cells = _of_poses
     for name in ["step", *names]:

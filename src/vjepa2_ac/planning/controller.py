@@ -111,9 +111,8 @@ class Controller:
 
     @property
     def shown_axes(self) -> tuple[int, ...]:
-        """The numbers to show, three at most: of a pose the position, of a vector the first that may change."""
-        is_placed = self.spaces.state.position is not None
-        return (0, 1, 2) if is_placed else tuple(self.space.free[:3].tolist())
+        """The numbers to show, three at most: of a pose the position, else the first that may change."""
+        return (0, 1, 2) if self.spaces.state.is_pose else tuple(self.space.free[:3].tolist())
 
     def reset(self, *goals: np.ndarray, durations: tuple[int, ...] = (), mask: np.ndarray | None = None) -> None:
         """Set a goal, or several in order, and forget all observations.

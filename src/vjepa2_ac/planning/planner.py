@@ -22,6 +22,14 @@ from vjepa2_ac.planning.solvers.icem import IcemSolver
 from vjepa2_ac.planning.solvers.mppi import MppiSolver
 
 Clock = Callable[[], float]  # seconds, from anywhere
+MakeSolver = Callable[[SearchSpace, PlanningConfig, Generator, PlanStart | None], Solver]
+
+SOLVERS: dict[str, MakeSolver] = {  # what `planning.planner` names
+    "cem": lambda space, config, *rest: CemSolver(space, config.cem, config.samples, *rest),
+    "icem": lambda space, config, *rest: IcemSolver(space, config.icem, config.samples, config.iterations, *rest),
+    "mppi": lambda space, config, *rest: MppiSolver(space, config.mppi, config.samples, *rest),
+    "gradient": lambda space, config, *rest: GradientSolver(space, config.gradient, config.iterations, *rest),
+}
 
 
 class Planner:
@@ -63,7 +71,7 @@ class Planner:
         began = self._clock()
         if start is not None and start.mean.shape != self.space.lower.shape:
             raise ValueError(f"a start of {tuple(start.mean.shape)} for {tuple(self.space.lower.shape)} decisions")
-        search = self._search(generator, start)
+        search = SOLVERS[self.config.planner](self.space, self.config, generator, start)
         record: list[Iteration] = []
         best = _Best()
         while len(record) < self.config.iterations and self._has_time(began, record):
@@ -86,16 +94,6 @@ class Planner:
             evaluations=sum(one.samples for one in record) + evaluated,
             seconds=self._clock() - began,
         )
-
-    def _search(self, generator: Generator, start: PlanStart | None) -> Solver:
-        config, space = self.config, self.space
-        if config.planner == "cem":
-            return CemSolver(space, config.cem, config.samples, generator, start)
-        if config.planner == "icem":
-            return IcemSolver(space, config.icem, config.samples, config.iterations, generator, start)
-        if config.planner == "mppi":
-            return MppiSolver(space, config.mppi, config.samples, generator, start)
-        return GradientSolver(space, config.gradient, config.iterations, generator, start)
 
     def _has_time(self, began: float, record: list[Iteration]) -> bool:
         """Return whether an iteration as long as the longest so far would end within the budget."""

@@ -133,7 +133,7 @@ def search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
     Raises:
         InputError: There are no limits for vectors, or not one for each number.
     """
-    return pose_space(config) if space.position is not None else vector_space(config, len(space))
+    return pose_space(config) if space.is_pose else vector_space(config, len(space))
 
 
 def vector_space(config: PlanningConfig, width: int) -> SearchSpace:

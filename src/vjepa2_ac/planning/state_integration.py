@@ -15,29 +15,33 @@ from vjepa2_ac.spaces import POSE, StateSpace
 _LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
 
 
-def apply_actions(states: Float[Tensor, "*batch 7"], actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
-    """Return the states after actions: xyz and gripper add, R' = R_delta @ R, the gripper is clipped to 0 .. 1.
+def apply_actions(
+    states: Float[Tensor, "*batch dim"], actions: Float[Tensor, "*batch dim"], space: StateSpace = POSE
+) -> Float[Tensor, "*batch dim"]:
+    """Return the states after changes: numbers add, rotations R' = R_delta @ R, a gripper is clipped to 0 .. 1.
 
     Autocast is disabled here: bfloat16 has too few digits for rotations.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.
     """
-    with torch.autocast(states.device.type, enabled=False):
-        rotation = matrices_from_euler(actions[..., POSE.rotation]) @ matrices_from_euler(states[..., POSE.rotation])
-    position = states[..., POSE.position] + actions[..., POSE.position]
-    gripper = (states[..., -1:] + actions[..., -1:]).clamp(0.0, 1.0)
-    return torch.cat([position, euler_from_matrices(rotation), gripper], dim=-1)
+    after = list((states + actions).unbind(dim=-1))
+    if space.rotation is not None:
+        with torch.autocast(states.device.type, enabled=False):
+            turn, now = (matrices_from_euler(one[..., space.rotation]) for one in (actions, states))
+            rotation = turn @ now
+        after[space.rotation] = euler_from_matrices(rotation).unbind(dim=-1)
+    if space.gripper is not None:
+        after[space.gripper] = after[space.gripper].clamp(0.0, 1.0)
+    return torch.stack(after, dim=-1)
 
 
 def states_along(
     state: Float[Tensor, " dim"], changes: Float[Tensor, "samples steps dim"], space: StateSpace = POSE
 ) -> Float[Tensor, "samples steps+1 dim"]:
     """Return the states before and after every change, starting from one state."""
-    if space.rotation is None:
-        return torch.cat([torch.zeros_like(changes[:, :1]), changes], dim=1).cumsum(dim=1) + state
     states = [state.expand(len(changes), -1)]
     for step in range(changes.shape[1]):
-        states.append(apply_actions(states[-1], changes[:, step]))
+        states.append(apply_actions(states[-1], changes[:, step], space))
     return torch.stack(states, dim=1)
 
 

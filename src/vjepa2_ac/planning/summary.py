@@ -25,10 +25,10 @@ def summarize(answer: PlanResult) -> str:
 
 def _motion(answer: PlanResult) -> str:
     space, change, steps = answer.state_space, answer.states[-1] - answer.states[0], len(answer.actions)
-    shown = change[list(answer.shown_axes)] * space.shown_factor
+    shown = change[list(answer.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
     names = [space.change_names[axis] for axis in answer.shown_axes]
     lasting = f"in {steps} model step{'s' * (steps > 1)}"
-    if space.position is None:
+    if not space.is_pose:
         parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, shown, strict=True))
         more = ", ..." if len(answer.space.free) > len(names) else ""
         return f"Changes {parts}{more} {lasting}."
@@ -63,7 +63,7 @@ def _warnings(answer: PlanResult, plan: Plan) -> list[str]:
     if not plan.energy < answer.doing_nothing:
         found.append("None of the evaluated actions is predicted to be better than doing nothing.")
     if at_limit := axes_at_limit(answer):
-        knob = f"planning.limits.{'axes' if answer.state_space.position is None else 'xyz'}"
+        knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
         found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
     if answer.unused_goals:
         unused = ", ".join(str(place + 1) for place in answer.unused_goals)
@@ -74,7 +74,7 @@ def _warnings(answer: PlanResult, plan: Plan) -> list[str]:
 def axes_at_limit(answer: PlanResult) -> list[str]:
     """Return the numbers, of a position or of a vector, whose first change is at its limit."""
     upper, space = answer.space.upper[0].numpy(), answer.state_space
-    numbers = answer.shown_axes if space.position is not None else range(len(space))
+    numbers = answer.shown_axes if space.is_pose else range(len(space))
     return [
         space.change_names[number] for number in numbers
         if upper[number] > 0 and abs(answer.actions[0, number]) >= _AT_LIMIT * upper[number]

@@ -66,7 +66,7 @@ def _pictures(part: Any, answer: PlanResult) -> None:
 def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     elites, heights, energies, path = part.subplots(1, 4, width_ratios=[3, 3, 3, 3])
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
-    factor = answer.state_space.shown_factor
+    factor = _factor(answer)
     first, upper = answer.actions[0] * factor, answer.space.upper[0].double().numpy() * factor
     across, up, third = _three(answer)
     for number, (one, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
@@ -80,9 +80,7 @@ def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     heights.axhspan(-upper[third], upper[third], color=_GREY, alpha=0.12, linewidth=0)
     heights.scatter(len(plan.iterations) + 1, first[third], **_STAR)
     heights.set(xlabel="iteration (star: chosen)", ylabel=_label(answer, third))
-    heights.set_title(
-        "Their height" if answer.state_space.position is not None else "Another number", loc="left", fontsize=9
-    )
+    heights.set_title("Their height" if answer.state_space.is_pose else "Another number", loc="left", fontsize=9)
     _energies(energies, answer, plan)
     _path(path, answer)
 
@@ -94,8 +92,12 @@ def _three(answer: PlanResult) -> tuple[int, int, int]:
 
 
 def _label(answer: PlanResult, axis: int) -> str:
-    name, unit = answer.state_space.change_names[axis], answer.state_space.shown_unit
-    return f"{name} ({unit})" if unit else name
+    name = answer.state_space.change_names[axis]
+    return f"{name} (cm)" if answer.state_space.is_pose else name
+
+
+def _factor(answer: PlanResult) -> float:
+    return answer.state_space.shown_factor if answer.state_space.is_pose else 1.0
 
 
 def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
@@ -123,8 +125,8 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
 
 def _path(axes: Any, answer: PlanResult) -> None:
     space = answer.state_space
-    way = (answer.states - answer.states[0]) * space.shown_factor
-    if space.position is None:
+    way = (answer.states - answer.states[0]) * _factor(answer)
+    if not space.is_pose:
         for number in answer.space.free[:_MOST_NUMBERS].tolist():
             axes.plot(way[:, number], "o-", markersize=4, label=space.names[number])
         axes.set(xlabel="model step", ylabel="change from now")
@@ -150,7 +152,7 @@ def _slices(part: Any, answer: PlanResult) -> None:
 
 def _slice(axes: Any, one: EnergySlice, answer: PlanResult, lowest: float, highest: float) -> Any:
     first, second = one.axes
-    factor = answer.state_space.shown_factor
+    factor = _factor(answer)
     across, up = one.across * factor, one.up * factor
     image = axes.pcolormesh(across, up, one.energy, shading="nearest", cmap="viridis", vmin=lowest, vmax=highest)
     upper = answer.space.upper[0].double().numpy() * factor
