@@ -1,4 +1,4 @@
-"""A toy of each thing that people add, through the doors of docs/extending.md; data and metrics have their own files."""
+"""A toy of each thing that people add, by the doors of docs/extending.md; data and metrics have their own files."""
 
 from typing import get_args
 

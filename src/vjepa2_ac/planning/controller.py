@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
+from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.episode import Progress, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.input_heads import widths_of_model
@@ -25,7 +27,9 @@ from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Clock, Planner
 from vjepa2_ac.planning.search_space import SearchSpace, search_space
+from vjepa2_ac.planning.settings import with_taught_limits
 from vjepa2_ac.planning.state_integration import states_along
+from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
 Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
@@ -53,12 +57,17 @@ class Controller:
 
     The same seed, images and states give the same actions: the n-th decision after a reset (from 0) is drawn with
     seed + n. Actions are within `planning.limits`, for any output of the model.
+
+    Example:
+        >>> controller = Controller(load_model("builtin:sim-tiny"))  # of a run: Controller.of_run(load_run(FOLDER))
+        >>> controller.reset(goal)  # height x width x 3, uint8, RGB
+        >>> action = controller.act(image, state)  # 7 numbers: metres, radians, closedness
     """
 
     def __init__(
         self,
         world_model: WorldModel,
-        config: PlanningConfig,
+        config: PlanningConfig | None = None,
         *,
         seed: int = 0,
         crop: Crop = "released",
@@ -72,7 +81,7 @@ class Controller:
         Args:
             world_model: A base or merged model, which is put into eval mode; or a trained one, of which a merged copy
                 plans (see `planning.model_setup`).
-            config: Planning settings.
+            config: Planning settings; None: the defaults.
             seed: Of all decisions.
             crop: As in training (`data.crop`).
             extrinsics: Pose of the camera, if the model uses it.
@@ -94,15 +103,42 @@ class Controller:
                 found=f"{world_model.sizes.predictor.use_extrinsics}, camera pose given: {extrinsics is not None}",
                 needed="a camera pose exactly where the model uses it",
             )
-        self._model, self.config, self.seed, self.crop = prepare_for_planning(world_model, config), config, seed, crop
+        self.config = config or PlanningConfig()
+        self._model, self.seed, self.crop = prepare_for_planning(world_model, self.config), seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
         self.spaces = spaces
-        self._planner = Planner(config, search_space(config, spaces.state), clock=clock, progress=progress)
+        space = search_space(self.config, spaces.state)
+        self._planner = Planner(self.config, space, clock=clock, progress=progress)
         self._goal: Goal | None = None
         self._like = np.zeros(0)
         self._seen: list[Seen] = []  # the newest `planning.context`
         self._done = 0
         self.decision: Decision | None = None  # the last one
+
+    @classmethod
+    def of_run(
+        cls,
+        run: TrainedRun,
+        config: PlanningConfig | None = None,
+        *,
+        seed: int | None = None,
+        extrinsics: Float[np.ndarray, " 6"] | None = None,
+    ) -> Controller:
+        """Return the controller of a trained run: with its crop and, unless others are given, its settings and seed.
+
+        Raises:
+            InputError: As `Controller`.
+        """
+        its = run.config if config is None else run.config.model_copy(update={"planning": config})
+        its = with_taught_limits(its, Path(its.run_dir))
+        return cls(
+            run.world_model,
+            its.planning,
+            seed=its.seed if seed is None else seed,
+            crop=its.data.crop,
+            extrinsics=extrinsics,
+            spaces=spaces_of(its.data, widths_of_model(run.world_model.sizes)),
+        )
 
     @property
     def space(self) -> SearchSpace:

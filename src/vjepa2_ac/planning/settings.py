@@ -35,11 +35,19 @@ def planning_settings(
     _require_relevant(overrides)
     if not is_run(subject):
         return _of_model(subject, config, overrides, dtype)
-    its = _of_run(subject, config, overrides)
-    if its.data.states == "pose" or its.planning.limits.axes != "data" or not (Path(subject) / CHANGES).is_file():
-        return its
-    limits = its.planning.limits.model_copy(update={"axes": _taught(Path(subject) / CHANGES)})
-    return its.model_copy(update={"planning": its.planning.model_copy(update={"limits": limits})})
+    return with_taught_limits(_of_run(subject, config, overrides), Path(subject))
+
+
+def with_taught_limits(config: Config, folder: Path) -> Config:
+    """Return the config of a run with the limits that `planning.limits.axes: data` means, if the run knows them.
+
+    Raises:
+        InputError: What the run noted are no limits.
+    """
+    if config.data.states == "pose" or config.planning.limits.axes != "data" or not (folder / CHANGES).is_file():
+        return config
+    limits = config.planning.limits.model_copy(update={"axes": _taught(folder / CHANGES)})
+    return config.model_copy(update={"planning": config.planning.model_copy(update={"limits": limits})})
 
 
 def _taught(path: Path) -> tuple[float, ...]:
