@@ -17,7 +17,7 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 ORDERS: dict[str, list[str]] = {
     "": [
         "__init__ errors places output episode geometry distances",
-        "storage",
+        "reporter storage",
         "config",
         "media",
         "model data",

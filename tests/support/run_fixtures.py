@@ -11,6 +11,8 @@ from killable import Nursery
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.reporter import NullReporter
 
 TINY = {
     "image_size": 32,
@@ -31,27 +33,25 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(threads)
 
 
-class SilentReporter:
+class SilentReporter(NullReporter):
     """Keeps what it is told."""
 
     def __init__(self) -> None:
+        self.tasks: dict[str, list[tuple[int, int]]] = {}
         self.notes: list[str] = []
         self.steps: list[int] = []
 
     def note(self, text: str) -> None:
         self.notes.append(text)
 
-    def indexed(self, done: int, total: int) -> None: ...
-
-    def encoded(self, done: int, total: int) -> None: ...
-
-    def started(self, done: int, total: int) -> None: ...
+    def task(self, title: str, unit: str = "") -> Progress:
+        del unit
+        reported = self.tasks[title] = []
+        return lambda done, total: reported.append((done, total))
 
     def stepped(self, step: int, figures: object) -> None:
         del figures
         self.steps.append(step)
-
-    def validated(self, step: int, errors: object) -> None: ...
 
 
 @pytest.fixture(scope="session")

@@ -68,7 +68,7 @@ def make_run(make_config: Callable[..., Config], reporter) -> Callable[..., Run]
             adapter__dropout=0.0, training__batch_size=2, training__accumulation=2, training__learning_rate=1e-2,
             training__warmup_steps=0, **changes,
         )  # fmt: skip
-        return set_up(config, reporter.note)
+        return set_up(config, reporter)
 
     return make
 

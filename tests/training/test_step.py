@@ -36,7 +36,7 @@ def prepared(make_config: Any, reporter: Any, batch_size: int, accumulation: int
         training__batch_size=batch_size, training__accumulation=accumulation, adapter__dropout=0.0,
         training__max_grad_norm=None, **changes,
     )  # fmt: skip
-    return set_up(config, reporter.note)
+    return set_up(config, reporter)
 
 
 def taken(run: Run, batches: list[Batch]) -> tuple[Gradients, dict[str, torch.Tensor]]:
@@ -147,9 +147,9 @@ def test_gradients_that_overflow_whatever_the_loss_scale_stop_the_run(make_confi
 def test_the_loss_scale_is_restored(make_config, reporter, tmp_path) -> None:
     config = make_config(training__max_grad_norm=None, training__precision="fp16")
     on_cpu = make_accelerator(make_config())  # which fp16 would be refused on
-    run = with_loss_scale(set_up(config, reporter.note, accelerator=on_cpu), 64.0)
+    run = with_loss_scale(set_up(config, reporter, accelerator=on_cpu), 64.0)
     training_step(run, training_loader(run.dataset, seed=0, batch_size=2), 1)
     save_checkpoint(run, tmp_path / "run")
-    other = set_up(config, reporter.note, accelerator=on_cpu)
+    other = set_up(config, reporter, accelerator=on_cpu)
     assert other.scaler.state_dict() == run.scaler.state_dict()
     assert other.scaler.state_dict()["_growth_tracker"] == 1

@@ -126,16 +126,16 @@ def _evaluate(options: argparse.Namespace) -> None:
         settle(subject, how)
         require_subject(subject, how.checkpoint)
 
-    from vjepa2_ac.console.evaluation import Stages, evaluation_tables
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.evaluation import evaluation_tables
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.evaluation.verdict import spread, verdict
     from vjepa2_ac.reports.write import evaluate_subject
 
     evaluations = []
     for subject, how in asked:
         say_places_elsewhere(subject)
-        with Stages() as stages:
-            measured = evaluate_subject(subject, how, stage=stages)
+        with ConsoleReporter() as reporter:
+            measured = evaluate_subject(subject, how, reporter)
         evaluations.append(measured.evaluation)
         console.print(f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject)
         for table in evaluation_tables(measured.evaluation):

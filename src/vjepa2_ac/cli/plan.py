@@ -99,9 +99,8 @@ def _plan(options: argparse.Namespace) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
     images = _images(options)
 
-    from vjepa2_ac.console.evaluation import Stages
     from vjepa2_ac.console.plan import plan_table
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.planning.decision import PlanRequest, decide
     from vjepa2_ac.planning.plan_json import PLAN_FILE, write_plan
     from vjepa2_ac.planning.session import load_to_plan
@@ -115,8 +114,8 @@ def _plan(options: argparse.Namespace) -> int:
     )
     if not options.durations:
         question = question.with_equal_durations(steering.config.planning.horizon)
-    with Stages() as stages:
-        progress = stages("planning, iterations")
+    with ConsoleReporter() as reporter:
+        progress = reporter.task("planning, iterations")
         controller = steering.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
         found = decide(controller, question, nodes=options.nodes)
     images_given = {"start": options.start, "goals": options.goal, "mask": options.mask}

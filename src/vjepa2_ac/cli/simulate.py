@@ -124,12 +124,13 @@ def _record(options: argparse.Namespace) -> int:
     with user_can_write(target):
         try_writing_at(target)
 
-    from vjepa2_ac.console.progress import ProgressBar, console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.simulation.recording.record import record_dataset
 
     output.never_wait()
-    bar = ProgressBar("recording", options.episodes)
-    try:
+    with ConsoleReporter() as reporter:
+        progress = reporter.task("recording")
+        progress(0, options.episodes)
         folder = record_dataset(
             target,
             domain=options.domain,
@@ -140,10 +141,8 @@ def _record(options: argparse.Namespace) -> int:
             cameras=options.cameras,
             renderer=options.renderer,
             task=None if options.task == "reach" else options.task,
-            progress=lambda done, _: bar.advance_to(done),
+            progress=progress,
         )
-    finally:
-        bar.close()
     console.print(f"{options.episodes} episodes are in {folder}")
     return 0
 
@@ -159,8 +158,7 @@ def _steer(options: argparse.Namespace) -> int:
     require_to_plan(options)
 
     from vjepa2_ac.console.closed_loop import contest_notes, contest_table
-    from vjepa2_ac.console.evaluation import Stages
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.planning.session import load_to_plan
     from vjepa2_ac.runs.own_files import refuse_links_out
     from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
@@ -184,8 +182,8 @@ def _steer(options: argparse.Namespace) -> int:
         refuse_links_out(Path(options.subject), [name])
     home = Path(options.subject) if is_run(options.subject) else Path()
     folder = options.out or home / name
-    with Stages() as stages:
-        contest, files = run_benchmark(steering, asked, folder, stage=stages)
+    with ConsoleReporter() as reporter:
+        contest, files = run_benchmark(steering, asked, folder, reporter)
     if steering.checkpoint:
         console.print(f"{options.subject}: checkpoint {steering.checkpoint}")
     console.print(contest_table(contest))

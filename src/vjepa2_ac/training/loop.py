@@ -23,6 +23,7 @@ from vjepa2_ac.distributed.collectives import all_reduce_max, broadcast_object, 
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.distributed.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import CheckpointClock
 from vjepa2_ac.runs.folder import CALIBRATION, check_run_folder, config_changes, open_run_folder, with_settled_stride
 from vjepa2_ac.runs.lock import RunLock
@@ -36,14 +37,16 @@ from vjepa2_ac.training.monitoring.divergence import WatchedMetricsLog
 from vjepa2_ac.training.monitoring.stopwatch import stopwatch_for
 from vjepa2_ac.training.monitoring.throughput import Throughput, TimedBatches
 from vjepa2_ac.training.optim import require_optimizer
-from vjepa2_ac.training.reporter import NullMetricsLog, NullReporter, Reporter
+from vjepa2_ac.training.reporter import NullMetricsLog, TrainingReporter
 from vjepa2_ac.training.resume import refuse_if_overtaken, require_same_data
 from vjepa2_ac.training.setup import Run, batches_from, save_checkpoint, set_up
 from vjepa2_ac.training.step import gradients, training_step
 from vjepa2_ac.training.validation import refuse_weak_base, validate, validate_if_due, validation_metrics
 
 
-def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
+def train(
+    config: Config, reporter: TrainingReporter, *, check_only: bool = False, allow_config_change: bool = False
+) -> Path:
     """Train by a config, from the newest checkpoint of its run folder if there is one.
 
     Args:
@@ -78,17 +81,17 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
             # Locked before anything is downloaded into the run's folder: another process could still be writing there.
             remote = open_remote(
                 config,
-                reporter.note,
+                reporter,
                 claim=lock.take if trial is None else lambda: None,
                 allow_config_change=allow_config_change,
                 into=trial,
             )
             config = with_settled_stride(remote.config if remote else config)
         else:
-            reporter = NullReporter()
+            reporter = SILENT
         config = broadcast_object(accelerator, config)
         until_the_end.enter_context(_out_of_memory_explained())
-        run = set_up(config, reporter.note, reporter.indexed, accelerator, reporter.encoded, check_only=check_only)
+        run = set_up(config, reporter, accelerator, check_only=check_only)
         try:
             return _train(run, lock, remote, reporter, check_only=check_only, allow_config_change=allow_config_change)
         except StoppedError:
@@ -97,7 +100,13 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
 
 
 def _train(
-    run: Run, lock: RunLock, remote: Remote | None, reporter: Reporter, *, check_only: bool, allow_config_change: bool
+    run: Run,
+    lock: RunLock,
+    remote: Remote | None,
+    reporter: TrainingReporter,
+    *,
+    check_only: bool,
+    allow_config_change: bool,
 ) -> Path:
     config, folder, writes = run.config, Path(run.config.run_dir), run.accelerator.is_main_process
     if writes and not allow_config_change:
@@ -129,16 +138,20 @@ def _train(
     return folder
 
 
-def _open_metrics_log(run: Run, folder: Path, reporter: Reporter) -> MetricsLog | NullMetricsLog:
+def _open_metrics_log(run: Run, folder: Path, reporter: TrainingReporter) -> MetricsLog | NullMetricsLog:
     if not run.accelerator.is_main_process:
         return NullMetricsLog()
     done = run.state.step
     trackers = open_trackers(run.config, folder, run_id=run.state.run_id, first_step=done)
-    return WatchedMetricsLog(folder, config=run.config, note=reporter.note, first_step=done, trackers=trackers)
+    return WatchedMetricsLog(folder, config=run.config, reporter=reporter, first_step=done, trackers=trackers)
 
 
 def _loop(
-    run: Run, folder: Path, metrics_log: MetricsLog | NullMetricsLog, mirror: Mirror | NoMirror, reporter: Reporter
+    run: Run,
+    folder: Path,
+    metrics_log: MetricsLog | NullMetricsLog,
+    mirror: Mirror | NoMirror,
+    reporter: TrainingReporter,
 ) -> None:
     training = run.config.training
     device, processes = run.accelerator.device, run.accelerator.num_processes

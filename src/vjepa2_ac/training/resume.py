@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from vjepa2_ac.distributed.collectives import broadcast_object, broadcast_tensor
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import load_trained
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import (
     ADAPTER,
     OPTIMIZER,
@@ -38,7 +38,7 @@ def restore(
     accelerator: Accelerator,
     world_model: WorldModel,
     optimizer: torch.optim.Optimizer,
-    note: Callable[[str], None],
+    reporter: Reporter,
 ) -> RunState:
     """Restore the run in every process: the first one reads the newest checkpoint and sends it to the others.
 
@@ -51,7 +51,7 @@ def restore(
     folder = Path(config.run_dir)
     if accelerator.is_main_process and (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is not None:
         state, moments = _read(checkpoint, world_model, optimizer)
-        note(f"Going on from {checkpoint} ({state.step} of {config.training.steps} steps are done).")
+        reporter.note(f"Going on from {checkpoint} ({state.step} of {config.training.steps} steps are done).")
     state = broadcast_object(accelerator, replace(state, run_id=state.run_id or run_id(folder)))
     broadcast_tensors(accelerator, world_model.predictor.state_dict().values())
     moments = broadcast_object(accelerator, moments)
@@ -60,7 +60,7 @@ def restore(
     return state
 
 
-def micro_batches_of(config: Config, state: RunState, processes: int, note: Callable[[str], None]) -> int:
+def micro_batches_of(config: Config, state: RunState, processes: int, reporter: Reporter) -> int:
     """Return the number of micro-batches of a process per step.
 
     It is the config's, at the first start and if batch_size * accumulation was changed on purpose; else the number that
@@ -84,7 +84,7 @@ def micro_batches_of(config: Config, state: RunState, processes: int, note: Call
             fix="Start another number of processes; or set training.batch_size and training.accumulation to what each"
             " is to do, with --allow-config-change",
         )
-    note(
+    reporter.note(
         f"{processes} processes, before {state.processes}: {micro_batches} micro-batches of {batch_size} in each, so"
         f" that a step has the same {state.clips_per_step} clips."
     )
@@ -149,11 +149,11 @@ def require_same_data(config: Config, dataset: Dataset, state: RunState) -> None
     )
 
 
-def report_data_changes(dataset: Dataset, state: RunState, note: Callable[[str], None]) -> None:
+def report_data_changes(dataset: Dataset, state: RunState, reporter: Reporter) -> None:
     """Report if the data has changed since the checkpoint was written."""
     windows = len(dataset.windows("train"))
     if state.windows not in {None, windows}:
-        note(
+        reporter.note(
             f"The data has changed: {windows:,} training clips instead of {state.windows:,}."
             " From here on their order is another, and some may be seen twice in this epoch or not at all."
         )

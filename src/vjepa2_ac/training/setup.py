@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,12 +24,13 @@ from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.distributed.shared_memory import warn_if_shared_memory_is_small
 from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for
 from vjepa2_ac.encoding.training_cache import with_latents
-from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, require_learned
 from vjepa2_ac.model.adapter.lora import add_adapter, save_trained, trainable_report
 from vjepa2_ac.model.adapter.lora_linear import CastMatrices
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import (
     ADAPTER,
     OPTIMIZER,
@@ -113,10 +113,8 @@ class Run:
 
 def set_up(
     config: Config,
-    note: Callable[[str], None],
-    indexed: Progress | None = None,
+    reporter: Reporter = SILENT,
     accelerator: Accelerator | None = None,
-    encoding: Progress | None = None,
     *,
     check_only: bool = False,
 ) -> Run:
@@ -124,10 +122,8 @@ def set_up(
 
     Args:
         config: The run.
-        note: Receives messages for the user.
-        indexed: Called with the progress of indexing, if the data set is not indexed yet.
+        reporter: Receives messages, and the progress of indexing and encoding.
         accelerator: The result of `make_accelerator` for this config; None: it is created here.
-        encoding: Called with the number of encoded frames, if `data.cache` is auto and they are missing.
         check_only: Do not write such a cache, and report its size.
 
     Raises:
@@ -137,23 +133,23 @@ def set_up(
     if config.data.stride == "auto":
         require_learned(config.model)
     with accelerator.local_main_process_first():  # the others find the index of the first one on this machine
-        dataset = open_dataset(config.data, progress=indexed)
+        dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     if (duplicates := find_duplicates(dataset)).episodes:
-        note(f"Warning: {duplicates}.")
+        reporter.note(f"Warning: {duplicates}.")
     check_heads(config, dataset)
     world_model, calibration = None, None
     if config.data.stride == "auto":
         world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
-        calibration = broadcast_object(accelerator, choose_stride(world_model, dataset, config, accelerator, note))
+        calibration = broadcast_object(accelerator, choose_stride(world_model, dataset, config, accelerator, reporter))
         config, dataset = with_stride(config, calibration.best.stride), dataset.with_stride(calibration.best.stride)
     first_clip = _read_one_clip_of_each_split(dataset)
     world_model = world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, first_clip)
-    dataset = with_latents(config, dataset, world_model, accelerator, note, encoding=encoding, check_only=check_only)
-    warn_if_shared_memory_is_small(config, dataset, first_clip, accelerator, note)
-    fit_to_data(world_model, config, dataset, note)
+    dataset = with_latents(config, dataset, world_model, accelerator, reporter, check_only=check_only)
+    warn_if_shared_memory_is_small(config, dataset, first_clip, accelerator, reporter)
+    fit_to_data(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
-    note(str(trainable_report(world_model)))
+    reporter.note(str(trainable_report(world_model)))
     world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
     world_model.set_attention(config.training.attention)
     world_model.set_compiled("with gradients" if config.training.compile == "blocks" else "never")
@@ -162,13 +158,13 @@ def set_up(
     world_model.to(accelerator.device)
     optimizer = make_optimizer(world_model, config.training)
     scaler = torch.amp.GradScaler(accelerator.device.type, enabled=config.training.precision == "fp16")
-    state = restore(config, accelerator, world_model, optimizer, note)
-    optimizer = shard_predictor(world_model, optimizer, config, accelerator, note)
+    state = restore(config, accelerator, world_model, optimizer, reporter)
+    optimizer = shard_predictor(world_model, optimizer, config, accelerator, reporter)
     restore_loss_scale(scaler, state)
     dataset.broken.recall(state.broken)
-    report_data_changes(dataset, state, note)
-    state = best_so_far(state, measured_on(config, dataset), note)
-    micro_batches = micro_batches_of(config, state, accelerator.num_processes, note)
+    report_data_changes(dataset, state, reporter)
+    state = best_so_far(state, measured_on(config, dataset), reporter)
+    micro_batches = micro_batches_of(config, state, accelerator.num_processes, reporter)
     objective = Objective(world_model, config.training)
     return Run(
         config, accelerator, world_model, objective, optimizer, scaler, dataset, state, micro_batches, calibration

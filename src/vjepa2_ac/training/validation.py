@@ -11,13 +11,13 @@ from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import PredictionErrors
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.new_embodiment import NOT_ASKED
-from vjepa2_ac.training.reporter import NullMetricsLog, Reporter
+from vjepa2_ac.training.reporter import NullMetricsLog, TrainingReporter
 from vjepa2_ac.training.setup import Run, encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: planning depends on the longest horizon
 
 
-def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter: Reporter) -> bool:
+def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter: TrainingReporter) -> bool:
     """Measure and log the validation, if it is due; return whether it is the best so far."""
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
@@ -43,7 +43,7 @@ def validation_metrics(errors: PredictionErrors) -> dict[str, Any]:
     }
 
 
-def validate(run: Run, reporter: Reporter) -> PredictionErrors:
+def validate(run: Run, reporter: TrainingReporter) -> PredictionErrors:
     """Measure the held-out clips."""
     config = run.config
     run.world_model.eval()
@@ -60,7 +60,7 @@ def validate(run: Run, reporter: Reporter) -> PredictionErrors:
     return errors
 
 
-def refuse_weak_base(run: Run, errors: PredictionErrors, reporter: Reporter) -> None:
+def refuse_weak_base(run: Run, errors: PredictionErrors, reporter: TrainingReporter) -> None:
     """Refuse to adapt a base that is no better than copying the last frame.
 
     Raises:

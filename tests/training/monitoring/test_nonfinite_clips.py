@@ -87,7 +87,7 @@ def test_a_full_disk_is_reported_and_not_raised(tmp_path: Path, monkeypatch: pyt
 @pytest.fixture
 def bad_clip(make_config: Any, reporter: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[str, int]:
     """The second clip of a run is poisoned where it is read: a state is not a number."""
-    read, batch = loader.read_clip, next(batches_from(set_up(make_config(), reporter.note)))
+    read, batch = loader.read_clip, next(batches_from(set_up(make_config(), reporter)))
     bad = (batch.episode_ids[1], batch.starts[1])
 
     def poisoned(*arguments: Any) -> Clip:
