@@ -11,6 +11,7 @@ import torch
 
 from paths import ROOT
 from ranks import Rank, finish, free_port, start_rank
+from run_fixtures import set_up
 from same_run import metrics, trained_weights
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.clips.loader import training_loader
@@ -20,7 +21,7 @@ from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import micro_batches_of
-from vjepa2_ac.training.setup import batches_from, set_up
+from vjepa2_ac.training.setup import batches_from
 
 
 @pytest.fixture

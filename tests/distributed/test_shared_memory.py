@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
+from run_fixtures import set_up
 from vjepa2_ac.config import Config
 from vjepa2_ac.distributed.shared_memory import SHARED_MEMORY, small_shared_memory
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import set_up
 
 MB = 10**6
 

@@ -14,7 +14,7 @@ from safetensors import safe_open
 
 from killable import KILLED, Nursery
 from ranks import finish, free_port, start_rank
-from run_fixtures import MakeConfig, SilentReporter, as_yaml
+from run_fixtures import MakeConfig, SilentReporter, as_yaml, set_up
 from same_run import assert_same_run
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import open_dataset
@@ -30,7 +30,6 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.storage import writing
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import set_up
 
 CAMERA = "exterior_1_left"
 
@@ -553,3 +552,20 @@ def test_two_processes_of_a_run_share_the_encoding_before_the_first_step(
     assert "encoding frames 96/96" in reported[0][0]
     assert "Latents come from" in reported[0][0]
     assert not reported[1][0]
+
+
+def test_no_latents_are_encoded_of_data_that_a_run_refuses(
+    make_config: MakeConfig, tmp_path: Path, data_folder: Path, cache: Path, encoded_frames: list[int]
+) -> None:
+    changes = {"training__steps": 2, "data__cache": "auto", "data__cache_dir": str(cache)}
+    train(make_config(**changes), SilentReporter())
+    before = files_of(cache)
+    encoded_frames.clear()
+    shutil.copytree(data_folder, tmp_path / "others")
+    next((tmp_path / "others").rglob("*.tfrecord*")).touch()
+    others = make_config(**changes, data__path=str(tmp_path / "others"))
+    with pytest.raises(InputError, match="other episodes or files than the run has seen"):
+        train(others, SilentReporter())
+    assert (files_of(cache), encoded_frames) == (before, [])
+    train(others, SilentReporter(), allow_config_change=True)
+    assert encoded_frames, "the change is meant"

@@ -16,6 +16,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from run_fixtures import set_up
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -30,7 +31,7 @@ from vjepa2_ac.runs.checkpoint import (
 )
 from vjepa2_ac.runs.manifest import write_manifest
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import save_checkpoint, set_up
+from vjepa2_ac.training.setup import save_checkpoint
 
 
 def write_weights(folder: Path) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from run_fixtures import set_up
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.clips.loader import training_loader
 from vjepa2_ac.distributed.collectives import (
@@ -21,7 +22,7 @@ from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.training.setup import Run, save_checkpoint, set_up
+from vjepa2_ac.training.setup import Run, save_checkpoint
 from vjepa2_ac.training.step import gradients, training_step
 
 

@@ -1,8 +1,11 @@
 """A tiny run on synthetic episodes."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -12,7 +15,13 @@ from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
 from vjepa2_ac.episode import Progress
-from vjepa2_ac.reporter import NullReporter
+from vjepa2_ac.reporter import SILENT, NullReporter
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+    from vjepa2_ac.training.reporter import TrainingReporter
+    from vjepa2_ac.training.setup import Run
 
 TINY = {
     "image_size": 32,
@@ -52,6 +61,14 @@ class SilentReporter(NullReporter):
     def stepped(self, step: int, figures: object) -> None:
         del figures
         self.steps.append(step)
+
+
+def set_up(config: Config, reporter: TrainingReporter = SILENT, accelerator: Accelerator | None = None) -> Run:
+    """Return a run as `train` has it before its first step."""
+    from vjepa2_ac.training.resume import restore
+    from vjepa2_ac.training.setup import open_data, open_model
+
+    return restore(open_model(open_data(config, reporter, accelerator), reporter), reporter)
 
 
 @pytest.fixture(scope="session")

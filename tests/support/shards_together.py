@@ -12,6 +12,7 @@ from accelerate import Accelerator
 from torch.distributed.fsdp import FSDPModule
 from torch.distributed.tensor import DTensor
 
+from run_fixtures import set_up
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, load_config, parse_config
 from vjepa2_ac.console.training import TrainingConsole
@@ -19,7 +20,7 @@ from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.training import optim
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import Run, batches_from, encode, set_up
+from vjepa2_ac.training.setup import Run, batches_from, encode
 from vjepa2_ac.training.step import gradients, training_step
 
 

@@ -10,6 +10,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from recording_cuda import RecordingCuda, recorded_copies
+from run_fixtures import set_up
 from same_run import assert_same_run
 from vjepa2_ac.data.clips import loader
 from vjepa2_ac.data.clips.clip_reader import ClipRequest
@@ -21,7 +22,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import read_state
 from vjepa2_ac.training import setup
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import Run, batches_from, set_up
+from vjepa2_ac.training.setup import Run, batches_from
 from vjepa2_ac.training.step import gradients, training_step
 
 COPY = [*["side 1: to pinned memory", "side 1: to device"] * 3]  # frames, states, actions

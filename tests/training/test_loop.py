@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from copied_sets import write_rlds
+from run_fixtures import set_up
 from same_run import assert_same_run, metrics, trained_weights
 from vjepa2_ac.config import CheckpointConfig, Config
 from vjepa2_ac.config.loading import config_as_yaml
@@ -24,7 +25,7 @@ from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import batches_from, set_up
+from vjepa2_ac.training.setup import batches_from
 from vjepa2_ac.training.step import step_seed, training_step
 
 

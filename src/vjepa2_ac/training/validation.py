@@ -60,18 +60,23 @@ def validate(run: Run, reporter: TrainingReporter) -> PredictionErrors:
     return errors
 
 
-def refuse_weak_base(run: Run, errors: PredictionErrors, reporter: TrainingReporter) -> None:
-    """Refuse to adapt a base that is no better than copying the last frame.
+def validate_base(run: Run, reporter: TrainingReporter) -> PredictionErrors | None:
+    """Measure a run before its first step, and refuse a base that is no better than copying the last frame.
+
+    None is returned of a run that goes on.
 
     Raises:
         InputError: It is not, and `training.allow_weak_base` is off.
     """
+    if run.state.step:
+        return None
+    errors = validate(run, reporter)
     config, error = run.config, one_step_over_persistence(errors).value
     if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:
-        return
+        return errors
     if run.world_model.fresh_heads is not None:
         reporter.note(NOT_ASKED)
-        return
+        return errors
     raise InputError(
         where="model.base",
         found=f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame",
