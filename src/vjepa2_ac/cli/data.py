@@ -193,18 +193,13 @@ def _calibrate(options: argparse.Namespace) -> None:
 
     from vjepa2_ac.console.data import calibration_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.evaluation.measure import ClipSample
     from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
     from vjepa2_ac.storage import write_atomically
 
     with ConsoleReporter() as reporter:
-        calibration = calibrate_config(
-            config,
-            model=options.model,
-            split=options.split,
-            clips=options.limit,
-            frames=options.frames,
-            reporter=reporter,
-        )
+        sample = ClipSample(options.split, options.limit, options.frames)
+        calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     console.print(calibration_table(calibration))
     console.print(calibration.verdict())
     path = options.out / "calibration.json"

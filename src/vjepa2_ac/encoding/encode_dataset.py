@@ -16,6 +16,7 @@ import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.clips.loader import ProcessShare
 from vjepa2_ac.data.sources.latents.manifest import Manifest, is_whole, read_manifest
 from vjepa2_ac.distributed.device import autocast, computing_device
 from vjepa2_ac.encoding.batch import encoding_of
@@ -24,7 +25,7 @@ from vjepa2_ac.encoding.cache_writer import CacheWriter
 from vjepa2_ac.encoding.disk_space import GIGABYTE, free_bytes, require_space
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, build
 from vjepa2_ac.encoding.repair import describe, missing_files, restart
-from vjepa2_ac.encoding.workload import Workload, WorkloadShare, claim_folder
+from vjepa2_ac.encoding.workload import Workload, claim_folder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -67,7 +68,7 @@ def encode_config(
             return EncodedSet(writer.folder, read_manifest(writer.folder))
         reporter.note(f"{describe(missing)}. It is encoded again.")
         restart(writer, missing)
-    share = WorkloadShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
+    share = ProcessShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
     at_work = encoder_on_device(config, model, device)
     return EncodedSet(writer.folder, encode_share(config, dataset, writer, at_work, share, reporter))
 
@@ -115,7 +116,7 @@ def encode_share(
     dataset: Dataset,
     writer: CacheWriter,
     encoder: EncoderOnDevice,
-    share: WorkloadShare,
+    share: ProcessShare,
     reporter: Reporter = SILENT,
 ) -> Manifest | None:
     """Report the work, check the disk space, and encode the share of one process.

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.data.sources.latents.dtypes import pack_latents
+from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode
 from vjepa2_ac.data.sources.latents.manifest import Manifest
 from vjepa2_ac.encoding.batching import Chunks, Encode, Encoded
 from vjepa2_ac.encoding.disk_space import small_frame_side
@@ -124,10 +125,8 @@ def _storing(work: Workload, encoder: EncoderOnDevice) -> Encode:
 
 def _write(work: Workload, one: Encoded) -> int:
     wanted = one.wanted
-    return work.writer.write_episode(
-        wanted.episode, wanted.camera, one.recording,
-        steps=wanted.steps.tolist(), latents=one.latents, small_frames=one.small_frames,
-    )  # fmt: skip
+    encoded = EncodedEpisode(one.recording, wanted.camera, wanted.steps.tolist(), one.latents, one.small_frames)
+    return work.writer.write_episode(wanted.episode, encoded)
 
 
 def _leave_out(work: Workload, one: Unreadable) -> None:

@@ -6,6 +6,7 @@ from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.clips.loader import WHOLE, ProcessShare
 from vjepa2_ac.data.sources.latents.manifest import is_whole
 from vjepa2_ac.distributed.collectives import broadcast_object
 from vjepa2_ac.encoding.batch import require_same_encoder
@@ -15,7 +16,7 @@ from vjepa2_ac.encoding.disk_space import require_space
 from vjepa2_ac.encoding.encode_dataset import duration, encode_share, encoder_on_device, size_reducing_knobs, writer_for
 from vjepa2_ac.encoding.pipeline import frames_per_second
 from vjepa2_ac.encoding.repair import MissingFiles, describe, missing_files, restart
-from vjepa2_ac.encoding.workload import Workload, WorkloadShare
+from vjepa2_ac.encoding.workload import Workload
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import Reporter
@@ -98,7 +99,7 @@ def _encode(
     Raises:
         InputError: They do not see the same folder; or as `encode_share`.
     """
-    share = WorkloadShare(accelerator.process_index, accelerator.num_processes)
+    share = ProcessShare(accelerator.process_index, accelerator.num_processes)
     encoder = encoder_on_device(config, model, accelerator.device)
     encode_share(config, dataset, writer, encoder, share, reporter)
     accelerator.wait_for_everyone()
@@ -119,7 +120,7 @@ def _report_encoding(
     writer: CacheWriter,
     reporter: Reporter,
 ) -> None:
-    work = Workload.of(dataset, writer, WorkloadShare())
+    work = Workload.of(dataset, writer, WHOLE)
     require_space(work.room, writer.folder, smaller=size_reducing_knobs(config))
     speed = frames_per_second(encoder_on_device(config, model, accelerator.device)) * accelerator.num_processes
     reporter.note(

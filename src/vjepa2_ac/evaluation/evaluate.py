@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_score.measure import PlanningStart, measure_plans, planning_start, study_of
-from vjepa2_ac.evaluation.action_use.energy_landscape import measure_landscapes
+from vjepa2_ac.evaluation.action_use.energy_landscape import LandscapeGrid, measure_landscapes
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, start_of
 from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sensitivity
 from vjepa2_ac.evaluation.estimates import episode_scores
@@ -93,6 +93,8 @@ def evaluate(
         episode_ids=tuple(np.repeat(np.array(ids), seen.actions.shape[1]).tolist()),
         is_pose=about.is_pose,
         reach=probes.reach_cm / 100,
+        samples=probes.samples,
+        seed=about.seed,
     )
     models: dict[str, ModelResult] = {}
     for contender in contenders:
@@ -100,8 +102,8 @@ def evaluate(
         with contender.switched():
             models[contender.name] = replace(
                 result,
-                sensitivity=_sensitivity(contender, seen.starts, pool, probes, about, reporter),
-                landscapes=_landscapes(contender, seen.starts, known, pool, probes, about, reporter),
+                sensitivity=_sensitivity(contender, seen.starts, pool, probes, reporter),
+                landscapes=_landscapes(contender, seen.starts, known, pool, probes, reporter),
                 plans=_plans(contender, seen.planned, probes, reporter),
             )
     evaluation = Evaluation(
@@ -186,24 +188,12 @@ def _largest_step(actions: Float[torch.Tensor, "time action_dim"], about: About)
 
 
 def _sensitivity(
-    contender: Contender,
-    starts: Sequence[RolloutStart],
-    pool: ActionPool,
-    probes: ProbeOptions,
-    about: About,
-    reporter: Reporter,
+    contender: Contender, starts: Sequence[RolloutStart], pool: ActionPool, probes: ProbeOptions, reporter: Reporter
 ) -> Sensitivity | None:
     if not starts:
         return None
-    return measure_sensitivity(
-        contender.model,
-        starts,
-        pool,
-        samples=probes.samples,
-        seed=about.seed,
-        at_once=probes.at_once,
-        progress=reporter.task(f"other actions, {contender.name}"),
-    )
+    progress = reporter.task(f"other actions, {contender.name}")
+    return measure_sensitivity(contender.model, starts, pool, at_once=probes.at_once, progress=progress)
 
 
 def _landscapes(
@@ -212,22 +202,15 @@ def _landscapes(
     clips: Clips,
     pool: ActionPool,
     probes: ProbeOptions,
-    about: About,
     reporter: Reporter,
 ) -> Landscapes | None:
     moving = [start for start in starts if clips.moving[start.clip].any()] or list(starts)
     if not probes.landscape_clips or not moving or pool.actions.shape[-1] < 3:
         return None
     chosen = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
-    return measure_landscapes(
-        contender.model,
-        chosen,
-        is_pose=about.is_pose,
-        nodes=probes.nodes,
-        reach=pool.reach if about.is_pose else 0.0,
-        at_once=probes.at_once,
-        progress=reporter.task(f"energy landscapes, {contender.name}"),
-    )
+    grid = LandscapeGrid(pool.is_pose, probes.nodes, reach=pool.reach if pool.is_pose else 0.0)
+    progress = reporter.task(f"energy landscapes, {contender.name}")
+    return measure_landscapes(contender.model, chosen, grid, at_once=probes.at_once, progress=progress)
 
 
 def _plans(

@@ -25,6 +25,7 @@ from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.examples import seen_by_the_encoder
+from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import About, Evaluation, Role, TrainingCurve
 from vjepa2_ac.evaluation.stride_calibration.measure import calibrate_model
@@ -96,9 +97,8 @@ def measure_subject(subject: str, asked: EvaluationOptions | None = None, *, rep
             dataset,
             config,
             accelerator,
-            clips=asked.clips,
-            split=asked.split,
-            progress=reporter.task("calibrating strides"),
+            ClipSample(asked.split, asked.clips),
+            reporter.task("calibrating strides"),
         ).as_dict()
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     read = partial(batches_of, batch_size=config.validation.batch_size, copies=copies_for(accelerator.device))

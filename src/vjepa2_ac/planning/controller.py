@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
-from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS, Progress
+from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.model.network.input_heads import widths_of_model
@@ -25,7 +24,7 @@ from vjepa2_ac.planning.goal import Goal, patch_weights
 from vjepa2_ac.planning.input_checks import require_extrinsics, require_image, require_mask, require_pose
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.model_setup import prepare_for_planning
-from vjepa2_ac.planning.planner import Clock, Planner
+from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.pose_integration import states_along
 
 Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
@@ -63,8 +62,7 @@ class Controller:
         seed: int = 0,
         crop: Crop = "released",
         extrinsics: Float[np.ndarray, " 6"] | None = None,
-        clock: Clock = time.perf_counter,
-        progress: Progress | None = None,
+        planner: Planner | None = None,
     ) -> None:
         """Create a controller.
 
@@ -75,8 +73,7 @@ class Controller:
             seed: Of all decisions.
             crop: As in training (`data.crop`).
             extrinsics: Pose of the camera, if the model uses it.
-            clock: Measures the time budget.
-            progress: Called with the number of finished iterations of a decision.
+            planner: Searches, by the same settings; None: one that reports no progress.
 
         Raises:
             InputError: The model's states and actions are no poses, or it needs a camera pose and none is given, or
@@ -96,7 +93,7 @@ class Controller:
             )
         self._model, self.config, self.seed, self.crop = prepare_for_planning(world_model, config), config, seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
-        self._planner = Planner(config, clock=clock, progress=progress)
+        self._planner = planner or Planner(config)
         self._goal: Goal | None = None
         self._like = np.zeros(0)
         self._seen: list[Seen] = []  # the newest `planning.context`

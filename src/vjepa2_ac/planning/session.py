@@ -21,6 +21,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.settings import planning_settings
 from vjepa2_ac.runs.checkpoint_selection import NEWEST
 from vjepa2_ac.runs.folder import is_run
@@ -77,7 +78,7 @@ class PlanningSession:
             seed=self.config.seed if seed is None else seed,
             crop=self.config.data.crop,
             extrinsics=extrinsics,
-            progress=progress,
+            planner=Planner(self.config.planning, progress=progress),
         )
 
     def as_dict(self) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from torch import nn
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import training_loader, validation_batches
+from vjepa2_ac.data.clips.loader import ProcessShare, training_loader, validation_batches
 from vjepa2_ac.data.clips.prefetch import Batches
 from vjepa2_ac.data.clips.streams import Copies, copies_for
 from vjepa2_ac.data.index.index_cache import fingerprints_of
@@ -194,8 +194,7 @@ def batches_from(run: Run) -> Batches:
         seed=run.config.seed,
         batch_size=run.config.training.batch_size,
         start_position=run.state.clips_done,
-        rank=run.accelerator.process_index,
-        world_size=run.accelerator.num_processes,
+        share=ProcessShare(run.accelerator.process_index, run.accelerator.num_processes),
         copies=run.copies,
     )
 

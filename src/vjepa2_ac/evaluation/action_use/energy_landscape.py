@@ -7,6 +7,7 @@ after one step from one frame. There the grid is centred on zero; here it also h
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,13 +23,20 @@ _SAME = 1e-6  # energies this close, as a share, are equally low
 _CM = 100.0
 
 
+@dataclass(frozen=True)
+class LandscapeGrid:
+    """A grid of actions over their first three numbers."""
+
+    is_pose: bool  # the numbers are dx, dy, dz in metres, and are reported in cm
+    nodes: int  # along each axis
+    reach: float  # it spans at least -reach .. reach (metres; of vectors: in its own numbers)
+
+
 def measure_landscapes(
     model: Predictor,
     starts: Sequence[RolloutStart],
+    grid: LandscapeGrid,
     *,
-    is_pose: bool,
-    nodes: int,
-    reach: float,
     at_once: int,
     progress: Progress | None = None,
 ) -> Landscapes:
@@ -37,20 +45,19 @@ def measure_landscapes(
     Args:
         model: The predictor.
         starts: One frame of each clip; one or more.
-        is_pose: The numbers are dx, dy, dz in metres, and are reported in cm.
-        nodes: Along each axis.
-        reach: The grid spans at least -reach .. reach (metres; of vectors: in its own numbers).
+        grid: The actions.
         at_once: Samples per batch.
         progress: Called with the number of finished starts.
 
     Raises:
         ValueError: No starts, fewer than three nodes, or actions of fewer than three numbers.
     """
+    is_pose, nodes = grid.is_pose, grid.nodes
     if not starts or nodes < 3 or len(starts[0].action) < 3:
         raise ValueError(f"{len(starts)} starts, {nodes} nodes")
     unit = _CM if is_pose else 1.0
     trues = np.stack([start.action[:3].cpu().numpy().astype(np.float64) for start in starts])
-    half = max(reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
+    half = max(grid.reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
     maps = []
     for done, (start, true) in enumerate(zip(starts, trues, strict=True), start=1):
         maps.append(_landscape(model, start, grid_axes(true, half, nodes), true, unit, at_once))

@@ -25,10 +25,9 @@ from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
-from vjepa2_ac.evaluation.measure import Predictor, one_step_errors
+from vjepa2_ac.evaluation.measure import ClipSample, Predictor, one_step_errors
 from vjepa2_ac.model.network.world_model import WorldModel
 
-FRAMES = 8  # of a clip at most: as the released weights were trained, and short enough for the widest stride
 _EPISODES_NEEDED = 2  # for an interval
 _EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
 
@@ -128,12 +127,8 @@ def calibrate(
     model: Predictor,
     encode: Callable[[Batch], LatentBatch],
     dataset: Dataset,
+    sample: ClipSample,
     *,
-    split: Split = "validation",
-    strides: Sequence[int] = (),
-    frames: int | None = None,
-    clips: int = 64,
-    batch_size: int = 8,
     copies: Copies = NO_COPIES,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -145,27 +140,23 @@ def calibrate(
     Args:
         model: The predictor.
         encode: Turns a batch of pixels into latents on the model's device.
-        dataset: The source of clips; its own stride and number of frames do not matter.
-        split: Which episodes.
-        strides: The candidates; none: those of the config.
-        frames: Of a clip; None: the config's, but 8 at most, so that wide strides fit.
-        clips: Number at each stride.
-        batch_size: Clips per batch.
+        dataset: The source of clips; its config has the candidates, its own stride does not matter.
+        sample: The clips at each stride.
         copies: Copies them to the model's device.
         progress: Called with (clips done, clips in total).
 
     Raises:
         InputError: The split is empty, no stride fits into any of its episodes, or a clip cannot be read.
     """
-    frames = min(dataset.config.frames, FRAMES) if frames is None else frames
-    strides = sorted(set(strides or dataset.config.strides_to_try(dataset.control_rate_hz)))
+    frames, split = sample.frames_of(dataset.config), sample.split
+    strides = sorted(set(dataset.config.strides_to_try(dataset.control_rate_hz)))
     settings = dataset.config.model_copy(update={"frames": frames, "short_episodes": "skip"})
     views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}
     possible, impossible = _possible(views, split)
-    chosen = validation_windows(views[possible[-1]], split, clips=clips)
+    chosen = validation_windows(views[possible[-1]], split, clips=sample.clips)
     measured = {}
     for done, stride in enumerate(possible):
-        batches = batches_of(views[stride], chosen, batch_size=batch_size, copies=copies)
+        batches = batches_of(views[stride], chosen, batch_size=sample.batch_size, copies=copies)
         parts = _measure(model, encode, batches, is_pose=settings.states == "pose")
         report = _with_progress(progress, done * len(chosen), len(possible) * len(chosen))
         measured[stride] = _Measured.joined(list(report(parts)))
@@ -293,11 +284,7 @@ def calibrate_model(
     dataset: Dataset,
     config: Config,
     accelerator: Accelerator,
-    *,
-    clips: int,
-    split: Split = "validation",
-    strides: Sequence[int] = (),
-    frames: int | None = None,
+    sample: ClipSample,
     progress: Progress | None = None,
 ) -> Calibration:
     """Calibrate a model that is on the accelerator's device, in the run's precision.
@@ -313,18 +300,7 @@ def calibrate_model(
             fix="Calibrate on the data set itself, with data.cache: off",
         )
     world_model.eval()
-
+    sample = replace(sample, batch_size=config.validation.batch_size)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     with accelerator.autocast(), torch.no_grad():
-        return calibrate(
-            world_model,
-            encode,
-            dataset,
-            split=split,
-            strides=strides,
-            frames=frames,
-            clips=clips,
-            batch_size=config.validation.batch_size,
-            copies=copies_for(accelerator.device),
-            progress=progress,
-        )
+        return calibrate(world_model, encode, dataset, sample, copies=copies_for(accelerator.device), progress=progress)

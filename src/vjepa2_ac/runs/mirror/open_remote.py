@@ -18,6 +18,7 @@ from vjepa2_ac.runs.folder import CHECKPOINTS
 from vjepa2_ac.runs.mirror.background_sync import Mirror, reason_of
 from vjepa2_ac.runs.mirror.fetch import fetch_newest
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
+from vjepa2_ac.runs.mirror.upload import RemoteUpdate
 from vjepa2_ac.storage import is_url, place, try_writing
 from vjepa2_ac.storage.remote import quietly
 
@@ -36,9 +37,8 @@ class Remote:
     def mirror(self, run_id: str) -> Mirror:
         """Return the mirror that keeps the place up to date."""
         folder, checkpoint = Path(self.config.run_dir), self.config.checkpoint
-        return Mirror(
-            self.place, folder, run_id, checkpoint, damaged=self.damaged, outage_reported=not self.is_reachable
-        )
+        update = RemoteUpdate(RemoteCheckpoints(self.place), folder, run_id, checkpoint.keep, self.damaged)
+        return Mirror(update, checkpoint, outage_reported=not self.is_reachable)
 
 
 def open_remote(
