@@ -49,7 +49,7 @@ from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import NullReporter
-from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.cost.flops import frame_flops
 from vjepa2_ac.training.monitoring.throughput import matmul_speed
 from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model
@@ -108,9 +108,8 @@ def measure_speed(options: argparse.Namespace, folder: Path, rows: Rows) -> None
     sizes = sizes_of(options)
     WorldModel.random(sizes, seed=0, dtype=dtype, device=options.device).save_pretrained(folder / "model")
     steps = (max(options.frames) - 1) * STRIDE + 9
-    record_dataset(
-        folder / "data", domain="A", episodes=options.episodes, steps=steps, seed=1, workers=max(1, options.workers)
-    )
+    spec = RecordingSpec("A", steps, seed=1)
+    record_dataset(folder / "data", spec, episodes=options.episodes, workers=max(1, options.workers))
     print(
         f"encoder {options.encoder_layers} of 40 layers, predictor {options.predictor_layers} of 24,"
         f" {options.image_size} px, batch {options.batch}; wall or processor's ms a clip, median of {options.repeats}"
@@ -246,7 +245,8 @@ def measure_domain(options: argparse.Namespace, folder: Path, model: WorldModel,
     domain = options.domains[number]
     place = folder / f"test {domain}"
     workers = max(1, options.workers)
-    record_dataset(place, domain=domain, episodes=options.test_episodes, steps=33, seed=7 + number, workers=workers)
+    spec = RecordingSpec(domain, steps=33, seed=7 + number)
+    record_dataset(place, spec, episodes=options.test_episodes, workers=workers)
     batches = list(latents_of(model, place, folder / "kept"))
     true: tuple[float, float] | None = None
     for kind in ("fp32", "bf16", "int8"):

@@ -30,7 +30,7 @@ from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
-from vjepa2_ac.simulation.closed_loop.rollout import run_task
+from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.training.cost.parameters import count_parameters
 from vjepa2_ac.training.loop import train
 
@@ -126,7 +126,7 @@ def planner(model: WorldModel, distance: str, config: PlanningConfig = PLANNING)
 def reach(cell: Cell, policy: Policy, *, seed: int, goals: int) -> dict[str, Any]:
     """Return distances to the goal (cm) before the first step and after each, and seconds of a decision."""
     with _bf16():
-        result = run_task("reach", SHIFTS[cell.shift], policy, episodes=goals, seed=seed)
+        result = run_task(RolloutSpec("reach", SHIFTS[cell.shift], goals, seed), policy)
     return {
         "goals_seed": seed,
         "distance_cm": np.round(result.distance_cm, 3).tolist(),

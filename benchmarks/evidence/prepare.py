@@ -16,7 +16,7 @@ from vjepa2_ac.export.export import export_run
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT
-from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.reporter import TrainingReporter
 
@@ -92,7 +92,7 @@ def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...
 def _record(data: DataConfig, domain: str, episodes: int, seed: int) -> None:
     if not Path(data.path).exists():
         world = SHIFTS.get(domain, domain)  # type: ignore[call-overload]
-        record_dataset(data.path, domain=world, episodes=episodes, seed=seed)
+        record_dataset(data.path, RecordingSpec(world, seed=seed), episodes=episodes)
 
 
 def _base_config(folder: Path) -> Config:

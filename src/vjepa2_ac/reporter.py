@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 
 INDEXING = "looking through the data set"  # a task of many
 
@@ -36,7 +36,7 @@ class NullReporter:
 
     def task(self, title: str, unit: str = "") -> Progress:  # noqa: ARG002
         """Return a function that shows nothing."""
-        return lambda done, total: None  # noqa: ARG005
+        return no_progress
 
     def started(self, done: int, total: int) -> None:
         """Show nothing."""

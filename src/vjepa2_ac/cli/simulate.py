@@ -125,24 +125,21 @@ def _record(options: argparse.Namespace) -> int:
         try_writing_at(target)
 
     from vjepa2_ac.console.progress import ConsoleReporter, console
-    from vjepa2_ac.simulation.recording.record import record_dataset
+    from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
     output.never_wait()
+    spec = RecordingSpec(
+        options.domain,
+        steps=options.steps,
+        seed=options.seed,
+        cameras=options.cameras,
+        renderer=options.renderer,
+        task=None if options.task == "reach" else options.task,
+    )
     with ConsoleReporter() as reporter:
         progress = reporter.task("recording")
         progress(0, options.episodes)
-        folder = record_dataset(
-            target,
-            domain=options.domain,
-            episodes=options.episodes,
-            steps=options.steps,
-            seed=options.seed,
-            workers=options.workers,
-            cameras=options.cameras,
-            renderer=options.renderer,
-            task=None if options.task == "reach" else options.task,
-            progress=progress,
-        )
+        folder = record_dataset(target, spec, episodes=options.episodes, workers=options.workers, progress=progress)
     console.print(f"{options.episodes} episodes are in {folder}")
     return 0
 

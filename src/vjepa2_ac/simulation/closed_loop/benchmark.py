@@ -18,7 +18,7 @@ from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
-from vjepa2_ac.simulation.closed_loop.rollout import run_task
+from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M, TaskName, arm_for
 from vjepa2_ac.simulation.closed_loop.video import write_film
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
@@ -97,19 +97,9 @@ def run_benchmark(
     arm = arm_for(asked.task, named_domain(asked.domain), renderer=asked.renderer)
     results = []
     for policy in _policies(steering, asked, arm):
-        result = run_task(
-            asked.task,
-            arm.domain,
-            policy,
-            episodes=asked.episodes,
-            seed=asked.seed,
-            steps=asked.steps,
-            stride=stride,
-            keep_frames=asked.films if isinstance(policy, Planning) else 0,
-            arm=arm,
-            progress=reporter.task(f"{asked.task}: {policy.name}"),
-        )
-        results.append(result)
+        films = asked.films if isinstance(policy, Planning) else 0
+        spec = RolloutSpec(asked.task, arm.domain, asked.episodes, asked.seed, asked.steps, stride, films)
+        results.append(run_task(spec, policy, arm, reporter.task(f"{asked.task}: {policy.name}")))
     contest = ClosedLoopBenchmark(
         steering.subject,
         steering.checkpoint,
