@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+import vjepa2_ac
 from paths import ROOT
 from vjepa2_ac.config.diagnostics import all_keys
 from vjepa2_ac.config.loading import parse_config
@@ -42,8 +43,10 @@ def is_there(path: str) -> bool:
 
 
 def is_module_or_part_of_one(dotted: str) -> bool:
-    """Whether a dotted name within the package is a module, or what a module defines or imports."""
+    """Whether a dotted name within the package is public, a module, or what a module defines or imports."""
     parts = dotted.split(".")
+    if parts[0] in vjepa2_ac.__all__:
+        return True
     for length in range(len(parts), 0, -1):
         place = PACKAGE.joinpath(*parts[:length])
         file = place / "__init__.py" if place.is_dir() else place.with_suffix(".py")

@@ -21,3 +21,18 @@ def test_an_old_name_is_the_new_one_and_says_so(old: str, name: str, new: str, n
     with pytest.warns(FutureWarning, match=new):
         module = importlib.import_module(old)
     assert getattr(module, name) is getattr(importlib.import_module(new), new_name)
+
+
+PRINTED = [
+    ("vjepa2_ac.config", "ModelConfig"),
+    ("vjepa2_ac.episode", "Widths"),
+    ("vjepa2_ac.model.adapter.lora", "load_trained"),
+    ("vjepa2_ac.model.checkpoints.loading", "load_base"),
+    ("vjepa2_ac.model.network.input_heads", "fit_heads"),
+    ("vjepa2_ac.planning.session", "load_to_plan"),
+]
+
+
+@pytest.mark.parametrize(("module", "name"), PRINTED)
+def test_what_cards_and_docs_imported_before_the_public_names_is_still_there(module: str, name: str) -> None:
+    assert callable(getattr(importlib.import_module(module), name))

@@ -1,5 +1,63 @@
-"""Fine-tune V-JEPA 2-AC, the action-conditioned video world model, and know whether it helped."""
+"""Fine-tune V-JEPA 2-AC, the action-conditioned video world model, and know whether it helped.
 
+The public names are described in docs/python.md. Each is imported when it is first used: `import vjepa2_ac` takes no
+time and imports no PyTorch.
+"""
+
+from importlib import import_module
 from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from vjepa2_ac.api.data import encode, open_dataset, read_clips
+    from vjepa2_ac.api.models import load_model, load_run
+    from vjepa2_ac.api.runs import evaluate, train
+    from vjepa2_ac.config.loading import load_config
+    from vjepa2_ac.errors import UserError
+    from vjepa2_ac.model.network.world_model import WorldModel
+    from vjepa2_ac.planning.controller import Controller
+
+__all__ = [
+    "Controller",
+    "UserError",
+    "WorldModel",
+    "encode",
+    "evaluate",
+    "load_config",
+    "load_model",
+    "load_run",
+    "open_dataset",
+    "read_clips",
+    "train",
+]
 
 __version__ = version("vjepa2-ac")
+
+_MODULES = {  # the same as above, for the time of use
+    "Controller": "vjepa2_ac.planning.controller",
+    "UserError": "vjepa2_ac.errors",
+    "WorldModel": "vjepa2_ac.model.network.world_model",
+    "encode": "vjepa2_ac.api.data",
+    "evaluate": "vjepa2_ac.api.runs",
+    "load_config": "vjepa2_ac.config.loading",
+    "load_model": "vjepa2_ac.api.models",
+    "load_run": "vjepa2_ac.api.models",
+    "open_dataset": "vjepa2_ac.api.data",
+    "read_clips": "vjepa2_ac.api.data",
+    "train": "vjepa2_ac.api.runs",
+}
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+if not TYPE_CHECKING:  # else a type checker would accept any name
+
+    def __getattr__(name: str) -> Any:
+        """Import a public name."""
+        if name not in _MODULES:
+            raise AttributeError(f"vjepa2_ac has no {name!r}; its public names are {', '.join(__all__)}")
+        found = getattr(import_module(_MODULES[name]), name)
+        globals()[name] = found
+        return found

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 from vjepa2_ac.episode import Progress, no_progress
 
@@ -41,10 +40,10 @@ class NullReporter:
     def started(self, done: int, total: int) -> None:
         """Show nothing."""
 
-    def stepped(self, step: int, metrics: Mapping[str, float]) -> None:
+    def stepped(self, step: int, metrics: Any) -> None:
         """Show nothing."""
 
-    def validated(self, step: int, errors: object) -> None:
+    def validated(self, step: int, errors: Any) -> None:
         """Show nothing."""
 
 

@@ -7,6 +7,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import torch
 from rich.table import Table
 
 from vjepa2_ac.console.closed_loop import contest_table
@@ -24,6 +25,7 @@ from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reports.comparison import Comparison
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
+from vjepa2_ac.spaces import POSE, vector_states
 from worlds import Copier, Halfway, about, again, clips_batch
 
 SURE = Estimate(-0.123, -0.145, -0.101)
@@ -45,7 +47,7 @@ def probes() -> list[Table]:
 
 def motions() -> list[Table]:
     one = Mock(stride=15, seconds=1.0, percentiles=lambda _: (1234.5, 2345.6, 3456.7, 4567.8))
-    both = [Mock(spec=Inspection, is_pose=is_pose, motions=[one], changes=[one]) for is_pose in (True, False)]
+    both = [Mock(spec=Inspection, has_poses=poses, motions=[one], changes=[one]) for poses in (True, False)]
     return [motion_table(inspection) for inspection in both]
 
 
@@ -65,7 +67,14 @@ def comparisons() -> list[Table]:
 
 def plans() -> list[Table]:
     actions, states = np.full((3, 7), -0.12345), np.full((4, 7), -0.54321)
-    return [plan_table(Mock(spec=PlanResult, actions=actions, states=states, decision=Mock(why="planned")))]
+    answers = [
+        Mock(
+            spec=PlanResult, actions=actions, states=states, decision=Mock(why="planned"), state_space=space,
+            space=Mock(free=torch.arange(7)),
+        )
+        for space in (POSE, vector_states(7))
+    ]  # fmt: skip
+    return [plan_table(answer) for answer in answers]
 
 
 def contests() -> list[Table]:

@@ -25,6 +25,7 @@ from vjepa2_ac.episode import Batch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.reports.figures.dataset import plot_dataset
+from vjepa2_ac.spaces import Spaces
 
 JOINTS = ("steps/observation/joint_position", "steps/observation/gripper_position")
 VELOCITIES = ("steps/action_dict/joint_velocity", "steps/action_dict/gripper_velocity")
@@ -234,6 +235,9 @@ def test_the_check_says_how_wide_and_that_all_is_well(tmp_path: Path) -> None:
     assert found["pictures"].text.startswith("0 of 16")
 
 
+FIVE = Spaces.of_vectors(Widths(5, 5), "difference")
+
+
 def batch(states: np.ndarray, actions: np.ndarray | None = None) -> Batch:
     numbers = states.astype(np.float32)[None]
     taken = np.diff(numbers, axis=1) if actions is None else actions.astype(np.float32)[None]
@@ -251,7 +255,7 @@ def batch(states: np.ndarray, actions: np.ndarray | None = None) -> Batch:
     ],
 )
 def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: str, level: str, words: str) -> None:
-    found = {one.about: one for one in findings_in([batch(states)], is_pose=False)}
+    found = {one.about: one for one in findings_in([batch(states)], FIVE)}
     assert found[about].level == level
     assert words in found[about].text
 
@@ -259,7 +263,7 @@ def test_the_check_tells_numbers_that_teach_nothing(states: np.ndarray, about: s
 def test_frames_that_never_change_while_a_number_does_are_an_error() -> None:
     moving = batch(vectors(9, 5, seed=0))
     stuck = Batch(torch.zeros_like(moving.frames), moving.states, moving.actions, None, ("e",), (0,))
-    found = {one.about: one for one in findings_in([stuck], is_pose=False)}
+    found = {one.about: one for one in findings_in([stuck], FIVE)}
     assert found["pictures"].level == "error"
 
 

@@ -27,6 +27,7 @@ from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import MODES, Evaluation, PredictionErrors, Stratum
 from vjepa2_ac.evaluation.verdict import improvement, uses_actions, verdict
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
+from vjepa2_ac.spaces import vector_actions
 from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, about, again, clips_batch
 
 PROBES = ProbeOptions(sensitivity_clips=6, samples=20, landscape_clips=3, nodes=5, examples=3, at_once=7)
@@ -201,11 +202,11 @@ def test_examples_are_the_best_the_worst_and_the_liveliest_with_their_errors(ora
 
 def test_vectors_have_no_centimetres_and_too_few_numbers_no_landscape() -> None:
     contenders = [Contender("model", "trained", Oracle())]
-    vectors = evaluate(contenders, again(clips_batch(width=4)), about(is_pose=False), probes=PROBES)
+    vectors = evaluate(contenders, again(clips_batch(width=4)), about(space=vector_actions(4, "change")), probes=PROBES)
     landscapes = vectors.models["model"].landscapes
     assert landscapes is not None
     assert (landscapes.unit, landscapes.axis_names[0]) == ("", "action 0")
-    narrow = evaluate(contenders, again(clips_batch(width=2)), about(is_pose=False), probes=PROBES)
+    narrow = evaluate(contenders, again(clips_batch(width=2)), about(space=vector_actions(2, "change")), probes=PROBES)
     assert narrow.models["model"].landscapes is None
     assert "an action has 2 numbers" in verdict(narrow)
     json.dumps(metrics_as_dict(narrow), allow_nan=False)

@@ -12,6 +12,7 @@ from vjepa2_ac.evaluation.result import MODES, Evaluation, Example, ModelResult,
 from vjepa2_ac.evaluation.strata import clips_of
 from vjepa2_ac.evaluation.verdict import improvement, spread, uses_actions, verdict
 from vjepa2_ac.reports.figures.evaluation import plot_evaluation
+from vjepa2_ac.spaces import POSE_CHANGE
 from worlds import about
 
 CLIPS, HORIZON = 24, 3
@@ -60,7 +61,7 @@ def evaluation(*models: ModelResult, episodes: int = 8) -> Evaluation:
     )
     return Evaluation(
         about=about(frames=HORIZON + 1, seconds_per_step=0.5),
-        clips=clips_of(actions, ids, tuple(range(CLIPS)), is_pose=True, seconds_per_step=0.5),
+        clips=clips_of(actions, ids, tuple(range(CLIPS)), space=POSE_CHANGE, seconds_per_step=0.5),
         models={each.name: each for each in models},
         strata=(),
         episodes=(),

@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from paths import GOLDEN
-from run_fixtures import SilentReporter, one_thread, tiny_config
+from run_fixtures import TINY, SilentReporter, one_thread, tiny_config
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.errors import InputError
@@ -248,8 +248,9 @@ def test_the_card_describes_unusual_adapter_settings(trained, tmp_path: Path) ->
     assert "from peft" not in card
 
 
-def test_the_code_of_the_card_runs(trained, tmp_path: Path) -> None:
-    run = trained()
+@pytest.mark.parametrize("sizes", [{}, {"model__sizes": TINY}], ids=["released sizes", "other sizes"])
+def test_the_code_of_the_card_runs(trained, tmp_path: Path, sizes: dict[str, Any]) -> None:
+    run = trained(**sizes)
     export_run(run, tmp_path / "hub", "hub")
     blocks = re.findall(r"```python\n(.*?)```", (tmp_path / "hub" / CARD).read_text(), flags=re.DOTALL)
     assert len(blocks) == 2

@@ -13,7 +13,6 @@ from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.decision import PlanRequest, PlanResult, decide
 from vjepa2_ac.planning.plan_json import write_plan
-from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.summary import axes_at_limit, summarize
 
 
@@ -129,7 +128,8 @@ def test_a_plan_that_is_no_better_than_doing_nothing_is_reported() -> None:
 def test_running_out_of_time_is_reported() -> None:
     ticks = iter(range(1000))
     config = QUICK.model_copy(update={"budget_s": 4.0})
-    controller = Controller(tiny_model(), config, planner=Planner(config, clock=lambda: float(next(ticks))))
+    controller = Controller(tiny_model(), config)
+    controller.planner.clock = lambda: float(next(ticks))
     found = decide(controller, PlanRequest(image(0), STATE, (image(100),)))
     assert "Time was up after" in summarize(found)
     assert " of 3 iterations" in summarize(found)

@@ -7,12 +7,14 @@ from torch import Tensor
 
 from tiny_models import DIM, TOKENS, actions, cost, draw, goal, scene, tiny_model
 from vjepa2_ac.config.planning import EnergyConfig, GradientConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.episode import Widths
 from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goal import Goal, patch_weights
 from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.spaces import Spaces
 
 
 @torch.no_grad()
@@ -48,6 +50,22 @@ def test_predictions_are_those_of_the_plain_computation(context: int, adapted: b
     torch.testing.assert_close(found, expected, rtol=2e-5, atol=2e-5)
     assert states.shape == (3, 4, 7)
     assert (found[0] - found[1]).abs().mean() > 1e-3  # it heeds its actions
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("joined", ["sum", "last"])
+def test_vectors_add_and_a_model_of_targets_is_given_the_states_that_changes_lead_to(joined: str) -> None:
+    sizes = tiny_model().sizes
+    predictor = sizes.predictor.model_copy(update={"state_dim": 3, "action_dim": 3})
+    model = WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0).eval()
+    model.base_predictor.action_encoder.weight.mul_(40)
+    start, tried = Scene(draw(1, TOKENS, DIM), draw(1, 3), draw(0, 3)), actions(2, 4)[..., :3]
+    spaces = Spaces.of_vectors(Widths(3, 3), joined)
+    found, states = WorldModelCost(model, start, goal(), EnergyConfig(), spaces=spaces).imagine(tried)
+    after = start.states + torch.cat([torch.zeros(2, 1, 3), tried.cumsum(dim=1)], dim=1)
+    torch.testing.assert_close(states, after)
+    given = after[:, 1:] if joined == "last" else tried
+    torch.testing.assert_close(found, model.rollout(start.latents.expand(2, -1, -1, -1), given, after[:, :-1]))
 
 
 @torch.no_grad()

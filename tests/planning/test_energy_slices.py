@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.planning.action_space import pose_space
-from vjepa2_ac.planning.energy_slices import PAIRS, energy_slices
+from vjepa2_ac.planning.energy_slices import energy_slices
+from vjepa2_ac.planning.search_space import pose_space
 
 CHOSEN = torch.arange(28.0).reshape(4, 7) / 1000
 LIMITS = LimitsConfig(xyz=(0.04, 0.08, 0.0))
@@ -20,7 +20,7 @@ def weighted(actions: Tensor) -> Tensor:
 
 def test_a_slice_changes_two_numbers_of_the_first_action_and_no_others() -> None:
     slices = energy_slices(weighted, CHOSEN, pose_space(PlanningConfig(horizon=4, limits=LIMITS)), nodes=5)
-    assert tuple(one.axes for one in slices) == PAIRS
+    assert tuple(one.axes for one in slices) == ((0, 1), (0, 2), (1, 2))
     for one in slices:
         for row, up in enumerate(one.up):
             for column, across in enumerate(one.across):

@@ -1,5 +1,6 @@
 """The planning session uses the given run or model with its own config, and refuses unusable ones."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ import yaml
 
 from adapted_run import write_adapted_run
 from vjepa2_ac.config.loading import config_as_dict, config_as_yaml
+from vjepa2_ac.data.sources.registry import open_source
+from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
@@ -16,6 +19,7 @@ from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.planning.session import PlanningSession, load_to_plan
 from vjepa2_ac.runs.folder import check_run_folder, config_changes, open_run_folder, read_run_config
 from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.training.loop import train
 
 PLANNING = {"horizon": 2, "samples": 12, "iterations": 2, "cem": {"elites": 4}}
 STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
@@ -117,13 +121,57 @@ def test_what_a_run_cannot_be_asked_for_is_refused(run: Path) -> None:
         load_to_plan(str(run / "nowhere"))
 
 
-def test_a_model_of_vectors_is_refused(make_config, tmp_path: Path) -> None:
-    config = make_config()
-    vectors = config.model_copy(update={"data": config.data.model_copy(update={"states": "vector"})})
-    path = tmp_path / "its.yaml"
-    path.write_text(config_as_yaml(vectors))
-    with pytest.raises(InputError, match="a model of poses"):
-        load_to_plan("builtin:sim-tiny", config=path)
+VECTORS = {
+    "data__states": "vector",
+    "data__fields": {"state": ["steps/observation/joint_position", "steps/observation/gripper_position"]},
+    "adapter__modules_to_save": ["state_encoder", "action_encoder"],
+    "planning": {"samples": 8, "iterations": 2, "cem": {"elites": 3}, "horizon": 2},
+}
+
+
+def image(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 255, (36, 64, 3), dtype=np.uint8)
+
+
+def test_a_run_of_vectors_plans_within_what_it_was_taught(make_config, reporter) -> None:
+    """Joint angles and a gripper: as many numbers as the data have, and no number changes more than it was taught."""
+    folder = train(make_config(**VECTORS, training__steps=1), reporter)
+    taught = json.loads((folder / "changes.json").read_text())["changes"]
+    states = [episode.states for episode in episodes_of(folder)]
+    expected = np.percentile(np.abs(np.concatenate([one[2:] - one[:-2] for one in states])), 99, axis=0)
+    np.testing.assert_allclose(taught, expected, rtol=1e-6)
+    controller = load_to_plan(str(folder)).controller()
+    controller.reset(image(0))
+    action = controller.act(image(1), states[0][0])
+    assert action.shape == (8,)
+    assert np.any(action)
+    assert (np.abs(action) <= taught).all()
+    np.testing.assert_allclose(controller.decision.states[1], states[0][0] + action, atol=1e-6)
+    limited = load_to_plan(str(folder), overrides=["planning.limits.axes=[0.01]"]).controller()
+    limited.reset(image(0))
+    assert np.abs(limited.act(image(1), states[0][0])).max() <= 0.01
+    with pytest.raises(InputError, match=r"state: 7 numbers .* needed: 8: state 0, state 1"):
+        limited.act(image(1), np.zeros(7))
+    for spoiled, complaint in (('{"changes": [1.0, "far"]}', "a number of 0 or more"), ('{"changes": 3}', "found|3")):
+        (folder / "changes.json").write_text(spoiled)
+        with pytest.raises(InputError, match=complaint):
+            load_to_plan(str(folder))
+    (folder / "changes.json").unlink()
+    with pytest.raises(InputError, match=r"planning\.limits\.axes: data, of a model that does not.*of the 8 numbers"):
+        load_to_plan(str(folder)).controller()
+
+
+def episodes_of(folder: Path) -> list[Episode]:
+    source = open_source(read_run_config(folder).data)
+    return [source.read(number) for number in range(len(source.infos()))]
+
+
+def test_recorded_commands_of_another_width_cannot_be_planned_with(make_config, reporter) -> None:
+    recorded = {"data__actions": "recorded", "data__join_actions": "last"}
+    recorded["data__fields"] = VECTORS["data__fields"] | {"action": ["steps/action_dict/joint_position"]}
+    folder = train(make_config(**{**VECTORS, **recorded}, training__steps=1), reporter)
+    with pytest.raises(InputError, match=r"data\.actions: recorded: commands of which nobody knows"):
+        load_to_plan(str(folder)).controller()
 
 
 ADAPTERS = {

@@ -12,9 +12,9 @@ from paths import GOLDEN
 from solver_problems import PLANNERS, config, parabola, rosenbrock, solve, space, two_basins
 from vjepa2_ac.config.planning import CemConfig, GradientConfig, IcemConfig, LimitsConfig, MppiConfig, PlanningConfig
 from vjepa2_ac.evaluation.action_score.protocol import SCORED
-from vjepa2_ac.planning.action_space import ActionSpace, Ball
 from vjepa2_ac.planning.interfaces import Plan, PlanStart
 from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.planning.search_space import Ball, SearchSpace
 from vjepa2_ac.planning.solvers.base import EvaluatedPlans, white_noise
 from vjepa2_ac.planning.solvers.gradient import GradientSolver
 from vjepa2_ac.planning.solvers.icem import coloured_noise
@@ -356,7 +356,7 @@ def test_coloured_noise_has_the_spectrum_that_was_asked_for() -> None:
 
 def test_held_axes_get_no_noise() -> None:
     upper = torch.tensor([[1.0, 0.0, 1.0]])
-    noise = white_noise(ActionSpace(-upper, upper, upper), 5, torch.Generator())
+    noise = white_noise(SearchSpace(-upper, upper, upper), 5, torch.Generator())
     assert not noise[..., 1].any()
     assert noise[..., [0, 2]].all()
 

@@ -29,6 +29,7 @@ from vjepa2_ac.evaluation.result import (
     TrainingCurve,
     Way,
 )
+from vjepa2_ac.spaces import POSE_CHANGE
 
 ABOUT = About(
     subject="runs/kitchen",
@@ -41,7 +42,7 @@ ABOUT = About(
     frames=4,
     stride=4,
     seconds_per_step=4 / 15,
-    is_pose=True,
+    space=POSE_CHANGE,
     seed=0,
     version="0.1.0",
     time="2026-11-21 16:00 UTC",

@@ -7,17 +7,17 @@ import torch
 from torch import Tensor
 
 from vjepa2_ac.config.planning import GradientConfig, MppiConfig, PlanningConfig
-from vjepa2_ac.planning.action_space import ActionSpace, Ball
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.planner import Planner
+from vjepa2_ac.planning.search_space import Ball, SearchSpace
 
 PLANNERS = ("cem", "icem", "mppi", "gradient")
 
 
-def space(decisions: int = 1, dim: int = 2, reach: float = 1.0, ball: Ball | None = None) -> ActionSpace:
+def space(decisions: int = 1, dim: int = 2, reach: float = 1.0, ball: Ball | None = None) -> SearchSpace:
     """Return a box around zero."""
     upper = torch.full((decisions, dim), reach)
-    return ActionSpace(-upper, upper, upper, ball=ball)
+    return SearchSpace(-upper, upper, upper, ball=ball)
 
 
 def config(planner: str, iterations: int = 30, samples: int = 200, **changes: Any) -> PlanningConfig:
@@ -28,7 +28,7 @@ def config(planner: str, iterations: int = 30, samples: int = 200, **changes: An
     return PlanningConfig(planner=planner, iterations=iterations, samples=samples, **(more | changes))
 
 
-def solve(planner: str, cost: Callable[[Tensor], Tensor], where: ActionSpace, seed: int = 0, **changes: Any) -> Plan:
+def solve(planner: str, cost: Callable[[Tensor], Tensor], where: SearchSpace, seed: int = 0, **changes: Any) -> Plan:
     """Return the plan of least cost in a space."""
     generator = torch.Generator().manual_seed(seed)
     return Planner(config(planner, **changes), where).plan(cost, generator)

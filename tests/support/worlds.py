@@ -9,6 +9,7 @@ from torch import Tensor
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.evaluate import RepeatableClips
 from vjepa2_ac.evaluation.result import About
+from vjepa2_ac.spaces import POSE_CHANGE
 
 TIME, TOKENS, DIM = 5, 4, 6
 
@@ -111,6 +112,6 @@ def about(**changes: object) -> About:
     values: dict[str, object] = {
         "subject": "run", "checkpoint": "step-00000002 (the newest)", "checkpoint_path": "step-00000002",
         "source": "rlds", "data": "data", "cameras": ("exterior_1_left",), "split": "test", "frames": TIME, "stride": 4,
-        "seconds_per_step": 0.25, "is_pose": True, "seed": 0, "version": "0", "time": "2026-01-01T00:00:00Z",
+        "seconds_per_step": 0.25, "space": POSE_CHANGE, "seed": 0, "version": "0", "time": "2026-01-01T00:00:00Z",
     }  # fmt: skip
     return About(**(values | changes))  # type: ignore[arg-type]

@@ -186,8 +186,7 @@ def test_the_card_on_the_hub_describes_the_new_heads(make_robot: MakeConfig, rep
     assert "recorded, joined by sum" in card
     lines = card.split("With PEFT's own loading")[1].split("```python")[1].split("```")[0]
     names: dict[str, Any] = {}
-    imports = "from vjepa2_ac.config import ModelConfig\nfrom vjepa2_ac.model.checkpoints.loading import load_base\n"
-    exec(imports + lines.replace("FOLDER", str(tmp_path / "hub")), names)  # noqa: S102 - the card's own words
+    exec("from vjepa2_ac import load_model\n" + lines.replace("FOLDER", str(tmp_path / "hub")), names)  # noqa: S102 - the card's own words
     generator = torch.Generator().manual_seed(1)
     latents, states, actions = (torch.randn(1, 2, *shape, generator=generator) for shape in ((4, 24), (8,), (7,)))
     with torch.no_grad():

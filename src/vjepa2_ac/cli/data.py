@@ -162,7 +162,7 @@ def _inspect(options: argparse.Namespace) -> None:
     for line in inspection_lines(inspection):
         console.print(line)
     console.print(motion_table(inspection))
-    if inspection.is_pose:
+    if inspection.has_poses:
         console.print(f"For comparison: {RELEASED}.")
     write_atomically(options.out / "inspect.json", json.dumps(inspection.as_dict(), indent=1).encode())
     path = options.out / "contact_sheet.png"

@@ -103,16 +103,17 @@ def require_subject(subject: str, checkpoint: str | None = None) -> None:
         require_listed(Path(subject), checkpoint)
 
 
-def require_to_plan(options: argparse.Namespace) -> None:
-    """Refuse a model, a checkpoint or settings that cannot be planned with, before what takes seconds is imported.
+def require_to_plan(options: argparse.Namespace) -> Config:
+    """Return the settings to plan with; refuse those that cannot be, before what takes seconds is imported.
 
     Raises:
         InputError: One of them is wrong or not there.
     """
     from vjepa2_ac.planning.settings import planning_settings
 
-    planning_settings(options.subject, config=options.config, overrides=options.overrides)
+    config = planning_settings(options.subject, config=options.config, overrides=options.overrides)
     require_subject(options.subject, options.checkpoint)
+    return config
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:

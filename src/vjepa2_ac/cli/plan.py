@@ -24,6 +24,8 @@ from vjepa2_ac.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
+    from vjepa2_ac.config import Config
+
 
 def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add `plan` to a parser."""
@@ -46,7 +48,8 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         "--state",
         metavar="NUMBERS",
         required=True,
-        help="measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed)",
+        help="measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers"
+        " of a vector, as the data had them",
     )
     parser.add_argument(
         "--goal",
@@ -92,9 +95,9 @@ def _plan(options: argparse.Namespace) -> int:
 
     # Wrong words are told before what takes seconds is imported.
     require_overrides(options.overrides, fix="Numbers of --state or --extrinsics go in one word: --state 0.4,0,0.3,...")
-    state, extrinsics = _state(options), _extrinsics(options)
+    state, extrinsics = _numbers(options.state, "--state"), _extrinsics(options)
     durations = _durations(options.durations, len(options.goal)) if options.durations else ()
-    require_to_plan(options)
+    _require_state(state, require_to_plan(options))
     with user_can_write(options.out):
         options.out.mkdir(parents=True, exist_ok=True)
     images = _images(options)
@@ -131,12 +134,12 @@ def _plan(options: argparse.Namespace) -> int:
     return int(found.decision.why == "no finite energy")
 
 
-def _state(options: argparse.Namespace) -> np.ndarray:
-    from vjepa2_ac.planning.input_checks import require_pose
+def _require_state(state: np.ndarray, config: Config) -> None:
+    """Refuse a state that is none of the config's space; how wide a vector is, only the model knows."""
+    from vjepa2_ac.data.sources.configured_spaces import measured_space
+    from vjepa2_ac.planning.input_checks import require_numbers
 
-    state = _numbers(options.state, "--state")
-    require_pose(state, where="--state")
-    return state
+    require_numbers(state, measured_space(config.data, len(state)), where="--state")
 
 
 class _Images(NamedTuple):
@@ -162,12 +165,13 @@ def _images(options: argparse.Namespace) -> _Images:
 
 
 def _extrinsics(options: argparse.Namespace) -> np.ndarray | None:
-    from vjepa2_ac.planning.input_checks import require_extrinsics
+    from vjepa2_ac.planning.input_checks import require_numbers
+    from vjepa2_ac.spaces import EXTRINSICS
 
     if options.extrinsics is None:
         return None
     extrinsics = _numbers(options.extrinsics, "--extrinsics")
-    require_extrinsics(extrinsics, where="--extrinsics")
+    require_numbers(extrinsics, EXTRINSICS, where="--extrinsics")
     return extrinsics
 
 

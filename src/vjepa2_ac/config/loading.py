@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import json
+import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -21,13 +21,19 @@ from vjepa2_ac.storage.structured import parse_yaml, require_shallow
 _MOST_BYTES = 4 << 20  # of a config: data.exclude may name thousands of episodes
 
 
-def load_config(path: str | Path, overrides: Iterable[str] = ()) -> Config:
-    """Read a config file and apply `key.sub=value` overrides.
+def load_config(config: str | Path | Mapping[str, Any], overrides: Iterable[str] = ()) -> Config:
+    """Read a config, from a file or from plain values, and apply `key.sub=value` overrides.
 
     Raises:
         InputError: The file cannot be read or is not a valid config; names every key that is wrong.
+
+    Example:
+        >>> config = load_config("configs/demo.yaml", ["training.steps=100"])
+        >>> config = load_config({"run_dir": "run", "data": {"path": "data"}, "model": {"base": "builtin:sim-tiny"}})
     """
-    return parse_config(_overridden(_read_yaml(Path(path)), overrides), where=str(path))
+    if isinstance(config, Mapping):
+        return config_from(config, overrides, where="load_config")
+    return parse_config(_overridden(_read_yaml(Path(config)), overrides), where=str(config))
 
 
 def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, where: str) -> Config:
@@ -36,7 +42,7 @@ def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, whe
     Raises:
         InputError: Names every key that is wrong.
     """
-    return parse_config(_overridden(copy.deepcopy(dict(values)), overrides), where=where)
+    return parse_config(_overridden(_plain(values, where), overrides), where=where)
 
 
 def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
@@ -122,6 +128,15 @@ def _read_yaml(path: Path) -> dict[str, Any]:
         found = "nothing" if values is None else f"a {type(values).__name__}"
         raise InputError(where=str(path), found=found, needed="a mapping of keys to values")
     return values
+
+
+def _plain(values: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Return a copy as a file would hold it: a Path is text."""
+    require_shallow(dict(values), where=where)
+    try:
+        return dict(json.loads(json.dumps(dict(values), default=os.fspath)))
+    except (TypeError, ValueError) as error:
+        raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
 
 
 def _overridden(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, Any]:

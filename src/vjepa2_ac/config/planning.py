@@ -24,6 +24,9 @@ class LimitsConfig(Section):
     """Of the ball, in metres."""
     rotation: Annotated[float, Field(ge=0.0, le=math.pi)] = 0.0
     """Largest turn about each axis, in radians; 0: the rotation is held, as upstream does."""
+    axes: Literal["data"] | Annotated[tuple[Annotated[float, Field(ge=0.0)], ...], Field(min_length=1)] = "data"
+    """Of vectors only: the largest change of each number, in its own unit; one number stands for all. data: what the
+    run was taught, the 99th percentile of each number's change."""
     gripper: Annotated[float, Field(ge=0.0, le=1.0)] = 0.75
     """Largest change of the gripper's closedness."""
     gripper_mode: Literal["rounded", "free", "held", "open", "close"] = "rounded"

@@ -56,7 +56,7 @@ def inspection_lines(inspection: Inspection) -> list[str]:
         "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
         "duplicates": str(inspection.duplicates) + _copies_are_listed(inspection),
         "sample": f"{len(inspection.sample):,} episodes, for what follows",
-        **(_pose_rows(inspection) if inspection.is_pose else _vector_rows(inspection)),
+        **(_pose_rows(inspection) if inspection.has_poses else _vector_rows(inspection)),
     }
     return [f"{name:<16}{text}" for name, text in rows.items()]
 
@@ -66,7 +66,7 @@ def _copies_are_listed(inspection: Inspection) -> str:
 
 
 def _pose_rows(inspection: Inspection) -> dict[str, str]:
-    gripper = inspection.range_of(6)
+    gripper = inspection.gripper_range
     limits = [(axis, *inspection.range_of(column)) for column, axis in enumerate("xyz")]
     places = ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in limits)
     return {
@@ -89,7 +89,7 @@ def _lasting(hours: float) -> str:
 
 def motion_table(inspection: Inspection) -> Table:
     """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
-    if not inspection.is_pose:
+    if not inspection.has_poses:
         return _change_table(inspection)
     table = MetricsTable("Motion per model step: 10 / 50 / 90 / 99 %")
     for name in ("stride", "seconds", "moves by (cm)", "turns by (degrees)"):

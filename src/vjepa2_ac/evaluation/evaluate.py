@@ -87,11 +87,11 @@ def evaluate(
     probes = probes or ProbeOptions()
     seen = _collect(contenders, clips, probes, about, metrics, reporter.task("measuring"))
     ids, seconds = tuple(seen.ids), about.seconds_per_step
-    known = clips_of(seen.actions, ids, tuple(seen.firsts), is_pose=about.is_pose, seconds_per_step=seconds)
+    known = clips_of(seen.actions, ids, tuple(seen.firsts), space=about.space, seconds_per_step=seconds)
     pool = ActionPool(
         actions=seen.actions.reshape(-1, seen.actions.shape[-1]),
         episode_ids=tuple(np.repeat(np.array(ids), seen.actions.shape[1]).tolist()),
-        is_pose=about.is_pose,
+        space=about.space,
         reach=probes.reach_cm / 100,
         samples=probes.samples,
         seed=about.seed,
@@ -110,7 +110,7 @@ def evaluate(
         about=about,
         clips=known,
         models=models,
-        strata=strata_of(known, is_pose=about.is_pose),
+        strata=strata_of(known, about.space),
         episodes=(),
         examples=(),
         planning=study_of(seen.planned, probes.planning) if seen.planned else None,
@@ -131,7 +131,7 @@ def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[s
         notes.append(_NOT_ASKED.format("--landscapes", "energy landscapes"))
     elif action_dim < 3:
         notes.append(_NO_LANDSCAPES.format(action_dim))
-    if probes.planning_clips and not about.is_pose:
+    if probes.planning_clips and about.space.position is None:
         notes.append(_NO_PLANS)
     if not probes.examples:
         notes.append(_NOT_ASKED.format("--examples", "example clips"))
@@ -161,7 +161,11 @@ def _collect(
     seen = _Seen([], [], np.zeros((0, 0, 0)), {contender.name: [] for contender in contenders}, [])
     actions = []
     probed = set(spread(clips.count, probes.sensitivity_clips)) if probes.sensitivity_clips else set()
-    planned = set(spread(clips.count, probes.planning_clips)) if probes.planning_clips and about.is_pose else set()
+    planned = (
+        set(spread(clips.count, probes.planning_clips))
+        if probes.planning_clips and about.space.position is not None
+        else set()
+    )
     for batch, others in with_other_actions(batch for batch, _ in clips.read(None)):
         for contender in contenders:
             with contender.switched():
@@ -184,7 +188,7 @@ def _collect(
 
 def _largest_step(actions: Float[torch.Tensor, "time action_dim"], about: About) -> int:
     """Return the step of a clip with the largest action: for poses, by the translation."""
-    return int((actions[:, :3] if about.is_pose else actions).norm(dim=-1).argmax())
+    return int(actions[:, about.space.sized].norm(dim=-1).argmax())
 
 
 def _sensitivity(
@@ -208,7 +212,7 @@ def _landscapes(
     if not probes.landscape_clips or not moving or pool.actions.shape[-1] < 3:
         return None
     chosen = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
-    grid = LandscapeGrid(pool.is_pose, probes.nodes, reach=pool.reach if pool.is_pose else 0.0)
+    grid = LandscapeGrid(pool.space, probes.nodes, reach=0.0 if pool.space.position is None else pool.reach)
     progress = reporter.task(f"energy landscapes, {contender.name}")
     return measure_landscapes(contender.model, chosen, grid, at_once=probes.at_once, progress=progress)
 

@@ -245,7 +245,7 @@ def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Datase
         frames=data.frames,
         stride=data.model_stride,
         seconds_per_step=data.model_stride / dataset.control_rate_hz,
-        is_pose=data.states == "pose",
+        space=dataset.spaces.action,
         seed=config.seed,
         version=__version__,
         time=utc_now(),

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
+from vjepa2_ac.spaces import ActionSpace
 
 Mode = Literal["teacher_forced", "rollout"]
 Actions = Literal["true", "zero", "shuffled"]
@@ -41,7 +42,7 @@ class About:
     frames: int  # of a clip
     stride: int  # control steps per model step
     seconds_per_step: float
-    is_pose: bool  # states are poses: action sizes and landscapes are in cm; else they are plain numbers
+    space: ActionSpace  # of the actions
     seed: int
     version: str  # of this package
     time: str  # UTC

@@ -10,7 +10,7 @@ from typing import Any
 from huggingface_hub import EvalResult, ModelCardData
 
 from vjepa2_ac import __version__
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.episode import Widths
 
@@ -203,35 +203,41 @@ def _ratio(ratio: Mapping[str, Any]) -> str:
 
 
 def _use(config: Config, fresh_heads: Widths | None) -> str:
-    base = config.model.model_dump(mode="json", include={"base", "sizes", "dtype"}, exclude_defaults=True)
     return f"""## Use
 
 With vjepa2-ac, which checks that the base is the one it was trained on:
 
 ```python
-from vjepa2_ac.config import ModelConfig
-from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.adapter.lora import load_trained
-
-model = load_base(ModelConfig.model_validate({base!r}), seed=0)
-load_trained(model, "FOLDER")  # the folder of this card
+{_imports(config)}
+model = load_model({_base_arguments(config)}, adapter="FOLDER")  # the folder of this card
 ```
 
-{_use_with_peft(config, base, fresh_heads)}"""
+{_use_with_peft(config, fresh_heads)}"""
 
 
-def _use_with_peft(config: Config, base: Mapping[str, Any], fresh_heads: Widths | None) -> str:
+def _imports(config: Config) -> str:
+    sizes = "" if config.model.sizes == ModelSizes() else "from vjepa2_ac.config import ModelSizes\n"
+    return f"from vjepa2_ac import load_model\n{sizes}"
+
+
+def _base_arguments(config: Config) -> str:
+    words = [repr(config.model.base), f"dtype={config.model.dtype!r}"]
+    sizes = config.model.sizes.model_dump(mode="json", exclude_defaults=True)
+    return ", ".join([*words, f"sizes=ModelSizes.model_validate({sizes!r})"] if sizes else words)
+
+
+def _use_with_peft(config: Config, fresh_heads: Widths | None) -> str:
     if config.adapter.init == "pissa":
         return (
             "PEFT alone cannot use it: an adapter that started as PiSSA belongs to a base from which `pissa_start` was"
-            " taken off, which `load_trained` does."
+            " taken off, which `load_model` does."
         )
     return f"""With PEFT's own loading and the imports above, on the predictor of that base{_with_heads(fresh_heads)}:
 
 ```python
 from peft import PeftModel
 
-{_peft_lines(base, fresh_heads)}
+{_peft_lines(config, fresh_heads)}
 ```"""
 
 
@@ -239,17 +245,17 @@ def _with_heads(fresh_heads: Widths | None) -> str:
     return "" if fresh_heads is None else ", whose input heads have other widths and must be replaced first"
 
 
-def _peft_lines(base: Mapping[str, Any], fresh_heads: Widths | None) -> str:
-    load = f"load_base(ModelConfig.model_validate({base!r}), seed=0)"
+def _peft_lines(config: Config, fresh_heads: Widths | None) -> str:
+    load = f"load_model({_base_arguments(config)})"
     if fresh_heads is None:
         return f'base = {load}\npredictor = PeftModel.from_pretrained(base.predictor, "FOLDER")'
     state, action = fresh_heads
     return f"""from vjepa2_ac.episode import Widths
 from vjepa2_ac.model.network.input_heads import fit_heads
 
-model = {load}
-fit_heads(model, Widths(state={state}, action={action}), seed=0)
-predictor = PeftModel.from_pretrained(model.predictor, "FOLDER")"""
+base = {load}
+fit_heads(base, Widths(state={state}, action={action}), seed=0)
+predictor = PeftModel.from_pretrained(base.predictor, "FOLDER")"""
 
 
 def _list(title: str, entries: Mapping[str, str]) -> str:

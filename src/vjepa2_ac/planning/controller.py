@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -13,19 +14,22 @@ from torch import Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
-from vjepa2_ac.episode import ACTION_DIM, POSE_WIDTHS
+from vjepa2_ac.data.sources.configured_spaces import spaces_of
+from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states
 from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.action_space import ActionSpace
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goal import Goal, patch_weights
-from vjepa2_ac.planning.input_checks import require_extrinsics, require_image, require_mask, require_pose
+from vjepa2_ac.planning.input_checks import require_image, require_mask, require_numbers
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.pose_integration import states_along
+from vjepa2_ac.planning.search_space import SearchSpace, search_space
+from vjepa2_ac.planning.settings import with_taught_limits
+from vjepa2_ac.planning.state_integration import states_along
+from vjepa2_ac.runs.loading import TrainedRun
+from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
 
 Seen = tuple[Tensor, np.ndarray]  # latents of an image, and the state
 Why = Literal["planned", "out of time", "at the goal", "no finite energy"]
@@ -37,13 +41,13 @@ _REACHED = 1e-6  # the energy of an image equal to the goal image, up to roundin
 class Decision:
     """The decision, and its reason."""
 
-    action: Float[np.ndarray, " 7"]  # for the next model step; zero for some values of `why`
+    action: Float[np.ndarray, " dim"]  # for the next model step; nothing changes for some values of `why`
     why: Why  # out of time: the best plan so far. at the goal, no finite energy: do nothing
     energy_now: float  # of the current image, if nothing changed: to compare with the plan's
     goal: int  # index of the goal that applies now
     goals: tuple[int, ...]  # and after each model step of a plan
     plan: Plan | None  # None if the goal is reached
-    states: Float[np.ndarray, "time 7"] | None  # states predicted along the plan, the current state first
+    states: Float[np.ndarray, "time dim"] | None  # states predicted along the plan, the current state first
     cost: WorldModelCost | None  # to evaluate other actions
 
 
@@ -52,58 +56,93 @@ class Controller:
 
     The same seed, images and states give the same actions: the n-th decision after a reset (from 0) is drawn with
     seed + n. Actions are within `planning.limits`, for any output of the model.
+
+    Example:
+        >>> controller = Controller(load_model("builtin:sim-tiny"))  # of a run: Controller.of_run(load_run(FOLDER))
+        >>> controller.reset(goal)  # height x width x 3, uint8, RGB
+        >>> action = controller.act(image, state)  # 7 numbers: metres, radians, closedness
     """
 
     def __init__(
         self,
         world_model: WorldModel,
-        config: PlanningConfig,
+        config: PlanningConfig | None = None,
         *,
         seed: int = 0,
         crop: Crop = "released",
         extrinsics: Float[np.ndarray, " 6"] | None = None,
-        planner: Planner | None = None,
+        spaces: Spaces = POSES,
     ) -> None:
         """Create a controller.
 
         Args:
             world_model: A base or merged model, which is put into eval mode; or a trained one, of which a merged copy
                 plans (see `planning.model_setup`).
-            config: Planning settings.
+            config: Planning settings; None: the defaults.
             seed: Of all decisions.
             crop: As in training (`data.crop`).
             extrinsics: Pose of the camera, if the model uses it.
-            planner: Searches, by the same settings; None: one that reports no progress.
+            spaces: What its states and actions are.
 
         Raises:
-            InputError: The model's states and actions are no poses, or it needs a camera pose and none is given, or
-                the other way round; or its blocks cannot be compiled or quantized to 8 bits.
+            InputError: The model's states and actions are of other spaces, or nobody knows which state follows from an
+                action; or it needs a camera pose and none is given, or the other way round; or its blocks cannot be
+                compiled or quantized to 8 bits; or vectors have no limits.
         """
-        if widths_of_model(world_model.sizes) != POSE_WIDTHS:
-            raise InputError(
-                where="model", found="states and actions that are no poses", needed="a model of 7 and 7 numbers"
-            )
+        _require_spaces(widths_of_model(world_model.sizes), spaces)
         if extrinsics is not None:
-            require_extrinsics(extrinsics, where="extrinsics")
+            require_numbers(extrinsics, EXTRINSICS, where="extrinsics")
         if world_model.sizes.predictor.use_extrinsics != (extrinsics is not None):
             raise InputError(
                 where="model: predictor.use_extrinsics",
                 found=f"{world_model.sizes.predictor.use_extrinsics}, camera pose given: {extrinsics is not None}",
                 needed="a camera pose exactly where the model uses it",
             )
-        self._model, self.config, self.seed, self.crop = prepare_for_planning(world_model, config), config, seed, crop
+        self.config = config or PlanningConfig()
+        self._model, self.seed, self.crop = prepare_for_planning(world_model, self.config), seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
-        self._planner = planner or Planner(config)
+        self.spaces = spaces
+        self.planner = Planner(self.config, search_space(self.config, spaces.state))
         self._goal: Goal | None = None
         self._like = np.zeros(0)
         self._seen: list[Seen] = []  # the newest `planning.context`
         self._done = 0
         self.decision: Decision | None = None  # the last one
 
+    @classmethod
+    def of_run(
+        cls,
+        run: TrainedRun,
+        config: PlanningConfig | None = None,
+        *,
+        seed: int | None = None,
+        extrinsics: Float[np.ndarray, " 6"] | None = None,
+    ) -> Controller:
+        """Return the controller of a trained run: with its crop and, unless others are given, its settings and seed.
+
+        Raises:
+            InputError: As `Controller`.
+        """
+        its = run.config if config is None else run.config.model_copy(update={"planning": config})
+        its = with_taught_limits(its, Path(its.run_dir))
+        return cls(
+            run.world_model,
+            its.planning,
+            seed=its.seed if seed is None else seed,
+            crop=its.data.crop,
+            extrinsics=extrinsics,
+            spaces=spaces_of(its.data, widths_of_model(run.world_model.sizes)),
+        )
+
     @property
-    def space(self) -> ActionSpace:
-        """The allowed actions."""
-        return self._planner.space
+    def space(self) -> SearchSpace:
+        """The allowed changes of the state."""
+        return self.planner.space
+
+    @property
+    def shown_axes(self) -> tuple[int, ...]:
+        """The numbers to show, three at most: of a pose the position, else the first that may change."""
+        return (0, 1, 2) if self.spaces.state.is_pose else tuple(self.space.free[:3].tolist())
 
     def reset(self, *goals: np.ndarray, durations: tuple[int, ...] = (), mask: np.ndarray | None = None) -> None:
         """Set a goal, or several in order, and forget all observations.
@@ -126,14 +165,17 @@ class Controller:
         self._like, self._done, self.decision = goals[0], 0, None
         self._seen = []
 
-    def act(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " 7"]:
+    def act(self, frame: np.ndarray, state: np.ndarray) -> Float[np.ndarray, " dim"]:
         """Return the action of the next model step: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`).
+
+        Of vectors: as many numbers as the state, what each of them changes by; targets where the model was trained on
+        recorded targets.
 
         Call it once per model step. `decision` then holds the reason.
 
         Args:
             frame: What the camera sees, of the goal image's size.
-            state: Measured pose and gripper.
+            state: Measured: pose and gripper, or the vector.
 
         Raises:
             InputError: The image or the state cannot be used.
@@ -143,7 +185,7 @@ class Controller:
             raise ValueError("no goal: call reset first")
         require_image(frame, where="frame", like=self._like)
         state = np.asarray(state, dtype=np.float64)
-        require_pose(state, where="state")
+        require_numbers(state, self.spaces.state, where="state")
         seen = [*self._seen, (self._encoded(frame), state)][-self.config.context :]
         before = self.decision
         decision = self._decided(self._goal, seen, None if before is None else before.plan)
@@ -157,18 +199,27 @@ class Controller:
         still = distance(latents.expand_as(wanted), wanted, self.config.energy.distance, goal.weights)
         energy = float(still[-1] if self.config.energy.steps == "last" else still.sum())
         if float(still.max()) <= _REACHED:
-            return Decision(np.zeros(ACTION_DIM), "at the goal", energy, places[0], places, None, None, None)
-        cost = WorldModelCost(self._model, self._scene(seen), goal, self.config.energy, done=self._done)
+            still_here = self._command(state, np.zeros(len(state)))
+            return Decision(still_here, "at the goal", energy, places[0], places, None, None, None)
+        cost = WorldModelCost(
+            self._model, self._scene(seen), goal, self.config.energy, done=self._done, spaces=self.spaces
+        )
         generator = torch.Generator().manual_seed(self.seed + self._done)
         start = before.start_after(1) if before is not None and self.config.warm_start else None
-        plan = self._planner.plan(cost, generator, start)
+        plan = self.planner.plan(cost, generator, start)
         why: Why = "planned" if plan.stopped == "finished" else plan.stopped
-        states = states_along(torch.from_numpy(state), plan.actions.double()[None])[0]
-        return Decision(plan.actions[0].double().numpy(), why, energy, places[0], places, plan, states.numpy(), cost)
+        states = states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0]
+        action = self._command(state, plan.actions[0].double().numpy())
+        return Decision(action, why, energy, places[0], places, plan, states.numpy(), cost)
+
+    def _command(self, state: np.ndarray, change: np.ndarray) -> Float[np.ndarray, " action_dim"]:
+        """Return the action that changes the state so: the change itself, or the state that it leads to."""
+        return state + change if self.spaces.action.follows == "target" else change
 
     def _scene(self, seen: Sequence[Seen]) -> Scene:
         states = np.stack([state for _, state in seen])
-        actions = actions_from_states(states) if len(states) > 1 else np.zeros((0, ACTION_DIM))
+        changes = self.spaces.state.differences(states) if len(states) > 1 else np.zeros((0, states.shape[1]))
+        actions = states[1:] if self.spaces.action.follows == "target" else changes
         return Scene(
             latents=torch.stack([latents for latents, _ in seen]),
             states=torch.from_numpy(states).float(),
@@ -192,3 +243,20 @@ class Controller:
             return patch_weights(seen > 0, grid).to(self._model.device)
         except ValueError:
             raise InputError(where="mask", found="nothing of what the model sees counts") from None
+
+
+def _require_spaces(widths: Widths, spaces: Spaces) -> None:
+    if widths != spaces.widths:
+        raise InputError(
+            where="model",
+            found=f"states of {widths.state} and actions of {widths.action} numbers",
+            needed=f"{spaces.widths.state} and {spaces.widths.action}, as the spaces say",
+            fix="Give the spaces of the data that it was trained on",
+        )
+    if spaces.action.follows == "unknown":
+        raise InputError(
+            where="data.actions: recorded",
+            found="commands of which nobody knows what they do to the state",
+            needed="to plan: differences of states; or recorded deltas or targets, as many numbers as a state has",
+            fix="Train with data.actions: difference, or with join_actions: sum or last",
+        )

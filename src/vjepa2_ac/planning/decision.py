@@ -9,9 +9,10 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.planning.action_space import ActionSpace
 from vjepa2_ac.planning.controller import Controller, Decision
 from vjepa2_ac.planning.energy_slices import EnergySlice, energy_slices
+from vjepa2_ac.planning.search_space import SearchSpace
+from vjepa2_ac.spaces import StateSpace
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +46,26 @@ class PlanResult:
     question: PlanRequest
     controller: Controller
     decision: Decision
-    actions: Float[np.ndarray, "steps 7"]  # zero where the decision is to do nothing
-    states: Float[np.ndarray, "steps+1 7"]  # predicted states along them, if the states are poses
+    actions: Float[np.ndarray, "steps dim"]  # changes of the state; zero where the decision is to do nothing
+    states: Float[np.ndarray, "steps+1 dim"]  # predicted states along them
     doing_nothing: float  # predicted energy of no motion; NaN if it was not computed
     slices: tuple[EnergySlice, ...]  # empty if there is no plan, or none were requested
     seconds: Seconds
 
     @property
-    def space(self) -> ActionSpace:
+    def space(self) -> SearchSpace:
         """The allowed actions."""
         return self.controller.space
+
+    @property
+    def state_space(self) -> StateSpace:
+        """What the numbers of a state are."""
+        return self.controller.spaces.state
+
+    @property
+    def shown_axes(self) -> tuple[int, ...]:
+        """The numbers of an action that figures show."""
+        return self.controller.shown_axes
 
     @property
     def unused_goals(self) -> tuple[int, ...]:
@@ -90,13 +101,14 @@ def decide(controller: Controller, question: PlanRequest, *, nodes: int = 0) -> 
         with torch.no_grad():
             still = float(decision.cost(torch.zeros_like(decision.plan.actions)[None])[0])
         if nodes >= 3 and decision.why != "no finite energy":
-            slices = energy_slices(decision.cost, decision.plan.actions, controller.space, nodes=nodes)
-    steps = controller.space.steps
+            actions, axes = decision.plan.actions, controller.shown_axes
+            slices = energy_slices(decision.cost, actions, controller.space, axes, nodes=nodes)
+    steps, dim = controller.space.steps, controller.space.dim
     return PlanResult(
         question=question,
         controller=controller,
         decision=decision,
-        actions=np.zeros((steps, 7)) if decision.plan is None else decision.plan.actions.double().numpy(),
+        actions=np.zeros((steps, dim)) if decision.plan is None else decision.plan.actions.double().numpy(),
         states=np.tile(question.state, (steps + 1, 1)) if decision.states is None else decision.states,
         doing_nothing=still,
         slices=slices,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,9 +16,8 @@ from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.goal import Goal
-from vjepa2_ac.planning.pose_integration import states_along
-
-Motion = Callable[[Float[Tensor, " state_dim"], Float[Tensor, "samples steps action_dim"]], Tensor]
+from vjepa2_ac.planning.state_integration import states_along
+from vjepa2_ac.spaces import POSES, Spaces
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class WorldModelCost:
         config: EnergyConfig,
         *,
         done: int = 0,
-        motion: Motion = states_along,
+        spaces: Spaces = POSES,
     ) -> None:
         """Compute what all samples share.
 
@@ -57,7 +55,8 @@ class WorldModelCost:
             goal: Their target.
             config: The distance, and the number of samples per batch.
             done: Model steps since the goal was set: selects the goal that applies.
-            motion: Returns the states after actions, the first one included; for poses, or for the kind of vector.
+            spaces: What the model's states and actions are. What is evaluated are changes of the state; where actions
+                are targets, the model is given the states that they lead to.
 
         Raises:
             ValueError: The model is in training mode.
@@ -65,7 +64,7 @@ class WorldModelCost:
         if world_model.predictor.training:
             raise ValueError("a model in training mode: dropout would change energies; call eval() first")
         device = world_model.device
-        self._model, self._config, self._motion, self._done = world_model, config, motion, done
+        self._model, self._config, self._spaces, self._done = world_model, config, spaces, done
         self._goal = Goal(
             goal.latents.to(device), goal.durations, None if goal.weights is None else goal.weights.to(device)
         )
@@ -92,11 +91,12 @@ class WorldModelCost:
         """Return the latents after each action, and the states before and after them. All samples at once."""
         samples, steps = actions.shape[:2]
         actions = actions.to(self._state)
-        states = self._motion(self._state, actions)
+        states = states_along(self._state, actions, self._spaces.state)
+        given = states[:, 1:] if self._spaces.action.follows == "target" else actions
         camera = None if self._camera is None else self._camera.expand(samples, steps, -1)
         frame = self._frame.expand(samples, 1, -1, -1)
         cache = None if self._cache is None else self._cache.expanded(samples)
-        return self._model.rollout(frame, actions, states[:, :-1], camera, cache=cache), states
+        return self._model.rollout(frame, given, states[:, :-1], camera, cache=cache), states
 
     def _energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
         predicted, _ = self.imagine(actions)

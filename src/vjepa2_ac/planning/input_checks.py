@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import StateSpace
 
 _LEAST_SIDE = 16  # pixels
-_REACH_M = 5.0  # larger positions are not in metres
-_ANGLE = 2 * math.pi + 0.01
-_GRIPPER_SLACK = 0.1  # a measured closedness may exceed 0 .. 1 by this
 
 
 def require_image(image: np.ndarray, *, where: str, like: np.ndarray | None = None) -> None:
@@ -54,42 +49,20 @@ def require_mask(mask: np.ndarray, *, where: str, like: np.ndarray) -> None:
         )
 
 
-def require_pose(state: np.ndarray, *, where: str) -> None:
-    """Refuse a state that is not a pose in metres and radians with a gripper's closedness.
+def require_numbers(numbers: np.ndarray, space: StateSpace, *, where: str) -> None:
+    """Refuse an array that is no state of a space, or no camera's pose, or one that no robot has.
 
     Raises:
         InputError: Says what was found.
     """
-    needed = f"{STATE_DIM} finite numbers: x, y, z in metres, roll, pitch, yaw in radians, closedness 0 .. 1"
-    if state.shape != (STATE_DIM,):
-        raise InputError(where=where, found=f"{state.size} numbers in the shape {state.shape}", needed=needed)
-    _require_place(state, where, needed)
-    if not -_GRIPPER_SLACK <= state[6] <= 1 + _GRIPPER_SLACK:
-        raise InputError(where=where, found=f"a closedness of {state[6]:g}", needed=needed, fix=_FROM_WIDTH)
+    if numbers.shape != (len(space),):
+        raise InputError(
+            where=where,
+            found=f"{numbers.size} numbers in the shape {numbers.shape}",
+            needed=f"{len(space)}: {', '.join(map(_with_unit, space.names, space.units))}",
+        )
+    space.require_plausible(numbers[None], where)
 
 
-def require_extrinsics(extrinsics: np.ndarray, *, where: str) -> None:
-    """Refuse an array that is no camera pose in the robot base frame.
-
-    Raises:
-        InputError: Says what was found.
-    """
-    needed = f"{EXTRINSICS_DIM} finite numbers: the camera's x, y, z in metres and roll, pitch, yaw in radians"
-    if extrinsics.shape != (EXTRINSICS_DIM,):
-        raise InputError(where=where, found=f"{extrinsics.size} numbers in the shape {extrinsics.shape}", needed=needed)
-    _require_place(extrinsics, where, needed)
-
-
-def _require_place(pose: np.ndarray, where: str, needed: str) -> None:
-    shown = ", ".join(f"{number:g}" for number in pose)
-    if not np.isfinite(pose).all():
-        raise InputError(where=where, found=shown, needed=needed)
-    if np.abs(pose[3:6]).max() > _ANGLE:
-        raise InputError(where=where, found=f"{shown}: angles beyond a whole turn", needed=needed, fix=_FROM_DEGREES)
-    if np.abs(pose[:3]).max() > _REACH_M:
-        raise InputError(where=where, found=f"{shown}: beyond {_REACH_M:g} m", needed=needed, fix=_FROM_MILLIMETRES)
-
-
-_FROM_DEGREES = "These look like degrees: multiply the angles by pi / 180"
-_FROM_MILLIMETRES = "These look like millimetres: divide the position by 1000"
-_FROM_WIDTH = "Give 0 for open and 1 for closed"
+def _with_unit(name: str, unit: str) -> str:
+    return f"{name} ({unit})" if unit else name

@@ -1,7 +1,7 @@
 """Interfaces of planners: a cost function in, a plan out.
 
 Axes: samples (action sequences), decisions (chosen actions), steps (of the model; a decision is repeated for
-`ActionSpace.repeat` of them), dim (components of an action). All on the CPU.
+`SearchSpace.repeat` of them), dim (components of an action). All on the CPU.
 """
 
 from __future__ import annotations

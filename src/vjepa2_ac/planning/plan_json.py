@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vjepa2_ac.planning.decision import PlanResult
-from vjepa2_ac.planning.energy_slices import AXES, EnergySlice
+from vjepa2_ac.planning.energy_slices import EnergySlice
 from vjepa2_ac.planning.interfaces import Iteration
 from vjepa2_ac.planning.summary import summarize
 from vjepa2_ac.storage import write_atomically
@@ -54,7 +54,7 @@ def plan_as_dict(answer: PlanResult, about: Mapping[str, Any]) -> dict[str, Any]
         },
         "evaluations": 0 if plan is None else plan.evaluations,
         "iterations": [] if plan is None else [_iteration(one) for one in plan.iterations],
-        "slices": [_slice(one) for one in answer.slices],
+        "slices": [_slice(one, answer.state_space.change_names) for one in answer.slices],
         "seconds": {
             "goals": answer.seconds.goals,
             "decision": answer.seconds.decision,
@@ -76,8 +76,8 @@ def _iteration(one: Iteration) -> dict[str, Any]:
     }
 
 
-def _slice(one: EnergySlice) -> dict[str, Any]:
-    across, up = (AXES[axis] for axis in one.axes)
+def _slice(one: EnergySlice, names: Sequence[str]) -> dict[str, Any]:
+    across, up = (names[axis] for axis in one.axes)
     return {"across": across, "up": up, across: _plain(one.across), up: _plain(one.up), "energy": _plain(one.energy)}
 
 

@@ -13,15 +13,16 @@ from jaxtyping import Float
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
+from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.distributed.device import has_bf16, is_on_cpu, require_type_of_weights
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.settings import planning_settings
 from vjepa2_ac.runs.checkpoint_selection import NEWEST
 from vjepa2_ac.runs.folder import is_run
@@ -70,16 +71,18 @@ class PlanningSession:
             progress: Called with the number of finished iterations of a decision.
 
         Raises:
-            InputError: The model's states are no poses, or it needs a camera pose and there is none.
+            InputError: As `Controller`.
         """
-        return Controller(
+        controller = Controller(
             self.world_model,
             self.config.planning,
             seed=self.config.seed if seed is None else seed,
             crop=self.config.data.crop,
             extrinsics=extrinsics,
-            planner=Planner(self.config.planning, progress=progress),
+            spaces=spaces_of(self.config.data, widths_of_model(self.world_model.sizes)),
         )
+        controller.planner.progress = progress
+        return controller
 
     def as_dict(self) -> dict[str, Any]:
         """Return the identity of the model as plain values: its name, and hashes of the weights."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from vjepa2_ac.config.effects import Affects, mark_of, names_that_affect
 from vjepa2_ac.config.loading import config_from, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import literal
-from vjepa2_ac.runs.folder import CONFIG, is_run
+from vjepa2_ac.runs.folder import CHANGES, CONFIG, is_run
+from vjepa2_ac.storage.structured import read_json_object, shown
 
 _ANY_TYPE = "training.precision=bf16"  # of autocast, which planning does without: weights may be of any type beside it
 
@@ -28,15 +30,32 @@ def planning_settings(
         dtype: Of the weights of a model, where no config says it.
 
     Raises:
-        InputError: A setting is wrong or does not matter, or the model is none of poses.
+        InputError: A setting is wrong or does not matter.
     """
     _require_relevant(overrides)
-    its = _of_run(subject, config, overrides) if is_run(subject) else _of_model(subject, config, overrides, dtype)
-    if its.data.states == "vector":
-        raise InputError(
-            where=subject, found="data.states: vector", needed="a model of poses: actions are limited in metres"
-        )
-    return its
+    if not is_run(subject):
+        return _of_model(subject, config, overrides, dtype)
+    return with_taught_limits(_of_run(subject, config, overrides), Path(subject))
+
+
+def with_taught_limits(config: Config, folder: Path) -> Config:
+    """Return the config of a run with the limits that `planning.limits.axes: data` means, if the run knows them.
+
+    Raises:
+        InputError: What the run noted are no limits.
+    """
+    if config.data.states == "pose" or config.planning.limits.axes != "data" or not (folder / CHANGES).is_file():
+        return config
+    limits = config.planning.limits.model_copy(update={"axes": _taught(folder / CHANGES)})
+    return config.model_copy(update={"planning": config.planning.model_copy(update={"limits": limits})})
+
+
+def _taught(path: Path) -> tuple[float, ...]:
+    """Return how far each number of a vector changed in a model step of the data, as the run noted it."""
+    changes = read_json_object(path).get("changes")
+    if not isinstance(changes, list) or not all(isinstance(one, float) and 0 <= one < math.inf for one in changes):
+        raise InputError(where=str(path), found=shown(changes), needed="a number of 0 or more for each of the state's")
+    return tuple(changes)
 
 
 def _of_run(subject: str, config: str | Path | None, overrides: Sequence[str]) -> Config:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from vjepa2_ac.planning.decision import PlanResult
-from vjepa2_ac.planning.energy_slices import AXES
 from vjepa2_ac.planning.interfaces import Plan
 
 _AT_LIMIT = 0.98  # share of a limit from which an action is said to be at it
@@ -25,12 +24,18 @@ def summarize(answer: PlanResult) -> str:
 
 
 def _motion(answer: PlanResult) -> str:
-    way = (answer.states[-1] - answer.states[0])[:3] * 100
-    steps = len(answer.actions)
-    parts = ", ".join(f"{axis} {value:+.1f}" for axis, value in zip(AXES, way, strict=True))
-    gripper = answer.states[-1, 6] - answer.states[0, 6]
+    space, change, steps = answer.state_space, answer.states[-1] - answer.states[0], len(answer.actions)
+    shown = change[list(answer.shown_axes)] * (space.shown_factor if space.is_pose else 1.0)
+    names = [space.change_names[axis] for axis in answer.shown_axes]
+    lasting = f"in {steps} model step{'s' * (steps > 1)}"
+    if not space.is_pose:
+        parts = ", ".join(f"{name} by {value:+.3g}" for name, value in zip(names, shown, strict=True))
+        more = ", ..." if len(answer.space.free) > len(names) else ""
+        return f"Changes {parts}{more} {lasting}."
+    parts = ", ".join(f"{name} {value:+.1f}" for name, value in zip(names, shown, strict=True))
+    gripper = 0.0 if space.gripper is None else change[space.gripper]
     grips = f", gripper {gripper:+.2f}" if gripper else ""
-    return f"Goes {np.linalg.norm(way):.1f} cm in {steps} model step{'s' * (steps > 1)} ({parts} cm{grips})."
+    return f"Goes {np.linalg.norm(shown):.1f} {space.shown_unit} {lasting} ({parts} {space.shown_unit}{grips})."
 
 
 def _energy(answer: PlanResult, plan: Plan) -> str:
@@ -58,7 +63,8 @@ def _warnings(answer: PlanResult, plan: Plan) -> list[str]:
     if not plan.energy < answer.doing_nothing:
         found.append("None of the evaluated actions is predicted to be better than doing nothing.")
     if at_limit := axes_at_limit(answer):
-        found.append(f"The first action is at its limit along {', '.join(at_limit)} (planning.limits.xyz).")
+        knob = f"planning.limits.{'xyz' if answer.state_space.is_pose else 'axes'}"
+        found.append(f"The first action is at its limit along {', '.join(at_limit)} ({knob}).")
     if answer.unused_goals:
         unused = ", ".join(str(place + 1) for place in answer.unused_goals)
         found.append(f"No part in this plan has goal {unused}: see durations, planning.horizon, planning.energy.steps.")
@@ -66,9 +72,10 @@ def _warnings(answer: PlanResult, plan: Plan) -> list[str]:
 
 
 def axes_at_limit(answer: PlanResult) -> list[str]:
-    """Return the axes among dx, dy, dz along which the first action is at its limit."""
-    upper = answer.space.upper[0].numpy()
+    """Return the numbers, of a position or of a vector, whose first change is at its limit."""
+    upper, space = answer.space.upper[0].numpy(), answer.state_space
+    numbers = answer.shown_axes if space.is_pose else range(len(space))
     return [
-        axis for number, axis in enumerate(AXES)
+        space.change_names[number] for number in numbers
         if upper[number] > 0 and abs(answer.actions[0, number]) >= _AT_LIMIT * upper[number]
     ]  # fmt: skip

@@ -31,6 +31,7 @@ from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
     MODES,
+    About,
     Clips,
     EpisodeScore,
     Evaluation,
@@ -88,7 +89,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "uses_actions": uses_actions(evaluation),
         "trained": evaluation.trained,
         "base": evaluation.base,
-        "about": dataclasses.asdict(evaluation.about),
+        "about": _about(evaluation.about),
         "clips": _clips(evaluation.clips),
         "persistence": _by_mode(
             evaluation, lambda mode, metric: _curve(mean_error(evaluation.errors, mode, metric, "persistence"))
@@ -104,6 +105,12 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "planning": None if evaluation.planning is None else study_as_dict(evaluation.planning),
         "notes": list(evaluation.notes),
     }
+
+
+def _about(about: About) -> dict[str, Any]:
+    values = {field.name: getattr(about, field.name) for field in dataclasses.fields(about)}
+    known = {"space": ("is_pose", about.space.position is not None)}
+    return dict(known.get(name, (name, value)) for name, value in values.items())
 
 
 def _clips(clips: Clips) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from vjepa2_ac.evaluation.estimates import Curve, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.evaluation.result import Evaluation
@@ -24,6 +25,16 @@ class Evaluated:
     evaluation: Evaluation
     checkpoint: str  # which one, as text; "" of a model
     files: tuple[Path, ...]  # written files
+
+    @property
+    def verdict(self) -> str:
+        """Whether training helped, how certain that is, and whether the actions are used, as text."""
+        return verdict(self.evaluation)
+
+    @property
+    def error_over_persistence(self) -> dict[str, Curve]:
+        """The L1 error of each model's rollout over that of copying the first frame, by horizon (index h - 1)."""
+        return {name: over_persistence(one.errors, "rollout") for name, one in self.evaluation.models.items()}
 
 
 def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, reporter: Reporter = SILENT) -> Evaluated:

@@ -3,6 +3,7 @@
 RUN/config.yaml         the resolved config, defaults and a chosen stride included
 RUN/environment.json    versions, machine, command and folder of every start
 RUN/calibration.json    metrics of each stride, where data.stride was auto
+RUN/changes.json        how far vector states change in a model step: what planning.limits.axes: data means
 RUN/run_id              a name that no other run has
 RUN/metrics.jsonl       metrics, a row per line
 RUN/metrics.json        what `evaluate` measured; report.html and evaluation.png show it
@@ -40,6 +41,7 @@ CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
 RUN_ID = "run_id"
 CALIBRATION = "calibration.json"  # of an auto stride
+CHANGES = "changes.json"  # of vector states
 CHECKPOINTS = "checkpoints"
 HELD = ".mirror"
 METRICS = "metrics.jsonl"
@@ -49,7 +51,7 @@ _MOST_BYTES_OF_ID = 1_000
 NOT_FINITE = "not_finite"  # each process writes its own, on the disk that it sees
 
 _OWN = (
-    *(LOCK, CONFIG, ENVIRONMENT, CALIBRATION, RUN_ID, METRICS),
+    *(LOCK, CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS),
     *(CHECKPOINTS, HELD, TENSORBOARD, WANDB, NOT_FINITE),
 )
 

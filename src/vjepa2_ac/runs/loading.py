@@ -17,16 +17,16 @@ from vjepa2_ac.runs.relative_paths import BASE, with_paths_from_start
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """A run's config and the model of one of its checkpoints, on the CPU."""
+    """A run's config, and the model of one of its checkpoints in eval mode."""
 
     config: Config
-    world_model: WorldModel
+    world_model: WorldModel  # with its trained weights, not merged
     checkpoint: Path
     chosen: str  # which checkpoint it is, as text
 
 
 def load_run(folder: Path, checkpoint: str = NEWEST, config: Config | None = None) -> TrainedRun:
-    """Load the model of a run: its base with the trained weights of a complete checkpoint.
+    """Load the model of a run, on the CPU: its base with the trained weights of a complete checkpoint.
 
     Args:
         folder: The run.

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState, find_damage, listed, read_state, step_of
 from vjepa2_ac.runs.folder import (
-    CALIBRATION,
     CHECKPOINTS,
     check_run_folder,
     config_changes,
@@ -26,7 +23,6 @@ from vjepa2_ac.runs.lock import RunLock
 from vjepa2_ac.runs.mirror.background_sync import Mirror, NoMirror
 from vjepa2_ac.runs.mirror.open_remote import Remote, open_remote
 from vjepa2_ac.runs.relative_paths import require_start_folder
-from vjepa2_ac.storage import write_atomically
 
 
 @dataclass(frozen=True)
@@ -43,25 +39,21 @@ class OpenRun:
         """Return a line per setting in which a config differs from the run's, where that is allowed."""
         return config_changes(config) if self.writes and self.allow_config_change else []
 
-    def begin(self, config: Config, state: RunState, calibration: Mapping[str, Any] | None) -> None:
+    def begin(self, config: Config, state: RunState) -> None:
         """Lock the folder, and record this start in it; a new folder is only created now.
 
         Args:
             config: Of the run; its stride is a number.
             state: Where it begins.
-            calibration: Metrics of the stride, if it was chosen now.
 
         Raises:
             InputError: Another process trains in the folder, or has done so since it was inspected; or as
                 `open_run_folder`.
         """
-        if not self.writes:
-            return
-        self.lock.take()
-        _refuse_if_overtaken(Path(config.run_dir), state)
-        folder = open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
-        if calibration is not None:
-            write_atomically(folder / CALIBRATION, json.dumps(calibration, indent=1).encode())
+        if self.writes:
+            self.lock.take()
+            _refuse_if_overtaken(Path(config.run_dir), state)
+            open_run_folder(config, state.run_id, allow_config_change=self.allow_config_change)
 
     def mirror(self, run_id: str) -> Mirror | NoMirror:
         """Return what keeps `checkpoint.remote` up to date."""

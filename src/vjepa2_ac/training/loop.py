@@ -7,6 +7,7 @@ A run is reproducible because the clips of a step, its learning rate and its ran
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import time
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
+from vjepa2_ac.data.inspection.statistics import usual_changes
 from vjepa2_ac.distributed.collectives import all_reduce_max, broadcast_object, require_same
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.distributed.preemption import StoppedError, stop_on_signals
@@ -24,10 +26,12 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.result import PredictionErrors
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import CheckpointClock
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.runs.mirror.background_sync import Mirror, NoMirror
 from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.runs.trackers import open_trackers, require_installed
+from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.monitoring.divergence import WatchedMetricsLog
 from vjepa2_ac.training.monitoring.stopwatch import stopwatch_for
 from vjepa2_ac.training.monitoring.throughput import Throughput, TimedBatches
@@ -80,12 +84,14 @@ def train(
             gradients(run, batches_from(run))
             reporter.note(_IN_PLACE)
         else:
-            opened.begin(run.config, run.state, run.calibration.as_dict() if run.calibration else None)
+            opened.begin(run.config, run.state)
             _train(run, opened, first, reporter)
     return Path(run.config.run_dir)
 
 
 def _train(run: Run, opened: OpenRun, first: PredictionErrors | None, reporter: TrainingReporter) -> None:
+    if opened.writes:
+        _write_measured(run)
     try:
         with _open_metrics_log(run, reporter) as metrics_log, opened.mirror(run.state.run_id) as mirror:
             if first is not None:
@@ -95,6 +101,16 @@ def _train(run: Run, opened: OpenRun, first: PredictionErrors | None, reporter: 
         run.accelerator.end_training()
         raise
     run.accelerator.end_training()
+
+
+def _write_measured(run: Run) -> None:
+    """Write what the data and the base have shown: the metrics of a chosen stride, and the usual changes of vectors."""
+    folder = Path(run.config.run_dir)
+    if run.calibration is not None:
+        write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
+    if run.dataset.spaces.state.position is None and not (folder / CHANGES).exists():
+        usual = {"percentile": 99, "changes": usual_changes(run.dataset).tolist()}
+        write_atomically(folder / CHANGES, json.dumps(usual).encode())
 
 
 def _open_metrics_log(run: Run, reporter: TrainingReporter) -> MetricsLog | NullMetricsLog:

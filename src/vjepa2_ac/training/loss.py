@@ -48,7 +48,7 @@ class Objective(nn.Module):
         self.world_model = world_model
         self.weights = (training.teacher_forcing_weight, training.rollout_weight)
         self.rollout_steps = training.rollout_steps if training.rollout_weight else 1  # weight 0: no cost
-        self.distance = distance_of(training)
+        self.distance = LOSSES[training.loss](training)
 
     def forward(self, batch: LatentBatch) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
         """Return (teacher forcing, rollout), each times its weight, so that the loss is their sum.
@@ -58,13 +58,6 @@ class Objective(nn.Module):
         losses = prediction_losses(self.world_model, batch, self.rollout_steps, self.distance)
         forced_weight, rollout_weight = self.weights
         return losses.teacher_forcing * forced_weight, losses.rollout * rollout_weight
-
-
-def distance_of(training: TrainingConfig) -> Distance:
-    """Return the distance that `training.loss` names."""
-    if training.loss == "smooth_l1":
-        return partial(_smooth_difference, beta=training.smooth_l1_beta)
-    return absolute_difference if training.loss == "l1" else squared_difference
 
 
 def prediction_losses(
@@ -103,3 +96,10 @@ def _smooth_difference(
 ) -> Float[Tensor, "batch time tokens dim"]:
     """Return d**2 / (2 * beta) where a difference d is below beta, and d - beta / 2 above, computed in float32."""
     return smooth_l1_loss(predicted.float(), true.float(), reduction="none", beta=beta)
+
+
+LOSSES: dict[str, Callable[[TrainingConfig], Distance]] = {  # what `training.loss` names
+    "l1": lambda _: absolute_difference,
+    "l2": lambda _: squared_difference,
+    "smooth_l1": lambda training: partial(_smooth_difference, beta=training.smooth_l1_beta),
+}

@@ -19,6 +19,7 @@ from vjepa2_ac.data.inspection.check_excerpts import excerpt_findings, signs_in
 from vjepa2_ac.data.inspection.excerpts import Excerpt, excerpts_of, small_grey, warmth_of
 from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import POSE, StateSpace, vector_states
 
 Pair = tuple[np.ndarray, np.ndarray]
 Spoil = Callable[[list[Pair]], list[Pair]]
@@ -73,9 +74,9 @@ SPOILS: dict[str, Spoil] = {
 }
 
 
-def found_in(pairs: list[Pair], *, stride: int = 4, is_pose: bool = True) -> list[Finding]:
+def found_in(pairs: list[Pair], *, stride: int = 4, space: StateSpace = POSE) -> list[Finding]:
     excerpts = [spot_excerpt(number, *pair) for number, pair in enumerate(pairs)]
-    return list(signs_in(excerpts, is_pose=is_pose, stride=stride, control_rate_hz=15.0))
+    return list(signs_in(excerpts, space=space, stride=stride, control_rate_hz=15.0))
 
 
 def alarms_in(pairs: list[Pair], **about: object) -> list[Finding]:
@@ -83,9 +84,9 @@ def alarms_in(pairs: list[Pair], **about: object) -> list[Finding]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("is_pose", [True, False])
-def test_what_belongs_together_gives_no_alarm(seed: int, is_pose: bool) -> None:
-    findings = found_in(recorded(seed), is_pose=is_pose)
+@pytest.mark.parametrize("space", [POSE, vector_states(7)], ids=["poses", "vectors"])
+def test_what_belongs_together_gives_no_alarm(seed: int, space: StateSpace) -> None:
+    findings = found_in(recorded(seed), space=space)
     assert not [finding for finding in findings if finding.level != "ok"]
     assert findings[-1].text.startswith("frames change when the robot moves: rank correlation")
 

@@ -17,8 +17,9 @@ from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.pose_integration import states_along
+from vjepa2_ac.planning.state_integration import states_along
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
+from vjepa2_ac.spaces import vector_actions
 from worlds import DIM, TIME, TOKENS, Copier, Oracle, actions_of, clips_batch, in_batches, moved, rows
 
 
@@ -257,7 +258,7 @@ def test_progress_counts_every_plan_of_a_model() -> None:
 
 
 def test_there_are_no_plans_of_vectors_and_the_reason_is_given() -> None:
-    found = planned(Copier(), is_pose=False)
+    found = planned(Copier(), space=vector_actions(7, "change"))
     assert found.planning is None
     assert found.models["adapter"].plans is None
     assert any("No plans" in note for note in found.notes)

@@ -6,6 +6,7 @@ import torch
 
 from vjepa2_ac.evaluation.action_use.one_step import evaluate_actions, start_of
 from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sensitivity
+from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, vector_actions
 from worlds import DIM, TIME, Copier, Halfway, Oracle, clips_batch
 
 CLIPS, SAMPLES = 8, 40
@@ -16,10 +17,12 @@ def starts(**changes: object) -> list:
     return [start_of(batch, clip, 0, clip) for clip in range(CLIPS)]
 
 
-def pool(*, is_pose: bool = True, reach: float = 0.075, samples: int = SAMPLES, seed: int = 0) -> ActionPool:
+def pool(
+    *, space: ActionSpace = POSE_CHANGE, reach: float = 0.075, samples: int = SAMPLES, seed: int = 0
+) -> ActionPool:
     batch = clips_batch(CLIPS)
     ids = tuple(name for name in batch.episode_ids for _ in range(TIME - 1))
-    return ActionPool(batch.actions.flatten(0, 1).double().numpy(), ids, is_pose, reach, samples, seed)
+    return ActionPool(batch.actions.flatten(0, 1).double().numpy(), ids, space, reach, samples, seed)
 
 
 def test_energy_and_change_are_the_distances_of_the_world() -> None:
@@ -74,7 +77,7 @@ def test_others_are_of_other_episodes_and_the_box_moves_only_the_hand() -> None:
     assert np.array_equal(boxed[:, 3:], np.tile(start.action[3:].double().numpy(), (500, 1)))
     assert 0.07 < np.abs(boxed[:, :3]).max() <= 0.075
     assert abs(boxed[:, :3].mean()) < 0.005
-    vectors = pool(is_pose=False, samples=500).in_box(start, np.random.default_rng(0))
+    vectors = pool(space=vector_actions(7, "change"), samples=500).in_box(start, np.random.default_rng(0))
     assert (np.abs(vectors).max(axis=0) <= np.abs(drawing.actions).max(axis=0)).all()
     assert np.abs(vectors[:, 3:]).max() > 0.05
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 pytest.importorskip("av", reason="the extra `video` is not installed")
@@ -17,8 +18,9 @@ from vjepa2_ac.cli import main
 from vjepa2_ac.console.closed_loop import contest_notes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import count_frames
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
-from vjepa2_ac.simulation.closed_loop.benchmark import FILE, FILM, BenchmarkOptions, run_benchmark
+from vjepa2_ac.simulation.closed_loop.benchmark import FILE, FILM, JOINT_FIELDS, BenchmarkOptions, run_benchmark
 from vjepa2_ac.simulation.closed_loop.video import film_frames
 
 SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3", "planning.limits.xyz=[0.03,0.03,0.03]"]
@@ -30,6 +32,36 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("models") / "tiny"
     tiny_model().save_pretrained(folder)
     return str(folder)
+
+
+@pytest.fixture(scope="module")
+def of_joints(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """Return a model of seven joint angles and a gripper, and a config that says so."""
+    folder = tmp_path_factory.mktemp("joints")
+    sizes = tiny_model().sizes
+    predictor = sizes.predictor.model_copy(update={"state_dim": 8, "action_dim": 8})
+    WorldModel.random(sizes.model_copy(update={"predictor": predictor}), seed=0).save_pretrained(folder / "model")
+    data = {"path": "none", "states": "vector", "fields": {"state": list(JOINT_FIELDS)}}
+    config = {"run_dir": "none", "data": data, "model": {"base": "none", "dtype": "float32"}}
+    (folder / "joints.yaml").write_text(yaml.safe_dump(config))
+    return str(folder / "model"), folder / "joints.yaml"
+
+
+def test_a_robot_of_joints_is_steered_by_its_joints(
+    of_joints: tuple[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, config = of_joints
+    given = ["simulate", model, "--config", str(config), "--domain", "B", *TWICE, "--out", str(tmp_path), *SMALL]
+    assert main([*given, "planning.limits.axes=[0.2]"]) == 0
+    assert metrics(tmp_path)["policies"]["model"]["why_counts"] == {"planned": 4}
+    distances = np.array(metrics(tmp_path)["policies"]["model"]["by_episode"]["distance_cm"])
+    assert (np.abs(np.diff(distances, axis=1)) > 0.1).all(), "the arm moves"
+    capsys.readouterr()
+    assert main(given) == 2
+    assert "planning.limits.axes: data, of a model that does not say" in capsys.readouterr().err
+    (tmp_path / "other.yaml").write_text(config.read_text().replace("joint_position", "other"))
+    assert main([*given, "--config", str(tmp_path / "other.yaml"), "planning.limits.axes=[0.2]"]) == 2
+    assert "other numbers than the simulated arm measures" in capsys.readouterr().err
 
 
 def metrics(folder: Path) -> dict:

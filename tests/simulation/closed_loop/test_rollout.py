@@ -12,10 +12,19 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from tiny_models import tiny_model
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, RandomActions, farthest, shortened
+from vjepa2_ac.simulation.closed_loop.policies import (
+    DoNothing,
+    Moves,
+    Oracle,
+    Planning,
+    RandomActions,
+    farthest,
+    shortened,
+)
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult, EpisodeResult
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_episode, run_task, ways_along
 from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.world.kinematics import HIGH, forward_kinematics
 
 LIMITS = LimitsConfig(xyz=(0.075, 0.075, 0.075))
 SMALL = LimitsConfig(xyz=(0.03, 0.03, 0.03))
@@ -24,7 +33,7 @@ SMALL = LimitsConfig(xyz=(0.03, 0.03, 0.03))
 class Scripted:
     """Follows a script, and records its observations."""
 
-    name, why = "scripted", "told"
+    name, why, moves = "scripted", "told", Moves.FLANGE
 
     def __init__(self, *actions: np.ndarray) -> None:
         self.actions, self.seen = list(actions), []
@@ -89,6 +98,25 @@ def test_an_action_of_a_model_step_is_followed_with_the_arms_lag(arm: SimulatedA
     np.testing.assert_allclose(settled[6], 0.5 * sign, atol=1e-3)
     share = np.linalg.norm(moved[:3]) / np.linalg.norm(wanted[:3])
     assert share == pytest.approx(1 - np.exp(-4 / 15 / DOMAIN_B.lag_s), abs=0.01)
+
+
+def test_joints_are_observed_moved_and_kept_within_their_limits(arm: SimulatedArm) -> None:
+    problem, policy = make_problem("reach", DOMAIN_B, 0, 1), Scripted(0.1 * np.eye(8)[0], 9.0 * np.eye(8)[1])
+    policy.moves = Moves.JOINTS
+    result = run_episode(arm, policy, problem, steps=2, stride=60)
+    (_, before), (_, after) = policy.seen
+    np.testing.assert_allclose(after - before, 0.1 * np.eye(8)[0], atol=1e-3)
+    np.testing.assert_allclose(result.states[1][:6], forward_kinematics(after[:7]), atol=1e-6)
+    assert result.unreachable == 1, "no joint turns by 9 radians"
+    assert arm.joints[1] == pytest.approx(HIGH[1], abs=1e-3)
+    with pytest.raises(ValueError, match="no action of 8 finite numbers"):
+        run_episode(arm, policy_of(np.zeros(7), Moves.JOINTS), problem, steps=1)
+
+
+def policy_of(action: np.ndarray, moves: Moves) -> Scripted:
+    policy = Scripted(action)
+    policy.moves = moves
+    return policy
 
 
 def test_the_same_problem_has_the_same_result_whatever_was_before(arm: SimulatedArm) -> None:

@@ -18,9 +18,13 @@ from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.cost.activations import Activations
 from vjepa2_ac.training.cost.block_activations import Setting, adapter_casts, block_bytes
-from vjepa2_ac.training.loss import distance_of, prediction_losses
+from vjepa2_ac.training.loss import LOSSES, Distance, prediction_losses
 
 TOLERANCE = 0.015
+
+
+def distance_of(config: Config) -> Distance:
+    return LOSSES[config.training.loss](config.training)
 
 
 class Held:
@@ -79,7 +83,11 @@ def known(model: WorldModel, batch: LatentBatch) -> list[Tensor]:
 def measured_parts(config: Config, sizes: ModelSizes) -> Measured:
     """Measure teacher forcing, the rollout after it, and the losses, each on its own."""
     model = built(config, sizes)
-    batch, steps, distance = clips(config, model), config.training.rollout_steps, distance_of(config.training)
+    batch, steps, distance = (
+        clips(config, model),
+        config.training.rollout_steps,
+        LOSSES[config.training.loss](config.training),
+    )
     cameras = None if batch.extrinsics is None else batch.extrinsics[:, :-1]
     forcing, rolling, losing = (Keeping(known(model, batch)) for _ in range(3))
     cache, rest = KeyValueCache(), slice(1, steps)
@@ -103,7 +111,7 @@ def measured_whole(config: Config, sizes: ModelSizes) -> int:
     batch = clips(config, model)
     keeping = Keeping(known(model, batch))
     with arithmetic(config), keeping:
-        losses = prediction_losses(model, batch, config.training.rollout_steps, distance_of(config.training))
+        losses = prediction_losses(model, batch, config.training.rollout_steps, distance_of(config))
     kept = keeping.bytes
     losses.total.backward()
     assert keeping.bytes == 0

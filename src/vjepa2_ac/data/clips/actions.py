@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.configured_spaces import measured_space
 from vjepa2_ac.episode import Episode, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import actions_from_states
 
 
 def actions_of(
@@ -30,10 +30,8 @@ def actions_of(
     Raises:
         ValueError: Commands are required and there are none.
     """
-    if config.states == "pose":
-        return actions_from_states(states)
     if config.actions == "difference":
-        return np.diff(states, axis=0)
+        return measured_space(config, states.shape[1]).differences(states)
     if commands is None:
         raise ValueError("no commands: a source gives them where data.actions is recorded")
     return joined(commands[steps[0] : steps[-1]], config.model_stride, config.join_actions)

@@ -20,10 +20,12 @@ from vjepa2_ac.data.filters.grouping import split_hash
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges, find_ranges
 from vjepa2_ac.data.filters.step_ranges import ClipStarts, StepSelection, clip_starts
 from vjepa2_ac.data.index.episode_table import EpisodeTable
+from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.data.sources.latents.source import LatentSource
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.episode import POSE_WIDTHS, EpisodeSource, Progress, StepRanges, Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import Spaces
 
 logger = logging.getLogger(__name__)
 
@@ -142,6 +144,11 @@ class Dataset:
         """Control steps per second: of the whole data set if the source knows it, else of its first episode."""
         rate = self.table.texts.get("control_rate_hz")
         return float(rate) if rate is not None else self.source.read(int(self.episodes[0])).control_rate_hz
+
+    @cached_property
+    def spaces(self) -> Spaces:
+        """The spaces of its states and actions."""
+        return spaces_of(self.config, self.widths)
 
     @cached_property
     def widths(self) -> Widths:

@@ -10,6 +10,7 @@ from vjepa2_ac.config import IdleConfig
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.spaces import POSE
 
 
 def kept_ranges(episode: Episode, config: IdleConfig) -> list[tuple[int, int]]:
@@ -50,9 +51,9 @@ def idle_by_motion(states: Float[np.ndarray, "steps 7"], config: IdleConfig) -> 
         return np.zeros(len(states), bool)
     motion = actions_from_states(states.astype(np.float64))
     still = (
-        (np.linalg.norm(motion[:, :3], axis=1) < config.translation_m)
-        & (Rotation.from_euler("xyz", motion[:, 3:6]).magnitude() < config.rotation_rad)
-        & (abs(motion[:, 6]) < config.gripper)
+        (np.linalg.norm(motion[:, POSE.position], axis=1) < config.translation_m)
+        & (Rotation.from_euler("xyz", motion[:, POSE.rotation]).magnitude() < config.rotation_rad)
+        & (abs(motion[:, POSE.gripper]) < config.gripper)
     )
     return np.concatenate([[False], still])
 

@@ -22,6 +22,7 @@ from vjepa2_ac.data.inspection.duplicates import find_duplicates
 from vjepa2_ac.data.inspection.finding import Finding, Level
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import POSE, POSES, Spaces
 
 _MOVED_M = 0.01  # of the flange: it should be visible
 _DARK = 8  # of 255: mean of frames that show next to nothing
@@ -123,7 +124,7 @@ def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int, clock: Ca
     if not read:
         yield Finding("error", "clips", f"none of {len(batches) * batch_size} could be read: see data.broken_episodes")
         return
-    yield from findings_in(read, is_pose=dataset.config.states == "pose")
+    yield from findings_in(read, dataset.spaces)
     rate = sum(len(batch.starts) for batch in batches[1:]) / max(rest_s, 1e-9)
     speed = f"first batch of {batch_size} after {first_s:.2f} s, then {rate:.1f} clips/s"
     yield Finding("ok", "timing", f"{speed} with {dataset.config.workers} workers")
@@ -133,7 +134,7 @@ def _read(dataset: Dataset, *, seed: int, batch_size: int, clips: int, clock: Ca
         yield Finding("ok", "network", f"{fetched / count / 1e3:,.0f} kB fetched per clip, over {count} clips")
 
 
-def findings_in(batches: Sequence[Batch], *, is_pose: bool = True) -> Iterator[Finding]:
+def findings_in(batches: Sequence[Batch], spaces: Spaces = POSES) -> Iterator[Finding]:
     """Yield the findings of some batches, with or without poses; a pure function, reads nothing."""
     clips = sum(len(batch.starts) for batch in batches)
     first = batches[0]
@@ -148,17 +149,18 @@ def findings_in(batches: Sequence[Batch], *, is_pose: bool = True) -> Iterator[F
     has_pixels = first.latents is None
     if has_pixels:
         yield _pixels(batches)
-    if not is_pose:
+    if spaces.state.position is None:
         ranges = torch.from_numpy((states.max(axis=0) - states.min(axis=0)).astype(np.float32))
         if has_pixels:
             yield _still_frames(batches, [has_moved(batch.states, ranges) for batch in batches])
         yield from vector_findings(states, actions)
         return
     if has_pixels:
-        yield _still_frames(batches, [batch.actions[..., :3].norm(dim=-1) > _MOVED_M for batch in batches])
+        moved = [batch.actions[..., spaces.action.sized].norm(dim=-1) > _MOVED_M for batch in batches]
+        yield _still_frames(batches, moved)
     yield _positions(states)
     yield _rotations(states, actions)
-    yield _gripper(states[:, 6], clips)
+    yield _gripper(states[:, POSE.gripper], clips)
     yield _motion(actions)
 
 
@@ -195,11 +197,12 @@ def _still_frames(batches: Sequence[Batch], has_moved: Sequence[Tensor]) -> Find
 
 
 def _positions(states: np.ndarray) -> Finding:
-    low, high = states[:, :3].min(axis=0), states[:, :3].max(axis=0)
+    places = states[:, POSE.position]
+    low, high = places.min(axis=0), places.max(axis=0)
     text = ", ".join(f"{axis} {a:.3f} to {b:.3f}" for axis, a, b in zip("xyz", low, high, strict=True)) + " m"
     if (high - low).max() == 0:
         return Finding("error", "position", f"{text}: it never changes. Check which fields the state is made of")
-    if np.linalg.norm(states[:, :3], axis=1).max() > _REACH_M:
+    if np.linalg.norm(places, axis=1).max() > _REACH_M:
         return Finding("warning", "position", f"{text}: farther than most arms reach. Is it metres, from the base?")
     if (high - low).max() < 0.01:
         return Finding("warning", "position", f"{text}: all within 1 cm. Is it metres?")
@@ -207,8 +210,8 @@ def _positions(states: np.ndarray) -> Finding:
 
 
 def _rotations(states: np.ndarray, actions: np.ndarray) -> Finding:
-    turned = np.rad2deg(Rotation.from_euler("xyz", actions[:, 3:6]).magnitude())
-    low, high = states[:, 3:6].min(), states[:, 3:6].max()
+    turned = np.rad2deg(Rotation.from_euler("xyz", actions[:, POSE.rotation]).magnitude())
+    low, high = states[:, POSE.rotation].min(), states[:, POSE.rotation].max()
     text = f"angles {low:.2f} to {high:.2f} rad; degrees per model step {_percentiles(turned, '.1f')}"
     if turned.max() == 0:
         return Finding("warning", "rotation", f"{text}: it never changes. Is it in the state?")
@@ -228,7 +231,7 @@ def _gripper(closedness: np.ndarray, clips: int) -> Finding:
 
 
 def _motion(actions: np.ndarray) -> Finding:
-    moved = np.linalg.norm(actions[:, :3], axis=1) * 100
+    moved = POSE.shown_size(actions)
     text = f"cm per model step {_percentiles(moved, '.2f')}"
     if not np.any(actions):
         return Finding("error", "actions", f"{text}: all are zero; there is nothing to learn from")

@@ -10,6 +10,7 @@ from vjepa2_ac.data.inspection import oddities
 from vjepa2_ac.data.inspection.agreement import FEWEST_EPISODES, Agreement, agreement_of
 from vjepa2_ac.data.inspection.excerpts import EPISODES, Excerpt, excerpts_of
 from vjepa2_ac.data.inspection.finding import Finding, Level
+from vjepa2_ac.spaces import StateSpace
 
 _EPISODES_FAR = 12  # of some 5 MB each, for DROID
 
@@ -27,20 +28,22 @@ def excerpt_findings(dataset: Dataset) -> Iterator[Finding]:
     excerpts = list(excerpts_of(dataset, episodes=_EPISODES_FAR if is_far else EPISODES))
     yield from signs_in(
         excerpts,
-        is_pose=dataset.config.states == "pose",
+        space=dataset.spaces.state,
         stride=dataset.config.model_stride,
         control_rate_hz=dataset.control_rate_hz,
     )
 
 
-def signs_in(excerpts: Sequence[Excerpt], *, is_pose: bool, stride: int, control_rate_hz: float) -> Iterator[Finding]:
+def signs_in(
+    excerpts: Sequence[Excerpt], *, space: StateSpace, stride: int, control_rate_hz: float
+) -> Iterator[Finding]:
     """Yield what is unusual in excerpts, and whether frames and states belong together; reads nothing."""
     excerpts = [one for one in excerpts if len(one.states) > 1]
     if not excerpts:
         return
-    moved = oddities.motion_in(excerpts, is_pose=is_pose)
+    moved = oddities.motion_in(excerpts, space)
     found = [oddities.noise_as_frames(excerpts), *oddities.repetitions(excerpts, moved)]
-    if is_pose:
+    if space.position is not None:
         deltas = oddities.deltas_for_poses(excerpts)
         found += [deltas or oddities.shaking(excerpts), oddities.too_fast(excerpts, control_rate_hz)]
     wrong = [one for one in found if one is not None]

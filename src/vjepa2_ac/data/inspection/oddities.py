@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.data.inspection.excerpts import Excerpt
 from vjepa2_ac.data.inspection.finding import Finding
+from vjepa2_ac.spaces import POSE, StateSpace
 
 _STILL_FRAME = 0.1  # of an episode's median change: the codec noise of a repeated frame
 _STALE, _MOSTLY_STALE = 0.05, 0.5
@@ -35,19 +36,19 @@ _FASTEST_M_S = 2.0  # Franka: 1.7
 _COLD, _COLD_SHARE, _COLD_EPISODES = -0.4, 0.9, 8
 
 
-def motion_in(excerpts: Sequence[Excerpt], *, is_pose: bool) -> list[Float[np.ndarray, " _"]]:
+def motion_in(excerpts: Sequence[Excerpt], space: StateSpace) -> list[Float[np.ndarray, " _"]]:
     """Return the motion of each episode at each step: the sum over its numbers, each in units of its typical change."""
-    changes = [_change_of_pose(one.states) if is_pose else np.diff(one.states, axis=0) for one in excerpts]
+    changes = [_change(one.states, space) for one in excerpts]
     scale = np.sqrt((np.concatenate(changes) ** 2).mean(axis=0))
     scale = np.where(scale > 0, scale, np.inf)  # constant numbers do not count
     return [np.abs(change / scale).sum(axis=1) for change in changes]
 
 
-def _change_of_pose(states: Float[np.ndarray, "steps 7"]) -> Float[np.ndarray, "changes 7"]:
+def _change(states: Float[np.ndarray, "steps dim"], space: StateSpace) -> Float[np.ndarray, "changes dim"]:
     change = np.diff(states, axis=0)
-    rotations = Rotation.from_euler("xyz", states[:, 3:6])
-    if len(change):  # angles jump at pi
-        change[:, 3:6] = (rotations[1:] * rotations[:-1].inv()).as_rotvec()
+    if space.rotation is not None and len(change):  # angles jump at pi
+        rotations = Rotation.from_euler("xyz", states[:, space.rotation])
+        change[:, space.rotation] = (rotations[1:] * rotations[:-1].inv()).as_rotvec()
     return change
 
 
@@ -115,7 +116,7 @@ def shaking(excerpts: Sequence[Excerpt]) -> Finding | None:
     The autocorrelation of the motion is near 1 for an arm and -0.5 for noise alone; it is below the limit if the
     noise, on each axis, is about as large as the arm's motion in a step.
     """
-    ways = [np.diff(one.states[:, :3], axis=0) for one in excerpts]
+    ways = [np.diff(one.states[:, POSE.position], axis=0) for one in excerpts]
     size = sum(float((way**2).sum()) for way in ways)
     jerks = np.concatenate([np.diff(way, n=2, axis=0) for way in ways])
     if not size > 0 or not len(jerks):
@@ -130,7 +131,7 @@ def shaking(excerpts: Sequence[Excerpt]) -> Finding | None:
 
 def deltas_for_poses(excerpts: Sequence[Excerpt]) -> Finding | None:
     """Report positions that are impossible for a flange: at the base, as differences of positions are."""
-    positions = [one.states[:, :3] for one in excerpts]
+    positions = [one.states[:, POSE.position] for one in excerpts]
     median_m = float(np.median(np.linalg.norm(np.concatenate(positions), axis=1)))
     if not 0 < median_m < _INSIDE_M:
         return None
@@ -145,7 +146,7 @@ def deltas_for_poses(excerpts: Sequence[Excerpt]) -> Finding | None:
 
 def too_fast(excerpts: Sequence[Excerpt], control_rate_hz: float) -> Finding | None:
     """Report a flange that is faster than arms: the control rate, or the unit, may be wrong."""
-    steps = np.concatenate([np.diff(one.states[:, :3], axis=0) for one in excerpts])
+    steps = np.concatenate([np.diff(one.states[:, POSE.position], axis=0) for one in excerpts])
     fast = float(np.percentile(np.linalg.norm(steps, axis=1), 99)) * control_rate_hz if len(steps) else 0.0
     if fast < _FASTEST_M_S:
         return None

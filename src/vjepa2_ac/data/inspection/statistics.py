@@ -19,8 +19,10 @@ from vjepa2_ac.data.clips.windows import in_split, spread
 from vjepa2_ac.data.filters.idle_rules import idle_by_motion
 from vjepa2_ac.data.inspection.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.inspection.statistics_vectors import ChangePerStep, change_per_step
+from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.episode import Episode, Progress, Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import POSE, Spaces
 
 PERCENTILES = (10, 50, 90, 99)
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -98,9 +100,14 @@ class Inspection:
         return self.config.offered_cameras
 
     @property
-    def is_pose(self) -> bool:
-        """Whether the states are poses."""
-        return self.config.states == "pose"
+    def spaces(self) -> Spaces:
+        """The spaces of states and actions."""
+        return spaces_of(self.config, self.widths)
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether there is a position, of which motion is measured."""
+        return self.spaces.state.position is not None
 
     @property
     def ranges(self) -> Float[np.ndarray, "state_dim 2"]:
@@ -111,6 +118,11 @@ class Inspection:
         """Return the least and the greatest value of one number of the sample's states."""
         values = np.concatenate([one.states[:, column] for one in self.sample])
         return float(values.min()), float(values.max())
+
+    @property
+    def gripper_range(self) -> tuple[float, float]:
+        """The least and the greatest closedness of the sample."""
+        return self.range_of(self.spaces.state.gripper or 0)
 
     def as_dict(self) -> dict[str, Any]:
         """Return all statistics as plain values, for `inspect.json`."""
@@ -134,14 +146,14 @@ class Inspection:
             "state_dim": self.widths.state,
             "action_dim": self.widths.action,
             "percentiles": list(PERCENTILES),
-            **(self._poses_as_dict() if self.is_pose else self._vectors_as_dict()),
+            **(self._poses_as_dict() if self.has_poses else self._vectors_as_dict()),
         }
 
     def _poses_as_dict(self) -> dict[str, Any]:
         return {
             "still_share": self.still_share,
             "xyz_m": [self.range_of(column) for column in range(3)],
-            "gripper": self.range_of(6),
+            "gripper": self.gripper_range,
             "per_model_step": [
                 {
                     "stride": one.stride,
@@ -197,12 +209,24 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
         motions=(),
         changes=(),
     )
-    if not found.is_pose:
+    if not found.has_poses:
         pieces = [one.states[start:end] for one in sample for start, end in one.kept]
         return replace(found, changes=tuple(change_per_step(pieces, found.ranges, stride, rate) for stride in strides))
     idle = np.concatenate([idle_runs(one.states, dataset.config) for one in sample])
     motions = tuple(motion_per_step(sample, stride, rate) for stride in strides)
     return replace(found, still_share=float(idle.mean()), motions=motions)
+
+
+def usual_changes(dataset: Dataset, *, episodes: int = 64) -> Float[np.ndarray, " state_dim"]:
+    """Return the 99th percentile of the size of each number's change per model step, over a sample of the episodes.
+
+    Raises:
+        InputError: As `inspect_dataset`.
+    """
+    stride, sample = dataset.config.model_stride, _read(dataset, sample_of(dataset, episodes), None)
+    pieces = [one.states[start:end] for one in sample for start, end in one.kept if end - start > stride]
+    changes = [np.abs(piece[stride:] - piece[:-stride]) for piece in pieces]
+    return np.asarray(np.percentile(np.concatenate(changes), 99, axis=0))
 
 
 def sample_of(dataset: Dataset, count: int) -> list[int]:
@@ -218,14 +242,12 @@ def motion_per_step(sample: Sequence[ReadEpisode], stride: int, control_rate_hz:
     pieces = [one.states[start:end] for one in sample for start, end in one.kept if end - start > stride]
     if not pieces:
         return MotionPerStep(stride, stride / control_rate_hz, np.zeros(0), np.zeros(0))
-    moved = [np.linalg.norm(piece[stride:, :3] - piece[:-stride, :3], axis=1) for piece in pieces]
+    moved = [POSE.shown_size(piece[stride:] - piece[:-stride]) for piece in pieces]
     turned = []
     for piece in pieces:
-        rotations = Rotation.from_euler("xyz", piece[:, 3:6])
+        rotations = Rotation.from_euler("xyz", piece[:, POSE.rotation])
         turned.append((rotations[stride:] * rotations[:-stride].inv()).magnitude())
-    return MotionPerStep(
-        stride, stride / control_rate_hz, np.concatenate(moved) * 100, np.rad2deg(np.concatenate(turned))
-    )
+    return MotionPerStep(stride, stride / control_rate_hz, np.concatenate(moved), np.rad2deg(np.concatenate(turned)))
 
 
 def idle_runs(states: Float[np.ndarray, "steps 7"], config: DataConfig) -> Bool[np.ndarray, " steps"]:

@@ -21,11 +21,12 @@ from vjepa2_ac.evaluation.action_score.protocol import FRAMES, FRAMES_SEEN, SCOR
 from vjepa2_ac.evaluation.action_use.one_step import clip_generator
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import PlanningStudy, Plans
-from vjepa2_ac.planning.action_space import ActionSpace, pose_space
 from vjepa2_ac.planning.energy import distance
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.planner import Planner
-from vjepa2_ac.planning.pose_integration import states_along
+from vjepa2_ac.planning.search_space import SearchSpace, pose_space
+from vjepa2_ac.planning.state_integration import states_along
+from vjepa2_ac.spaces import POSE
 
 _RANDOM_PLANS = 64  # of each start: their mean error is the random plan's
 _SAME_M = 1e-6
@@ -174,7 +175,7 @@ def _array(plan: Plan) -> Float[np.ndarray, "steps 7"]:
     return plan.actions.numpy().astype(np.float64)
 
 
-def _random(starts: Sequence[PlanningStart], one: ActionSpace, scored: ActionSpace) -> Plans:
+def _random(starts: Sequence[PlanningStart], one: SearchSpace, scored: SearchSpace) -> Plans:
     """Return plans of which every number is uniform within its limits, independently of all others."""
     drawn: list[list[np.ndarray]] = [[], []]
     for start in starts:
@@ -186,11 +187,11 @@ def _random(starts: Sequence[PlanningStart], one: ActionSpace, scored: ActionSpa
     return Plans(one_step[:, :, 0], three_steps)
 
 
-def _allowed(space: ActionSpace, actions: np.ndarray) -> np.ndarray:
+def _allowed(space: SearchSpace, actions: np.ndarray) -> np.ndarray:
     return space.allowed(torch.from_numpy(actions).float()).numpy().astype(np.float64)
 
 
 def _beyond(allowed: np.ndarray, demonstrated: np.ndarray) -> float:
     """Return the share of demonstrated steps that exceed the limits of a plan along an axis."""
-    cut = np.abs(allowed - demonstrated)[..., :3] > _SAME_M
+    cut = np.abs(allowed - demonstrated)[..., POSE.position] > _SAME_M
     return float(cut.any(axis=-1).mean())

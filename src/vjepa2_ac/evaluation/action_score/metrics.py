@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from vjepa2_ac.evaluation.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
+from vjepa2_ac.spaces import POSE
 
 AXES = ("x", "y", "z")
 LEAST_CM = 0.5  # a demonstrated step that is shorter has no direction, and along an axis no sign
@@ -51,7 +52,7 @@ def ways_of(evaluation: Evaluation) -> dict[str, Plans]:
 def metrics_of(study: PlanningStudy, plans: Plans) -> PlanMetrics:
     """Return the errors of plans with respect to the demonstrated actions."""
     ids, missed, step = study.episode_ids, missed_cm(study, plans), _step_cm(study, plans)
-    wanted, planned = 100 * study.demonstrated[:, 0, :3], 100 * plans.one_step[..., :3]
+    wanted, planned = 100 * study.demonstrated[:, 0, POSE.position], 100 * plans.one_step[..., POSE.position]
     return PlanMetrics(
         score=bootstrapped(_score, _sums(missed), ids)[0],
         missed_cm=mean_of(missed, ids),
@@ -82,13 +83,13 @@ def missed_cm(study: PlanningStudy, plans: Plans) -> Float[np.ndarray, " starts"
     Source: facebookresearch/jepa-wms @ 6eafb14, evals/simu_env_planning/planning/plan_evaluator.py, PlanEvaluator.eval:
     end_distance_xyz.
     """
-    ends = plans.three_steps[..., :3].sum(axis=-2) - study.demonstrated[..., :3].sum(axis=-2)
+    ends = plans.three_steps[..., POSE.position].sum(axis=-2) - study.demonstrated[..., POSE.position].sum(axis=-2)
     return np.asarray(100 * np.abs(ends).sum(axis=-1).mean(axis=0))
 
 
 def directed(study: PlanningStudy) -> Bool[np.ndarray, " starts"]:
     """Return which demonstrated first steps are long enough to have a direction."""
-    return np.asarray(100 * np.linalg.norm(study.demonstrated[:, 0, :3], axis=-1) >= LEAST_CM)
+    return np.asarray(100 * np.linalg.norm(study.demonstrated[:, 0, POSE.position], axis=-1) >= LEAST_CM)
 
 
 def signed_along(study: PlanningStudy, axis: int) -> Bool[np.ndarray, " starts"]:
@@ -109,7 +110,7 @@ def _sums(values: Float[np.ndarray, " starts"]) -> Float[np.ndarray, "2 starts 1
 
 
 def _step_cm(study: PlanningStudy, plans: Plans) -> Float[np.ndarray, " starts"]:
-    apart = plans.one_step[..., :3] - study.demonstrated[:, 0, :3]
+    apart = plans.one_step[..., POSE.position] - study.demonstrated[:, 0, POSE.position]
     return np.asarray(100 * np.linalg.norm(apart, axis=-1).mean(axis=0))
 
 
@@ -124,7 +125,7 @@ def _angles(
 
 def _signs(study: PlanningStudy, planned: Float[np.ndarray, "draws starts 3"]) -> tuple[Estimate, Estimate, Estimate]:
     """Return shares of right signs; a plan that does not move counts half."""
-    right = 0.5 + 0.5 * np.sign(planned) * np.sign(study.demonstrated[:, 0, :3])
+    right = 0.5 + 0.5 * np.sign(planned) * np.sign(study.demonstrated[:, 0, POSE.position])
     x, y, z = (
         _mean_where(right[..., axis].mean(axis=0), signed_along(study, axis), study.episode_ids) for axis in range(3)
     )

@@ -17,17 +17,18 @@ from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_acti
 from vjepa2_ac.evaluation.intervals import Estimate, mean_of
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import Landscape, Landscapes
+from vjepa2_ac.spaces import ActionSpace
 
 _ROOM = 1.25  # extent of the grid relative to the largest true action
 _SAME = 1e-6  # energies this close, as a share, are equally low
-_CM = 100.0
+_AXES = slice(0, 3)  # of the grid: of poses, the position
 
 
 @dataclass(frozen=True)
 class LandscapeGrid:
     """A grid of actions over their first three numbers."""
 
-    is_pose: bool  # the numbers are dx, dy, dz in metres, and are reported in cm
+    space: ActionSpace  # of the actions; positions are reported in cm
     nodes: int  # along each axis
     reach: float  # it spans at least -reach .. reach (metres; of vectors: in its own numbers)
 
@@ -52,19 +53,18 @@ def measure_landscapes(
     Raises:
         ValueError: No starts, fewer than three nodes, or actions of fewer than three numbers.
     """
-    is_pose, nodes = grid.is_pose, grid.nodes
+    nodes, unit = grid.nodes, grid.space.shown_factor
     if not starts or nodes < 3 or len(starts[0].action) < 3:
         raise ValueError(f"{len(starts)} starts, {nodes} nodes")
-    unit = _CM if is_pose else 1.0
-    trues = np.stack([start.action[:3].cpu().numpy().astype(np.float64) for start in starts])
+    trues = np.stack([start.action[_AXES].cpu().numpy().astype(np.float64) for start in starts])
     half = max(grid.reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
     maps = []
     for done, (start, true) in enumerate(zip(starts, trues, strict=True), start=1):
         maps.append(_landscape(model, start, grid_axes(true, half, nodes), true, unit, at_once))
         if progress is not None:
             progress(done, len(starts))
-    names = ("dx", "dy", "dz") if is_pose else ("action 0", "action 1", "action 2")
-    return _summary(tuple(maps), names, "cm" if is_pose else "", least=unit * half / (nodes - 1))
+    first, second, third = grid.space.names[_AXES]
+    return _summary(tuple(maps), (first, second, third), grid.space.shown_unit, least=unit * half / (nodes - 1))
 
 
 def grid_axes(true: Float[np.ndarray, " 3"], half: float, nodes: int) -> Float[np.ndarray, "3 nodes"]:
@@ -85,9 +85,9 @@ def _landscape(
 ) -> Landscape:
     nodes = axes.shape[1]
     evaluated = np.tile(start.action.cpu().numpy().astype(np.float64), (nodes**3, 1))
-    evaluated[:, :3] = _places(axes)
+    evaluated[:, _AXES] = _places(axes)
     energy = evaluate_actions(model, start, evaluated, at_once=at_once).energy.reshape(nodes, nodes, nodes)
-    minimum = evaluated[lowest(energy).ravel(), :3].mean(axis=0)
+    minimum = evaluated[lowest(energy).ravel(), _AXES].mean(axis=0)
     return Landscape(
         episode_id=start.episode_id,
         start=start.first_step,

@@ -14,6 +14,7 @@ from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_acti
 from vjepa2_ac.evaluation.intervals import mean_of, ratio
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import Ranking, Sensitivity
+from vjepa2_ac.spaces import ActionSpace
 
 TOP = (1, 5, 10)
 _SAME = 1e-6  # relative difference below which energies are equal: rounding decides no rank
@@ -25,7 +26,7 @@ class ActionPool:
 
     actions: Float[np.ndarray, "count action_dim"]
     episode_ids: tuple[str, ...]  # of each action
-    is_pose: bool
+    space: ActionSpace
     reach: float  # half the width of the box along each of x, y, z, in metres; of poses only
     samples: int  # drawn per start, from each of the two sources
     seed: int  # a start gets the same actions whatever else is measured
@@ -46,17 +47,17 @@ class ActionPool:
         true = start.action.cpu().numpy().astype(np.float64)
         half = np.abs(self.actions).max(axis=0)
         drawn = generator.uniform(-1.0, 1.0, size=(self.samples, len(true)))
-        if not self.is_pose:
+        if self.space.position is None:
             return np.asarray(drawn * half)
         evaluated = np.tile(true, (self.samples, 1))
-        evaluated[:, :3] = drawn[:, :3] * self.reach
+        evaluated[:, self.space.position] = drawn[:, self.space.position] * self.reach
         return evaluated
 
     def words(self, drawn_from: Literal["clips", "box"]) -> str:
         """Return as text where actions are drawn from."""
         if drawn_from == "clips":
             return "actions of other episodes"
-        if self.is_pose:
+        if self.space.position is not None:
             return f"(dx, dy, dz) uniform within {self.reach * 100:g} cm along each axis"
         return "every number uniform within its largest size"
 

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.episode import Episode, EpisodeInfo, EpisodeSource, Progress, StepRanges
 from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
+from vjepa2_ac.spaces import POSE
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,8 @@ def mirrored(states: Float[np.ndarray, "steps 7"], axis: int) -> Float[np.ndarra
     """Return poses mirrored across the plane of two axes: one coordinate and two rotations negated."""
     mirror = np.ones(3)
     mirror[axis] = -1
-    rotations = matrices_from_euler(states[:, 3:6]) * mirror[:, None] * mirror
-    return np.concatenate([states[:, :3] * mirror, euler_from_matrices(rotations), states[:, 6:]], axis=1)
+    rotations = matrices_from_euler(states[:, POSE.rotation]) * mirror[:, None] * mirror
+    return np.concatenate([states[:, POSE.position] * mirror, euler_from_matrices(rotations), states[:, -1:]], axis=1)
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ def _with_mirrored_states(episode: Episode, *, axis: int) -> Episode:
 
 def _with_gripper_inverted(episode: Episode) -> Episode:
     states = episode.states.copy()
-    states[:, 6] = 1 - states[:, 6]
+    states[:, POSE.gripper] = 1 - states[:, POSE.gripper]
     return replace(episode, states=states)
 
 

@@ -27,6 +27,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.evaluation.measure import ClipSample, Predictor, one_step_errors
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.spaces import ActionSpace
 
 _EPISODES_NEEDED = 2  # for an interval
 _EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
@@ -157,7 +158,7 @@ def calibrate(
     measured = {}
     for done, stride in enumerate(possible):
         batches = batches_of(views[stride], chosen, batch_size=sample.batch_size, copies=copies)
-        parts = _measure(model, encode, batches, is_pose=settings.states == "pose")
+        parts = _measure(model, encode, batches, dataset.spaces.action)
         report = _with_progress(progress, done * len(chosen), len(possible) * len(chosen))
         measured[stride] = _Measured.joined(list(report(parts)))
     runner_up, difference = _compared(measured)
@@ -206,13 +207,13 @@ class _Measured:
 
 
 def _measure(
-    model: Predictor, encode: Callable[[Batch], LatentBatch], batches: Iterator[Batch], *, is_pose: bool
+    model: Predictor, encode: Callable[[Batch], LatentBatch], batches: Iterator[Batch], space: ActionSpace
 ) -> Iterator[_Measured]:
     for batch in batches:
         errors, persistence = one_step_errors(model, encode(batch))
         moved_cm = np.zeros(0)
-        if is_pose:
-            moved_cm = batch.actions[..., :3].norm(dim=-1).flatten().numpy().astype(np.float64) * 100
+        if space.position is not None:
+            moved_cm = space.shown_size(batch.actions.flatten(0, 1).numpy().astype(np.float64))
         yield _Measured(errors, persistence, moved_cm, tuple(zip(batch.episode_ids, batch.starts, strict=True)))
 
 

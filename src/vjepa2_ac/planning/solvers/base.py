@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from vjepa2_ac.planning.action_space import ActionSpace
+from vjepa2_ac.planning.search_space import SearchSpace
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Solver(Protocol):
         ...
 
 
-def white_noise(space: ActionSpace, samples: int, generator: Generator) -> Float[Tensor, "samples decisions dim"]:
+def white_noise(space: SearchSpace, samples: int, generator: Generator) -> Float[Tensor, "samples decisions dim"]:
     """Return independent standard normal numbers, zero on axes that are fixed in all decisions.
 
     Drawn decision by decision and for free axes only, in upstream's order: the same seed gives upstream's samples.

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import CemConfig
-from vjepa2_ac.planning.action_space import ActionSpace
 from vjepa2_ac.planning.interfaces import PlanStart
+from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.solvers.base import EvaluatedPlans, white_noise
 
 
@@ -24,7 +24,7 @@ class CemSolver:
     uses_gradients = False
 
     def __init__(
-        self, space: ActionSpace, config: CemConfig, samples: int, generator: Generator, start: PlanStart | None = None
+        self, space: SearchSpace, config: CemConfig, samples: int, generator: Generator, start: PlanStart | None = None
     ) -> None:
         self.elites = config.elites
         self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
@@ -54,7 +54,7 @@ class CemSolver:
         return self.mean if self._answers_mean else None
 
 
-def _momentum(space: ActionSpace, others: float, gripper: float) -> Float[Tensor, " dim"]:
+def _momentum(space: SearchSpace, others: float, gripper: float) -> Float[Tensor, " dim"]:
     momentum = torch.full((space.dim,), others)
     if space.gripper is not None:
         momentum[space.gripper] = gripper

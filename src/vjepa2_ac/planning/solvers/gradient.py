@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import GradientConfig
-from vjepa2_ac.planning.action_space import ActionSpace
 from vjepa2_ac.planning.interfaces import PlanStart
+from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.solvers.base import EvaluatedPlans, white_noise
 
 
@@ -21,7 +21,7 @@ class GradientSolver:
     uses_gradients = True
 
     def __init__(
-        self, space: ActionSpace, config: GradientConfig, iterations: int, generator: Generator, start: PlanStart | None
+        self, space: SearchSpace, config: GradientConfig, iterations: int, generator: Generator, start: PlanStart | None
     ) -> None:
         self.elites = config.starts
         noise = white_noise(space, config.starts, generator)

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import IcemConfig
-from vjepa2_ac.planning.action_space import ActionSpace
 from vjepa2_ac.planning.interfaces import PlanStart
+from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.solvers.base import EvaluatedPlans
 
 
@@ -24,7 +24,7 @@ class IcemSolver:
 
     def __init__(
         self,
-        space: ActionSpace,
+        space: SearchSpace,
         config: IcemConfig,
         samples: int,
         iterations: int,

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import MppiConfig
-from vjepa2_ac.planning.action_space import ActionSpace
 from vjepa2_ac.planning.interfaces import PlanStart
+from vjepa2_ac.planning.search_space import SearchSpace
 from vjepa2_ac.planning.solvers.base import EvaluatedPlans, white_noise
 
 _RECORDED = 10
@@ -26,7 +26,7 @@ class MppiSolver:
     elites = _RECORDED
 
     def __init__(
-        self, space: ActionSpace, config: MppiConfig, samples: int, generator: Generator, start: PlanStart | None = None
+        self, space: SearchSpace, config: MppiConfig, samples: int, generator: Generator, start: PlanStart | None = None
     ) -> None:
         self.mean = space.allowed(torch.zeros_like(space.lower) if start is None else start.mean)
         self.std = space.first_std

@@ -129,8 +129,8 @@ def _ranges(axes: Any, ranges: Float[np.ndarray, "state_dim 2"]) -> None:
 
 
 def _motion(axes: Any, sheet: ContactSheet) -> None:
-    is_pose = sheet.places_m is not None
-    unit = "cm" if is_pose else "%"
+    has_poses = sheet.places_m is not None
+    unit = "cm" if has_poses else "%"
     values = [moved for moved in sheet.moved.values() if len(moved)]
     far = max([(sheet.reference or 1.0) * 1.3, *(float(np.percentile(moved, 97)) for moved in values)])
     reached = np.linspace(0, far, 200)
@@ -143,7 +143,9 @@ def _motion(axes: Any, sheet: ContactSheet) -> None:
     if sheet.reference is not None:
         axes.axvline(sheet.reference, color=_GRIPPER, linestyle="--", linewidth=1.2, label="upstream's example pair")
     less = (
-        "that move the flange less far than this (cm)" if is_pose else "that change no number by more (% of its range)"
+        "that move the flange less far than this (cm)"
+        if has_poses
+        else "that change no number by more (% of its range)"
     )
     axes.set_title(f"Share of model steps (%) {less}", loc="left", fontsize=9)
     axes.set(xlim=(0, far), ylim=(0, 102))

@@ -45,8 +45,8 @@ def plot_dataset(
 
 def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
     """Return the content of the sheet besides the strips: the title, the facts and the data of the plots."""
-    config, is_pose = inspection.config, inspection.is_pose
-    places = np.concatenate([one.states[:, :3] for one in inspection.sample])
+    config, has_poses = inspection.config, inspection.has_poses
+    places = np.concatenate([one.states[:, inspection.spaces.state.sized] for one in inspection.sample])
     moved = {one.stride: one.moved_cm for one in inspection.motions}
     return ContactSheet(
         title=config.path,
@@ -54,11 +54,11 @@ def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
         strips=tuple(strips),
         control_rate_hz=inspection.control_rate_hz,
         lengths_s=inspection.lengths / inspection.control_rate_hz,
-        moved=moved if is_pose else {one.stride: one.percent for one in inspection.changes},
-        reference=RELEASED_STEP_CM if is_pose else None,
-        places_m=places[:: -(-len(places) // _PLACES)] if is_pose else None,
+        moved=moved if has_poses else {one.stride: one.percent for one in inspection.changes},
+        reference=RELEASED_STEP_CM if has_poses else None,
+        places_m=places[:: -(-len(places) // _PLACES)] if has_poses else None,
         shaded_means=_shaded_means(config),
-        ranges=None if is_pose else inspection.ranges,
+        ranges=None if has_poses else inspection.ranges,
     )
 
 
@@ -86,7 +86,7 @@ def _facts(inspection: Inspection) -> tuple[str, ...]:
         + ", ".join(f"{count:,} {name}" for name, count in inspection.windows_of.items()),
     ]
     sampled = len(inspection.sample)
-    shown = "Motion and gripper" if inspection.is_pose else "Motion"
+    shown = "Motion and gripper" if inspection.has_poses else "Motion"
     third = f"{shown}: from {'all' if sampled == len(inspection.lengths) else 'a sample of'} {sampled} episodes."
     return "  ·  ".join(first), "  ·  ".join(second), third
 
@@ -98,9 +98,9 @@ def _shaded_means(config: DataConfig) -> str:
 
 
 def _about_states(inspection: Inspection) -> str:
-    if not inspection.is_pose:
+    if not inspection.has_poses:
         return f"states of {inspection.widths.state} numbers, actions of {inspection.widths.action}"
-    gripper = inspection.range_of(6)
+    gripper = inspection.gripper_range
     return f"gripper {gripper[0]:.2f} to {gripper[1]:.2f}"
 
 
@@ -137,7 +137,7 @@ def _strip(dataset: Dataset, inspection: Inspection, one: ReadEpisode, name: str
         frames=episode.read_frames([int(step) for step in at]),
         steps=at,
         speed=_change_per_step(one, inspection) * episode.control_rate_hz,
-        closedness=one.states[:, 6] if inspection.is_pose else None,
+        closedness=one.states[:, inspection.spaces.state.gripper] if inspection.has_poses else None,
         shaded=_shaded(dataset, one),
         seen=crop_box(height, width, dataset.config.crop),
     )
@@ -147,9 +147,9 @@ def _change_per_step(one: ReadEpisode, inspection: Inspection) -> Float[np.ndarr
     """Return the motion in each control step, in the sheet's unit."""
     if len(one.states) == 1:
         return np.zeros(1)
-    if not inspection.is_pose:
+    if not inspection.has_poses:
         return largest_change(np.gradient(one.states, axis=0), inspection.ranges)
-    return np.asarray(np.linalg.norm(np.gradient(one.states[:, :3], axis=0), axis=1) * 100)
+    return inspection.spaces.state.shown_size(np.gradient(one.states, axis=0))
 
 
 def _shaded(dataset: Dataset, one: ReadEpisode) -> tuple[tuple[int, int], ...]:

@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.clips.transforms import crop_box
 from vjepa2_ac.planning.decision import PlanResult
-from vjepa2_ac.planning.energy_slices import AXES, EnergySlice
+from vjepa2_ac.planning.energy_slices import EnergySlice
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.summary import summarize
 from vjepa2_ac.reports.figures.page import new_figure
@@ -21,8 +21,8 @@ from vjepa2_ac.storage import atomic_writer
 PLAN_IMAGE = "plan.png"
 
 _STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False}
-_CM = 100.0
 _GREY, _BLUE, _RED, _FRAME = "#8a8a8a", "#1f6fb4", "#b3246b", "#e8b10c"
+_MOST_NUMBERS = 8  # of a vector
 _MOST_GOALS = 3  # that are shown: the first ones, and the last
 _STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": _RED, "edgecolors": "white", "zorder": 5}
 
@@ -66,21 +66,38 @@ def _pictures(part: Any, answer: PlanResult) -> None:
 def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     elites, heights, energies, path = part.subplots(1, 4, width_ratios=[3, 3, 3, 3])
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
-    first, upper = answer.actions[0] * _CM, answer.space.upper[0].double().numpy() * _CM
+    factor = _factor(answer)
+    first, upper = answer.actions[0] * factor, answer.space.upper[0].double().numpy() * factor
+    across, up, third = _three(answer)
     for number, (one, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
-        tried = one.elites[:, 0].double().numpy() * _CM
-        elites.scatter(tried[:, 0], tried[:, 1], s=9, color=colour, alpha=0.8)
-        heights.scatter(np.full(len(tried), number), tried[:, 2], s=9, color=colour, alpha=0.8)
-    _limits(elites, upper[0], upper[1])
-    elites.scatter(first[0], first[1], **_STAR)
-    elites.set(xlabel="dx (cm)", ylabel="dy (cm)", aspect="equal")
+        tried = one.elites[:, 0].double().numpy() * factor
+        elites.scatter(tried[:, across], tried[:, up], s=9, color=colour, alpha=0.8)
+        heights.scatter(np.full(len(tried), number), tried[:, third], s=9, color=colour, alpha=0.8)
+    _limits(elites, upper[across], upper[up])
+    elites.scatter(first[across], first[up], **_STAR)
+    elites.set(xlabel=_label(answer, across), ylabel=_label(answer, up), aspect="equal")
     elites.set_title("Best of each iteration,\nfirst action (dark: last)", loc="left", fontsize=9)
-    heights.axhspan(-upper[2], upper[2], color=_GREY, alpha=0.12, linewidth=0)
-    heights.scatter(len(plan.iterations) + 1, first[2], **_STAR)
-    heights.set(xlabel="iteration (star: chosen)", ylabel="dz (cm)")
-    heights.set_title("Their height", loc="left", fontsize=9)
+    heights.axhspan(-upper[third], upper[third], color=_GREY, alpha=0.12, linewidth=0)
+    heights.scatter(len(plan.iterations) + 1, first[third], **_STAR)
+    heights.set(xlabel="iteration (star: chosen)", ylabel=_label(answer, third))
+    heights.set_title("Their height" if answer.state_space.is_pose else "Another number", loc="left", fontsize=9)
     _energies(energies, answer, plan)
     _path(path, answer)
+
+
+def _three(answer: PlanResult) -> tuple[int, int, int]:
+    """Return the numbers of an action that are shown; one again where there are fewer."""
+    shown = answer.shown_axes
+    return shown[0], shown[min(1, len(shown) - 1)], shown[-1]
+
+
+def _label(answer: PlanResult, axis: int) -> str:
+    name = answer.state_space.change_names[axis]
+    return f"{name} (cm)" if answer.state_space.is_pose else name
+
+
+def _factor(answer: PlanResult) -> float:
+    return answer.state_space.shown_factor if answer.state_space.is_pose else 1.0
 
 
 def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
@@ -107,14 +124,21 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
 
 
 def _path(axes: Any, answer: PlanResult) -> None:
-    way = (answer.states[:, :3] - answer.states[0, :3]) * _CM
-    axes.plot(way[:, 0], way[:, 1], "o-", color=_RED, markersize=4, label="x, y (from above)")
-    axes.plot(way[:, 0], way[:, 2], "s:", color=_BLUE, markersize=4, label="x, z (from the side)")
-    axes.plot(0, 0, "o", color="black", markersize=6, zorder=6)
-    reach = 1.2 * max(float(np.abs(way).max()), 1.0)
-    axes.set(xlabel="x from here (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+    space = answer.state_space
+    way = (answer.states - answer.states[0]) * _factor(answer)
+    if not space.is_pose:
+        for number in answer.space.free[:_MOST_NUMBERS].tolist():
+            axes.plot(way[:, number], "o-", markersize=4, label=space.names[number])
+        axes.set(xlabel="model step", ylabel="change from now")
+        axes.set_title("Planned states", loc="left", fontsize=9)
+    else:
+        axes.plot(way[:, 0], way[:, 1], "o-", color=_RED, markersize=4, label="x, y (from above)")
+        axes.plot(way[:, 0], way[:, 2], "s:", color=_BLUE, markersize=4, label="x, z (from the side)")
+        axes.plot(0, 0, "o", color="black", markersize=6, zorder=6)
+        reach = 1.2 * max(float(np.abs(way[:, space.position]).max()), 1.0)
+        axes.set(xlabel="x from here (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+        axes.set_title("Planned path of the flange,\nrobot base frame", loc="left", fontsize=9)
     axes.legend(frameon=False, fontsize=7.5)
-    axes.set_title("Planned path of the flange,\nrobot base frame", loc="left", fontsize=9)
 
 
 def _slices(part: Any, answer: PlanResult) -> None:
@@ -128,14 +152,15 @@ def _slices(part: Any, answer: PlanResult) -> None:
 
 def _slice(axes: Any, one: EnergySlice, answer: PlanResult, lowest: float, highest: float) -> Any:
     first, second = one.axes
-    across, up = one.across * _CM, one.up * _CM
+    factor = _factor(answer)
+    across, up = one.across * factor, one.up * factor
     image = axes.pcolormesh(across, up, one.energy, shading="nearest", cmap="viridis", vmin=lowest, vmax=highest)
-    upper = answer.space.upper[0].double().numpy() * _CM
+    upper = answer.space.upper[0].double().numpy() * factor
     _limits(axes, upper[first], upper[second])
     axes.plot(0, 0, "+", color="white", markersize=9)
-    axes.scatter(answer.actions[0, first] * _CM, answer.actions[0, second] * _CM, **_STAR)
-    axes.set(xlabel=f"{AXES[first]} (cm)", ylabel=f"{AXES[second]} (cm)", aspect="equal")
-    title = "Energy around the first action\n(star; +: no motion; box: limits)" if one.axes == (0, 1) else "\n"
+    axes.scatter(answer.actions[0, first] * factor, answer.actions[0, second] * factor, **_STAR)
+    axes.set(xlabel=_label(answer, first), ylabel=_label(answer, second), aspect="equal")
+    title = "Energy around the first action\n(star; +: no motion; box: limits)" if one is answer.slices[0] else "\n"
     axes.set_title(title, loc="left", fontsize=9)
     return image
 

@@ -160,7 +160,7 @@ def _compared_table(evaluation: Evaluation, one: ModelResult, base: ModelResult)
 def _strata_table(evaluation: Evaluation, kind: str, strata: Sequence[Stratum]) -> Markup:
     shown = models_of(evaluation)
     base = evaluation.base_errors
-    what = kind if kind == "motion" or evaluation.about.is_pose else "norm of the action"
+    what = kind if kind == "motion" or evaluation.about.space.position is not None else "norm of the action"
     rows = []
     for stratum in strata:
         cells = [value(stratum_over_persistence(one.model.errors, stratum)) for one in shown]

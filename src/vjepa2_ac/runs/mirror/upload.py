@@ -16,12 +16,12 @@ from pathlib import Path
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import checkpoint_name, find_damage, listed, step_of, written_state
-from vjepa2_ac.runs.folder import CALIBRATION, CHECKPOINTS, CONFIG, ENVIRONMENT, HELD, METRICS, RUN_ID
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, CHECKPOINTS, CONFIG, ENVIRONMENT, HELD, METRICS, RUN_ID
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.storage import join, read_bounded, upload
 from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown
 
-SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, RUN_ID, METRICS)
+SMALL_FILES = (CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS)
 
 GoOn = Callable[[], None]
 """Called before each file; raises to break off."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vjepa2_ac import __version__
+from vjepa2_ac.config import RldsData
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_writer import video_library
 from vjepa2_ac.planning.session import PlanningSession
@@ -28,6 +29,7 @@ from vjepa2_ac.storage import user_can_write, write_atomically
 from vjepa2_ac.storage.structured import utc_now
 
 FILE, FILM = "closed_loop.json", "closed_loop.mp4"
+JOINT_FIELDS = ("steps/observation/joint_position", "steps/observation/gripper_position")
 FORMAT = 1  # incremented when a reader of the file would have to change
 
 
@@ -90,6 +92,7 @@ def run_benchmark(
             found="a model of states in another frame",
             needed="base: the simulated arm is steered in the frame of its base",
         )
+    _require_measured(steering)
     if asked.films:
         video_library()
     with user_can_write(folder):
@@ -109,6 +112,17 @@ def run_benchmark(
         tuple(results),
     )
     return contest, _written(contest, folder)
+
+
+def _require_measured(steering: PlanningSession) -> None:
+    """Refuse a model of vectors that are not what the simulated arm measures."""
+    data = steering.config.data
+    if data.states == "vector" and not (isinstance(data, RldsData) and data.fields.state == JOINT_FIELDS):
+        raise InputError(
+            where="data.states: vector",
+            found="a model of other numbers than the simulated arm measures",
+            needed=f"poses; or seven joint angles and the gripper: data.fields.state: [{', '.join(JOINT_FIELDS)}]",
+        )
 
 
 def benchmark_as_dict(contest: ClosedLoopBenchmark) -> dict[str, Any]:

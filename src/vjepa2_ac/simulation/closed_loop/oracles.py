@@ -7,7 +7,7 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.episode import ACTION_DIM
-from vjepa2_ac.simulation.closed_loop.policies import Oracle, Policy, shortened
+from vjepa2_ac.simulation.closed_loop.policies import Moves, Oracle, Policy, shortened
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, TaskName, TaskProblem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 
@@ -25,7 +25,7 @@ class _Scripted:
         arm: The arm whose block is observed.
     """
 
-    name, why = "oracle", "scripted"
+    name, why, moves = "oracle", "scripted", Moves.FLANGE
 
     def __init__(self, limits: LimitsConfig, arm: SimulatedArm) -> None:
         self._limits, self._arm = limits, arm

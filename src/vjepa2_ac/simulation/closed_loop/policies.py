@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -15,26 +16,34 @@ from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem
 _ALMOST = 1 - 1e-9  # of a limit: rounding must not exceed it
 
 
+class Moves(Enum):
+    """What a policy observes and changes: the flange's pose, or the joints; and the gripper."""
+
+    FLANGE = 7
+    JOINTS = 8
+
+
 @runtime_checkable
 class Policy(Protocol):
-    """Chooses the action of the next model step (legend of actions: episode.py)."""
+    """Chooses the action of the next model step (legend of actions: episode.py; of joints, radians and closedness)."""
 
     name: str
     why: str  # reason of the last action, short enough to be counted
+    moves: Moves  # what its states and actions are: poses of the flange, or joint angles and gripper
 
     def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:
         """Begin an episode. Only an oracle uses more of the problem than the images."""
 
     def act(
-        self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
-    ) -> Float[np.ndarray, " 7"]:
+        self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " dim"]
+    ) -> Float[np.ndarray, " dim"]:
         """Return the action of the next model step from the camera image and the measured state, in base frame."""
 
 
 class DoNothing:
     """Does not move the arm."""
 
-    name, why = "do nothing", "nothing"
+    name, why, moves = "do nothing", "nothing", Moves.FLANGE
 
     def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:
         """Do nothing."""
@@ -56,7 +65,7 @@ class RandomActions:
         seed: Of the actions, with the problem's number.
     """
 
-    name, why = "random", "random"
+    name, why, moves = "random", "random", Moves.FLANGE
 
     def __init__(self, limits: LimitsConfig, seed: int = 0) -> None:
         self._limits, self._seed = limits, seed
@@ -82,7 +91,7 @@ class Oracle:
         limits: The allowed actions.
     """
 
-    name, why = "oracle", "scripted"
+    name, why, moves = "oracle", "scripted", Moves.FLANGE
 
     def __init__(self, limits: LimitsConfig) -> None:
         self._limits = limits
@@ -119,18 +128,19 @@ class Planning:
 
     def __init__(self, controller: Controller, name: str = "model") -> None:
         self.controller, self.name, self.why = controller, name, ""
+        self.moves = Moves.FLANGE if controller.spaces.state.position is not None else Moves.JOINTS
 
     def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
         """Give the planner the goal image."""
         self.controller.reset(goal_image)
 
     def act(
-        self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " 7"]
-    ) -> Float[np.ndarray, " 7"]:
-        """Return the first action of a plan."""
+        self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " dim"]
+    ) -> Float[np.ndarray, " dim"]:
+        """Return the first action of a plan; for joints as a change, whatever the model was taught."""
         action = self.controller.act(image, state)
         self.why = self.controller.decision.why if self.controller.decision else ""
-        return action
+        return action - state if self.controller.spaces.action.follows == "target" else action
 
 
 def farthest(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:

@@ -18,7 +18,7 @@ class EpisodeResult:
 
     problem: TaskProblem
     states: Float[np.ndarray, "time 7"]  # measured, in the robot base frame
-    actions: Float[np.ndarray, "steps 7"]  # as returned by the policy
+    actions: Float[np.ndarray, "steps dim"]  # as returned by the policy
     blocks: Float[np.ndarray, "time 4"] | None  # pose of the block, as in `TaskProblem`; None: there is none
     distances_m: Float[np.ndarray, " time"]  # of what the task moves, to its goal
     seconds: Float[np.ndarray, " steps"]  # taken by the policy

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.episode import ACTION_DIM, Progress, no_progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.simulation.closed_loop.policies import Policy
+from vjepa2_ac.simulation.closed_loop.policies import Moves, Policy
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult, EpisodeResult
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, named_domain
-from vjepa2_ac.simulation.world.kinematics import OutOfReachError
+from vjepa2_ac.simulation.world.kinematics import HIGH, LOW, OutOfReachError
 from vjepa2_ac.simulation.world.motion import rest_joints
 
 _PARTS = 8  # of a displacement that cannot be completed
@@ -101,11 +101,12 @@ def run_episode(
     actions, seconds, whys, unreachable = [], [], [], 0
     for _ in range(steps):
         began = time.perf_counter()
-        action = np.asarray(policy.act(frames[-1], states[-1]), dtype=np.float64)
+        measured = states[-1] if policy.moves == Moves.FLANGE else arm.joint_state
+        action = np.asarray(policy.act(frames[-1], measured), dtype=np.float64)
         seconds.append(time.perf_counter() - began)
         actions.append(_checked(action, policy))
         whys.append(policy.why)
-        unreachable += not _send(arm, action, stride)
+        unreachable += not (_send if policy.moves == Moves.FLANGE else _send_joints)(arm, action, stride)
         states.append(arm.state)
         blocks.append(arm.block)
         frames.append(arm.image())
@@ -140,10 +141,18 @@ def ways_along(
     return list(apply_action(np.tile(state, (parts, 1)), shares * action))
 
 
-def _checked(action: Float[np.ndarray, " dim"], policy: Policy) -> Float[np.ndarray, " 7"]:
-    if action.shape != (ACTION_DIM,) or not np.isfinite(action).all():
-        raise ValueError(f"{policy.name}: {action.tolist()} is no action of {ACTION_DIM} finite numbers")
+def _checked(action: Float[np.ndarray, " dim"], policy: Policy) -> Float[np.ndarray, " dim"]:
+    if action.shape != (policy.moves.value,) or not np.isfinite(action).all():
+        raise ValueError(f"{policy.name}: {action.tolist()} is no action of {policy.moves.value} finite numbers")
     return action
+
+
+def _send_joints(arm: SimulatedArm, action: Float[np.ndarray, " 8"], stride: int) -> bool:
+    """Command the joints after an action, within their limits; return whether it was within them."""
+    wanted = arm.joints + action[:-1]
+    reachable = np.clip(wanted, LOW, HIGH)
+    arm.command_joints(reachable, float(np.clip(arm.closedness + action[-1], 0.0, 1.0)), stride)
+    return bool(np.array_equal(wanted, reachable))
 
 
 def _send(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int) -> bool:

@@ -32,10 +32,10 @@ from vjepa2_ac.data.sources.droid_raw.episode_folders import (
 from vjepa2_ac.data.sources.droid_raw.metadata import DroidMetadata
 from vjepa2_ac.data.sources.droid_raw.trajectory import Trajectory, parse_trajectory
 from vjepa2_ac.data.sources.listing import in_parallel
-from vjepa2_ac.data.sources.validation import require_plausible
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import count_frames, read_frames
+from vjepa2_ac.spaces import POSE
 from vjepa2_ac.storage.structured import json_object
 
 logger = logging.getLogger(__name__)
@@ -228,7 +228,7 @@ class RawDroidSource:
             raise InputError(where=path, found="no poses of the camera", needed=needed, fix="Set data.pose_frame: base")
         if self._config.droid_raw.skip_action == "drop":
             trajectory = trajectory.at(np.flatnonzero(~trajectory.skipped))
-        require_plausible(trajectory.states, path, fix=_FIX)
+        POSE.require_plausible(trajectory.states, path, fix=_FIX)
         return trajectory
 
     def _path(self, place: _Place | str, name: str) -> str:

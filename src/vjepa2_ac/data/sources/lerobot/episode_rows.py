@@ -53,8 +53,8 @@ def content_of(rows: Columns, length: int, info: DatasetInfo, config: LeRobotDat
     _require_rows(rows, length, info.fps, where)
     fields = config.lerobot
     columns = [_column(rows, name, info, where) for name in fields.state]
-    is_pose = config.states == "pose"
-    states = states_of(columns, fields, where) if is_pose else vectors_of(columns, fields.select, where)
+    poses = config.states == "pose"
+    states = states_of(columns, fields, where) if poses else vectors_of(columns, fields.select, where)
     commands = None
     if config.actions == "recorded":
         commands = vectors_of([_column(rows, name, info, where) for name in fields.action], None, where)

@@ -17,9 +17,9 @@ from vjepa2_ac.data.index.state_hash import hash_of_states
 from vjepa2_ac.data.sources.lerobot.episode_list import EpisodeRow, VideoPlace, data_file, video_file
 from vjepa2_ac.data.sources.lerobot.episode_rows import EpisodeContent
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo
-from vjepa2_ac.data.sources.validation import zero_steps
 from vjepa2_ac.episode import EpisodeInfo, Progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import zero_steps
 
 Check = Callable[[EpisodeRow], EpisodeContent]  # reads an episode's rows
 

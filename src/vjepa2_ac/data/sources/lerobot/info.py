@@ -72,7 +72,7 @@ class DatasetInfo:
             for name in names:
                 if name not in columns:
                     raise missing(f"data.lerobot.{knob}", "column", name, self.where, columns)
-        _require_state(self, fields, is_pose=config.states == "pose")
+        _require_state(self, config)
         for camera in config.cameras:
             self.camera_key(fields, camera)
 
@@ -173,7 +173,8 @@ def _require_version(where: str, version: object) -> None:
     )
 
 
-def _require_state(info: DatasetInfo, fields: LeRobotFields, *, is_pose: bool) -> None:
+def _require_state(info: DatasetInfo, config: LeRobotData) -> None:
+    fields = config.lerobot
     described = " + ".join(_described(name, info.features[name]) for name in fields.state)
     where = "data.lerobot.select" if fields.select is not None else "data.lerobot.state"
     joined = sum(info.features[name].width for name in fields.state)
@@ -182,7 +183,7 @@ def _require_state(info: DatasetInfo, fields: LeRobotFields, *, is_pose: bool) -
             where=where, found=f"{beyond[0]}, of {joined} numbers in {described}", needed=f"0 to {joined - 1}"
         )
     width, needed = len(fields.select or range(joined)), _STATE_NUMBERS[fields.rotation]
-    if is_pose and width != needed:
+    if config.states == "pose" and width != needed:
         rotation = "3 Euler angles" if needed == STATE_WITH_EULER else "a quaternion's 4"
         raise InputError(
             where=where,

@@ -9,8 +9,8 @@ from jaxtyping import Float, Shaped
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.config import LeRobotFields
-from vjepa2_ac.data.sources.validation import require_finite, require_plausible
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import POSE, require_finite
 
 _UNIT_TOLERANCE = 1e-2
 _FIX = "Check data.lerobot: state, select, rotation, gripper_open and gripper_closed"
@@ -29,8 +29,8 @@ def states_of(
         joined = joined[:, fields.select]
     require_finite(joined, where, fix=_FIX)
     gripper = (joined[:, -1:] - fields.gripper_open) / (fields.gripper_closed - fields.gripper_open)
-    states = np.concatenate([joined[:, :3], _euler(joined[:, 3:-1], fields, where), gripper], axis=1)
-    require_plausible(states, where, fix=_FIX)
+    states = np.concatenate([joined[:, POSE.position], _euler(joined[:, 3:-1], fields, where), gripper], axis=1)
+    POSE.require_plausible(states, where, fix=_FIX)
     return states
 
 

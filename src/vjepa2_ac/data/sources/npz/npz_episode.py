@@ -37,7 +37,7 @@ from jaxtyping import Float, Float64
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
-from vjepa2_ac.data.sources.validation import require_finite, require_plausible
+from vjepa2_ac.data.sources.configured_spaces import measured_space
 from vjepa2_ac.episode import EXTRINSICS_DIM, STATE_DIM
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_size import require_bounded
@@ -82,10 +82,9 @@ def read_episode(opened: str | BlockCachedFile, path: str, cameras: Sequence[str
     """
     with opened_npz(opened, path) as file:
         arrays = _Arrays(file, path)
-        is_pose = config.states == "pose"
-        states = arrays.numbers("states", (None, STATE_DIM if is_pose else None))
+        states = arrays.numbers("states", (None, STATE_DIM if config.states == "pose" else None))
         steps = len(states)
-        (require_plausible if is_pose else require_finite)(states, path, fix=FORMAT_HELP)
+        measured_space(config, states.shape[1]).require_plausible(states, path, fix=FORMAT_HELP)
         extrinsics = {}
         for camera in cameras:
             require_frames(file, camera, steps, path)

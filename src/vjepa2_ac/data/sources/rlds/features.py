@@ -7,9 +7,9 @@ from jaxtyping import Float
 
 from vjepa2_ac.config import RldsData, RldsFields
 from vjepa2_ac.data.sources.rlds.example import ExampleRecord
-from vjepa2_ac.data.sources.validation import require_finite, require_plausible, zero_steps
 from vjepa2_ac.episode import STATE_DIM, EpisodeInfo
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import POSE, require_finite, zero_steps
 
 IDENTITY_SEPARATOR = "--"  # as in the published lists of DROID's idle ranges
 STEP_FLAG = "steps/is_first"
@@ -71,9 +71,9 @@ def states_of(record: ExampleRecord, config: RldsData, steps: int, where: str) -
         raise InputError(
             where=f"{where}: data.fields.state", found=found, needed=f"{STATE_DIM} numbers a step: xyz, Euler, gripper"
         )
-    require_plausible(states, where, fix="Check data.fields.state")
+    POSE.require_plausible(states, where, fix="Check data.fields.state")
     if fields.gripper == "openness":
-        states[:, 6] = 1.0 - states[:, 6]
+        states[:, POSE.gripper] = 1.0 - states[:, POSE.gripper]
     return states
 
 

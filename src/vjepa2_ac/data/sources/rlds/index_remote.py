@@ -40,9 +40,9 @@ from vjepa2_ac.data.sources.rlds.wire_format import (
     features_behind,
     iterate_features,
 )
-from vjepa2_ac.data.sources.validation import zero_steps
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import zero_steps
 
 logger = logging.getLogger(__name__)
 

@@ -10,12 +10,12 @@ from pydantic import ValidationError
 
 from solver_problems import space
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.planning.action_space import ActionSpace, Ball, pose_space
+from vjepa2_ac.planning.search_space import Ball, SearchSpace, pose_space
 
 LIMITS = (0.05, 0.03, 0.07, 0.2, 0.2, 0.2, 0.75)
 
 
-def pose(horizon: int = 1, action_repeat: int = 1, **limits: object) -> ActionSpace:
+def pose(horizon: int = 1, action_repeat: int = 1, **limits: object) -> SearchSpace:
     given = {"xyz": LIMITS[:3], "rotation": 0.2} | limits
     return pose_space(
         PlanningConfig(horizon=horizon, action_repeat=action_repeat, limits=LimitsConfig(**given))  # type: ignore[arg-type]
@@ -74,7 +74,7 @@ def test_the_gripper_closes_from_the_step_that_was_asked_for() -> None:
 
 
 def test_an_action_is_repeated_for_consecutive_steps() -> None:
-    where = ActionSpace(-torch.ones(2, 1), torch.ones(2, 1), torch.ones(2, 1), repeat=3)
+    where = SearchSpace(-torch.ones(2, 1), torch.ones(2, 1), torch.ones(2, 1), repeat=3)
     assert where.over_steps(torch.tensor([[[1.0], [2.0]]])).flatten().tolist() == [1, 1, 1, 2, 2, 2]
     assert where.steps == 6
 
@@ -85,7 +85,7 @@ def test_an_action_is_repeated_for_consecutive_steps() -> None:
 def test_impossible_limits_are_refused(lower: float, upper: float, ball: str | None) -> None:
     ones = torch.ones(1, 3)
     with pytest.raises(ValueError, match="limits"):
-        ActionSpace(ones * lower, ones * upper, ones, ball=None if ball is None else Ball("l2", 1.0))
+        SearchSpace(ones * lower, ones * upper, ones, ball=None if ball is None else Ball("l2", 1.0))
 
 
 @pytest.mark.parametrize(

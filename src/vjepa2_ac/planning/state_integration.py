@@ -1,6 +1,7 @@
-"""Pose integration: poses after a sequence of actions, batched, on any device, and differentiable.
+"""State integration: states after a sequence of changes, batched, on any device, and differentiable.
 
-The same as `geometry.apply_action` (NumPy, SciPy), except that the gripper is limited to between open and closed.
+Of poses the same as `geometry.apply_action` (NumPy, SciPy), except that the gripper is limited to between open and
+closed. Vectors add.
 """
 
 from __future__ import annotations
@@ -9,29 +10,38 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vjepa2_ac.spaces import POSE, StateSpace
+
 _LOCKED = 1e-6  # cos(pitch) below which only roll - yaw or roll + yaw is determined
 
 
-def apply_actions(states: Float[Tensor, "*batch 7"], actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
-    """Return the states after actions: xyz and gripper add, R' = R_delta @ R, the gripper is clipped to 0 .. 1.
+def apply_actions(
+    states: Float[Tensor, "*batch dim"], actions: Float[Tensor, "*batch dim"], space: StateSpace = POSE
+) -> Float[Tensor, "*batch dim"]:
+    """Return the states after changes: numbers add, rotations R' = R_delta @ R, a gripper is clipped to 0 .. 1.
 
     Autocast is disabled here: bfloat16 has too few digits for rotations.
 
     Source: facebookresearch/vjepa2 @ c2963a4, notebooks/utils/mpc_utils.py, compute_new_pose.
     """
-    with torch.autocast(states.device.type, enabled=False):
-        rotation = matrices_from_euler(actions[..., 3:6]) @ matrices_from_euler(states[..., 3:6])
-    gripper = (states[..., 6:] + actions[..., 6:]).clamp(0.0, 1.0)
-    return torch.cat([states[..., :3] + actions[..., :3], euler_from_matrices(rotation), gripper], dim=-1)
+    after = list((states + actions).unbind(dim=-1))
+    if space.rotation is not None:
+        with torch.autocast(states.device.type, enabled=False):
+            turn, now = (matrices_from_euler(one[..., space.rotation]) for one in (actions, states))
+            rotation = turn @ now
+        after[space.rotation] = euler_from_matrices(rotation).unbind(dim=-1)
+    if space.gripper is not None:
+        after[space.gripper] = after[space.gripper].clamp(0.0, 1.0)
+    return torch.stack(after, dim=-1)
 
 
 def states_along(
-    state: Float[Tensor, " 7"], actions: Float[Tensor, "samples steps 7"]
-) -> Float[Tensor, "samples steps+1 7"]:
-    """Return the states before and after every action, starting from one state."""
-    states = [state.expand(len(actions), -1)]
-    for step in range(actions.shape[1]):
-        states.append(apply_actions(states[-1], actions[:, step]))
+    state: Float[Tensor, " dim"], changes: Float[Tensor, "samples steps dim"], space: StateSpace = POSE
+) -> Float[Tensor, "samples steps+1 dim"]:
+    """Return the states before and after every change, starting from one state."""
+    states = [state.expand(len(changes), -1)]
+    for step in range(changes.shape[1]):
+        states.append(apply_actions(states[-1], changes[:, step], space))
     return torch.stack(states, dim=1)
 
 

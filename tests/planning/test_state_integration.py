@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from paths import GOLDEN
 from synthetic import synthetic_states
 from vjepa2_ac.geometry import actions_from_states, apply_action
-from vjepa2_ac.planning.pose_integration import apply_actions, euler_from_matrices, matrices_from_euler, states_along
+from vjepa2_ac.planning.state_integration import apply_actions, euler_from_matrices, matrices_from_euler, states_along
 
 
 def assert_same_poses(found: torch.Tensor, expected: np.ndarray, tolerance: float) -> None:

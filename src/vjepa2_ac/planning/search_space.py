@@ -10,9 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
-from vjepa2_ac.episode import ACTION_DIM
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import StateSpace
 
-GRIPPER = 6
+GRIPPER = 6  # of a pose
 _ROUNDING = 4 * torch.finfo(torch.float32).eps  # a norm is rounded more than once
 
 
@@ -26,7 +27,7 @@ class Ball:
 
 
 @dataclass(frozen=True)
-class ActionSpace:
+class SearchSpace:
     """Limits of each component of each decision; where both limits are equal, it is fixed.
 
     Raises:
@@ -103,7 +104,7 @@ class ActionSpace:
         return decisions.repeat_interleave(self.repeat, dim=-2)
 
 
-def pose_space(config: PlanningConfig) -> ActionSpace:
+def pose_space(config: PlanningConfig) -> SearchSpace:
     """Return the allowed actions of an arm: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`)."""
     limits, decisions = config.limits, config.horizon // config.action_repeat
     gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
@@ -115,7 +116,7 @@ def pose_space(config: PlanningConfig) -> ActionSpace:
         lower[first:, GRIPPER] = upper[first:, GRIPPER] = 1.0 if limits.gripper_mode == "close" else -1.0
     std = config.start_std * reach
     std[GRIPPER] = config.gripper_start_std
-    return ActionSpace(
+    return SearchSpace(
         lower=lower,
         upper=upper,
         std=std.repeat(decisions, 1),
@@ -126,14 +127,35 @@ def pose_space(config: PlanningConfig) -> ActionSpace:
     )
 
 
+def search_space(config: PlanningConfig, space: StateSpace) -> SearchSpace:
+    """Return the allowed changes of a state: of a pose within the limits of an arm, of a vector within `limits.axes`.
+
+    Raises:
+        InputError: There are no limits for vectors, or not one for each number.
+    """
+    return pose_space(config) if space.is_pose else vector_space(config, len(space))
+
+
+def vector_space(config: PlanningConfig, width: int) -> SearchSpace:
+    """Return the allowed changes of a vector: each number by `limits.axes` at most, up and down."""
+    limits, decisions = config.limits.axes, config.horizon // config.action_repeat
+    if not isinstance(limits, tuple) or len(limits) not in {1, width}:
+        raise InputError(
+            where="planning.limits.axes",
+            found="data, of a model that does not say what it was taught" if limits == "data" else f"{limits}",
+            needed=f"the largest change of each of the {width} numbers in a model step; or one number for all",
+            fix="Such as planning.limits.axes=[0.05]; a run keeps what it was taught, and then data means that",
+        )
+    upper = _towards_zero(list(limits) * (width // len(limits))).repeat(decisions, 1)
+    return SearchSpace(lower=-upper, upper=upper, std=config.start_std * upper, repeat=config.action_repeat)
+
+
 def _rounding(limits: LimitsConfig) -> float:
     return 0.0 if limits.gripper_mode == "free" else limits.gripper_rounding
 
 
 def _towards_zero(values: list[float]) -> Float[Tensor, " dim"]:
     """Return values in float32, rounded towards smaller ones: float32's 0.05 is above 0.05."""
-    if len(values) != ACTION_DIM:
-        raise ValueError(f"{len(values)} limits for an action of {ACTION_DIM} numbers")
     exact = torch.tensor(values, dtype=torch.float64)
     nearest = exact.float()
     return torch.where(nearest.double() > exact, torch.nextafter(nearest, torch.zeros_like(nearest)), nearest)

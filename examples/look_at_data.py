@@ -1,0 +1,47 @@
+"""Look at a data set: what is in it, what a clip holds, and a contact sheet to look at.
+
+    python examples/look_at_data.py [DATA]
+
+Without DATA, a folder of DROID's RLDS form, a few episodes of the simulated arm are recorded first.
+"""
+
+import sys
+from pathlib import Path
+
+from vjepa2_ac import UserError, open_dataset, read_clips
+from vjepa2_ac.data.inspection.statistics import inspect_dataset
+from vjepa2_ac.reports.figures.dataset import plot_dataset
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+
+RECORDED, SHEET = Path("demo/examples/data"), Path("demo/examples/contact_sheet.png")
+
+
+def main(data: str | None = None) -> None:
+    """Print what is in a data set, and draw it."""
+    if data is None and not RECORDED.exists():
+        print("Recording 12 episodes of the simulated arm ...")
+        record_dataset(RECORDED, RecordingSpec("B", steps=33, seed=4), episodes=12)
+    dataset = open_dataset(data or RECORDED, frames=4, stride=4, validation_share=0.2, test_share=0.3)
+    print(f"{len(dataset.table)} episodes, {len(dataset.windows('train'))} training clips")
+
+    batch = next(read_clips(dataset, "train", clips=4))
+    if batch.frames is not None:  # as in a latent cache
+        print(f"frames   {tuple(batch.frames.shape)}: clips, time, height, width, RGB")
+    print(f"states   {tuple(batch.states.shape)}: x, y, z (m), roll, pitch, yaw (rad), gripper (0 open, 1 closed)")
+    print(f"actions  {tuple(batch.actions.shape)}: the change from each state to the next")
+    for clip, start in enumerate(batch.starts):
+        steps = ", ".join(f"{100 * float(action[:3].norm()):.1f}" for action in batch.actions[clip])
+        print(f"  clip {clip}, from control step {start}: the hand moves by {steps} cm")
+
+    inspection = inspect_dataset(dataset)
+    SHEET.parent.mkdir(parents=True, exist_ok=True)
+    x, y, z = (inspection.range_of(axis) for axis in range(3))
+    print(f"The hand was at x {x[0]:.2f} to {x[1]:.2f}, y {y[0]:.2f} to {y[1]:.2f}, z {z[0]:.2f} to {z[1]:.2f} m.")
+    print(f"Look at {plot_dataset(dataset, inspection, SHEET, rows=4)}")
+
+
+if __name__ == "__main__":
+    try:
+        main(*sys.argv[1:2])
+    except UserError as error:
+        sys.exit(f"error: {error}")

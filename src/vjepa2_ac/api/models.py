@@ -1,0 +1,126 @@
+"""Models by name: a base, an adapter on it, or the model of a trained run; on its device, ready to predict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from vjepa2_ac import places
+from vjepa2_ac.config import ModelConfig, ModelSizes
+from vjepa2_ac.distributed.device import has_bf16, require_type_of_weights
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE
+from vjepa2_ac.model.adapter.lora import load_trained
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.runs import loading
+from vjepa2_ac.runs.folder import is_run
+
+Device = str | torch.device
+WeightType = Literal["auto", "float32", "bfloat16"]
+
+_AUTO = "auto"
+_TYPES = ("float32", "bfloat16")
+
+
+def load_model(
+    name: str | Path,
+    *,
+    adapter: str | Path | None = None,
+    device: Device = _AUTO,
+    dtype: WeightType = "auto",
+    sizes: ModelSizes | None = None,
+) -> WorldModel:
+    """Load a world model, in eval mode; no weight requires a gradient.
+
+    Args:
+        name: What `model.base` takes: the official `.pt`, a folder from `vjepa2-ac export`, or `builtin:sim-tiny`.
+        adapter: A folder from `vjepa2-ac export --to hub`, whose adapter is put on this model.
+        device: Such as cpu or cuda:1; auto: CUDA where there is one.
+        dtype: Type of the weights; auto: bfloat16 on a GPU that computes in it, else float32. Trained weights of an
+            adapter are float32, and so are latents.
+        sizes: Of an official `.pt`, whose file has no image size and heads; None: the released ones.
+
+    Raises:
+        InputError: There is no such model, adapter or device, it cannot be read, or the adapter is of another base.
+
+    Example:
+        >>> model = load_model("builtin:sim-tiny")
+        >>> model.image_size, model.num_tokens, model.latent_dim  # pixels, tokens of a frame, width of a token
+        (96, 36, 128)
+    """
+    place = _device(device)
+    config = _config(_name(name), dtype, sizes or ModelSizes(), place)
+    model = load_base(config, seed=0)
+    if adapter is not None:
+        load_trained(model, adapter, trainable=False)
+    return model.to(place).eval()
+
+
+def load_run(folder: str | Path, checkpoint: str | int = "newest", *, device: Device = _AUTO) -> loading.TrainedRun:
+    """Load the model of a trained run, in eval mode: its base with the adapter of a complete checkpoint.
+
+    Args:
+        folder: The run, as `train` returns it.
+        checkpoint: newest, best (by validation), or a number of optimizer steps.
+        device: As of `load_model`. The type of the base's weights is the run's `model.dtype`.
+
+    Returns:
+        `world_model`, with the adapter beside its base; `config` of the run; `checkpoint`, the folder it is from.
+
+    Raises:
+        InputError: Not a run, no such checkpoint or device, or its base cannot be loaded.
+
+    Example:
+        >>> run = load_run("runs/droid-lora", "best")
+        >>> controller = Controller.of_run(run)
+    """
+    place, folder = _device(device), Path(folder)
+    if not is_run(str(folder)) and (folder / ADAPTER_FILE).is_file():
+        raise InputError(
+            where=str(folder),
+            found="an adapter without its run",
+            needed="the folder of a run",
+            fix="Name its base, too: load_model(BASE, adapter=FOLDER)",
+        )
+    run = loading.load_run(folder, str(checkpoint))
+    run.world_model.to(place).eval()
+    return run
+
+
+def _name(name: str | Path) -> str:
+    try:
+        return places.of_a_model(str(name))
+    except ValueError as error:
+        raise InputError(
+            where="load_model", found=f"{str(name)!r} {error}", needed="a model: a .pt, a folder or builtin:sim-tiny"
+        ) from None
+
+
+def _config(name: str, dtype: str, sizes: ModelSizes, device: torch.device) -> ModelConfig:
+    if dtype == _AUTO:
+        dtype = "bfloat16" if device.type == "cuda" and has_bf16() else "float32"
+    if dtype not in _TYPES:
+        raise InputError(where="load_model", found=f"dtype {dtype!r}", needed=", ".join([_AUTO, *_TYPES]))
+    config = ModelConfig.model_validate({"base": name, "dtype": dtype, "sizes": sizes})
+    require_type_of_weights(config, device)
+    return config
+
+
+def _device(device: Device) -> torch.device:
+    has_cuda = torch.cuda.is_available()
+    if device == _AUTO:
+        return torch.device("cuda" if has_cuda else "cpu")
+    try:
+        found = torch.device(device)
+    except (RuntimeError, TypeError):
+        raise InputError(where="device", found=repr(device), needed="auto, cpu, cuda, or one such as cuda:1") from None
+    if found.type == "cuda" and not has_cuda:
+        raise InputError(
+            where="device",
+            found=f"{device}, but this PyTorch sees no CUDA device",
+            fix="Take device='cpu', or install a CUDA build of PyTorch and a driver",
+        )
+    return found

@@ -1,0 +1,195 @@
+"""State and action spaces: what the numbers of a robot are, which of them are plausible, and how states change.
+
+A pose has a position, a rotation and a gripper (legend: `vjepa2_ac.episode`). Of a vector only the width is known: a
+robot's joints, two arms, a mobile base. Whoever needs a part asks for it: `space.position` is None where there is none.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from vjepa2_ac.episode import Widths
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
+
+REACH_M = 5.0  # larger positions are not in metres
+ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
+GRIPPER_SLACK = 0.1  # a measured closedness may exceed 0 .. 1 by this
+
+Follows = Literal["change", "target", "unknown"]
+
+
+@dataclass(frozen=True)
+class Space:
+    """The numbers of a state or an action, and which of them are position, rotation and gripper."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    position: slice | None = None  # metres
+    rotation: slice | None = None  # extrinsic xyz Euler angles
+    gripper: int | None = None  # closedness, 0 open .. 1 closed
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def is_pose(self) -> bool:
+        """Whether it has all parts of a pose in space: position, rotation and gripper."""
+        return self.gripper is not None and self.rotation is not None and self.position == slice(0, 3)
+
+    @property
+    def sized(self) -> slice:
+        """The numbers whose norm is the size of a motion: the position, or all."""
+        return slice(None) if self.position is None else self.position
+
+    @property
+    def shown_unit(self) -> str:
+        """The unit in which people read such sizes: cm, or none."""
+        return "" if self.position is None else "cm"
+
+    @property
+    def shown_factor(self) -> float:
+        """How many of that unit one is."""
+        return 1.0 if self.position is None else 100.0
+
+    def shown_size(self, numbers: Float[np.ndarray, "*batch dim"]) -> Float[np.ndarray, "*batch"]:
+        """Return the size of motions in the unit in which people read it."""
+        return np.asarray(np.linalg.norm(numbers[..., self.sized], axis=-1) * self.shown_factor)
+
+
+@dataclass(frozen=True)
+class StateSpace(Space):
+    """The numbers of a state."""
+
+    frame: Literal["base", "camera"] = "base"  # of poses
+
+    @property
+    def change_names(self) -> tuple[str, ...]:
+        """The names of the numbers' changes: dx, dy, ...; of a vector those of its numbers."""
+        return self.names if self.position is None else tuple(f"d{name}" for name in self.names)
+
+    def differences(self, states: Float[np.ndarray, "time dim"]) -> Float[np.ndarray, "time-1 dim"]:
+        """Return the change from each state to the next; of rotations R[t+1] @ R[t].T, as of poses.
+
+        Raises:
+            ValueError: Fewer than two states.
+        """
+        if len(states) < 2:
+            raise ValueError(f"a difference needs two states; got {len(states)}")
+        changes = np.diff(states, axis=0)
+        if self.rotation is not None:
+            rotations = matrices_from_euler(states[:, self.rotation])
+            changes[:, self.rotation] = euler_from_matrices(rotations[1:] @ rotations[:-1].swapaxes(-1, -2))
+        return changes
+
+    def require_plausible(self, states: Float[np.ndarray, "steps dim"], where: str, *, fix: str = "") -> None:
+        """Refuse states that no robot has: not finite; of poses, no metres, radians or closedness.
+
+        Args:
+            states: One for each control step.
+            where: File and episode, for messages.
+            fix: Which settings to check; empty: what the numbers look like.
+
+        Raises:
+            InputError: There are none; or names the first implausible one, and its numbers.
+        """
+        if len(states) == 0:
+            raise zero_steps(where)
+        for wrong, needed, looks in self._checks(states):
+            if wrong.any():
+                step = int(wrong.argmax())
+                raise InputError(
+                    where=f"{where}: step {step}" if len(states) > 1 else where,
+                    found=f"the numbers {np.array2string(states[step], precision=4, max_line_width=200)}",
+                    needed=needed,
+                    fix=fix or looks,
+                )
+
+    def _checks(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[np.ndarray, str, str]]:
+        """Return, for each rule: where it is broken, what is needed, and what the numbers look like."""
+        checks = [(~np.isfinite(states).all(axis=1), "finite numbers", "")]
+        if self.position is not None:
+            far = abs(states[:, self.position]).max(axis=1) > REACH_M
+            needed = f"a position within {REACH_M:g} m of the base, in metres"
+            checks.append((far, needed, "These look like millimetres: divide the position by 1000"))
+        if self.rotation is not None:
+            wild = abs(states[:, self.rotation]).max(axis=1) > ANGLE_RAD
+            checks.append((wild, "Euler angles in radians", "These look like degrees: multiply the angles by pi / 180"))
+        if self.gripper is not None:
+            closed = states[:, self.gripper]
+            beyond = (closed < -GRIPPER_SLACK) | (closed > 1 + GRIPPER_SLACK)
+            checks.append((beyond, "a gripper between 0 and 1", "Give 0 for open and 1 for closed"))
+        return checks
+
+
+@dataclass(frozen=True)
+class ActionSpace(Space):
+    """The numbers of an action, and how the next state follows from it."""
+
+    follows: Follows = "change"  # the state changes by it, becomes it, or nobody knows
+
+
+def zero_steps(where: str) -> InputError:
+    """Return the error of an episode without steps."""
+    return InputError(where=where, found="no steps", needed="one or more")
+
+
+_AXES = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
+_UNITS = ("m", "m", "m", "rad", "rad", "rad", "")
+POSE = StateSpace(_AXES, _UNITS, slice(0, 3), slice(3, 6), 6)
+CAMERA_POSE = StateSpace(_AXES, _UNITS, slice(0, 3), slice(3, 6), 6, "camera")
+EXTRINSICS = StateSpace(_AXES[:6], _UNITS[:6], slice(0, 3), slice(3, 6))
+POSE_CHANGE = ActionSpace(tuple(f"d{axis}" for axis in _AXES), _UNITS, slice(0, 3), slice(3, 6), 6)
+
+
+def vector_states(width: int) -> StateSpace:
+    """Return the space of states whose numbers have no known meaning."""
+    return StateSpace(tuple(f"state {number}" for number in range(width)), ("",) * width)
+
+
+def require_finite(numbers: Float[np.ndarray, "steps dim"], where: str, *, fix: str) -> None:
+    """Refuse numbers of unknown meaning that are not finite, and an episode without steps.
+
+    Raises:
+        InputError: As `StateSpace.require_plausible`.
+    """
+    vector_states(numbers.shape[1]).require_plausible(numbers, where, fix=fix)
+
+
+def vector_actions(width: int, follows: Follows) -> ActionSpace:
+    """Return the space of actions whose numbers have no known meaning."""
+    return ActionSpace(tuple(f"action {number}" for number in range(width)), ("",) * width, follows=follows)
+
+
+@dataclass(frozen=True)
+class Spaces:
+    """The spaces of a robot's states and actions."""
+
+    state: StateSpace
+    action: ActionSpace
+
+    @property
+    def widths(self) -> Widths:
+        """How many numbers they have."""
+        return Widths(len(self.state), len(self.action))
+
+    @classmethod
+    def of_vectors(cls, widths: Widths, joined: str | None) -> Spaces:
+        """Return the spaces of vectors.
+
+        Args:
+            widths: Of both.
+            joined: difference, of states; or how recorded commands were joined to one (`data.join_actions`), which says
+                what they are: a sum of deltas changes the state by itself, the last target becomes it.
+        """
+        known: dict[str | None, Follows] = {"difference": "change", "sum": "change", "last": "target"}
+        follows: Follows = known.get(joined, "unknown") if widths.state == widths.action else "unknown"
+        return cls(vector_states(widths.state), vector_actions(widths.action, follows))
+
+
+POSES = Spaces(POSE, POSE_CHANGE)

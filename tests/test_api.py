@@ -1,0 +1,248 @@
+"""The public names: known to users, editors and docs alike, imported when they are used, and good for what they say."""
+
+import ast
+import inspect
+import re
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import vjepa2_ac
+from adapted_run import write_adapted_run
+from paths import ROOT
+from run_fixtures import MakeConfig
+from vjepa2_ac import (
+    Controller,
+    UserError,
+    WorldModel,
+    encode,
+    evaluate,
+    load_config,
+    load_model,
+    load_run,
+    open_dataset,
+    read_clips,
+    train,
+)
+from vjepa2_ac.export.export import export_run
+
+PAGE = (ROOT / "docs/python.md").read_text()
+BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)
+TINY = "builtin:sim-tiny"
+
+
+# The names.
+
+
+def test_the_table_of_the_page_has_exactly_the_public_names() -> None:
+    table = PAGE.split("| name | does |")[1].split("\n\n")[0]
+    named = re.findall(r"^\| `(\w+)", table, flags=re.MULTILINE)
+    assert sorted(named) == sorted(vjepa2_ac.__all__)
+
+
+@pytest.mark.parametrize("name", [name for name in vjepa2_ac.__all__ if name[0].islower()])
+def test_the_page_shows_the_parameters_of_each_function(name: str) -> None:
+    (shown,) = re.findall(rf"^\| `{name}\((.*?)\)`", PAGE, flags=re.MULTILINE)
+    parameters = inspect.signature(getattr(vjepa2_ac, name)).parameters.values()
+    assert re.findall(r"\w+", shown) == [one.name for one in parameters]
+    assert len(parameters) <= 6
+
+
+@pytest.mark.parametrize("name", vjepa2_ac.__all__)
+def test_every_name_is_documented_with_an_example(name: str) -> None:
+    text = inspect.getdoc(getattr(vjepa2_ac, name)) or ""
+    assert name in {"UserError", "WorldModel"} or "Example:\n    >>> " in text
+
+
+def test_what_type_checkers_see_is_what_is_imported() -> None:
+    tree = ast.parse(Path(vjepa2_ac.__file__).read_text())
+    (block,) = (node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+    seen = {alias.name: node.module for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert seen == vjepa2_ac._MODULES
+    assert sorted(seen) == vjepa2_ac.__all__
+    for name, module in seen.items():
+        assert getattr(vjepa2_ac, name) is getattr(import_module(str(module)), name)
+
+
+def test_importing_the_package_imports_next_to_nothing_and_dir_knows_the_names() -> None:
+    code = (
+        "import sys, vjepa2_ac\n"
+        "assert set(vjepa2_ac.__all__) <= set(dir(vjepa2_ac))\n"
+        "found = {name for name in sys.modules if name.startswith('vjepa2_ac.')}\n"
+        "assert not found and not {'torch', 'numpy', 'pydantic'} & set(sys.modules), found\n"
+        "from vjepa2_ac import UserError, load_config\n"
+        "assert not {'torch', 'transformers'} & set(sys.modules)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_name_that_is_not_there_is_told_with_those_that_are() -> None:
+    with pytest.raises(AttributeError, match=r"no 'load_modle'; its public names are Controller, .* load_model"):
+        vjepa2_ac.load_modle  # type: ignore[attr-defined]  # noqa: B018
+
+
+@pytest.mark.usefixtures("clone")
+def test_the_code_of_the_page_runs_as_it_stands(capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, Any] = {}
+    for block in BLOCKS:
+        quick = block.replace('"steps": 20', '"steps": 2, "allow_weak_base": True').replace("samples=50", "samples=12")
+        exec(quick, names)  # noqa: S102 - our own page, as a reader runs it
+    printed = capsys.readouterr().out
+    assert "8 episodes, " in printed
+    assert "Validation at step 2" in printed
+    assert "did you mean frames?" in printed
+    assert isinstance(names["model"], WorldModel)
+    (in_readme,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
+    exec(in_readme.replace("demo/run", "demo/examples/short").replace("demo/data", "demo/examples/data"), names)  # noqa: S102
+
+
+# Models.
+
+
+def test_a_model_is_ready_to_predict() -> None:
+    model = load_model(TINY)
+    assert (model.image_size, model.num_tokens, model.latent_dim) == (96, 36, 128)
+    assert not model.training
+    assert not any(value.requires_grad for value in model.parameters())
+    assert next(load_model(TINY, device="cpu", dtype="bfloat16").parameters()).dtype == torch.bfloat16
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"name": "nowhere"}, "vjepa2-ac download"),
+        ({"name": ""}, "is empty"),
+        ({"name": "gs://bucket/model"}, "URL"),
+        ({"name": TINY, "dtype": "float64"}, "auto, float32, bfloat16"),
+        ({"name": TINY, "device": "gpu"}, "auto, cpu, cuda"),
+        ({"name": TINY, "adapter": "nowhere"}, "nowhere"),
+    ],
+    ids=lambda value: "-".join(value.values()) if isinstance(value, dict) else "",
+)
+def test_a_model_that_cannot_be_had_is_told(arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        load_model(**arguments)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is CUDA")
+def test_cuda_that_is_not_there_is_told() -> None:
+    with pytest.raises(UserError, match="sees no CUDA device"):
+        load_model(TINY, device="cuda:0")
+
+
+@torch.no_grad()
+def test_a_run_and_its_exported_adapter_predict_alike(make_config: MakeConfig, tmp_path: Path) -> None:
+    folder = write_adapted_run(make_config(run_dir=str(tmp_path / "run")))
+    run = load_run(folder, "best")
+    assert run.checkpoint.name != load_run(folder).checkpoint.name
+    assert load_run(folder, 10).checkpoint == run.checkpoint
+    hub = export_run(folder, tmp_path / "hub", "hub", "best").path
+    exported = load_model(str(run.config.model.base), adapter=hub, dtype="float32")
+    given = torch.randn(1, 2, exported.num_tokens, exported.latent_dim), torch.ones(1, 2, 7), torch.ones(1, 2, 7)
+    torch.testing.assert_close(exported.predict(*given), run.world_model.predict(*given), rtol=0, atol=0)
+    with pytest.raises(UserError, match=r"load_model\(BASE, adapter=FOLDER\)"):
+        load_run(hub)
+    with pytest.raises(UserError, match="no such folder"):
+        load_run(tmp_path / "nowhere")
+
+
+# Data.
+
+
+def test_clips_of_a_split_are_the_same_each_time(simulated: Path) -> None:
+    dataset = open_dataset(simulated, frames=3, test_share=0.3)
+    first, again = ([batch.actions for batch in read_clips(dataset, "test", clips=5, batch_size=2)] for _ in range(2))
+    assert [len(one) for one in first] == [2, 2, 1]
+    assert all(torch.equal(one, other) for one, other in zip(first, again, strict=True))
+
+
+def test_a_config_opens_its_data_and_knobs_change_it(simulated: Path) -> None:
+    values = {"run_dir": "none", "data": {"path": simulated, "frames": 3}, "model": {"base": TINY}}
+    config = load_config(values, ["data.stride=auto"])
+    with pytest.raises(UserError, match="stride=4"):
+        read_clips(open_dataset(config))
+    dataset = open_dataset(config, stride=2)
+    assert (dataset.config.frames, dataset.config.stride) == (3, 2)
+    with pytest.raises(UserError, match="train, validation, test"):
+        read_clips(dataset, "tset")  # type: ignore[arg-type]
+
+
+def test_a_config_file_is_no_data_set() -> None:
+    with pytest.raises(UserError, match="load_config"):
+        open_dataset(ROOT / "configs/demo.yaml")
+
+
+def test_a_value_that_a_config_cannot_hold_is_told() -> None:
+    with pytest.raises(UserError, match="a value that a config cannot hold"):
+        load_config({"run_dir": "run", "data": {"path": object()}})
+
+
+# Latents.
+
+
+def test_frames_and_batches_have_the_same_latents(simulated: Path) -> None:
+    model = load_model(TINY)
+    batch = next(read_clips(open_dataset(simulated, frames=2), clips=2))
+    seen = encode(model, batch)
+    assert batch.frames is not None
+    of_frames = encode(model, batch.frames.numpy())
+    assert tuple(of_frames.shape) == (2, 2, 36, 128)
+    torch.testing.assert_close(of_frames, seen.latents)
+    image = encode(model, batch.frames.numpy()[1, 0])
+    assert tuple(image.shape) == (36, 128)
+    torch.testing.assert_close(image, seen.latents[1, 0], rtol=1e-4, atol=1e-4)
+
+
+def test_the_crop_is_that_of_training() -> None:
+    model, wide = load_model(TINY), np.zeros((20, 60, 3), np.uint8)
+    wide[:, :15] = 255  # outside of the centre
+    assert torch.equal(encode(model, wide), encode(model, np.zeros_like(wide)))
+    assert not torch.equal(encode(model, wide, crop="letterbox"), encode(model, np.zeros_like(wide), crop="letterbox"))
+
+
+@pytest.mark.parametrize("frames", [np.zeros((4, 4, 3)), np.zeros((4, 4), np.uint8), np.zeros((3, 4, 4), np.uint8)])
+def test_what_is_no_frame_is_told(frames: np.ndarray) -> None:
+    with pytest.raises(UserError, match="uint8"):
+        encode(load_model(TINY), frames)
+
+
+# Runs.
+
+
+def test_a_run_is_trained_resumed_and_measured(make_config: MakeConfig, tmp_path: Path) -> None:
+    notes: list[str] = []
+    steps: dict[int, float] = {}
+    config = make_config(training__steps=2, validation__every=2, data__test_share=0.4)
+    train(config, check_only=True)
+    assert not Path(config.run_dir).exists()
+    run = train(config, note=notes.append, on_step=lambda step, metrics: steps.update({step: metrics["loss"]}))
+    assert run == Path(config.run_dir)
+    assert sorted(steps) == [1, 2]
+    assert sum(note.startswith("Validation at step") for note in notes) == 2
+    assert train(config, on_step=lambda *_: pytest.fail("it is finished")) == run
+    result = evaluate(run, clips=4, out=tmp_path / "out", probes=False)
+    assert list(result.error_over_persistence) == ["base", "adapter"]
+    assert len(result.error_over_persistence["adapter"]) == config.data.frames - 1
+    assert result.verdict.startswith("The adapter")
+    assert all(path.parent == tmp_path / "out" for path in result.files)
+    with pytest.raises(UserError, match="no checkpoint of step 7"):
+        evaluate(run, checkpoint=7)
+    with pytest.raises(UserError, match="no such folder"):
+        evaluate(tmp_path / "nowhere")
+    with pytest.raises(UserError, match="out=FOLDER"):
+        evaluate(TINY, data=config)
+
+
+def test_a_run_plans_with_its_own_settings(make_config: MakeConfig) -> None:
+    planning = {"horizon": 2, "samples": 12, "iterations": 2, "cem": {"elites": 4}}
+    folder = write_adapted_run(make_config(planning=planning, seed=7, data__crop="square"))
+    controller = Controller.of_run(load_run(folder))
+    assert (controller.config.horizon, controller.seed, controller.crop) == (2, 7, "square")
+    assert Controller.of_run(load_run(folder), seed=3).seed == 3
+    assert Controller(load_model(TINY)).config.samples == 800
