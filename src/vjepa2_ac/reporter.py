@@ -28,7 +28,7 @@ class Reporter(Protocol):
 
 
 class NullReporter:
-    """Shows nothing, of a training run (`training.reporter`) neither."""
+    """Shows nothing; for a training run, too (`training.reporter`)."""
 
     def note(self, text: str) -> None:
         """Show nothing."""

@@ -14,7 +14,7 @@ import vjepa2_ac
 from vjepa2_ac.cli import main
 from vjepa2_ac.console import data, training
 from vjepa2_ac.console import progress as console_module
-from vjepa2_ac.console.progress import ProgressBar
+from vjepa2_ac.console.progress import ConsoleReporter, ProgressBar
 from vjepa2_ac.console.training import TrainingConsole
 from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.evaluation.measure import VALIDATED
@@ -78,6 +78,24 @@ def test_a_terminal_has_one_bar_with_the_same_words(monkeypatch: pytest.MonkeyPa
     last = [line for line in written.getvalue().splitlines() if "training" in line][-1]
     assert "2/2" in last
     assert "loss 0.5123  1.50 clips/s  2.50 MB/clip" in last
+
+
+def test_a_task_with_a_unit_shows_its_speed_and_the_next_one_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = shown_on(monkeypatch, terminal=True)
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with ConsoleReporter() as reporter:
+        encoding = reporter.task("encoding frames", "frames")
+        assert not written.getvalue(), "a bar begins with its work"
+        encoding(0, 96)
+        now[0] = 4.0
+        encoding(48, 96)
+        reporter.task("measuring")(1, 2)
+        reporter.note("done")
+    shown = written.getvalue()
+    assert "12.0 frames/s" in [line for line in shown.splitlines() if "48/96" in line][-1]
+    assert shown.rindex("frames/s") < shown.index("measuring")
+    assert "done" in shown
 
 
 HOSTILE = "run[lr=0.01] [/b] :smile: \x1b[31m\x1b]0;x\x07"

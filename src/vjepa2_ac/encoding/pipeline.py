@@ -25,7 +25,7 @@ from vjepa2_ac.encoding.batching import Chunks, Encode, Encoded
 from vjepa2_ac.encoding.disk_space import small_frame_side
 from vjepa2_ac.encoding.prefetch import Unreadable, prefetched
 from vjepa2_ac.encoding.workload import Workload, broken_in, forget_broken, note_broken
-from vjepa2_ac.episode import Progress, StoredLatents
+from vjepa2_ac.episode import Progress, StoredLatents, no_progress
 from vjepa2_ac.model.network.world_model import WorldModel
 
 _WRITES_UNDER_WAY = 2  # files: limits the memory
@@ -50,7 +50,7 @@ class EncoderOnDevice:
 
 
 def build(
-    work: Workload, encoder: EncoderOnDevice, *, threads: int, progress: Progress | None = None
+    work: Workload, encoder: EncoderOnDevice, *, threads: int, progress: Progress = no_progress
 ) -> Manifest | None:
     """Encode the share of this process, and finalize the cache if nothing is missing by then.
 
@@ -71,8 +71,7 @@ def build(
     for episode in sorted({one.episode for one in work.left}):
         forget_broken(folder, episode)
     for frames in _written(work, encoder, threads) if work.left else ():
-        if progress is not None:
-            progress(frames, work.frames_left)
+        progress(frames, work.frames_left)
     if work.is_incomplete:
         return None
     broken = broken_in(folder)

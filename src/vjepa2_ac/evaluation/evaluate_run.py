@@ -92,14 +92,8 @@ def measure_subject(subject: str, asked: EvaluationOptions | None = None, *, rep
     world_model.to(accelerator.device).eval()
     calibration = None
     if asked.calibrate:
-        calibration = calibrate_model(
-            world_model,
-            dataset,
-            config,
-            accelerator,
-            ClipSample(asked.split, asked.clips),
-            reporter.task("calibrating strides"),
-        ).as_dict()
+        sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
+        calibration = calibrate_model(world_model, dataset, config, accelerator, sample, progress).as_dict()
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     read = partial(batches_of, batch_size=config.validation.batch_size, copies=copies_for(accelerator.device))
     clips = _clips(through_cache, chosen, read, encode, world_model.image_size)

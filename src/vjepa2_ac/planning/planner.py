@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan, PlanStart, Stopped
 from vjepa2_ac.planning.search_space import SearchSpace, pose_space
 from vjepa2_ac.planning.solvers.base import EvaluatedPlans, Solver
@@ -43,7 +43,7 @@ class Planner:
         config: PlanningConfig,
         space: SearchSpace | None = None,
         clock: Clock = time.perf_counter,
-        progress: Progress | None = None,
+        progress: Progress = no_progress,
     ) -> None:
         """Select a planner.
 
@@ -76,8 +76,7 @@ class Planner:
         best = _Best()
         while len(record) < self.config.iterations and self._has_time(began, record):
             record.append(self._iterate(search, cost, best))
-            if self.progress is not None:
-                self.progress(len(record), self.config.iterations)
+            self.progress(len(record), self.config.iterations)
         stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"
         actions, energy, evaluated = self._chosen(search.result(), best, cost, lowest=stopped == "out of time")
         if actions is None:

@@ -86,7 +86,7 @@ def train(
         else:
             opened.begin(run.config, run.state)
             _train(run, opened, first, reporter)
-    return Path(run.config.run_dir)
+    return run.folder
 
 
 def _train(run: Run, opened: OpenRun, first: PredictionErrors | None, reporter: TrainingReporter) -> None:
@@ -105,7 +105,7 @@ def _train(run: Run, opened: OpenRun, first: PredictionErrors | None, reporter: 
 
 def _write_measured(run: Run) -> None:
     """Write what the data and the base have shown: the metrics of a chosen stride, and the usual changes of vectors."""
-    folder = Path(run.config.run_dir)
+    folder = run.folder
     if run.calibration is not None:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
     if run.dataset.spaces.state.position is None and not (folder / CHANGES).exists():
@@ -116,7 +116,7 @@ def _write_measured(run: Run) -> None:
 def _open_metrics_log(run: Run, reporter: TrainingReporter) -> MetricsLog | NullMetricsLog:
     if not run.accelerator.is_main_process:
         return NullMetricsLog()
-    folder, done = Path(run.config.run_dir), run.state.step
+    folder, done = run.folder, run.state.step
     trackers = open_trackers(run.config, folder, run_id=run.state.run_id, first_step=done)
     return WatchedMetricsLog(folder, config=run.config, reporter=reporter, first_step=done, trackers=trackers)
 
@@ -124,7 +124,7 @@ def _open_metrics_log(run: Run, reporter: TrainingReporter) -> MetricsLog | Null
 def _loop(
     run: Run, metrics_log: MetricsLog | NullMetricsLog, mirror: Mirror | NoMirror, reporter: TrainingReporter
 ) -> None:
-    training, folder = run.config.training, Path(run.config.run_dir)
+    training, folder = run.config.training, run.folder
     device, processes = run.accelerator.device, run.accelerator.num_processes
     throughput = Throughput.of(run.config, run.world_model.sizes, device, processes, encodes=run.encodes)
     reporter.note(str(throughput))

@@ -55,11 +55,10 @@ def _state_of_all(run: Run, reporter: Reporter) -> RunState:
     encoder = world_model.adaptation.encoder if world_model.adaptation else ""
     require_same(accelerator, encoder, what="model.base", fix="Give every machine the same checkpoint")
     state, moments = RunState(step=0), None
-    folder = Path(config.run_dir)
-    if accelerator.is_main_process and (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is not None:
+    if accelerator.is_main_process and (checkpoint := newest_checkpoint(run.folder / CHECKPOINTS)) is not None:
         state, moments = _read(checkpoint, world_model, run.optimizer)
         reporter.note(f"Going on from {checkpoint} ({state.step} of {config.training.steps} steps are done).")
-    state = broadcast_object(accelerator, replace(state, run_id=state.run_id or run_id(folder)))
+    state = broadcast_object(accelerator, replace(state, run_id=state.run_id or run_id(run.folder)))
     broadcast_tensors(accelerator, world_model.predictor.state_dict().values())
     moments = broadcast_object(accelerator, moments)
     if moments is not None and not accelerator.is_main_process:

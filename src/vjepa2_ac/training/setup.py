@@ -80,6 +80,11 @@ class Run:
     calibration: Calibration | None = None  # if data.stride was auto and is now chosen
 
     @property
+    def folder(self) -> Path:
+        """The run's folder."""
+        return Path(self.config.run_dir)
+
+    @property
     def encodes(self) -> bool:
         """Whether clips are frames that go through the encoder, not latents of a cache."""
         return not self.dataset.config.is_cache

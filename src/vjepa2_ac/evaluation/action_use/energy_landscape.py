@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.intervals import Estimate, mean_of
 from vjepa2_ac.evaluation.measure import Predictor
@@ -39,7 +39,7 @@ def measure_landscapes(
     grid: LandscapeGrid,
     *,
     at_once: int,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Landscapes:
     """Compute the energy over a grid of the first three numbers of the action, the others being the true ones.
 
@@ -61,8 +61,7 @@ def measure_landscapes(
     maps = []
     for done, (start, true) in enumerate(zip(starts, trues, strict=True), start=1):
         maps.append(_landscape(model, start, grid_axes(true, half, nodes), true, unit, at_once))
-        if progress is not None:
-            progress(done, len(starts))
+        progress(done, len(starts))
     first, second, third = grid.space.names[_AXES]
     return _summary(tuple(maps), (first, second, third), grid.space.shown_unit, least=unit * half / (nodes - 1))
 

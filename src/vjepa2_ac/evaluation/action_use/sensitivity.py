@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.intervals import mean_of, ratio
 from vjepa2_ac.evaluation.measure import Predictor
@@ -68,7 +68,7 @@ def measure_sensitivity(
     pool: ActionPool,
     *,
     at_once: int,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Sensitivity:
     """Evaluate other actions from each start.
 
@@ -89,8 +89,7 @@ def measure_sensitivity(
         ranks["box"].append(_place(own[0], boxed))
         changes.append(float(evaluated.change[1 : 1 + samples].mean()))
         persistence.append(start.persistence)
-        if progress is not None:
-            progress(done, len(starts))
+        progress(done, len(starts))
     ids = tuple(start.episode_id for start in starts)
     clips = tuple(start.clip for start in starts)
     return Sensitivity(

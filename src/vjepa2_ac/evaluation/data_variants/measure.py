@@ -14,7 +14,7 @@ import numpy as np
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.windows import spread
-from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.data_variants.variants import ChangedSource, RememberingSource, Variant, variants_of
 from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.evaluation.measure import ClipSample, OneStepErrors, Predictor, one_step_errors
@@ -83,7 +83,7 @@ def probe_variants(
     encode: Callable[[Batch], LatentBatch],
     dataset: Dataset,
     sample: ClipSample,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> VariantProbe:
     """Measure a model's one-step error on unchanged clips, and under each variant.
 
@@ -111,8 +111,7 @@ def probe_variants(
         changed = [_under(one, model, encode, *here, latents) for one in variants]
         measured.append([one_step_errors(model, latents), *changed])
         ids += batch.episode_ids
-        if progress is not None:
-            progress(len(ids), len(windows))
+        progress(len(ids), len(windows))
     plain, *others = [
         OneStepErrors(*map(np.concatenate, zip(*of_one, strict=True))) for of_one in zip(*measured, strict=True)
     ]

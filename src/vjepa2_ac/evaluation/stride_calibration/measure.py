@@ -22,7 +22,7 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.streams import NO_COPIES, Copies, copies_for
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.evaluation.measure import ClipSample, Predictor, one_step_errors
@@ -131,7 +131,7 @@ def calibrate(
     sample: ClipSample,
     *,
     copies: Copies = NO_COPIES,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Calibration:
     """Measure a model's one-step error over persistence at each stride.
 
@@ -159,8 +159,8 @@ def calibrate(
     for done, stride in enumerate(possible):
         batches = batches_of(views[stride], chosen, batch_size=sample.batch_size, copies=copies)
         parts = _measure(model, encode, batches, dataset.spaces.action)
-        report = _with_progress(progress, done * len(chosen), len(possible) * len(chosen))
-        measured[stride] = _Measured.joined(list(report(parts)))
+        before, total = done * len(chosen), len(possible) * len(chosen)
+        measured[stride] = _Measured.joined(list(_reported(parts, progress, before, total)))
     runner_up, difference = _compared(measured)
     rate = dataset.control_rate_hz
     results = tuple(one.summary(stride, stride / rate) for stride, one in measured.items())
@@ -217,18 +217,11 @@ def _measure(
         yield _Measured(errors, persistence, moved_cm, tuple(zip(batch.episode_ids, batch.starts, strict=True)))
 
 
-def _with_progress(
-    progress: Progress | None, before: int, total: int
-) -> Callable[[Iterator[_Measured]], Iterator[_Measured]]:
-    def report(parts: Iterator[_Measured]) -> Iterator[_Measured]:
-        done = before
-        for part in parts:
-            done += len(part.clips)
-            if progress is not None:
-                progress(done, total)
-            yield part
-
-    return report
+def _reported(parts: Iterator[_Measured], progress: Progress, done: int, total: int) -> Iterator[_Measured]:
+    for part in parts:
+        done += len(part.clips)
+        progress(done, total)
+        yield part
 
 
 def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:
@@ -286,7 +279,7 @@ def calibrate_model(
     config: Config,
     accelerator: Accelerator,
     sample: ClipSample,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Calibration:
     """Calibrate a model that is on the accelerator's device, in the run's precision.
 
