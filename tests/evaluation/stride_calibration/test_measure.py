@@ -12,7 +12,7 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.step_ranges import StepSelection
 from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, Progress, StepRanges
+from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibrate
@@ -74,7 +74,7 @@ class GoesOn:
         raise AssertionError("calibration needs no rollout")
 
 
-def calibrated(model: GoesOn, source: Tracks, progress: Progress | None = None, **options: object) -> Calibration:
+def calibrated(model: GoesOn, source: Tracks, progress: Progress = no_progress, **options: object) -> Calibration:
     sample = ClipSample(batch_size=4, **options)  # type: ignore[arg-type]
     return calibrate(model, encode, dataset_of(source), sample, progress=progress)
 
