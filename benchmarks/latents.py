@@ -45,13 +45,14 @@ from vjepa2_ac.distributed.device import autocast
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.disk_space import small_frame_bytes
 from vjepa2_ac.encoding.encode_dataset import encode_config
-from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.reporter import NullReporter
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.cost.flops import frame_flops
 from vjepa2_ac.training.monitoring.throughput import matmul_speed
-from vjepa2_ac.training.setup import Run, batches_from, set_up
+from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model
 from vjepa2_ac.training.step import training_step
 
 RATE_HZ, STRIDE = 15, 4
@@ -107,9 +108,8 @@ def measure_speed(options: argparse.Namespace, folder: Path, rows: Rows) -> None
     sizes = sizes_of(options)
     WorldModel.random(sizes, seed=0, dtype=dtype, device=options.device).save_pretrained(folder / "model")
     steps = (max(options.frames) - 1) * STRIDE + 9
-    record_dataset(
-        folder / "data", domain="A", episodes=options.episodes, steps=steps, seed=1, workers=max(1, options.workers)
-    )
+    spec = RecordingSpec("A", steps, seed=1)
+    record_dataset(folder / "data", spec, episodes=options.episodes, workers=max(1, options.workers))
     print(
         f"encoder {options.encoder_layers} of 40 layers, predictor {options.predictor_layers} of 24,"
         f" {options.image_size} px, batch {options.batch}; wall or processor's ms a clip, median of {options.repeats}"
@@ -118,7 +118,7 @@ def measure_speed(options: argparse.Namespace, folder: Path, rows: Rows) -> None
         f"{'frames':>6}{'encoder frames/s':>18}{'MFU':>7}{'encode frames/s':>17}{'of encoder':>12}{'pictures, ms':>14}"
         f"{'min':>8}{'latents, ms':>13}{'min':>8}{'ratio':>8}"
     )
-    alone = encoder_speed(set_up(config_of(options, folder, options.frames[0], "off"), lambda _: None), options)
+    alone = encoder_speed(open_model(open_data(config_of(options, folder, options.frames[0], "off"))), options)
     mfu = alone * frame_flops(sizes) / matmul_speed(torch.device(options.device), dtype)
     rows.add({"measured": "encoder alone", "frames_per_s": alone, "mfu": mfu})
     for frames in options.frames:
@@ -139,7 +139,7 @@ def speed_row(options: argparse.Namespace, folder: Path, frames: int, rows: Rows
     pictures, latents = (config_of(options, folder, frames, cache) for cache in ("off", "require"))
     row: Row = {"measured": "speed", "frames": frames, "encode_frames_per_s": encode(latents, options.device)}
     rows.so_far(row)
-    runs = {"pictures": set_up(pictures, lambda _: None), "latents": set_up(latents, lambda _: None)}
+    runs = {"pictures": open_model(open_data(pictures)), "latents": open_model(open_data(latents))}
     batches = {name: batches_from(run) for name, run in runs.items()}
     steps = {name: partial(training_step, run, batches[name], PAST_WARM_UP) for name, run in runs.items()}
     turns: dict[str, Turns] = {}
@@ -185,7 +185,14 @@ def config_of(options: argparse.Namespace, folder: Path, frames: int, cache: str
 def encode(config: Config, device: str) -> float:
     """Write the cache of a run, and return the frames per second, decoding and writing included."""
     told: list[tuple[float, int]] = []
-    encode_config(config, lambda _: None, progress=lambda done, _: told.append((clock_s(device), done)))
+
+    class Timed(NullReporter):
+        def task(self, title: str, unit: str = "") -> Progress:
+            if not unit:
+                return super().task(title)
+            return lambda done, _: told.append((clock_s(device), done))
+
+    encode_config(config, Timed())
     (began, _), (ended, frames) = told[0], told[-1]
     return frames / (ended - began)
 
@@ -238,7 +245,8 @@ def measure_domain(options: argparse.Namespace, folder: Path, model: WorldModel,
     domain = options.domains[number]
     place = folder / f"test {domain}"
     workers = max(1, options.workers)
-    record_dataset(place, domain=domain, episodes=options.test_episodes, steps=33, seed=7 + number, workers=workers)
+    spec = RecordingSpec(domain, steps=33, seed=7 + number)
+    record_dataset(place, spec, episodes=options.test_episodes, workers=workers)
     batches = list(latents_of(model, place, folder / "kept"))
     true: tuple[float, float] | None = None
     for kind in ("fp32", "bf16", "int8"):

@@ -29,7 +29,7 @@ from vjepa2_ac.data.inspection.statistics import sample_of
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.data_variants.from_config import probe_config
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe
-from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 HELD_OUT = 0.7  # of the episodes: the probe measures these
 _HINT = "hint: "
@@ -82,8 +82,8 @@ def _recordings(options: argparse.Namespace, temporary: Path) -> tuple[list[Reco
     if options.data:
         config = load_config(options.data, [])
     else:
-        about = {"episodes": options.episodes, "steps": options.steps, "seed": options.seed}
-        folder = record_dataset(temporary / "simulated", domain=options.domain, **about)
+        spec = RecordingSpec(options.domain, options.steps, options.seed)
+        folder = record_dataset(temporary / "simulated", spec, episodes=options.episodes)
         config = _config(folder, temporary, options.model, {"source": "rlds", "stride": 4})
     dataset = at_some_stride(open_dataset(config.data))
     if dataset.config.states != "pose" or dataset.config.source == "latents":

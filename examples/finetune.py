@@ -11,7 +11,7 @@ from pathlib import Path
 
 from vjepa2_ac import UserError, evaluate, load_config, load_run, train
 from vjepa2_ac.distributed.preemption import StoppedError
-from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 RECORDED = Path("demo/examples/data")
 
@@ -21,7 +21,7 @@ def main(*arguments: str) -> None:
     data = [argument for argument in arguments if "=" not in argument]
     if not data and not RECORDED.exists():
         print("Recording 12 episodes of the simulated arm ...")
-        record_dataset(RECORDED, domain="B", episodes=12, steps=33, seed=4)
+        record_dataset(RECORDED, RecordingSpec("B", steps=33, seed=4), episodes=12)
     shares = {"validation_share": 0.2, "test_share": 0.3}
     config = load_config(
         {

@@ -11,7 +11,7 @@ from pathlib import Path
 from vjepa2_ac import UserError, open_dataset, read_clips
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.reports.figures.dataset import plot_dataset
-from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 RECORDED, SHEET = Path("demo/examples/data"), Path("demo/examples/contact_sheet.png")
 
@@ -20,7 +20,7 @@ def main(data: str | None = None) -> None:
     """Print what is in a data set, and draw it."""
     if data is None and not RECORDED.exists():
         print("Recording 12 episodes of the simulated arm ...")
-        record_dataset(RECORDED, domain="B", episodes=12, steps=33, seed=4)
+        record_dataset(RECORDED, RecordingSpec("B", steps=33, seed=4), episodes=12)
     dataset = open_dataset(data or RECORDED, frames=4, stride=4, validation_share=0.2, test_share=0.3)
     print(f"{len(dataset.table)} episodes, {len(dataset.windows('train'))} training clips")
 

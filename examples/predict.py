@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 
 from vjepa2_ac import UserError, encode, load_model, open_dataset, read_clips
-from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
 RECORDED = Path("demo/examples/data")
 
@@ -25,7 +25,7 @@ def main(data: str | None = None, model: str = "builtin:sim-tiny") -> None:
     """Print the errors of one step and of a rollout beside those of persistence."""
     if data is None and not RECORDED.exists():
         print("Recording 12 episodes of the simulated arm ...")
-        record_dataset(RECORDED, domain="B", episodes=12, steps=33, seed=4)
+        record_dataset(RECORDED, RecordingSpec("B", steps=33, seed=4), episodes=12)
     dataset = open_dataset(data or RECORDED, frames=4, stride=4)
     world_model = load_model(model)
     seconds = dataset.config.model_stride / dataset.control_rate_hz

@@ -17,7 +17,7 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 ORDERS: dict[str, list[str]] = {
     "": [
         "__init__ errors places output episode geometry distances",
-        "spaces",
+        "spaces reporter",
         "storage",
         "config",
         "media",
@@ -89,6 +89,8 @@ HOMES = {
     "transformers": ["model/network/"],
 }  # fmt: skip
 
+MOST_PARAMETERS = 6  # of a function, without self and cls: more are a record
+OF_OTHERS = {"model/adapter/lora_linear.py: forward"}  # torch.autograd.Function takes every tensor as an argument
 MOST_FILES = 16  # in one folder, `__init__` included
 
 
@@ -196,6 +198,19 @@ def test_a_folder_is_small_enough_to_be_read_at_a_glance() -> None:
     for path in modules().values():
         count[path.parent.relative_to(PACKAGE).as_posix()] += 1
     assert not {folder: files for folder, files in count.items() if files > MOST_FILES}
+
+
+def test_a_function_has_few_parameters() -> None:
+    wrong = []
+    for path in modules().values():
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+                count = sum(one.arg not in {"self", "cls"} for one in given)
+                where = f"{path.relative_to(PACKAGE).as_posix()}: {node.name}"
+                if count > MOST_PARAMETERS and where not in OF_OTHERS:
+                    wrong.append(f"{where} has {count}")
+    assert not wrong, "\n".join(wrong)
 
 
 def test_heavy_libraries_stay_in_their_homes() -> None:

@@ -42,7 +42,7 @@ def test_a_first_look_at_data_records_them_and_draws_a_sheet(
     monkeypatch.chdir(tmp_path)
     asked: list[dict[str, Any]] = []
 
-    def recorded(folder: Path, **options: Any) -> None:
+    def recorded(folder: Path, _spec: object, **options: Any) -> None:
         asked.append(options)
         folder.parent.mkdir(parents=True)
         folder.symlink_to(simulated)

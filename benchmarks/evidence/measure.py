@@ -27,12 +27,12 @@ from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
-from vjepa2_ac.simulation.closed_loop.rollout import run_task
+from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.training.cost.parameters import count_parameters
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.reporter import NullReporter
 
 TEST_GOALS, VALIDATION_GOALS = 9_000, 4_000  # seeds of problems, to which a cell adds its own
 GOALS, CLIPS = 20, 128  # of one run; a row of the table pools its seeds, each with other goals
@@ -53,7 +53,7 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         model = load_base(config.model, seed=cell.seed)
         trained: dict[str, Any] = {"trained_share": 0.0, "trained_parameters": 0, "adapter_mb": 0.0}
     else:
-        run = train(config, NullReporter())
+        run = train(config, SILENT)
         model, trained = _trained(run)
     seconds = time.process_time() - started[0], time.perf_counter() - started[1]
     split: Split = "validation" if choosing else "test"
@@ -126,7 +126,7 @@ def planner(model: WorldModel, distance: str, config: PlanningConfig = PLANNING)
 def reach(cell: Cell, policy: Policy, *, seed: int, goals: int) -> dict[str, Any]:
     """Return distances to the goal (cm) before the first step and after each, and seconds of a decision."""
     with _bf16():
-        result = run_task("reach", SHIFTS[cell.shift], policy, episodes=goals, seed=seed)
+        result = run_task(RolloutSpec("reach", SHIFTS[cell.shift], goals, seed), policy)
     return {
         "goals_seed": seed,
         "distance_cm": np.round(result.distance_cm, 3).tolist(),

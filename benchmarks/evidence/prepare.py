@@ -15,9 +15,10 @@ from vjepa2_ac.encoding.encode_dataset import encode_config
 from vjepa2_ac.export.export import export_run
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.reporter import NullReporter, Reporter
+from vjepa2_ac.training.reporter import TrainingReporter
 
 BUILTIN = "builtin:sim-tiny"
 EPISODES_A, EPISODES_SHIFTED = 400, 100
@@ -52,14 +53,14 @@ def base_model(folder: Path, base: Base, seed: int) -> str:
     return str(folder / (f"scratch-{seed}" if base == "none" else "base-one-camera"))
 
 
-def prepare(folder: Path, seeds: int, reporter: Reporter | None = None) -> None:
+def prepare(folder: Path, seeds: int, reporter: TrainingReporter = SILENT) -> None:
     """Make everything that is not there yet: some 25 minutes on one core, nearly all of it the base of one camera."""
     folder.mkdir(parents=True, exist_ok=True)
     _record(data_a(folder), "A", EPISODES_A, SEED_A)
     for shift in SHIFTS:
         _record(data_shifted(folder, shift), shift, EPISODES_SHIFTED, SEED_SHIFTED)
     if not Path(base_model(folder, "one camera", 0)).exists():
-        run = train(_base_config(folder), reporter or NullReporter())
+        run = train(_base_config(folder), reporter)
         export_run(run, Path(base_model(folder, "one camera", 0)))
     for seed in range(seeds):
         _without_a_past(Path(base_model(folder, "none", seed)), seed)
@@ -71,7 +72,7 @@ def prepare(folder: Path, seeds: int, reporter: Reporter | None = None) -> None:
 def encode(data: DataConfig, base: str) -> None:
     """Keep the latents of every episode: cells leave out different ones. Nothing to do where they are there."""
     model = ModelConfig(base=base, dtype="float32")
-    encode_config(Config(run_dir="none", data=data, model=model, training=TRAINING), lambda _: None)
+    encode_config(Config(run_dir="none", data=data, model=model, training=TRAINING))
 
 
 def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...]:
@@ -91,7 +92,7 @@ def training_episodes(data: DataConfig, count: int, seed: int) -> tuple[str, ...
 def _record(data: DataConfig, domain: str, episodes: int, seed: int) -> None:
     if not Path(data.path).exists():
         world = SHIFTS.get(domain, domain)  # type: ignore[call-overload]
-        record_dataset(data.path, domain=world, episodes=episodes, seed=seed)
+        record_dataset(data.path, RecordingSpec(world, seed=seed), episodes=episodes)
 
 
 def _base_config(folder: Path) -> Config:

@@ -35,6 +35,11 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int], None]  # done, total
 
+
+def no_progress(done: int, total: int) -> None:
+    """Show nothing."""
+
+
 STATE_DIM = 7  # of a pose
 ACTION_DIM = 7
 EXTRINSICS_DIM = 6

@@ -14,7 +14,7 @@ import pytest
 
 from paths import ROOT
 from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.simulation.recording.record import record_dataset
+from vjepa2_ac.simulation.recording.record import RecordingSpec
 from vjepa2_ac.simulation.world.domains import DOMAIN_A
 
 pytest.importorskip("mujoco")
@@ -95,7 +95,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         patch.setattr(measure, "planner", partial(measure.planner, config=few))
         patch.setattr(measure, "CLIPS", 6)
         patch.setattr(measure, "base_model", lambda *_: prepare.BUILTIN)
-        patch.setattr(prepare, "record_dataset", partial(record_dataset, steps=14))
+        patch.setattr(prepare, "RecordingSpec", partial(RecordingSpec, steps=14))
         modules.folder = tmp_path_factory.mktemp("evidence")
         for name, make in (("data_a", prepare.data_a), ("data_shifted", prepare.data_shifted)):
             for module in (prepare, measure):

@@ -14,8 +14,8 @@ import vjepa2_ac
 from vjepa2_ac.cli import main
 from vjepa2_ac.console import data, training
 from vjepa2_ac.console import progress as console_module
-from vjepa2_ac.console.progress import ProgressBar
-from vjepa2_ac.console.training import ConsoleReporter
+from vjepa2_ac.console.progress import ConsoleReporter, ProgressBar
+from vjepa2_ac.console.training import TrainingConsole
 from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.evaluation.measure import VALIDATED
 from vjepa2_ac.evaluation.result import PredictionErrors
@@ -46,7 +46,7 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
     written = shown_on(monkeypatch, terminal=False)
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    reporter = ConsoleReporter()
+    reporter = TrainingConsole()
     reporter.validated(10, errors())
     reporter.started(10, 100)
     for step in (11, 12, 13):
@@ -61,7 +61,7 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
 @pytest.mark.parametrize(("share", "reported"), [(0.2, False), (0.35, True)])
 def test_waiting_for_data_is_shown_where_it_is_much(monkeypatch, share: float, *, reported: bool) -> None:
     written = shown_on(monkeypatch, terminal=False)
-    reporter = ConsoleReporter()
+    reporter = TrainingConsole()
     reporter.started(0, 1)
     reporter.stepped(1, {**FIGURES, "data_wait_share": share})
     assert ("waits for data 35% of the time" in written.getvalue()) == reported
@@ -70,14 +70,32 @@ def test_waiting_for_data_is_shown_where_it_is_much(monkeypatch, share: float, *
 
 def test_a_terminal_has_one_bar_with_the_same_words(monkeypatch: pytest.MonkeyPatch) -> None:
     written = shown_on(monkeypatch, terminal=True)
-    reporter = ConsoleReporter()
+    reporter = TrainingConsole()
     reporter.started(0, 2)
     reporter.stepped(1, FIGURES)
     reporter.stepped(2, {**FIGURES, "bytes_per_clip": 2.5e6})
-    reporter.close()
+    reporter.__exit__()
     last = [line for line in written.getvalue().splitlines() if "training" in line][-1]
     assert "2/2" in last
     assert "loss 0.5123  1.50 clips/s  2.50 MB/clip" in last
+
+
+def test_a_task_with_a_unit_shows_its_speed_and_the_next_one_ends_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    written = shown_on(monkeypatch, terminal=True)
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    with ConsoleReporter() as reporter:
+        encoding = reporter.task("encoding frames", "frames")
+        assert not written.getvalue(), "a bar begins with its work"
+        encoding(0, 96)
+        now[0] = 4.0
+        encoding(48, 96)
+        reporter.task("measuring")(1, 2)
+        reporter.note("done")
+    shown = written.getvalue()
+    assert "12.0 frames/s" in [line for line in shown.splitlines() if "48/96" in line][-1]
+    assert shown.rindex("frames/s") < shown.index("measuring")
+    assert "done" in shown
 
 
 HOSTILE = "run[lr=0.01] [/b] :smile: \x1b[31m\x1b]0;x\x07"
@@ -94,8 +112,7 @@ def test_no_name_is_markup_wherever_it_is_shown(monkeypatch: pytest.MonkeyPatch,
     table.add_column(HOSTILE)
     table.add_row(HOSTILE)
     shown.print(table)
-    bar = ProgressBar(HOSTILE, total=1)
-    bar.advance_to(1, HOSTILE)
+    ProgressBar(HOSTILE)(1, 1, HOSTILE)
     assert written.getvalue().count(SHOWN) >= 6, "a line, a title, a column, a cell, a bar and its words"
     assert "\x1b]" not in written.getvalue()
     assert "\x1b[31m" not in written.getvalue(), "colours are the bar's own"

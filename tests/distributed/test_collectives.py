@@ -11,6 +11,7 @@ import torch
 
 from paths import ROOT
 from ranks import Rank, finish, free_port, start_rank
+from run_fixtures import set_up
 from same_run import metrics, trained_weights
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.clips.loader import training_loader
@@ -20,7 +21,7 @@ from vjepa2_ac.runs.checkpoint import RunState, newest_checkpoint, read_state
 from vjepa2_ac.runs.metrics_log import read_metrics_log
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.resume import micro_batches_of
-from vjepa2_ac.training.setup import batches_from, set_up
+from vjepa2_ac.training.setup import batches_from
 
 
 @pytest.fixture
@@ -111,21 +112,20 @@ def test_what_processes_say_to_each_other(tmp_path, without_dropout) -> None:
     ("before", "now", "micro_batches"), [(1, 1, 4), (1, 2, 2), (1, 4, 1), (2, 1, 8), (4, 2, 8), (2, 8, 1)]
 )
 def test_a_step_has_the_clips_that_it_had_on_any_number_of_processes(
-    make_config, before: int, now: int, micro_batches: int
+    make_config, reporter, before: int, now: int, micro_batches: int
 ) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
     state = RunState(step=3, processes=before, clips_per_step=8 * before)
-    notes: list[str] = []
-    assert micro_batches_of(config, state, now, notes.append) == micro_batches
+    assert micro_batches_of(config, state, now, reporter) == micro_batches
     assert micro_batches * now * 2 == state.clips_per_step
-    assert bool(notes) == (before != now)
+    assert bool(reporter.notes) == (before != now)
 
 
 @pytest.mark.parametrize("starts", [(2, 1, 1, 2), (1, 4, 4, 2), (4, 2, 8, 8, 1)])
 def test_a_step_keeps_its_clips_however_often_the_run_goes_on(make_config, starts: tuple[int, ...], reporter) -> None:
     config, state = make_config(training__batch_size=2, training__accumulation=4), RunState(step=0)
     for processes in starts:
-        micro_batches = micro_batches_of(config, state, processes, reporter.note)
+        micro_batches = micro_batches_of(config, state, processes, reporter)
         clips = micro_batches * processes * 2
         state = replace(state, processes=processes, clips_per_step=clips, clips_asked=8)
         assert clips == 8 * starts[0]
@@ -134,17 +134,17 @@ def test_a_step_keeps_its_clips_however_often_the_run_goes_on(make_config, start
 def test_processes_that_cannot_share_a_step_are_refused(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=4)
     with pytest.raises(InputError, match="3 processes of 2 clips for a run with 8 clips per step"):
-        micro_batches_of(config, RunState(step=3, clips_per_step=8), 3, reporter.note)
+        micro_batches_of(config, RunState(step=3, clips_per_step=8), 3, reporter)
 
 
 def test_accumulation_changed_on_purpose_counts_as_it_is_written(make_config, reporter) -> None:
     config = make_config(training__batch_size=2, training__accumulation=3)
     for state in (RunState(step=3, clips_per_step=8), RunState(step=3, clips_per_step=8, clips_asked=4, processes=1)):
-        assert micro_batches_of(config, state, 2, reporter.note) == 3
+        assert micro_batches_of(config, state, 2, reporter) == 3
 
 
 def test_a_run_whose_step_changes_goes_on_in_the_row_of_clips_where_it_stood(make_config, reporter) -> None:
-    run = set_up(make_config(), reporter.note)
+    run = set_up(make_config(), reporter)
     run.state = replace(run.state, step=1, clips_done=6)
     expected = training_loader(run.dataset, seed=run.config.seed, batch_size=2, start_position=6)
     assert next(batches_from(run)).starts == next(expected).starts

@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 
+from run_fixtures import set_up
 from vjepa2_ac.config import Config
 from vjepa2_ac.distributed.shared_memory import SHARED_MEMORY, small_shared_memory
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import set_up
 
 MB = 10**6
 
@@ -76,9 +76,9 @@ def notes_of(reporter: Any) -> list[str]:
 
 @pytest.mark.usefixtures("little")
 def test_a_run_says_so_before_its_first_step_and_only_where_it_has_workers(make_config, reporter) -> None:
-    set_up(make_config(), reporter.note)
+    set_up(make_config(), reporter)
     assert notes_of(reporter) == []
-    set_up(make_config(data__workers=2), reporter.note)
+    set_up(make_config(data__workers=2), reporter)
     (said,) = notes_of(reporter)
     frames, numbers = 4 * 36 * 49 * 3, 4 * (4 * 7 + 3 * 7)
     assert f"2 workers x (2 prefetched + 1) x 2 clips of {(frames + numbers) / MB:.3g} MB" in said
@@ -89,7 +89,7 @@ def test_cached_latents_count_as_what_they_are(make_config, reporter, tmp_path) 
     config = make_config(data__cache="auto", data__cache_dir=str(tmp_path / "cache"), training__steps=1)
     train(config, reporter)
     assert notes_of(reporter) == []
-    set_up(config.model_copy(update={"data": config.data.model_copy(update={"workers": 1})}), reporter.note)
+    set_up(config.model_copy(update={"data": config.data.model_copy(update={"workers": 1})}), reporter)
     (said,) = notes_of(reporter)
     latents, numbers = 4 * 4 * 24 * 2, 4 * (4 * 7 + 3 * 7)  # 4 frames of 4 tokens of 24 numbers, bf16
     assert f"clips of {(latents + numbers) / MB:.3g} MB" in said

@@ -33,7 +33,7 @@ from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.inspection.check import check_data
 from vjepa2_ac.data.inspection.statistics import inspect_dataset
 from vjepa2_ac.data.sources.latents.dtypes import CacheType, pack_latents, unpack_latents
-from vjepa2_ac.data.sources.latents.episode_file import EpisodeFile, EpisodeLayout, write_episode_file
+from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode, EpisodeFile, EpisodeLayout, write_episode_file
 from vjepa2_ac.data.sources.latents.manifest import EPISODES, KEPT, MANIFEST, path_of
 from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
 from vjepa2_ac.encoding.cache_lookup import needed_frames, require_encoding, through_cache
@@ -71,9 +71,8 @@ def drawn_latents(frames: int = len(FRAMES), seed: int = 0) -> torch.Tensor:
 def written(folder: Path, kind: CacheType = "fp32") -> tuple[Path, EpisodeLayout]:
     path, layout = folder / "a" / "b.safetensors", EpisodeLayout("key", kind, TOKENS, DIM)
     pictures = np.stack([np.full((16, 16, 3), 20 * step, np.uint8) for step in FRAMES])
-    write_episode_file(
-        path, layout, episode(), "left", steps=FRAMES, latents=pack_latents(drawn_latents(), kind), pictures=pictures
-    )
+    latents = pack_latents(drawn_latents(), kind)
+    write_episode_file(path, layout, EncodedEpisode(episode(), "left", FRAMES, latents, pictures))
     return path, layout
 
 
@@ -212,7 +211,7 @@ def test_only_the_frames_that_are_asked_for_are_read(tmp_path: Path) -> None:
     count = 200  # of 256 kB
     latents = StoredLatents(torch.zeros(1, 64, 1024).expand(count, -1, -1))
     pictures = np.zeros((count, 8, 8, 3), np.uint8)
-    write_episode_file(path, layout, episode(count), "left", steps=range(count), latents=latents, pictures=pictures)
+    write_episode_file(path, layout, EncodedEpisode(episode(count), "left", range(count), latents, pictures))
     record = EpisodeFile(path, layout)
     kept = record.latents([17, 190], check=[17, 190])
     assert 2 * 256 << 10 <= resident_of(path) < path.stat().st_size / 5  # some kernels map 2 MB at once

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from run_fixtures import SilentReporter
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
     gain_over,
@@ -235,13 +236,13 @@ def test_each_model_is_measured_only_while_it_is_switched_on() -> None:
 
 
 def test_progress_names_each_part_of_the_work() -> None:
-    reported: dict[str, tuple[int, int]] = {}
-
-    def stage(title: str):  # type: ignore[no-untyped-def]
-        return lambda done, total: reported.__setitem__(title, (done, total))
-
-    evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=PROBES, stage=stage)
-    assert reported == {"measuring": (12, 12), "other actions, model": (6, 6), "energy landscapes, model": (3, 3)}
+    reporter = SilentReporter()
+    evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=PROBES, reporter=reporter)
+    assert {title: seen[-1] for title, seen in reporter.tasks.items()} == {
+        "measuring": (12, 12),
+        "other actions, model": (6, 6),
+        "energy landscapes, model": (3, 3),
+    }
 
 
 @pytest.mark.parametrize(

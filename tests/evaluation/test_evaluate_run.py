@@ -19,20 +19,12 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.reports.write import Evaluated, evaluate_subject
 from vjepa2_ac.training.loop import train
 
 PROBES = ProbeOptions(sensitivity_clips=3, samples=6, landscape_clips=1, nodes=3, examples=1)
 QUICK = ["--sensitivity-clips", "3", "--samples", "6", "--landscapes", "1", "--nodes", "3", "--examples", "1"]
-
-
-class _Silent:
-    def note(self, text: str) -> None: ...
-    def indexed(self, done: int, total: int) -> None: ...
-    def encoded(self, done: int, total: int) -> None: ...
-    def started(self, done: int, total: int) -> None: ...
-    def stepped(self, step: int, metrics: object) -> None: ...
-    def validated(self, step: int, errors: object) -> None: ...
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +47,7 @@ def config(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_fol
         "tracking": {"tensorboard": False},
     }  # fmt: skip
     config = parse_config(values, where="test")
-    train(config, _Silent())
+    train(config, SILENT)
     return config
 
 

@@ -243,7 +243,7 @@ def test_a_decision_that_failed_can_be_asked_for_again(monkeypatch: pytest.Monke
     run.act(image(0), STATE)
     for step in (1, 2):
         with monkeypatch.context() as patch:
-            patch.setattr(run._planner, "plan", fail)
+            patch.setattr(run.planner, "plan", fail)
             with pytest.raises(RuntimeError, match="out of memory"):
                 run.act(image(step), STATE)
         np.testing.assert_array_equal(run.act(image(step), STATE), undisturbed[step])
@@ -277,8 +277,8 @@ def test_one_model_step_of_the_last_plan_is_gone_when_the_next_begins(monkeypatc
     run = controller(warm_start=True, horizon=3)
     actions(run, 1)
     assert run.decision is not None
-    before, starts, plan = run.decision.plan, [], run._planner.plan
-    monkeypatch.setattr(run._planner, "plan", lambda *given: (starts.append(given[2]), plan(*given))[1])
+    before, starts, plan = run.decision.plan, [], run.planner.plan
+    monkeypatch.setattr(run.planner, "plan", lambda *given: (starts.append(given[2]), plan(*given))[1])
     run.act(image(1), STATE)
     assert before is not None
     assert torch.equal(starts[0].mean, before.mean[[1, 2, 2]])

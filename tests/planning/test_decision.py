@@ -127,7 +127,9 @@ def test_a_plan_that_is_no_better_than_doing_nothing_is_reported() -> None:
 
 def test_running_out_of_time_is_reported() -> None:
     ticks = iter(range(1000))
-    controller = Controller(tiny_model(), QUICK.model_copy(update={"budget_s": 4.0}), clock=lambda: float(next(ticks)))
+    config = QUICK.model_copy(update={"budget_s": 4.0})
+    controller = Controller(tiny_model(), config)
+    controller.planner.clock = lambda: float(next(ticks))
     found = decide(controller, PlanRequest(image(0), STATE, (image(100),)))
     assert "Time was up after" in summarize(found)
     assert " of 3 iterations" in summarize(found)

@@ -16,6 +16,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from run_fixtures import set_up
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -30,7 +31,7 @@ from vjepa2_ac.runs.checkpoint import (
 )
 from vjepa2_ac.runs.manifest import write_manifest
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import save_checkpoint, set_up
+from vjepa2_ac.training.setup import save_checkpoint
 
 
 def write_weights(folder: Path) -> None:
@@ -276,7 +277,7 @@ def files_end_at(size: int) -> Iterator[None]:
 def test_a_disk_that_fills_up_in_any_file_is_the_users_error_and_changes_nothing(make_config, reporter, init) -> None:
     config = make_config(training__steps=1, adapter__init=init)
     folder = train(config, reporter)
-    run = set_up(config, reporter.note)
+    run = set_up(config, reporter)
     older = newest_checkpoint(folder / "checkpoints")
     sizes = sorted(path.stat().st_size for path in older.rglob("*") if path.is_file())
     run.state = replace(run.state, step=2)
@@ -297,7 +298,7 @@ def test_a_disk_that_fills_up_in_any_file_is_the_users_error_and_changes_nothing
 def test_a_checkpoint_holds_what_is_trained_and_never_the_frozen_base(make_config, reporter, changes) -> None:
     config = make_config(training__steps=1, **changes)
     checkpoint = newest_checkpoint(train(config, reporter) / "checkpoints")
-    model = set_up(config, reporter.note).world_model
+    model = set_up(config, reporter).world_model
     trained = sum(value.numel() for value in model.parameters() if value.requires_grad)
     state = torch.load(checkpoint / "optimizer.pt", weights_only=True)["state"].values()
     assert sum(moments[name].numel() for moments in state for name in ("exp_avg", "exp_avg_sq")) == 2 * trained
@@ -353,4 +354,4 @@ def test_a_run_of_pissa_goes_on_without_computing_where_it_started(make_config, 
     config = make_config(training__steps=1, adapter__init="pissa")
     train(config, reporter)
     monkeypatch.setattr(torch.linalg, "svd", lambda *_, **__: pytest.fail("minutes, at the real size"))
-    assert set_up(config, reporter.note).state.step == 1
+    assert set_up(config, reporter).state.step == 1

@@ -124,15 +124,15 @@ def test_a_check_needs_no_lock(make_config, reporter) -> None:
 
 
 def test_a_start_that_another_one_overtook_leaves_its_run_alone(make_config, reporter, monkeypatch) -> None:
-    config, set_up = make_config(), loop.set_up
+    config, restore = make_config(), loop.restore
 
-    def overtaken(*arguments, **keywords):
-        run = set_up(*arguments, **keywords)
-        monkeypatch.setattr(loop, "set_up", set_up)
+    def overtaken(*arguments):
+        run = restore(*arguments)
+        monkeypatch.setattr(loop, "restore", restore)
         train(config, type(reporter)())
         return run
 
-    monkeypatch.setattr(loop, "set_up", overtaken)
+    monkeypatch.setattr(loop, "restore", overtaken)
     with pytest.raises(InputError, match="step 6, which another start wrote while this one stood at 0"):
         train(config, reporter)
     assert newest_checkpoint(Path(config.run_dir) / "checkpoints").name == "step-00000006"

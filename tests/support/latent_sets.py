@@ -14,6 +14,7 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.transforms import pixels_to_input, view
 from vjepa2_ac.data.sources.latents.cache_key import Encoding
 from vjepa2_ac.data.sources.latents.dtypes import pack_latents
+from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode
 from vjepa2_ac.encoding.batch import encoding_of
 from vjepa2_ac.encoding.cache_lookup import folder_of, key_for, needed_frames
 from vjepa2_ac.encoding.cache_writer import CacheWriter
@@ -47,10 +48,8 @@ def write_cache(dataset: Dataset, encoding: Encoding = NUMBERS, encode: Encode =
                 continue
             count += len(frames)
             latents = pack_latents(encode(frames), key.kind)
-            writer.write_episode(
-                needed.episode, camera, episode,
-                steps=needed.steps.tolist(), latents=latents, small_frames=_squashed(frames, 16),
-            )  # fmt: skip
+            encoded = EncodedEpisode(episode, camera, needed.steps.tolist(), latents, _squashed(frames, 16))
+            writer.write_episode(needed.episode, encoded)
     writer.finish(dataset, broken=broken, frames=count)
     return writer.folder
 

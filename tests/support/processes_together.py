@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from run_fixtures import set_up
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.clips.loader import training_loader
 from vjepa2_ac.distributed.collectives import (
@@ -20,7 +21,8 @@ from vjepa2_ac.distributed.collectives import (
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.training.setup import Run, save_checkpoint, set_up
+from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.training.setup import Run, save_checkpoint
 from vjepa2_ac.training.step import gradients, training_step
 
 
@@ -61,7 +63,7 @@ def main() -> None:
     with pytest.raises(InputError, match="in process 1 than in process 0"):
         require_same(accelerator, rank, what="it", fix="none")
 
-    run = set_up(config, lambda _: None, accelerator=accelerator)
+    run = set_up(config, SILENT, accelerator=accelerator)
     first = run.world_model.predictor.state_dict()
     assert all(
         all(torch.equal(one, other) for one in all_gather_object(accelerator, other)) for other in first.values()
@@ -89,7 +91,7 @@ def main() -> None:
     run.state = replace(run.state, step=1, clips_done=8)
     save_checkpoint(run, Path(config.run_dir))
     own_disk = config.model_copy(update={"run_dir": config.run_dir if rank == 0 else f"{config.run_dir}-elsewhere"})
-    again = set_up(own_disk, lambda _: None, accelerator=accelerator)
+    again = set_up(own_disk, SILENT, accelerator=accelerator)
     assert (again.state.step, again.state.clips_done, again.state.run_id) == (1, 8, run.state.run_id)
     for before, after in zip(run.world_model.parameters(), again.world_model.parameters(), strict=True):
         assert torch.equal(before, after)

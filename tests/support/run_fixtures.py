@@ -1,8 +1,11 @@
 """A tiny run on synthetic episodes."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -11,6 +14,14 @@ from killable import Nursery
 from synthetic import write_synthetic_droid
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, parse_config
+from vjepa2_ac.episode import Progress
+from vjepa2_ac.reporter import SILENT, NullReporter
+
+if TYPE_CHECKING:
+    from accelerate import Accelerator
+
+    from vjepa2_ac.training.reporter import TrainingReporter
+    from vjepa2_ac.training.setup import Run
 
 TINY = {
     "image_size": 32,
@@ -31,27 +42,33 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(threads)
 
 
-class SilentReporter:
+class SilentReporter(NullReporter):
     """Keeps what it is told."""
 
     def __init__(self) -> None:
+        self.tasks: dict[str, list[tuple[int, int]]] = {}
         self.notes: list[str] = []
         self.steps: list[int] = []
 
     def note(self, text: str) -> None:
         self.notes.append(text)
 
-    def indexed(self, done: int, total: int) -> None: ...
-
-    def encoded(self, done: int, total: int) -> None: ...
-
-    def started(self, done: int, total: int) -> None: ...
+    def task(self, title: str, unit: str = "") -> Progress:
+        del unit
+        reported = self.tasks[title] = []
+        return lambda done, total: reported.append((done, total))
 
     def stepped(self, step: int, figures: object) -> None:
         del figures
         self.steps.append(step)
 
-    def validated(self, step: int, errors: object) -> None: ...
+
+def set_up(config: Config, reporter: TrainingReporter = SILENT, accelerator: Accelerator | None = None) -> Run:
+    """Return a run as `train` has it before its first step."""
+    from vjepa2_ac.training.resume import restore
+    from vjepa2_ac.training.setup import open_data, open_model
+
+    return restore(open_model(open_data(config, reporter, accelerator), reporter), reporter)
 
 
 @pytest.fixture(scope="session")

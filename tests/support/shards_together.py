@@ -12,13 +12,15 @@ from accelerate import Accelerator
 from torch.distributed.fsdp import FSDPModule
 from torch.distributed.tensor import DTensor
 
+from run_fixtures import set_up
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, load_config, parse_config
-from vjepa2_ac.console.training import ConsoleReporter
+from vjepa2_ac.console.training import TrainingConsole
 from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.training import optim
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import Run, batches_from, encode, set_up
+from vjepa2_ac.training.setup import Run, batches_from, encode
 from vjepa2_ac.training.step import gradients, training_step
 
 
@@ -50,9 +52,9 @@ def gradient_of(run: Run) -> tuple[float, float, dict[str, torch.Tensor]]:
 
 def check_gradients(config: Config, accelerator: Accelerator) -> None:
     """Loss, norm and gradients are those of processes that share clips only; so they are with a scaled loss."""
-    shared = set_up(config, lambda _: None, accelerator=accelerator)
+    shared = set_up(config, SILENT, accelerator=accelerator)
     with unshared():
-        plain = set_up(config, lambda _: None, accelerator=accelerator)
+        plain = set_up(config, SILENT, accelerator=accelerator)
     loss, norm, expected = gradient_of(plain)
     for scaler in (shared.scaler, torch.amp.GradScaler("cpu", init_scale=8.0)):
         shared.scaler = scaler
@@ -67,7 +69,7 @@ def check_gradients(config: Config, accelerator: Accelerator) -> None:
 
 def check_parts(config: Config, accelerator: Accelerator) -> None:
     """Between steps a process holds half of each weight, gradient and moment, also after a look at the predictions."""
-    run = set_up(config, lambda _: None, accelerator=accelerator)
+    run = set_up(config, SILENT, accelerator=accelerator)
     batches = batches_from(run)
     training_step(run, batches, 1)
     gradients(run, batches)
@@ -90,7 +92,7 @@ def check_fused(config: Config, accelerator: Accelerator) -> None:
     moved = []
     for fused in (False, True):
         with mock.patch.object(optim, "_are_on_cuda", lambda _, fused=fused: fused):
-            run = set_up(config, lambda _: None, accelerator=accelerator)
+            run = set_up(config, SILENT, accelerator=accelerator)
         assert all(bool(group["fused"]) == fused for group in run.optimizer.param_groups)
         batches = batches_from(run)
         for step in (1, 2):
@@ -114,9 +116,9 @@ def main() -> None:
     check_fused(config, accelerator)
     leave, Accelerator.end_training = Accelerator.end_training, lambda _: None  # this process has more to do
     # Two steps, then two more: goes on from what was shared. Then from what one process alone has written.
-    train(changed(config, steps=2), ConsoleReporter(), allow_config_change=True)
-    train(changed(config, steps=4), ConsoleReporter(), allow_config_change=True)
-    train(changed(load_config(folder / "handed_over.yaml"), steps=6), ConsoleReporter(), allow_config_change=True)
+    train(changed(config, steps=2), TrainingConsole(), allow_config_change=True)
+    train(changed(config, steps=4), TrainingConsole(), allow_config_change=True)
+    train(changed(load_config(folder / "handed_over.yaml"), steps=6), TrainingConsole(), allow_config_change=True)
     leave(accelerator)
 
 

@@ -58,13 +58,14 @@ def test_the_best_checkpoint_stays_when_a_run_is_resumed_unchanged(make_config, 
         ({"data__split_by": r"episode_(\d+)"}, {"its clips"}),
     ],
 )
-def test_what_changes_the_measurement_is_named(make_config, change: dict[str, object], named: set[str]) -> None:
+def test_what_changes_the_measurement_is_named(
+    make_config, reporter, change: dict[str, object], named: set[str]
+) -> None:
     before, now = of(make_config()), of(make_config(**change))
     assert {key for key in before | now if before.get(key) != now.get(key)} == named
-    notes: list[str] = []
-    state = best_so_far(replace(BEST, measured_on=before), now, notes.append)
+    state = best_so_far(replace(BEST, measured_on=before), now, reporter)
     assert (state.best_step, state.best_error, state.measured_on) == (None, None, now)
-    assert all(name in notes[0] for name in named)
+    assert all(name in reporter.notes[0] for name in named)
 
 
 def test_the_same_clips_elsewhere_are_the_same(make_config, tmp_path: Path, data_folder: Path) -> None:

@@ -10,6 +10,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from recording_cuda import RecordingCuda, recorded_copies
+from run_fixtures import set_up
 from same_run import assert_same_run
 from vjepa2_ac.data.clips import loader
 from vjepa2_ac.data.clips.clip_reader import ClipRequest
@@ -21,7 +22,7 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.runs.checkpoint import read_state
 from vjepa2_ac.training import setup
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import Run, batches_from, set_up
+from vjepa2_ac.training.setup import Run, batches_from
 from vjepa2_ac.training.step import gradients, training_step
 
 COPY = [*["side 1: to pinned memory", "side 1: to device"] * 3]  # frames, states, actions
@@ -58,7 +59,7 @@ def micro_batch(event: int) -> list[str]:
 
 
 def test_the_next_batch_is_on_its_way_before_the_host_waits_for_the_losses(make_config, reporter, cuda) -> None:
-    run = set_up(make_config(), reporter.note)
+    run = set_up(make_config(), reporter)
     batches = copied(run, cuda)
     for step in (1, 2):
         training_step(run, batches, step)
@@ -72,7 +73,7 @@ def test_the_next_batch_is_on_its_way_before_the_host_waits_for_the_losses(make_
 
 
 def test_after_the_last_step_and_in_a_trial_nothing_is_fetched_ahead(make_config, reporter, cuda) -> None:
-    run = set_up(make_config(training__steps=1), reporter.note)
+    run = set_up(make_config(training__steps=1), reporter)
     training_step(run, copied(run, cuda), 1)
     assert cuda.calls[-1] == "host: waits for the losses"
     assert cuda.calls[-2] == "backward"
@@ -107,7 +108,7 @@ def test_a_run_that_copies_ahead_is_the_run_that_does_not(make_config, reporter,
 
 def test_a_checkpoint_knows_nothing_of_the_clips_of_the_next_step(make_config, reporter, monkeypatch, request) -> None:
     read, config = loader.read_clip, make_config(data__broken_episodes="skip", checkpoint__every=1)
-    third = next(itertools.islice(batches_from(set_up(config, reporter.note)), 4, None))  # of two in each step
+    third = next(itertools.islice(batches_from(set_up(config, reporter)), 4, None))  # of two in each step
     bad = (third.episode_ids[0], third.starts[0])
 
     def read_some(dataset: Dataset, wish: ClipRequest) -> Clip:
@@ -135,7 +136,7 @@ def test_a_clip_that_cannot_be_read_stops_the_run_at_its_own_step(
         return read(*arguments)
 
     del on_device
-    run = set_up(config, reporter.note)
+    run = set_up(config, reporter)
     monkeypatch.setattr(loader, "read_clip", read_some)
     monkeypatch.setattr("vjepa2_ac.data.clips.clip_reader.read_clip", read_some)
     batches = batches_from(run)

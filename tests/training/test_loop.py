@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from copied_sets import write_rlds
+from run_fixtures import set_up
 from same_run import assert_same_run, metrics, trained_weights
 from vjepa2_ac.config import CheckpointConfig, Config
 from vjepa2_ac.config.loading import config_as_yaml
@@ -24,7 +25,7 @@ from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.training import loop, validation
 from vjepa2_ac.training.loop import train
-from vjepa2_ac.training.setup import batches_from, set_up
+from vjepa2_ac.training.setup import batches_from
 from vjepa2_ac.training.step import step_seed, training_step
 
 
@@ -135,7 +136,7 @@ def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporte
             training__batch_size=batch_size, training__accumulation=accumulation, adapter__dropout=0.0,
             training__max_grad_norm=None,
         )  # fmt: skip
-        run = set_up(config, reporter.note)
+        run = set_up(config, reporter)
         run.optimizer.step = lambda: None
         run.optimizer.zero_grad = lambda **_: None
         training_step(run, batches_from(run), 1)
@@ -149,7 +150,7 @@ def test_micro_batches_and_accumulation_equal_the_big_batch(make_config, reporte
 
 def test_checkpointing_of_activations_changes_no_gradient(make_config, reporter) -> None:
     def one_step(checkpointing: bool) -> list[float]:
-        run = set_up(make_config(training__gradient_checkpointing=checkpointing), reporter.note)
+        run = set_up(make_config(training__gradient_checkpointing=checkpointing), reporter)
         figures_of_step = training_step(run, batches_from(run), 1)
         return [figures_of_step["loss"], figures_of_step["grad_norm"]]
 
@@ -202,7 +203,7 @@ def test_check_does_everything_but_writes_nothing(make_config, reporter) -> None
 
 
 def test_a_loss_that_is_not_finite_stops_before_the_weights_move(make_config, reporter) -> None:
-    run = set_up(make_config(), reporter.note)
+    run = set_up(make_config(), reporter)
     poisoned = next(p for p in run.world_model.parameters() if p.requires_grad)
     with torch.no_grad():
         poisoned[0, 0] = float("nan")
@@ -258,7 +259,7 @@ def test_an_allowed_config_change_is_written_and_reported(make_config, reporter)
 def test_allowed_changes_of_the_optimizer_take_effect(make_config, reporter) -> None:
     """Its saved state has the old settings, and would restore them."""
     train(make_config(training__steps=2, training__weight_decay=0.04), reporter)
-    run = set_up(make_config(training__weight_decay=0.5, training__betas=[0.8, 0.9]), reporter.note)
+    run = set_up(make_config(training__weight_decay=0.5, training__betas=[0.8, 0.9]), reporter)
     assert [(group["weight_decay"], group["betas"]) for group in run.optimizer.param_groups] == [(0.5, (0.8, 0.9))]
     assert all(moments["step"] == 2 for moments in run.optimizer.state_dict()["state"].values())
 
@@ -331,7 +332,7 @@ def test_bf16_runs_and_keeps_what_is_trained_in_float32(make_config: object, rep
 
 def test_a_resumed_run_still_counts_the_broken_episodes_that_it_met(make_config, reporter, monkeypatch) -> None:
     read, config = loader.read_clip, make_config(training__steps=2, data__broken_episodes="skip")
-    bad = next(batches_from(set_up(config, reporter.note))).episode_ids[0]
+    bad = next(batches_from(set_up(config, reporter))).episode_ids[0]
 
     def read_some(dataset: Dataset, wish: ClipRequest) -> Clip:
         if dataset.table.identity(wish.episode) == bad:
@@ -342,13 +343,13 @@ def test_a_resumed_run_still_counts_the_broken_episodes_that_it_met(make_config,
     monkeypatch.setattr(loader, "read_clip", read_some)
     train(config, reporter)
     monkeypatch.setattr(loader, "read_clip", read)
-    assert set_up(config, reporter.note).dataset.broken.reasons == {bad: "here: damaged."}
+    assert set_up(config, reporter).dataset.broken.reasons == {bad: "here: damaged."}
 
 
 def test_an_episode_may_be_left_out_within_a_run(make_config, reporter) -> None:
     config = make_config(training__steps=2)
     train(config, reporter)
-    broken = next(batches_from(set_up(config, reporter.note))).episode_ids[0]
+    broken = next(batches_from(set_up(config, reporter))).episode_ids[0]
     assert not any("data has changed" in note for note in reporter.notes)
     train(make_config(training__steps=2, data__exclude=[broken]), reporter)
     reported = "\n".join(reporter.notes)

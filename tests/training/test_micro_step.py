@@ -9,13 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
+from run_fixtures import set_up
 from vjepa2_ac.config import Config
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora_linear import CastMatrices, LoraLinear
 from vjepa2_ac.training.micro_step import Body, CapturedMicroStep, MicroStep
-from vjepa2_ac.training.setup import Run, batches_from, encode, set_up
+from vjepa2_ac.training.setup import Run, batches_from, encode
 from vjepa2_ac.training.step import training_step
 
 STEPS = 3
@@ -68,7 +69,7 @@ def make_run(make_config: Callable[..., Config], reporter) -> Callable[..., Run]
             adapter__dropout=0.0, training__batch_size=2, training__accumulation=2, training__learning_rate=1e-2,
             training__warmup_steps=0, **changes,
         )  # fmt: skip
-        return set_up(config, reporter.note)
+        return set_up(config, reporter)
 
     return make
 

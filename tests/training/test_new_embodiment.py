@@ -14,6 +14,7 @@ from vector_sets import write_vectors
 from vjepa2_ac.config import Config, ModelConfig
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
 from vjepa2_ac.export.export import export_run
@@ -130,7 +131,7 @@ def test_what_it_learnt_is_a_base_that_the_same_robot_trains_on(
     assert any("state encoder: the base's own" in note for note in again.notes)
     evaluation = evaluate_subject(str(folder), QUICK).evaluation
     assert list(evaluation.models) == ["base", "adapter"]
-    results = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), clips=4).results
+    results = calibrate_config(make_robot(data__stride_candidates=[1, 2], **second), ClipSample(clips=4)).results
     assert [one.moved_cm for one in results] == [None, None]
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 import torch
 
+from run_fixtures import set_up
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.loader import training_loader
 from vjepa2_ac.distributed.launch import make_accelerator
@@ -15,7 +16,7 @@ from vjepa2_ac.encoding.batch import extrinsics_for
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training import optim
-from vjepa2_ac.training.setup import Run, save_checkpoint, set_up
+from vjepa2_ac.training.setup import Run, save_checkpoint
 from vjepa2_ac.training.step import Gradients, gradients, training_step
 
 
@@ -36,7 +37,7 @@ def prepared(make_config: Any, reporter: Any, batch_size: int, accumulation: int
         training__batch_size=batch_size, training__accumulation=accumulation, adapter__dropout=0.0,
         training__max_grad_norm=None, **changes,
     )  # fmt: skip
-    return set_up(config, reporter.note)
+    return set_up(config, reporter)
 
 
 def taken(run: Run, batches: list[Batch]) -> tuple[Gradients, dict[str, torch.Tensor]]:
@@ -147,9 +148,9 @@ def test_gradients_that_overflow_whatever_the_loss_scale_stop_the_run(make_confi
 def test_the_loss_scale_is_restored(make_config, reporter, tmp_path) -> None:
     config = make_config(training__max_grad_norm=None, training__precision="fp16")
     on_cpu = make_accelerator(make_config())  # which fp16 would be refused on
-    run = with_loss_scale(set_up(config, reporter.note, accelerator=on_cpu), 64.0)
+    run = with_loss_scale(set_up(config, reporter, accelerator=on_cpu), 64.0)
     training_step(run, training_loader(run.dataset, seed=0, batch_size=2), 1)
     save_checkpoint(run, tmp_path / "run")
-    other = set_up(config, reporter.note, accelerator=on_cpu)
+    other = set_up(config, reporter, accelerator=on_cpu)
     assert other.scaler.state_dict() == run.scaler.state_dict()
     assert other.scaler.state_dict()["_growth_tracker"] == 1

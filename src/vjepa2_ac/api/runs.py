@@ -11,9 +11,9 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.estimates import over_persistence
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 from vjepa2_ac.evaluation.result import PredictionErrors
+from vjepa2_ac.reporter import NullReporter
 from vjepa2_ac.reports.write import Evaluated, evaluate_subject
 from vjepa2_ac.training import loop
-from vjepa2_ac.training.reporter import NullReporter
 
 logger = logging.getLogger(__name__)
 

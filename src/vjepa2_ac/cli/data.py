@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -72,16 +70,18 @@ def _check(options: argparse.Namespace) -> int:
         require_subject(options.model)
 
     from vjepa2_ac.console.data import print_finding
+    from vjepa2_ac.console.progress import ConsoleReporter
     from vjepa2_ac.data.inspection.check import check_data
+    from vjepa2_ac.reporter import INDEXING
 
     wrong = 0
-    with _progress("looking through the data set") as progress:
+    with ConsoleReporter() as reporter:
         findings = check_data(
             config.data,
             seed=config.seed,
             batch_size=config.training.batch_size,
             clips=options.limit,
-            progress=progress,
+            progress=reporter.task(INDEXING),
         )
         for finding in findings:
             print_finding(finding)
@@ -93,15 +93,15 @@ def _check(options: argparse.Namespace) -> int:
 
 def _probe(config: Config, model: str, *, clips: int) -> None:
     from vjepa2_ac.console.data import print_finding, probe_table
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.data.clips.dataset import open_dataset
     from vjepa2_ac.data.inspection.check import at_some_stride
     from vjepa2_ac.data.inspection.finding import Finding
     from vjepa2_ac.evaluation.data_variants.from_config import probe_config
 
     dataset = at_some_stride(open_dataset(config.data))
-    with _progress("probing") as progress:
-        probe = probe_config(config, dataset, model=model, clips=clips, progress=progress)
+    with ConsoleReporter() as reporter:
+        probe = probe_config(config, dataset, model=model, clips=clips, progress=reporter.task("probing"))
     console.print(probe_table(probe))
     print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
 
@@ -117,13 +117,14 @@ def _index(options: argparse.Namespace) -> None:
     config = read_config(options.config, options.overrides).data
 
     from vjepa2_ac.console.data import index_lines
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.data.clips.dataset import open_dataset
     from vjepa2_ac.data.index.index_cache import record_usage
+    from vjepa2_ac.reporter import INDEXING
 
     started = time.perf_counter()
-    with _progress("looking through the data set") as progress, record_usage(rebuild=options.rebuild) as watch:
-        dataset = open_dataset(config, progress=progress)
+    with ConsoleReporter() as reporter, record_usage(rebuild=options.rebuild) as watch:
+        dataset = open_dataset(config, progress=reporter.task(INDEXING))
     for line in index_lines(dataset.table, watch, time.perf_counter() - started):
         console.print(line)
 
@@ -144,19 +145,20 @@ def _inspect(options: argparse.Namespace) -> None:
     _make_folder(options.out)
 
     from vjepa2_ac.console.data import inspection_lines, motion_table
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.data.clips.dataset import open_dataset
     from vjepa2_ac.data.inspection.check import at_some_stride
     from vjepa2_ac.data.inspection.statistics import RELEASED, inspect_dataset
+    from vjepa2_ac.reporter import INDEXING
     from vjepa2_ac.reports.figures.dataset import plot_dataset
     from vjepa2_ac.storage import write_atomically
 
-    with _progress("looking through the data set") as progress:
-        dataset = at_some_stride(open_dataset(config.data, progress=progress))
+    with ConsoleReporter() as reporter:
+        dataset = at_some_stride(open_dataset(config.data, progress=reporter.task(INDEXING)))
     if config.data.stride == "auto":
         console.print(f"data.stride is auto: looked at the smallest candidate, {dataset.config.stride}")
-    with _progress("reading states") as progress:
-        inspection = inspect_dataset(dataset, episodes=options.episodes, progress=progress)
+    with ConsoleReporter() as reporter:
+        inspection = inspect_dataset(dataset, episodes=options.episodes, progress=reporter.task("reading states"))
     for line in inspection_lines(inspection):
         console.print(line)
     console.print(motion_table(inspection))
@@ -164,8 +166,8 @@ def _inspect(options: argparse.Namespace) -> None:
         console.print(f"For comparison: {RELEASED}.")
     write_atomically(options.out / "inspect.json", json.dumps(inspection.as_dict(), indent=1).encode())
     path = options.out / "contact_sheet.png"
-    with _progress("reading frames") as progress:
-        image = plot_dataset(dataset, inspection, path, rows=options.rows, progress=progress)
+    with ConsoleReporter() as reporter:
+        image = plot_dataset(dataset, inspection, path, rows=options.rows, progress=reporter.task("reading frames"))
     console.print(f"  {image}\n  {options.out / 'inspect.json'}")
 
 
@@ -190,37 +192,19 @@ def _calibrate(options: argparse.Namespace) -> None:
     _make_folder(options.out)
 
     from vjepa2_ac.console.data import calibration_table
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.evaluation.measure import ClipSample
     from vjepa2_ac.evaluation.stride_calibration.from_config import calibrate_config
     from vjepa2_ac.storage import write_atomically
 
-    with _progress("looking through the data set") as indexing, _progress("measuring clips") as measuring:
-        calibration = calibrate_config(
-            config,
-            model=options.model,
-            split=options.split,
-            clips=options.limit,
-            frames=options.frames,
-            indexing=indexing,
-            measuring=measuring,
-        )
+    with ConsoleReporter() as reporter:
+        sample = ClipSample(options.split, options.limit, options.frames)
+        calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     console.print(calibration_table(calibration))
     console.print(calibration.verdict())
     path = options.out / "calibration.json"
     write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
     console.print(f"  {path}")
-
-
-@contextlib.contextmanager
-def _progress(title: str) -> Iterator[Callable[[int, int], None]]:
-    """Provide a function that shows the progress of long work; nothing is shown for work that is done at once."""
-    from vjepa2_ac.console.progress import LateProgress
-
-    bar = LateProgress(title)
-    try:
-        yield bar
-    finally:
-        bar.close()
 
 
 def _make_folder(folder: Path) -> None:

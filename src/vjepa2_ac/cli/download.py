@@ -18,9 +18,14 @@ def add_download(commands: Commands[argparse.ArgumentParser]) -> None:
 
 
 def _download(options: argparse.Namespace) -> None:
-    from vjepa2_ac.console.progress import DownloadProgress, console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.model.checkpoints.download import OFFICIAL_URL, download
 
-    progress = DownloadProgress(options.path.name)
-    download(options.url or OFFICIAL_URL, options.path, progress=progress)
+    with ConsoleReporter() as reporter:
+        show = reporter.task(f"{options.path.name} (MB)")
+
+        def progress(done: int, whole: int | None) -> None:
+            show(done // 10**6, (whole or 0) // 10**6)
+
+        download(options.url or OFFICIAL_URL, options.path, progress=progress)
     console.print(f"The checkpoint is in {options.path}")

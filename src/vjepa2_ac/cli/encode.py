@@ -31,28 +31,14 @@ def add_encode(commands: Commands[argparse.ArgumentParser]) -> None:
 def _encode(options: argparse.Namespace) -> None:
     config = read_config(options.config, options.overrides, base=True)
 
-    from vjepa2_ac.console.progress import EncodingBar, LateProgress, console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.encoding.encode_dataset import encode_config
+    from vjepa2_ac.reporter import SILENT
 
     output.never_wait()
     is_first = os.environ.get("RANK", "0") == "0"
-    looking, bar = LateProgress("looking through the data set"), EncodingBar()
-
-    def note(text: str) -> None:
-        if is_first:
-            console.print(text)
-
-    try:
-        encoded = encode_config(
-            config,
-            note,
-            out=options.out,
-            indexed=looking if is_first else None,
-            progress=bar if is_first else None,
-        )
-    finally:
-        looking.close()
-        bar.close()
+    with ConsoleReporter() as reporter:
+        encoded = encode_config(config, reporter if is_first else SILENT, out=options.out)
     manifest = encoded.manifest
     if manifest is None:
         console.print(f"This process has done its share; others are still at work on {encoded.folder}")

@@ -78,6 +78,12 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser.add_argument("--clips", type=count, default=256, help="at most this many clips, spread over the episodes")
     add_checkpoint(parser)
     parser.add_argument("--calibrate", action="store_true", help="measure the one-step error at other strides, too")
+    parser.set_defaults(overrides=[])
+    _add_probes(parser)
+    _add_planning(parser)
+
+
+def _add_probes(parser: argparse.ArgumentParser) -> None:
     probes = parser.add_argument_group("use of the actions")
     probes.add_argument(
         "--sensitivity-clips", metavar="N", type=whole_number(0), default=32, help="clips to try other actions on (32)"
@@ -104,6 +110,9 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
     probes.add_argument(
         "--at-once", metavar="N", type=count, default=64, help="actions computed together (64): lower it to save memory"
     )
+
+
+def _add_planning(parser: argparse.ArgumentParser) -> None:
     planning = parser.add_argument_group("plans (they take long: see docs/evaluation.md)")
     planning.add_argument(
         "--planning",
@@ -112,7 +121,6 @@ def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
         help="plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score;"
         " settings of the plan of one step, such as planning.samples=200, in place of the config's, here or anywhere",
     )
-    parser.set_defaults(overrides=[])
     planning.add_argument(
         "--planning-clips", metavar="N", type=count, default=32, help="clips to plan from, one frame of each (32)"
     )
@@ -126,16 +134,16 @@ def _evaluate(options: argparse.Namespace) -> None:
         settle(subject, how)
         require_subject(subject, how.checkpoint)
 
-    from vjepa2_ac.console.evaluation import Stages, evaluation_tables
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.evaluation import evaluation_tables
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.evaluation.verdict import spread, verdict
     from vjepa2_ac.reports.write import evaluate_subject
 
     evaluations = []
     for subject, how in asked:
         say_places_elsewhere(subject)
-        with Stages() as stages:
-            measured = evaluate_subject(subject, how, stage=stages)
+        with ConsoleReporter() as reporter:
+            measured = evaluate_subject(subject, how, reporter)
         evaluations.append(measured.evaluation)
         console.print(f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject)
         for table in evaluation_tables(measured.evaluation):

@@ -41,6 +41,23 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         "subject", metavar="RUN_OR_MODEL", type=as_model, help="folder of a run, or what model.base takes"
     )
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as planning.horizon=2")
+    _add_request(parser)
+    parser.add_argument(
+        "--config", metavar="CONFIG", type=as_local, help="for a model: the config whose planning, crop and dtype count"
+    )
+    add_checkpoint(parser)
+    parser.add_argument("--seed", metavar="N", type=whole_number(0, 2**31 - 1), help="default: the config's")
+    parser.add_argument(
+        "--nodes",
+        metavar="N",
+        type=whole_number(0, 101),
+        default=13,
+        help="of an energy slice along each axis (13); below 3: no slices",
+    )
+    parser.add_argument("--out", metavar="FOLDER", type=as_path, default=Path("plan"), help="for both files (plan)")
+
+
+def _add_request(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--start", metavar="IMAGE", type=as_local, required=True, help="what the camera sees: PNG or JPEG"
     )
@@ -75,19 +92,6 @@ def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
         metavar="NUMBERS",
         help="the camera in the robot base frame: x,y,z,roll,pitch,yaw; where the model uses it",
     )
-    parser.add_argument(
-        "--config", metavar="CONFIG", type=as_local, help="for a model: the config whose planning, crop and dtype count"
-    )
-    add_checkpoint(parser)
-    parser.add_argument("--seed", metavar="N", type=whole_number(0, 2**31 - 1), help="default: the config's")
-    parser.add_argument(
-        "--nodes",
-        metavar="N",
-        type=whole_number(0, 101),
-        default=13,
-        help="of an energy slice along each axis (13); below 3: no slices",
-    )
-    parser.add_argument("--out", metavar="FOLDER", type=as_path, default=Path("plan"), help="for both files (plan)")
 
 
 def _plan(options: argparse.Namespace) -> int:
@@ -102,9 +106,8 @@ def _plan(options: argparse.Namespace) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
     images = _images(options)
 
-    from vjepa2_ac.console.evaluation import Stages
     from vjepa2_ac.console.plan import plan_table
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.planning.decision import PlanRequest, decide
     from vjepa2_ac.planning.plan_json import PLAN_FILE, write_plan
     from vjepa2_ac.planning.session import load_to_plan
@@ -118,8 +121,8 @@ def _plan(options: argparse.Namespace) -> int:
     )
     if not options.durations:
         question = question.with_equal_durations(steering.config.planning.horizon)
-    with Stages() as stages:
-        progress = stages("planning, iterations")
+    with ConsoleReporter() as reporter:
+        progress = reporter.task("planning, iterations")
         controller = steering.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
         found = decide(controller, question, nodes=options.nodes)
     images_given = {"start": options.start, "goals": options.goal, "mask": options.mask}

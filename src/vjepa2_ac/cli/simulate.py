@@ -124,26 +124,22 @@ def _record(options: argparse.Namespace) -> int:
     with user_can_write(target):
         try_writing_at(target)
 
-    from vjepa2_ac.console.progress import ProgressBar, console
-    from vjepa2_ac.simulation.recording.record import record_dataset
+    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
 
     output.never_wait()
-    bar = ProgressBar("recording", options.episodes)
-    try:
-        folder = record_dataset(
-            target,
-            domain=options.domain,
-            episodes=options.episodes,
-            steps=options.steps,
-            seed=options.seed,
-            workers=options.workers,
-            cameras=options.cameras,
-            renderer=options.renderer,
-            task=None if options.task == "reach" else options.task,
-            progress=lambda done, _: bar.advance_to(done),
-        )
-    finally:
-        bar.close()
+    spec = RecordingSpec(
+        options.domain,
+        steps=options.steps,
+        seed=options.seed,
+        cameras=options.cameras,
+        renderer=options.renderer,
+        task=None if options.task == "reach" else options.task,
+    )
+    with ConsoleReporter() as reporter:
+        progress = reporter.task("recording")
+        progress(0, options.episodes)
+        folder = record_dataset(target, spec, episodes=options.episodes, workers=options.workers, progress=progress)
     console.print(f"{options.episodes} episodes are in {folder}")
     return 0
 
@@ -159,8 +155,7 @@ def _steer(options: argparse.Namespace) -> int:
     require_to_plan(options)
 
     from vjepa2_ac.console.closed_loop import contest_notes, contest_table
-    from vjepa2_ac.console.evaluation import Stages
-    from vjepa2_ac.console.progress import console
+    from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.planning.session import load_to_plan
     from vjepa2_ac.runs.own_files import refuse_links_out
     from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions, run_benchmark
@@ -184,8 +179,8 @@ def _steer(options: argparse.Namespace) -> int:
         refuse_links_out(Path(options.subject), [name])
     home = Path(options.subject) if is_run(options.subject) else Path()
     folder = options.out or home / name
-    with Stages() as stages:
-        contest, files = run_benchmark(steering, asked, folder, stage=stages)
+    with ConsoleReporter() as reporter:
+        contest, files = run_benchmark(steering, asked, folder, reporter)
     if steering.checkpoint:
         console.print(f"{options.subject}: checkpoint {steering.checkpoint}")
     console.print(contest_table(contest))

@@ -51,21 +51,19 @@ def _train(options: argparse.Namespace) -> int:
     config = read_run_config(path) if options.resume else read_config(path, options.overrides, base=True)
 
     from vjepa2_ac.console.progress import console
-    from vjepa2_ac.console.training import ConsoleReporter
+    from vjepa2_ac.console.training import TrainingConsole
     from vjepa2_ac.distributed.preemption import EXIT_STATUS, StoppedError
     from vjepa2_ac.training.loop import train
 
     output.never_wait()
-    reporter = ConsoleReporter()
     speaks = os.environ.get("RANK", "0") == "0"  # one of several processes
     try:
-        folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
+        with TrainingConsole() as reporter:
+            folder = train(config, reporter, check_only=options.check, allow_config_change=options.allow_config_change)
     except StoppedError as stopped:
         if speaks:
             print(printable(str(stopped)), file=sys.stderr)
         return EXIT_STATUS
-    finally:
-        reporter.close()
     if speaks and not options.check:
         console.print(f"The run is in {folder}; see how good it is: vjepa2-ac evaluate {folder}")
     return 0

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from types import TracebackType
 from typing import Literal
 
 from rich.table import Table
 
-from vjepa2_ac.console.progress import LateProgress, MetricsTable
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.console.progress import MetricsTable
 from vjepa2_ac.evaluation.action_score.metrics import AXES, PlanMetrics, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
@@ -20,34 +18,6 @@ from vjepa2_ac.reports.comparison import Comparison
 
 _MOST_HORIZONS = 8  # rows; of longer clips some are left out, but are in metrics.json
 _TOP = 5
-
-
-class Stages:
-    """Shows the parts of the work one after another, each with a progress bar."""
-
-    def __init__(self) -> None:
-        self._bar: LateProgress | None = None
-
-    def __call__(self, title: str) -> Progress:
-        """Begin another part; return the function that receives its progress."""
-        self._close()
-        self._bar = LateProgress(title)
-        return self._bar
-
-    def __enter__(self) -> Stages:
-        """Return these stages."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Restore the terminal."""
-        self._close()
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
 
 
 def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:

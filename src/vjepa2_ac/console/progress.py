@@ -5,16 +5,17 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from datetime import timedelta
-from typing import Any
+from typing import Any, Self
 
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 from rich.text import Text
 
 from vjepa2_ac.errors import printable
 
+_LINE_EVERY_S = 10.0
 _WIDE = 120  # columns that leave room for a long bar
 _BESIDE_A_CELL = 3  # a line and two spaces
 _WHOLE = 16  # characters: a longer word of a table, such as a path, may be divided
@@ -78,35 +79,30 @@ if not console.is_terminal:
 
 
 class ProgressBar:
-    """A progress bar with a short text in a terminal; a line every few seconds elsewhere."""
+    """The progress of a task: a bar with a short text in a terminal, a line every few seconds elsewhere.
 
-    def __init__(self, title: str, total: int, done: int = 0, line_every_s: float = 10.0) -> None:
-        self._title, self._total, self._done, self._line_every_s = title, total, done, line_every_s
-        self._first, self._began = done, time.monotonic()
-        self._last_line = self._began
+    It begins at the first call: nothing is shown of work that is done at once.
+    """
+
+    def __init__(self, title: str, unit: str = "") -> None:
+        self._title, self._unit, self._total = title, unit, -1
+        self._first, self._began, self._last_line = 0, 0.0, 0.0
         self._bar: Progress | None = None
-        self._task: TaskID | None = None
-        if console.is_terminal:
-            self._bar = Progress(
-                _Words("{task.description}"),
-                BarColumn(bar_width=40 if console.width >= _WIDE else 6, table_column=Column(no_wrap=True)),
-                MofNCompleteColumn(table_column=Column(no_wrap=True)),
-                TimeRemainingColumn(table_column=Column(no_wrap=True)),
-                _Words("{task.fields[words]}", table_column=Column()),  # wraps if it does not fit
-                console=console,
-            )
-            self._task = self._bar.add_task(title, total=total, completed=done, words="")
-            self._bar.start()
 
-    def advance_to(self, done: int, words: str = "") -> None:
-        """Show that `done` of the total are done."""
-        self._done = done
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=done, words=words)
-        elif done == self._total or time.monotonic() - self._last_line >= self._line_every_s:
-            self._last_line = time.monotonic()
-            console.print(f"{self._title} {done}/{self._total}  {words}{self._left()}")
-        if done >= self._total:
+    def __call__(self, done: int, total: int, words: str = "") -> None:
+        """Show that `done` of `total` are done; another total begins another bar."""
+        if total != self._total:
+            self._open(done, total)
+        now = time.monotonic()
+        if self._unit and done:
+            speed = done / max(now - self._began, 1e-9)
+            words = f"{speed:.{1 if speed < 100 else 0}f} {self._unit}/s"
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=done, words=words)
+        elif not console.is_terminal and (done == total or now - self._last_line >= _LINE_EVERY_S):
+            self._last_line = now
+            console.print(f"{self._title} {done}/{total}  {words}{self._left(done, now)}")
+        if done >= total:
             self.close()
 
     def close(self) -> None:
@@ -115,67 +111,51 @@ class ProgressBar:
             self._bar.stop()
             self._bar = None
 
-    def _left(self) -> str:
+    def _open(self, done: int, total: int) -> None:
+        self.close()
+        self._first, self._total = done, total
+        self._began = self._last_line = time.monotonic()
+        if not console.is_terminal:
+            return
+        self._bar = Progress(
+            _Words("{task.description}"),
+            BarColumn(bar_width=40 if console.width >= _WIDE else 6, table_column=Column(no_wrap=True)),
+            MofNCompleteColumn(table_column=Column(no_wrap=True)),
+            TimeRemainingColumn(table_column=Column(no_wrap=True)),
+            _Words("{task.fields[words]}", table_column=Column()),  # wraps if it does not fit
+            console=console,
+        )
+        self._bar.add_task(self._title, total=total, completed=done, words="")
+        self._bar.start()
+
+    def _left(self, done: int, now: float) -> str:
         """Return as text the time left at the average speed so far."""
-        advanced, remaining = self._done - self._first, self._total - self._done
+        advanced, remaining = done - self._first, self._total - done
         if advanced <= 0 or remaining <= 0:
             return ""
-        seconds = (time.monotonic() - self._began) / advanced * remaining
-        return f"  {timedelta(seconds=round(seconds))} left"
+        return f"  {timedelta(seconds=round((now - self._began) / advanced * remaining))} left"
 
 
-class LateProgress:
-    """A progress bar whose total is known when the work begins; none is shown if there is nothing to do."""
-
-    def __init__(self, title: str) -> None:
-        self._title = title
-        self._bar: ProgressBar | None = None
-        self._total = -1
-
-    def __call__(self, done: int, total: int) -> None:
-        """Show that `done` of `total` are done; another total begins another bar."""
-        if total != self._total:
-            self.close()
-            self._bar, self._total = ProgressBar(self._title, total), total
-        if self._bar is not None:
-            self._bar.advance_to(done)
-
-    def close(self) -> None:
-        """Restore the terminal."""
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-
-
-class EncodingBar:
-    """A progress bar of encoded frames, with their number per second; begins at the first call."""
+class ConsoleReporter:
+    """Shows messages, and one task after another as a bar; at the end of its `with` block the terminal is restored."""
 
     def __init__(self) -> None:
-        self._bar: ProgressBar | None = None
-        self._began = 0.0
+        self._bar = ProgressBar("")
 
-    def __call__(self, done: int, total: int) -> None:
-        """Show that `done` of `total` are done."""
-        if self._bar is None:
-            self._bar, self._began = ProgressBar("encoding frames", total), time.monotonic()
-        speed = done / max(time.monotonic() - self._began, 1e-9)
-        self._bar.advance_to(done, f"{speed:.{1 if speed < 100 else 0}f} frames/s" if done else "")
+    def note(self, text: str) -> None:
+        """Print a message."""
+        console.print(text)
 
-    def close(self) -> None:
+    def task(self, title: str, unit: str = "") -> ProgressBar:
+        """Begin another task; return its bar."""
+        self._bar.close()
+        self._bar = ProgressBar(title, unit)
+        return self._bar
+
+    def __enter__(self) -> Self:
+        """Return this reporter."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
         """Restore the terminal."""
-        if self._bar is not None:
-            self._bar.close()
-
-
-class DownloadProgress:
-    """Shows the progress of a download."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._bar: ProgressBar | None = None
-
-    def __call__(self, done: int, whole: int | None) -> None:
-        """Show that `done` of `whole` bytes are downloaded; in megabytes."""
-        if self._bar is None:
-            self._bar = ProgressBar(f"{self._name} (MB)", (whole or 0) // 10**6)
-        self._bar.advance_to(done // 10**6)
+        self._bar.close()

@@ -4,48 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from vjepa2_ac.console.progress import EncodingBar, LateProgress, ProgressBar, console
+from vjepa2_ac.console.progress import ConsoleReporter, console
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, PredictionErrors
 
 _MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
 
 
-class ConsoleReporter:
+class TrainingConsole(ConsoleReporter):
     """Shows a training run."""
 
     def __init__(self) -> None:
-        self._looking = LateProgress("looking through the data set")
-        self._encoding = EncodingBar()
-        self._bar: ProgressBar | None = None
-        self._validation = ""
-
-    def note(self, text: str) -> None:
-        """Show a message."""
-        console.print(text)
-
-    def indexed(self, done: int, total: int) -> None:
-        """Show the progress of indexing."""
-        self._looking(done, total)
-
-    def encoded(self, done: int, total: int) -> None:
-        """Show the progress of the latent cache."""
-        self._encoding(done, total)
+        super().__init__()
+        self._steps, self._validation = 0, ""
 
     def started(self, done: int, total: int) -> None:
         """Begin the bar."""
-        self._bar = ProgressBar("training", total, done)
+        bar, self._steps = self.task("training"), total
+        if done < total:
+            bar(done, total)
 
     def stepped(self, step: int, metrics: Mapping[str, float]) -> None:
         """Move the bar."""
-        if self._bar is not None:
-            speed = metrics["samples_per_second"]
-            words = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
-            if "bytes_per_clip" in metrics:
-                words.append(f"{metrics['bytes_per_clip'] / 1e6:.2f} MB/clip")
-            if metrics.get("data_wait_share", 0.0) > _MUCH_WAITING:
-                words.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
-            self._bar.advance_to(step, "  ".join(word for word in words if word))
+        speed = metrics["samples_per_second"]
+        words = [f"loss {metrics['loss']:.4f}", self._validation, f"{speed:.{1 if speed >= 10 else 2}f} clips/s"]
+        if "bytes_per_clip" in metrics:
+            words.append(f"{metrics['bytes_per_clip'] / 1e6:.2f} MB/clip")
+        if metrics.get("data_wait_share", 0.0) > _MUCH_WAITING:
+            words.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
+        self._bar(step, self._steps, "  ".join(word for word in words if word))
 
     def validated(self, step: int, errors: PredictionErrors) -> None:
         """Print a line of the validation's metrics."""
@@ -57,10 +44,3 @@ class ConsoleReporter:
             f" (zero actions {zero:.3f}, shuffled {shuffled:.3f});"
             f" rollout by horizon  {horizons}"
         )
-
-    def close(self) -> None:
-        """Restore the terminal."""
-        self._looking.close()
-        self._encoding.close()
-        if self._bar is not None:
-            self._bar.close()

@@ -14,6 +14,7 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import CLIPS_WORTH_WORKERS, validation_batches
 from vjepa2_ac.distributed.collectives import all_gather_object
 from vjepa2_ac.episode import Batch
+from vjepa2_ac.reporter import Reporter
 
 SHARED_MEMORY = "/dev/shm"  # noqa: S108  # where PyTorch puts them on Linux
 _MOST_CLIPS_READ = 8  # one is needed; the others replace clips that data.broken_episodes skips
@@ -36,7 +37,7 @@ class FileSystem(Protocol):
 
 
 def warn_if_shared_memory_is_small(
-    config: Config, dataset: Dataset, batch_of_frames: Batch, accelerator: Accelerator, note: Callable[[str], None]
+    config: Config, dataset: Dataset, batch_of_frames: Batch, accelerator: Accelerator, reporter: Reporter
 ) -> None:
     """Warn before the first step if batches of this run may not fit. All processes have to call.
 
@@ -45,7 +46,7 @@ def warn_if_shared_memory_is_small(
         dataset: Its clips.
         batch_of_frames: A batch of them as frames, also where they come from a latent cache now.
         accelerator: Used to count the processes on this machine.
-        note: Called with the warning.
+        reporter: Receives the warning.
     """
     here = platform.node()
     processes = all_gather_object(accelerator, here).count(here)
@@ -56,7 +57,7 @@ def warn_if_shared_memory_is_small(
         clip = next(validation_batches(dataset, "train", clips=_MOST_CLIPS_READ, batch_size=1))
     text = small_shared_memory(config, clip.nbytes, processes)
     if text is not None:
-        note(text)
+        reporter.note(text)
 
 
 def small_shared_memory(

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Int64, UInt8
+from jaxtyping import Int64
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.filters.idle_ranges import find_ranges
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding
-from vjepa2_ac.data.sources.latents.episode_file import EpisodeLayout, write_episode_file
+from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode, EpisodeLayout, write_episode_file
 from vjepa2_ac.data.sources.latents.manifest import EPISODES, KEPT, MANIFEST, Manifest, path_of, size_column
-from vjepa2_ac.episode import Episode, StoredLatents
 
 if TYPE_CHECKING:
     from vjepa2_ac.data.clips.dataset import Dataset
@@ -37,32 +36,18 @@ class CacheWriter:
         """Return whether an episode, by its index in the data set, has been written."""
         return path_of(self.folder, number, camera).is_file()
 
-    def write_episode(
-        self,
-        number: int,
-        camera: str,
-        episode: Episode,
-        *,
-        steps: Sequence[int],
-        latents: StoredLatents,
-        small_frames: UInt8[np.ndarray, "frames height width 3"],
-    ) -> int:
+    def write_episode(self, number: int, encoded: EncodedEpisode) -> int:
         """Write an episode of one camera and return the size of its file.
 
         Args:
             number: Index of the episode in the data set.
-            camera: One of `data.camera`.
-            episode: From the source for this camera; none of its frames is read.
-            steps: Control steps of the frames, as `latent_cache.needed_frames` names them.
-            latents: Of these frames, in the type that the key names (`precision.stored` converts them).
-            small_frames: Of these frames, square as the encoder sees them and small; for display.
+            encoded: Its latents, of the frames that `cache_lookup.needed_frames` names, in the type of the key.
 
         Raises:
             InputError: The folder cannot be written, or the disk is full.
         """
         layout = EpisodeLayout(self.key.digest, self.key.kind, self.encoding.tokens, self.encoding.dim)
-        path = path_of(self.folder, number, camera)
-        return write_episode_file(path, layout, episode, camera, steps=steps, latents=latents, pictures=small_frames)
+        return write_episode_file(path_of(self.folder, number, encoded.camera), layout, encoded)
 
     def finish(
         self, dataset: Dataset, *, broken: Mapping[str, str], frames: int, about: Mapping[str, Any] | None = None

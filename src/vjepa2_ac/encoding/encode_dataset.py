@@ -7,7 +7,6 @@ file.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
 from functools import partial
@@ -17,6 +16,7 @@ import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.clips.loader import ProcessShare
 from vjepa2_ac.data.sources.latents.manifest import Manifest, is_whole, read_manifest
 from vjepa2_ac.distributed.device import autocast, computing_device
 from vjepa2_ac.encoding.batch import encoding_of
@@ -25,13 +25,11 @@ from vjepa2_ac.encoding.cache_writer import CacheWriter
 from vjepa2_ac.encoding.disk_space import GIGABYTE, free_bytes, require_space
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, build
 from vjepa2_ac.encoding.repair import describe, missing_files, restart
-from vjepa2_ac.encoding.workload import Workload, WorkloadShare, claim_folder
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.encoding.workload import Workload, claim_folder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
-
-Note = Callable[[str], None]
+from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 
 
 @dataclass(frozen=True)
@@ -44,39 +42,35 @@ class EncodedSet:
 
 def encode_config(
     config: Config,
-    note: Note,
+    reporter: Reporter = SILENT,
     *,
     out: Path | None = None,
-    indexed: Progress | None = None,
-    progress: Progress | None = None,
 ) -> EncodedSet:
     """Write the latents of every frame that the clips of a config need, or this process's share of them.
 
     Args:
         config: The data, the model whose encoder is used, device and precision.
-        note: Receives messages for the user.
+        reporter: Receives messages, and the progress of indexing and encoding.
         out: The folder of the cache; None: the one of `data.cache`.
-        indexed: Called with the progress of indexing.
-        progress: Called with (done, total) in frames.
 
     Raises:
         InputError: Some input cannot be used, or the disk space is too small.
     """
     require_encodable(config)
     device = computing_device(config.training)
-    dataset = open_dataset(config.data, progress=indexed)
+    dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     model = load_base(config.model, seed=config.seed)
     writer = writer_for(config, dataset, model, out)
     if is_whole(writer.folder):
         claim_folder(writer)
         if not (missing := missing_files(dataset, writer)):
-            note(f"Everything is encoded already, in {writer.folder}")
+            reporter.note(f"Everything is encoded already, in {writer.folder}")
             return EncodedSet(writer.folder, read_manifest(writer.folder))
-        note(f"{describe(missing)}. It is encoded again.")
+        reporter.note(f"{describe(missing)}. It is encoded again.")
         restart(writer, missing)
-    share = WorkloadShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
+    share = ProcessShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
     at_work = encoder_on_device(config, model, device)
-    return EncodedSet(writer.folder, encode_share(config, dataset, writer, at_work, share, note, progress))
+    return EncodedSet(writer.folder, encode_share(config, dataset, writer, at_work, share, reporter))
 
 
 def require_encodable(config: Config) -> None:
@@ -122,9 +116,8 @@ def encode_share(
     dataset: Dataset,
     writer: CacheWriter,
     encoder: EncoderOnDevice,
-    share: WorkloadShare,
-    note: Note,
-    progress: Progress | None = None,
+    share: ProcessShare,
+    reporter: Reporter = SILENT,
 ) -> Manifest | None:
     """Report the work, check the disk space, and encode the share of one process.
 
@@ -133,13 +126,15 @@ def encode_share(
     """
     work = Workload.of(dataset, writer, share)
     free = free_bytes(writer.folder) / GIGABYTE
-    note(f"Encoding {config.data.path}: {work.room} as {config.data.cache_dtype}")
-    note(f"The latents go into {writer.folder}, with {free:.4g} GB free on its disk")
+    reporter.note(f"Encoding {config.data.path}: {work.room} as {config.data.cache_dtype}")
+    reporter.note(f"The latents go into {writer.folder}, with {free:.4g} GB free on its disk")
     if work.left_in_total < work.frames:
-        note(f"{work.frames - work.left_in_total:,} frames are there already; {work.left_in_total:,} are left")
+        reporter.note(f"{work.frames - work.left_in_total:,} frames are there already; {work.left_in_total:,} are left")
     require_space(work.room, writer.folder, smaller=size_reducing_knobs(config))
     claim_folder(writer)
-    return build(work, encoder, threads=max(1, config.data.workers), progress=progress)
+    return build(
+        work, encoder, threads=max(1, config.data.workers), progress=reporter.task("encoding frames", "frames")
+    )
 
 
 def duration(frames: int, per_second: float) -> str:

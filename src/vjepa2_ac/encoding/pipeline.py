@@ -19,12 +19,13 @@ from torch import Tensor
 
 from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.data.sources.latents.dtypes import pack_latents
+from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode
 from vjepa2_ac.data.sources.latents.manifest import Manifest
 from vjepa2_ac.encoding.batching import Chunks, Encode, Encoded
 from vjepa2_ac.encoding.disk_space import small_frame_side
 from vjepa2_ac.encoding.prefetch import Unreadable, prefetched
 from vjepa2_ac.encoding.workload import Workload, broken_in, forget_broken, note_broken
-from vjepa2_ac.episode import Progress, StoredLatents
+from vjepa2_ac.episode import Progress, StoredLatents, no_progress
 from vjepa2_ac.model.network.world_model import WorldModel
 
 _WRITES_UNDER_WAY = 2  # files: limits the memory
@@ -49,7 +50,7 @@ class EncoderOnDevice:
 
 
 def build(
-    work: Workload, encoder: EncoderOnDevice, *, threads: int, progress: Progress | None = None
+    work: Workload, encoder: EncoderOnDevice, *, threads: int, progress: Progress = no_progress
 ) -> Manifest | None:
     """Encode the share of this process, and finalize the cache if nothing is missing by then.
 
@@ -70,8 +71,7 @@ def build(
     for episode in sorted({one.episode for one in work.left}):
         forget_broken(folder, episode)
     for frames in _written(work, encoder, threads) if work.left else ():
-        if progress is not None:
-            progress(frames, work.frames_left)
+        progress(frames, work.frames_left)
     if work.is_incomplete:
         return None
     broken = broken_in(folder)
@@ -124,10 +124,8 @@ def _storing(work: Workload, encoder: EncoderOnDevice) -> Encode:
 
 def _write(work: Workload, one: Encoded) -> int:
     wanted = one.wanted
-    return work.writer.write_episode(
-        wanted.episode, wanted.camera, one.recording,
-        steps=wanted.steps.tolist(), latents=one.latents, small_frames=one.small_frames,
-    )  # fmt: skip
+    encoded = EncodedEpisode(one.recording, wanted.camera, wanted.steps.tolist(), one.latents, one.small_frames)
+    return work.writer.write_episode(wanted.episode, encoded)
 
 
 def _leave_out(work: Workload, one: Unreadable) -> None:

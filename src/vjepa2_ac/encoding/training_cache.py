@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.clips.loader import WHOLE, ProcessShare
 from vjepa2_ac.data.sources.latents.manifest import is_whole
 from vjepa2_ac.distributed.collectives import broadcast_object
 from vjepa2_ac.encoding.batch import require_same_encoder
@@ -17,10 +16,10 @@ from vjepa2_ac.encoding.disk_space import require_space
 from vjepa2_ac.encoding.encode_dataset import duration, encode_share, encoder_on_device, size_reducing_knobs, writer_for
 from vjepa2_ac.encoding.pipeline import frames_per_second
 from vjepa2_ac.encoding.repair import MissingFiles, describe, missing_files, restart
-from vjepa2_ac.encoding.workload import Workload, WorkloadShare
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.encoding.workload import Workload
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import Reporter
 
 
 def with_latents(
@@ -28,9 +27,8 @@ def with_latents(
     dataset: Dataset,
     model: WorldModel,
     accelerator: Accelerator,
-    note: Callable[[str], None],
+    reporter: Reporter,
     *,
-    encoding: Progress | None = None,
     check_only: bool = False,
 ) -> Dataset:
     """Return the data set of a run, with its clips from the latent cache if the config has one.
@@ -40,8 +38,7 @@ def with_latents(
         dataset: The open data set, at its stride.
         model: The model whose encoder is used.
         accelerator: Its processes share the encoding.
-        note: Receives messages for the user.
-        encoding: Called with (done, total) in frames of this process.
+        reporter: Receives messages for the user.
         check_only: Encode nothing: report what would be encoded, and leave the clips as frames.
 
     Raises:
@@ -52,7 +49,9 @@ def with_latents(
         return dataset
     writer = writer_for(config, dataset, model)
     if missing := _missing(config, dataset, accelerator, writer):
-        note(f"{describe(missing)}. " + ("A run would encode it again." if check_only else "It is encoded again."))
+        reporter.note(
+            f"{describe(missing)}. " + ("A run would encode it again." if check_only else "It is encoded again.")
+        )
         if check_only:
             return dataset
         if accelerator.is_main_process:
@@ -61,10 +60,10 @@ def with_latents(
         if config.data.cache == "require":
             return through_cache(dataset, writer.encoding)  # which reports what was found instead
         if check_only:
-            _report_encoding(config, dataset, model, accelerator, writer, note)
+            _report_encoding(config, dataset, model, accelerator, writer, reporter)
             return dataset
-        _encode(config, dataset, model, accelerator, writer, note, encoding)
-    note(f"Latents come from {writer.folder}: the encoder is not needed")
+        _encode(config, dataset, model, accelerator, writer, reporter)
+    reporter.note(f"Latents come from {writer.folder}: the encoder is not needed")
     return through_cache(dataset, writer.encoding)
 
 
@@ -93,17 +92,16 @@ def _encode(
     model: WorldModel,
     accelerator: Accelerator,
     writer: CacheWriter,
-    note: Callable[[str], None],
-    encoding: Progress | None,
+    reporter: Reporter,
 ) -> None:
     """Let all processes encode their share.
 
     Raises:
         InputError: They do not see the same folder; or as `encode_share`.
     """
-    share = WorkloadShare(accelerator.process_index, accelerator.num_processes)
+    share = ProcessShare(accelerator.process_index, accelerator.num_processes)
     encoder = encoder_on_device(config, model, accelerator.device)
-    encode_share(config, dataset, writer, encoder, share, note, encoding)
+    encode_share(config, dataset, writer, encoder, share, reporter)
     accelerator.wait_for_everyone()
     if not is_whole(writer.folder):
         raise InputError(
@@ -120,12 +118,12 @@ def _report_encoding(
     model: WorldModel,
     accelerator: Accelerator,
     writer: CacheWriter,
-    note: Callable[[str], None],
+    reporter: Reporter,
 ) -> None:
-    work = Workload.of(dataset, writer, WorkloadShare())
+    work = Workload.of(dataset, writer, WHOLE)
     require_space(work.room, writer.folder, smaller=size_reducing_knobs(config))
     speed = frames_per_second(encoder_on_device(config, model, accelerator.device)) * accelerator.num_processes
-    note(
+    reporter.note(
         f"A run would first encode {work.left_in_total:,} of {work.room} as {config.data.cache_dtype}, into"
         f" {writer.folder}. At the {speed:.3g} frames/s of one chunk just timed that takes"
         f" {duration(work.left_in_total, speed)}"

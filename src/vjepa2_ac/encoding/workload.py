@@ -11,6 +11,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.clips.loader import ProcessShare
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey
 from vjepa2_ac.data.sources.latents.dtypes import bytes_per_frame
 from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest
@@ -24,14 +25,6 @@ from vjepa2_ac.storage.structured import read_json_object, record_of
 _BROKEN, _KEY = "broken", "key.json"
 
 
-@dataclass(frozen=True)
-class WorkloadShare:
-    """The index of a process among those that encode."""
-
-    rank: int = 0
-    processes: int = 1
-
-
 @dataclass(frozen=True, eq=False)
 class Workload:
     """A cache to write, and the share of this process: every episode belongs to one process."""
@@ -43,7 +36,7 @@ class Workload:
     left_in_total: int  # frames, of all processes
 
     @classmethod
-    def of(cls, dataset: Dataset, writer: CacheWriter, share: WorkloadShare) -> Workload:
+    def of(cls, dataset: Dataset, writer: CacheWriter, share: ProcessShare) -> Workload:
         """Compare with the existing files: written episodes are not encoded again; broken ones are retried."""
         frames, left_in_total, left = 0, 0, []
         for place, needed in enumerate(needed_frames(dataset)):

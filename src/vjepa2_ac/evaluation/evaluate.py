@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_score.measure import PlanningStart, measure_plans, planning_start, study_of
-from vjepa2_ac.evaluation.action_use.energy_landscape import measure_landscapes
+from vjepa2_ac.evaluation.action_use.energy_landscape import LandscapeGrid, measure_landscapes
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, start_of
 from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sensitivity
 from vjepa2_ac.evaluation.estimates import episode_scores
@@ -34,6 +34,7 @@ from vjepa2_ac.evaluation.result import (
     Sensitivity,
 )
 from vjepa2_ac.evaluation.strata import clips_of, strata_of
+from vjepa2_ac.reporter import SILENT, Reporter
 
 ClipName = tuple[str, int]  # id of the episode, first control step
 FramesOfRow = Callable[[int], UInt8[np.ndarray, "time height width 3"] | None]  # of a row of the current batch
@@ -68,7 +69,7 @@ def evaluate(
     *,
     metrics: tuple[Metric, ...] = METRICS,
     probes: ProbeOptions | None = None,
-    stage: Callable[[str], Progress] | None = None,
+    reporter: Reporter = SILENT,
 ) -> Evaluation:
     """Measure models on the same clips.
 
@@ -78,13 +79,13 @@ def evaluate(
         about: Description of the evaluation.
         metrics: Of the errors; the first one is L1.
         probes: Options of the measurements beyond the errors.
-        stage: Returns a progress bar for a part of the work, by its title.
+        reporter: Shows the progress of each part of the work.
 
     Raises:
         ValueError: No clips; or too few frames for planning.
     """
     probes = probes or ProbeOptions()
-    seen = _collect(contenders, clips, probes, about, metrics, _bar(stage, "measuring"))
+    seen = _collect(contenders, clips, probes, about, metrics, reporter.task("measuring"))
     ids, seconds = tuple(seen.ids), about.seconds_per_step
     known = clips_of(seen.actions, ids, tuple(seen.firsts), space=about.space, seconds_per_step=seconds)
     pool = ActionPool(
@@ -92,6 +93,8 @@ def evaluate(
         episode_ids=tuple(np.repeat(np.array(ids), seen.actions.shape[1]).tolist()),
         space=about.space,
         reach=probes.reach_cm / 100,
+        samples=probes.samples,
+        seed=about.seed,
     )
     models: dict[str, ModelResult] = {}
     for contender in contenders:
@@ -99,9 +102,9 @@ def evaluate(
         with contender.switched():
             models[contender.name] = replace(
                 result,
-                sensitivity=_sensitivity(contender, seen.starts, pool, probes, about, stage),
-                landscapes=_landscapes(contender, seen.starts, known, pool, probes, about, stage),
-                plans=_plans(contender, seen.planned, probes, stage),
+                sensitivity=_sensitivity(contender, seen.starts, pool, probes, reporter),
+                landscapes=_landscapes(contender, seen.starts, known, pool, probes, reporter),
+                plans=_plans(contender, seen.planned, probes, reporter),
             )
     evaluation = Evaluation(
         about=about,
@@ -153,7 +156,7 @@ def _collect(
     probes: ProbeOptions,
     about: About,
     metrics: Sequence[Metric],
-    progress: Progress | None,
+    progress: Progress,
 ) -> _Seen:
     seen = _Seen([], [], np.zeros((0, 0, 0)), {contender.name: [] for contender in contenders}, [])
     actions = []
@@ -176,8 +179,7 @@ def _collect(
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
         seen.ids += batch.episode_ids
         seen.firsts += batch.starts
-        if progress is not None:
-            progress(len(seen.ids), clips.count)
+        progress(len(seen.ids), clips.count)
     if not seen.ids:
         raise ValueError("no clips to evaluate on")
     seen.actions = np.concatenate(actions)
@@ -190,24 +192,12 @@ def _largest_step(actions: Float[torch.Tensor, "time action_dim"], about: About)
 
 
 def _sensitivity(
-    contender: Contender,
-    starts: Sequence[RolloutStart],
-    pool: ActionPool,
-    probes: ProbeOptions,
-    about: About,
-    stage: Callable[[str], Progress] | None,
+    contender: Contender, starts: Sequence[RolloutStart], pool: ActionPool, probes: ProbeOptions, reporter: Reporter
 ) -> Sensitivity | None:
     if not starts:
         return None
-    return measure_sensitivity(
-        contender.model,
-        starts,
-        pool,
-        samples=probes.samples,
-        seed=about.seed,
-        at_once=probes.at_once,
-        progress=_bar(stage, f"other actions, {contender.name}"),
-    )
+    progress = reporter.task(f"other actions, {contender.name}")
+    return measure_sensitivity(contender.model, starts, pool, at_once=probes.at_once, progress=progress)
 
 
 def _landscapes(
@@ -216,34 +206,27 @@ def _landscapes(
     clips: Clips,
     pool: ActionPool,
     probes: ProbeOptions,
-    about: About,
-    stage: Callable[[str], Progress] | None,
+    reporter: Reporter,
 ) -> Landscapes | None:
     moving = [start for start in starts if clips.moving[start.clip].any()] or list(starts)
     if not probes.landscape_clips or not moving or pool.actions.shape[-1] < 3:
         return None
     chosen = [moving[place] for place in spread(len(moving), probes.landscape_clips)]
-    return measure_landscapes(
-        contender.model,
-        chosen,
-        space=about.space,
-        nodes=probes.nodes,
-        reach=0.0 if about.space.position is None else pool.reach,
-        at_once=probes.at_once,
-        progress=_bar(stage, f"energy landscapes, {contender.name}"),
-    )
+    grid = LandscapeGrid(pool.space, probes.nodes, reach=0.0 if pool.space.position is None else pool.reach)
+    progress = reporter.task(f"energy landscapes, {contender.name}")
+    return measure_landscapes(contender.model, chosen, grid, at_once=probes.at_once, progress=progress)
 
 
 def _plans(
     contender: Contender,
     starts: Sequence[PlanningStart],
     probes: ProbeOptions,
-    stage: Callable[[str], Progress] | None,
+    reporter: Reporter,
 ) -> Plans | None:
     if not starts:
         return None
     model = contender.model if contender.to_plan is None else contender.to_plan()
-    return measure_plans(model, starts, probes.planning, _bar(stage, f"planning, {contender.name}"))
+    return measure_plans(model, starts, probes.planning, reporter.task(f"planning, {contender.name}"))
 
 
 def _examples(
@@ -265,7 +248,3 @@ def _examples(
                     predicted[contender.name] = predicted_rollout(contender.model, batch, row)
             found[name] = make_example(reasons[name], batch, row, predicted, frames_of_row(row))
     return tuple(found[name] for name in names if name in found)
-
-
-def _bar(stage: Callable[[str], Progress] | None, title: str) -> Progress | None:
-    return None if stage is None else stage(title)

@@ -21,10 +21,11 @@ from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
-from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.examples import seen_by_the_encoder
+from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import About, Evaluation, Role, TrainingCurve
 from vjepa2_ac.evaluation.stride_calibration.measure import calibrate_model
@@ -33,6 +34,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
 from vjepa2_ac.runs.folder import METRICS, is_run
 from vjepa2_ac.runs.loading import TrainedRun, load_run
@@ -53,15 +55,13 @@ class Measured:
     folder: Path  # of the output
 
 
-def measure_subject(
-    subject: str, asked: EvaluationOptions | None = None, *, stage: Callable[[str], Progress] | None = None
-) -> Measured:
+def measure_subject(subject: str, asked: EvaluationOptions | None = None, *, reporter: Reporter = SILENT) -> Measured:
     """Measure a run or a model on held-out episodes. Cheap failures first.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
         asked: The options.
-        stage: Returns a progress bar for a part of the work, by its title.
+        reporter: Shows the progress of each part of the work.
 
     Raises:
         InputError: The subject, the data, or a model to compare with cannot be used; the split is empty.
@@ -77,7 +77,7 @@ def measure_subject(
     if asked.probes.planning_clips and planning.quantize != "off":
         dtype = getattr(torch, config.model.dtype)
         require_8_bits(planning.quantize, dtype, accelerator.device, where="planning.quantize")
-    dataset = open_dataset(config.data, progress=stage("looking through the data") if stage else None)
+    dataset = open_dataset(config.data, progress=reporter.task("looking through the data"))
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     run = load_run(Path(subject), asked.checkpoint) if is_run(subject) else None
     world_model = run.world_model if run else _load_model(subject, config)
@@ -92,15 +92,8 @@ def measure_subject(
     world_model.to(accelerator.device).eval()
     calibration = None
     if asked.calibrate:
-        calibration = calibrate_model(
-            world_model,
-            dataset,
-            config,
-            accelerator,
-            clips=asked.clips,
-            split=asked.split,
-            progress=stage("calibrating strides") if stage else None,
-        ).as_dict()
+        sample, progress = ClipSample(asked.split, asked.clips), reporter.task("calibrating strides")
+        calibration = calibrate_model(world_model, dataset, config, accelerator, sample, progress).as_dict()
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     read = partial(batches_of, batch_size=config.validation.batch_size, copies=copies_for(accelerator.device))
     clips = _clips(through_cache, chosen, read, encode, world_model.image_size)
@@ -110,7 +103,7 @@ def measure_subject(
             clips,
             _about(subject, run, config, dataset, asked),
             probes=replace(asked.probes, planning=planning),
-            stage=stage,
+            reporter=reporter,
         )
     evaluation = replace(
         evaluation,

@@ -7,6 +7,7 @@ was seen. A ratio of 1 means: as good as doing nothing; 0: perfect.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import chain, product
 from typing import NamedTuple, Protocol, get_args, runtime_checkable
 
@@ -15,6 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.config.data import Split
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import MODES, Mode, PredictionErrors, Way
@@ -26,6 +29,7 @@ VALIDATED: tuple[tuple[Way, Mode], ...] = (  # rollouts, which take longest, wit
     ("zero", "teacher_forced"),
     ("shuffled", "teacher_forced"),
 )
+_MOST_FRAMES = 8  # of a sample: as the released weights were trained, and short enough for the widest stride
 ONE_STEP: tuple[tuple[Way, Mode], ...] = (("true", "teacher_forced"), ("persistence", "teacher_forced"))
 
 
@@ -44,6 +48,20 @@ class Predictor(Protocol):
     ) -> Float[Tensor, "batch horizon tokens dim"]:
         """Return the frames after the context, each prediction fed back."""
         ...
+
+
+@dataclass(frozen=True)
+class ClipSample:
+    """Held-out clips to measure, and how many of them are computed together."""
+
+    split: Split = "validation"
+    clips: int = 64  # at most
+    frames: int | None = None  # of a clip; None: as the data have them, but 8 at most
+    batch_size: int = 8
+
+    def frames_of(self, config: DataConfig) -> int:
+        """Return the frames of a clip of these data."""
+        return min(config.frames, _MOST_FRAMES) if self.frames is None else self.frames
 
 
 @torch.no_grad()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from torch import Tensor
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
-from vjepa2_ac.episode import Progress, Widths
+from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -25,7 +24,7 @@ from vjepa2_ac.planning.goal import Goal, patch_weights
 from vjepa2_ac.planning.input_checks import require_image, require_mask, require_numbers
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.model_setup import prepare_for_planning
-from vjepa2_ac.planning.planner import Clock, Planner
+from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.search_space import SearchSpace, search_space
 from vjepa2_ac.planning.settings import with_taught_limits
 from vjepa2_ac.planning.state_integration import states_along
@@ -73,8 +72,6 @@ class Controller:
         crop: Crop = "released",
         extrinsics: Float[np.ndarray, " 6"] | None = None,
         spaces: Spaces = POSES,
-        clock: Clock = time.perf_counter,
-        progress: Progress | None = None,
     ) -> None:
         """Create a controller.
 
@@ -86,8 +83,6 @@ class Controller:
             crop: As in training (`data.crop`).
             extrinsics: Pose of the camera, if the model uses it.
             spaces: What its states and actions are.
-            clock: Measures the time budget.
-            progress: Called with the number of finished iterations of a decision.
 
         Raises:
             InputError: The model's states and actions are of other spaces, or nobody knows which state follows from an
@@ -107,8 +102,7 @@ class Controller:
         self._model, self.seed, self.crop = prepare_for_planning(world_model, self.config), seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
         self.spaces = spaces
-        space = search_space(self.config, spaces.state)
-        self._planner = Planner(self.config, space, clock=clock, progress=progress)
+        self.planner = Planner(self.config, search_space(self.config, spaces.state))
         self._goal: Goal | None = None
         self._like = np.zeros(0)
         self._seen: list[Seen] = []  # the newest `planning.context`
@@ -143,7 +137,7 @@ class Controller:
     @property
     def space(self) -> SearchSpace:
         """The allowed changes of the state."""
-        return self._planner.space
+        return self.planner.space
 
     @property
     def shown_axes(self) -> tuple[int, ...]:
@@ -212,7 +206,7 @@ class Controller:
         )
         generator = torch.Generator().manual_seed(self.seed + self._done)
         start = before.start_after(1) if before is not None and self.config.warm_start else None
-        plan = self._planner.plan(cost, generator, start)
+        plan = self.planner.plan(cost, generator, start)
         why: Why = "planned" if plan.stopped == "finished" else plan.stopped
         states = states_along(torch.from_numpy(state), plan.actions.double()[None], self.spaces.state)[0]
         action = self._command(state, plan.actions[0].double().numpy())

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from vjepa2_ac.config.planning import PlanningConfig
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.planning.interfaces import Cost, Iteration, Plan, PlanStart, Stopped
 from vjepa2_ac.planning.search_space import SearchSpace, pose_space
 from vjepa2_ac.planning.solvers.base import EvaluatedPlans, Solver
@@ -43,7 +43,7 @@ class Planner:
         config: PlanningConfig,
         space: SearchSpace | None = None,
         clock: Clock = time.perf_counter,
-        progress: Progress | None = None,
+        progress: Progress = no_progress,
     ) -> None:
         """Select a planner.
 
@@ -55,7 +55,7 @@ class Planner:
         """
         self.config = config
         self.space = pose_space(config) if space is None else space
-        self._clock, self._progress = clock, progress
+        self.clock, self.progress = clock, progress
 
     def plan(self, cost: Cost, generator: Generator, start: PlanStart | None = None) -> Plan:
         """Return the best plan found.
@@ -68,7 +68,7 @@ class Planner:
         Raises:
             ValueError: The cost does not return one number per sample, or `start` is of another shape.
         """
-        began = self._clock()
+        began = self.clock()
         if start is not None and start.mean.shape != self.space.lower.shape:
             raise ValueError(f"a start of {tuple(start.mean.shape)} for {tuple(self.space.lower.shape)} decisions")
         search = SOLVERS[self.config.planner](self.space, self.config, generator, start)
@@ -76,8 +76,7 @@ class Planner:
         best = _Best()
         while len(record) < self.config.iterations and self._has_time(began, record):
             record.append(self._iterate(search, cost, best))
-            if self._progress is not None:
-                self._progress(len(record), self.config.iterations)
+            self.progress(len(record), self.config.iterations)
         stopped: Stopped = "finished" if len(record) == self.config.iterations else "out of time"
         actions, energy, evaluated = self._chosen(search.result(), best, cost, lowest=stopped == "out of time")
         if actions is None:
@@ -92,17 +91,17 @@ class Planner:
             planner=self.config.planner,
             seed=generator.initial_seed(),
             evaluations=sum(one.samples for one in record) + evaluated,
-            seconds=self._clock() - began,
+            seconds=self.clock() - began,
         )
 
     def _has_time(self, began: float, record: list[Iteration]) -> bool:
         """Return whether an iteration as long as the longest so far would end within the budget."""
         if self.config.budget_s is None or not record:
             return True
-        return self._clock() - began + max(one.seconds for one in record) <= self.config.budget_s
+        return self.clock() - began + max(one.seconds for one in record) <= self.config.budget_s
 
     def _iterate(self, search: Solver, cost: Cost, best: _Best) -> Iteration:
-        began = self._clock()
+        began = self.clock()
         decisions = search.sample()
         evaluated = self._try(cost, decisions, gradients=search.uses_gradients)
         elites = evaluated.best(search.elites)
@@ -119,7 +118,7 @@ class Planner:
             elite_energies=elites.energies,
             mean=search.mean,
             std=search.std,
-            seconds=self._clock() - began,
+            seconds=self.clock() - began,
         )
 
     def _try(self, cost: Cost, decisions: Float[Tensor, "samples decisions dim"], *, gradients: bool) -> EvaluatedPlans:

@@ -15,7 +15,7 @@ from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.distributed.device import has_bf16, is_on_cpu, require_type_of_weights
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
@@ -61,7 +61,7 @@ class PlanningSession:
         *,
         seed: int | None = None,
         extrinsics: Float[np.ndarray, " 6"] | None = None,
-        progress: Progress | None = None,
+        progress: Progress = no_progress,
     ) -> Controller:
         """Return a controller with these settings.
 
@@ -73,15 +73,16 @@ class PlanningSession:
         Raises:
             InputError: As `Controller`.
         """
-        return Controller(
+        controller = Controller(
             self.world_model,
             self.config.planning,
             seed=self.config.seed if seed is None else seed,
             crop=self.config.data.crop,
             extrinsics=extrinsics,
             spaces=spaces_of(self.config.data, widths_of_model(self.world_model.sizes)),
-            progress=progress,
         )
+        controller.planner.progress = progress
+        return controller
 
     def as_dict(self) -> dict[str, Any]:
         """Return the identity of the model as plain values: its name, and hashes of the weights."""

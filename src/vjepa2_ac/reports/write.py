@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from vjepa2_ac.episode import Progress
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions
 from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.evaluation.verdict import verdict
+from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.reports.figures.evaluation import plot_evaluation
 from vjepa2_ac.reports.html.page import write_report
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, write_metrics
@@ -38,15 +37,13 @@ class Evaluated:
         return {name: over_persistence(one.errors, "rollout") for name, one in self.evaluation.models.items()}
 
 
-def evaluate_subject(
-    subject: str, asked: EvaluationOptions | None = None, *, stage: Callable[[str], Progress] | None = None
-) -> Evaluated:
+def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, reporter: Reporter = SILENT) -> Evaluated:
     """Measure as `measure_subject` does, and write metrics.json, report and figure.
 
     Raises:
         InputError: As `measure_subject`; or the folder cannot be written.
     """
-    measured = measure_subject(subject, asked, stage=stage)
+    measured = measure_subject(subject, asked, reporter=reporter)
     return Evaluated(measured.evaluation, measured.checkpoint, _written(measured.evaluation, measured.folder))
 
 

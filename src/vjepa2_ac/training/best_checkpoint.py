@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 from vjepa2_ac.config import Config
@@ -12,6 +12,7 @@ from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.config.loading import flat
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import validation_windows
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 
 
@@ -24,7 +25,7 @@ def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
     return {**settings, "its clips": hashlib.sha256(json.dumps(clips).encode()).hexdigest()[:16]}
 
 
-def best_so_far(state: RunState, now: Mapping[str, str], note: Callable[[str], None]) -> RunState:
+def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> RunState:
     """Return the state to resume from: a best error of other measurements is dropped, with a message.
 
     What a state of an earlier version does not record, or records beyond what matters now, is accepted.
@@ -34,7 +35,7 @@ def best_so_far(state: RunState, now: Mapping[str, str], note: Callable[[str], N
     state = replace(state, measured_on=dict(now))
     if not differing or state.best_error is None:
         return state
-    note(
+    reporter.note(
         f"Validation measures something else than before (other: {', '.join(differing)}): the error"
         f" {state.best_error:.4g} of step {state.best_step}, the best so far, does not compare and no longer counts."
     )

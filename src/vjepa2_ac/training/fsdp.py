@@ -10,7 +10,7 @@ without FSDP2.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -23,6 +23,7 @@ from torch.distributed.tensor import DTensor, distribute_tensor
 from vjepa2_ac.config import Config
 from vjepa2_ac.distributed.launch import shares_weights
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.training.optim import make_optimizer
 
 
@@ -31,7 +32,7 @@ def shard_predictor(
     optimizer: torch.optim.Optimizer,
     config: Config,
     accelerator: Accelerator,
-    note: Callable[[str], None],
+    reporter: Reporter,
 ) -> torch.optim.Optimizer:
     """Give each process its part of the predictor's weights and moments, if the launch requests it.
 
@@ -53,7 +54,7 @@ def shard_predictor(
         part.set_force_sum_reduction_for_comms(True)  # otherwise it is scaled on the way, which gloo cannot do
     of_part = make_optimizer(world_model, config.training)
     of_part.load_state_dict(_parted(optimizer.state_dict(), of_part))
-    note(
+    reporter.note(
         f"{accelerator.num_processes} processes share the predictor's weights, gradients and moments (FSDP2):"
         f" {_own_numbers(predictor):,} weights are in this one."
     )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import json
 import signal
-import tempfile
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -24,34 +23,31 @@ from vjepa2_ac.distributed.collectives import all_reduce_max, broadcast_object, 
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.distributed.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.result import PredictionErrors
+from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import CheckpointClock
-from vjepa2_ac.runs.folder import (
-    CALIBRATION,
-    CHANGES,
-    check_run_folder,
-    config_changes,
-    open_run_folder,
-    with_settled_stride,
-)
-from vjepa2_ac.runs.lock import RunLock
+from vjepa2_ac.runs.folder import CALIBRATION, CHANGES
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.runs.mirror.background_sync import Mirror, NoMirror
-from vjepa2_ac.runs.mirror.open_remote import Remote, open_remote
-from vjepa2_ac.runs.relative_paths import require_start_folder
+from vjepa2_ac.runs.open_run import OpenRun, open_run
 from vjepa2_ac.runs.trackers import open_trackers, require_installed
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.training.monitoring.divergence import WatchedMetricsLog
 from vjepa2_ac.training.monitoring.stopwatch import stopwatch_for
 from vjepa2_ac.training.monitoring.throughput import Throughput, TimedBatches
 from vjepa2_ac.training.optim import require_optimizer
-from vjepa2_ac.training.reporter import NullMetricsLog, NullReporter, Reporter
-from vjepa2_ac.training.resume import refuse_if_overtaken, require_same_data
-from vjepa2_ac.training.setup import Run, batches_from, save_checkpoint, set_up
+from vjepa2_ac.training.reporter import NullMetricsLog, TrainingReporter
+from vjepa2_ac.training.resume import require_same_data, restore
+from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model, save_checkpoint
 from vjepa2_ac.training.step import gradients, training_step
-from vjepa2_ac.training.validation import refuse_weak_base, validate, validate_if_due, validation_metrics
+from vjepa2_ac.training.validation import validate_base, validate_if_due, validation_metrics
+
+_IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."
 
 
-def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow_config_change: bool = False) -> Path:
+def train(
+    config: Config, reporter: TrainingReporter, *, check_only: bool = False, allow_config_change: bool = False
+) -> Path:
     """Train by a config, from the newest checkpoint of its run folder if there is one.
 
     Args:
@@ -70,88 +66,65 @@ def train(config: Config, reporter: Reporter, *, check_only: bool = False, allow
     accelerator = make_accelerator(config)
     require_same(accelerator, config_as_dict(config), what="the config", fix="Start all processes with one config")
     require_optimizer(config.training)
-    if accelerator.is_main_process:  # the only one that has trackers
-        require_installed(config.tracking)
-    remote = None
-    with contextlib.ExitStack() as until_the_end:
-        lock = until_the_end.enter_context(RunLock(Path(config.run_dir)))
-        if accelerator.is_main_process:  # the only one that needs to see the run's folder
-            config = with_settled_stride(config)
-            check_run_folder(config, allow_config_change=allow_config_change)
-            require_start_folder(config, Path(config.run_dir))
-            if not check_only and Path(config.run_dir).is_dir():  # a new one is created, and locked, after all checks
-                lock.take()
-            # A check downloads into a temporary folder.
-            trial = Path(until_the_end.enter_context(tempfile.TemporaryDirectory()), "run") if check_only else None
-            # Locked before anything is downloaded into the run's folder: another process could still be writing there.
-            remote = open_remote(
-                config,
-                reporter.note,
-                claim=lock.take if trial is None else lambda: None,
-                allow_config_change=allow_config_change,
-                into=trial,
-            )
-            config = with_settled_stride(remote.config if remote else config)
-        else:
-            reporter = NullReporter()
-        config = broadcast_object(accelerator, config)
-        until_the_end.enter_context(_out_of_memory_explained())
-        run = set_up(config, reporter.note, reporter.indexed, accelerator, reporter.encoded, check_only=check_only)
-        try:
-            return _train(run, lock, remote, reporter, check_only=check_only, allow_config_change=allow_config_change)
-        except StoppedError:
-            accelerator.end_training()
-            raise
-
-
-def _train(
-    run: Run, lock: RunLock, remote: Remote | None, reporter: Reporter, *, check_only: bool, allow_config_change: bool
-) -> Path:
-    config, folder, writes = run.config, Path(run.config.run_dir), run.accelerator.is_main_process
-    if writes and not allow_config_change:
-        require_same_data(config, run.dataset, run.state)
-    first = validate(run, reporter) if run.state.step == 0 else None
-    if first is not None:
-        refuse_weak_base(run, first, reporter)
-    if allow_config_change and writes:
-        for line in config_changes(config):
-            reporter.note(f"The config changes: {line}")
-    if check_only:
-        gradients(run, batches_from(run))
-        reporter.note(
-            "Everything is in place: data, model, validation and gradients were checked; nothing was written."
-        )
-        return folder
+    writes = accelerator.is_main_process  # the only one that reports, has trackers and needs to see the run's folder
     if writes:
-        lock.take()
-        refuse_if_overtaken(folder, run.state)
-        open_run_folder(config, run.state.run_id, allow_config_change=allow_config_change)
-    if run.calibration is not None and writes:
+        require_installed(config.tracking)
+    else:
+        reporter = SILENT
+    opening = open_run(config, reporter, writes=writes, check_only=check_only, allow_config_change=allow_config_change)
+    with opening as opened, _out_of_memory_explained():
+        data = open_data(broadcast_object(accelerator, opened.config), reporter, accelerator)
+        if writes and not allow_config_change:
+            require_same_data(data.config, data.dataset)
+        run = restore(open_model(data, reporter, check_only=check_only), reporter)
+        first = validate_base(run, reporter)
+        for line in opened.changes(run.config):
+            reporter.note(f"The config changes: {line}")
+        if check_only:
+            gradients(run, batches_from(run))
+            reporter.note(_IN_PLACE)
+        else:
+            opened.begin(run.config, run.state)
+            _train(run, opened, first, reporter)
+    return run.folder
+
+
+def _train(run: Run, opened: OpenRun, first: PredictionErrors | None, reporter: TrainingReporter) -> None:
+    if opened.writes:
+        _write_measured(run)
+    try:
+        with _open_metrics_log(run, reporter) as metrics_log, opened.mirror(run.state.run_id) as mirror:
+            if first is not None:
+                metrics_log.write("validation", 0, validation_metrics(first))
+            _loop(run, metrics_log, mirror, reporter)
+    except StoppedError:
+        run.accelerator.end_training()
+        raise
+    run.accelerator.end_training()
+
+
+def _write_measured(run: Run) -> None:
+    """Write what the data and the base have shown: the metrics of a chosen stride, and the usual changes of vectors."""
+    folder = run.folder
+    if run.calibration is not None:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
-    if writes and run.dataset.spaces.state.position is None and not (folder / CHANGES).exists():
+    if run.dataset.spaces.state.position is None and not (folder / CHANGES).exists():
         usual = {"percentile": 99, "changes": usual_changes(run.dataset).tolist()}
         write_atomically(folder / CHANGES, json.dumps(usual).encode())
-    with _open_metrics_log(run, folder, reporter) as metrics_log:
-        if first is not None:
-            metrics_log.write("validation", 0, validation_metrics(first))
-        with remote.mirror(run.state.run_id) if remote else NoMirror() as mirror:
-            _loop(run, folder, metrics_log, mirror, reporter)
-    run.accelerator.end_training()
-    return folder
 
 
-def _open_metrics_log(run: Run, folder: Path, reporter: Reporter) -> MetricsLog | NullMetricsLog:
+def _open_metrics_log(run: Run, reporter: TrainingReporter) -> MetricsLog | NullMetricsLog:
     if not run.accelerator.is_main_process:
         return NullMetricsLog()
-    done = run.state.step
+    folder, done = run.folder, run.state.step
     trackers = open_trackers(run.config, folder, run_id=run.state.run_id, first_step=done)
-    return WatchedMetricsLog(folder, config=run.config, note=reporter.note, first_step=done, trackers=trackers)
+    return WatchedMetricsLog(folder, config=run.config, reporter=reporter, first_step=done, trackers=trackers)
 
 
 def _loop(
-    run: Run, folder: Path, metrics_log: MetricsLog | NullMetricsLog, mirror: Mirror | NoMirror, reporter: Reporter
+    run: Run, metrics_log: MetricsLog | NullMetricsLog, mirror: Mirror | NoMirror, reporter: TrainingReporter
 ) -> None:
-    training = run.config.training
+    training, folder = run.config.training, run.folder
     device, processes = run.accelerator.device, run.accelerator.num_processes
     throughput = Throughput.of(run.config, run.world_model.sizes, device, processes, encodes=run.encodes)
     reporter.note(str(throughput))

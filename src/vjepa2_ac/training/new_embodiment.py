@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.base_model import base_sizes
 from vjepa2_ac.model.network.input_heads import fit_heads, heads_to_replace, require_trained
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import Reporter
 
 
 def check_heads(config: Config, dataset: Dataset) -> None:
@@ -31,14 +30,14 @@ def check_heads(config: Config, dataset: Dataset) -> None:
     require_trained(heads, config.adapter)
 
 
-def fit_to_data(world_model: WorldModel, config: Config, dataset: Dataset, note: Callable[[str], None]) -> None:
+def fit_to_data(world_model: WorldModel, config: Config, dataset: Dataset, reporter: Reporter) -> None:
     """Give a base new input heads if the data's states or actions have other widths, and report them.
 
     Args:
         world_model: The base, without an adapter.
         config: The config of the run; its seed initializes the heads.
         dataset: The data.
-        note: Receives a message for each new head, and for each head that takes vectors and stays.
+        reporter: Receives a message for each new head, and for each head that takes vectors and stays..
 
     Raises:
         InputError: A new head would not be trained.
@@ -46,11 +45,11 @@ def fit_to_data(world_model: WorldModel, config: Config, dataset: Dataset, note:
     heads = heads_to_replace(world_model.sizes, dataset.widths)
     require_trained(heads, config.adapter)
     for line in fit_heads(world_model, dataset.widths, config.seed):
-        note(line)
+        reporter.note(line)
     trained = config.adapter.kind == "none" or config.model.random is not None
     for name in ("state_encoder", "action_encoder"):
         if config.data.states == "vector" and name not in {*heads, *config.adapter.modules_to_save} and not trained:
-            note(
+            reporter.note(
                 f"{name.replace('_', ' ')}: the base's own, as wide as the data. If its numbers mean something else"
                 f" than those the base was trained on, add {name} to adapter.modules_to_save"
             )

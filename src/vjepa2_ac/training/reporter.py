@@ -7,23 +7,12 @@ from contextlib import contextmanager
 from typing import Any, Protocol, runtime_checkable
 
 from vjepa2_ac.evaluation.result import PredictionErrors
+from vjepa2_ac.reporter import Reporter
 
 
 @runtime_checkable
-class Reporter(Protocol):
-    """Shows the progress of a run."""
-
-    def note(self, text: str) -> None:
-        """Show a message."""
-        ...
-
-    def indexed(self, done: int, total: int) -> None:
-        """Show the progress of indexing a data set."""
-        ...
-
-    def encoded(self, done: int, total: int) -> None:
-        """Show the progress of encoding frames into the latent cache."""
-        ...
+class TrainingReporter(Reporter, Protocol):
+    """Shows the progress of a run, too."""
 
     def started(self, done: int, total: int) -> None:
         """The loop begins after `done` of `total` optimizer steps."""
@@ -36,28 +25,6 @@ class Reporter(Protocol):
     def validated(self, step: int, errors: PredictionErrors) -> None:
         """Held-out clips were measured after `step` optimizer steps."""
         ...
-
-
-class NullReporter:
-    """Shows nothing."""
-
-    def note(self, text: str) -> None:
-        """Show nothing."""
-
-    def indexed(self, done: int, total: int) -> None:
-        """Show nothing."""
-
-    def encoded(self, done: int, total: int) -> None:
-        """Show nothing."""
-
-    def started(self, done: int, total: int) -> None:
-        """Show nothing."""
-
-    def stepped(self, step: int, metrics: dict[str, float]) -> None:
-        """Show nothing."""
-
-    def validated(self, step: int, errors: PredictionErrors) -> None:
-        """Show nothing."""
 
 
 class NullMetricsLog:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
@@ -17,50 +15,58 @@ from vjepa2_ac.distributed.collectives import broadcast_object, broadcast_tensor
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import load_trained
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import (
     ADAPTER,
     OPTIMIZER,
     STATE,
     RunState,
-    find_damage,
-    listed,
     newest_checkpoint,
     read_state,
-    step_of,
+    written_state,
 )
 from vjepa2_ac.runs.folder import CHECKPOINTS, CONFIG, read_run_config, run_id
 from vjepa2_ac.runs.torch_file import read_torch
+from vjepa2_ac.training.best_checkpoint import best_so_far, measured_on
+from vjepa2_ac.training.fsdp import shard_predictor
 from vjepa2_ac.training.optim import load_moments
+from vjepa2_ac.training.setup import Run
 
 
-def restore(
-    config: Config,
-    accelerator: Accelerator,
-    world_model: WorldModel,
-    optimizer: torch.optim.Optimizer,
-    note: Callable[[str], None],
-) -> RunState:
-    """Restore the run in every process: the first one reads the newest checkpoint and sends it to the others.
+def restore(run: Run, reporter: Reporter) -> Run:
+    """Bring a run to its newest checkpoint, in every process, and share its weights where the launch requests it.
 
     Raises:
         InputError: The processes have different bases, or the checkpoint is not of this run.
     """
+    state = _state_of_all(run, reporter)
+    run.optimizer = shard_predictor(run.world_model, run.optimizer, run.config, run.accelerator, reporter)
+    restore_loss_scale(run.scaler, state)
+    run.dataset.broken.recall(state.broken)
+    _report_data_changes(run.dataset, state, reporter)
+    run.state = best_so_far(state, measured_on(run.config, run.dataset), reporter)
+    run.micro_batches = micro_batches_of(run.config, state, run.accelerator.num_processes, reporter)
+    return run
+
+
+def _state_of_all(run: Run, reporter: Reporter) -> RunState:
+    """Restore weights and moments in every process: the first one reads them, and sends them to the others."""
+    config, accelerator, world_model = run.config, run.accelerator, run.world_model
     encoder = world_model.adaptation.encoder if world_model.adaptation else ""
     require_same(accelerator, encoder, what="model.base", fix="Give every machine the same checkpoint")
     state, moments = RunState(step=0), None
-    folder = Path(config.run_dir)
-    if accelerator.is_main_process and (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is not None:
-        state, moments = _read(checkpoint, world_model, optimizer)
-        note(f"Going on from {checkpoint} ({state.step} of {config.training.steps} steps are done).")
-    state = broadcast_object(accelerator, replace(state, run_id=state.run_id or run_id(folder)))
+    if accelerator.is_main_process and (checkpoint := newest_checkpoint(run.folder / CHECKPOINTS)) is not None:
+        state, moments = _read(checkpoint, world_model, run.optimizer)
+        reporter.note(f"Going on from {checkpoint} ({state.step} of {config.training.steps} steps are done).")
+    state = broadcast_object(accelerator, replace(state, run_id=state.run_id or run_id(run.folder)))
     broadcast_tensors(accelerator, world_model.predictor.state_dict().values())
     moments = broadcast_object(accelerator, moments)
     if moments is not None and not accelerator.is_main_process:
-        load_moments(optimizer, moments)
+        load_moments(run.optimizer, moments)
     return state
 
 
-def micro_batches_of(config: Config, state: RunState, processes: int, note: Callable[[str], None]) -> int:
+def micro_batches_of(config: Config, state: RunState, processes: int, reporter: Reporter) -> int:
     """Return the number of micro-batches of a process per step.
 
     It is the config's, at the first start and if batch_size * accumulation was changed on purpose; else the number that
@@ -84,29 +90,11 @@ def micro_batches_of(config: Config, state: RunState, processes: int, note: Call
             fix="Start another number of processes; or set training.batch_size and training.accumulation to what each"
             " is to do, with --allow-config-change",
         )
-    note(
+    reporter.note(
         f"{processes} processes, before {state.processes}: {micro_batches} micro-batches of {batch_size} in each, so"
         f" that a step has the same {state.clips_per_step} clips."
     )
     return micro_batches
-
-
-def refuse_if_overtaken(folder: Path, state: RunState) -> None:
-    """Check that no other process trained in a new run's folder between its first inspection and its lock.
-
-    Raises:
-        InputError: Another process did.
-    """
-    # Checkpoints up to its own step were inspected when the run was resumed.
-    further = [path for path in listed(folder / CHECKPOINTS) if (step_of(path.name) or 0) > state.step]
-    newest = next((path for path in reversed(further) if find_damage(path) is None), None)
-    if newest is not None:
-        raise InputError(
-            where=str(newest),
-            found=f"a checkpoint of step {read_state(newest).step}, which another start wrote while this one stood at"
-            f" {state.step}",
-            fix="Start again: the run continues from there",
-        )
 
 
 def restore_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
@@ -126,8 +114,8 @@ def restore_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
     scaler.load_state_dict(dict(state.loss_scale))
 
 
-def require_same_data(config: Config, dataset: Dataset, state: RunState) -> None:
-    """Refuse to go on with another data set than the one that the run began with.
+def require_same_data(config: Config, dataset: Dataset) -> None:
+    """Refuse to go on with another data set than the one that the run in its folder began with.
 
     At the place where it began the data may have changed, which is reported; elsewhere they must be the same.
 
@@ -135,25 +123,26 @@ def require_same_data(config: Config, dataset: Dataset, state: RunState) -> None
         InputError: They are others, or an earlier version did not note which they were.
     """
     folder = Path(config.run_dir)
-    if not state.step or not (folder / CONFIG).is_file():
+    began_with = read_run_config(folder).data.path if (folder / CONFIG).is_file() else config.data.path
+    if began_with == config.data.path or (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is None:
         return
-    began_with = read_run_config(folder).data.path
-    if began_with == config.data.path or state.data in fingerprints_of(dataset.table):
+    seen = written_state(checkpoint).data
+    if seen in fingerprints_of(dataset.table):
         return
     raise InputError(
         where=f"data.path: {config.data.path}",
-        found="other episodes or files than the run has seen" if state.data else "a run that did not note its data",
+        found="other episodes or files than the run has seen" if seen else "a run that did not note its data",
         needed=f"the data set that was at {began_with}",
         fix="Set data.path to where that is now (its files keep names, sizes and times when they are moved); where the"
         " change is meant, add --allow-config-change",
     )
 
 
-def report_data_changes(dataset: Dataset, state: RunState, note: Callable[[str], None]) -> None:
+def _report_data_changes(dataset: Dataset, state: RunState, reporter: Reporter) -> None:
     """Report if the data has changed since the checkpoint was written."""
     windows = len(dataset.windows("train"))
     if state.windows not in {None, windows}:
-        note(
+        reporter.note(
             f"The data has changed: {windows:,} training clips instead of {state.windows:,}."
             " From here on their order is another, and some may be seen twice in this epoch or not at all."
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +13,7 @@ from torch import nn
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import training_loader, validation_batches
+from vjepa2_ac.data.clips.loader import ProcessShare, training_loader, validation_batches
 from vjepa2_ac.data.clips.prefetch import Batches
 from vjepa2_ac.data.clips.streams import Copies, copies_for
 from vjepa2_ac.data.index.index_cache import fingerprints_of
@@ -25,12 +24,13 @@ from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.distributed.shared_memory import warn_if_shared_memory_is_small
 from vjepa2_ac.encoding.batch import encode_batch, extrinsics_for
 from vjepa2_ac.encoding.training_cache import with_latents
-from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, require_learned
 from vjepa2_ac.model.adapter.lora import add_adapter, save_trained, trainable_report
 from vjepa2_ac.model.adapter.lora_linear import CastMatrices
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.checkpoint import (
     ADAPTER,
     OPTIMIZER,
@@ -42,16 +42,26 @@ from vjepa2_ac.runs.checkpoint import (
 from vjepa2_ac.runs.folder import CHECKPOINTS, with_stride
 from vjepa2_ac.runs.slow_disk import warn_if_stalled
 from vjepa2_ac.runs.torch_file import write_torch
-from vjepa2_ac.training.best_checkpoint import best_so_far, measured_on
-from vjepa2_ac.training.fsdp import full_optimizer_state_dict, full_state_dict, shard_predictor
+from vjepa2_ac.training.fsdp import full_optimizer_state_dict, full_state_dict
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.micro_step import CapturedMicroStep, MicroStep, captured_on_cuda
 from vjepa2_ac.training.new_embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
-from vjepa2_ac.training.resume import micro_batches_of, report_data_changes, restore, restore_loss_scale
 from vjepa2_ac.training.stride_choice import choose_stride
 
 _CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes
+
+
+@dataclass(frozen=True)
+class RunData:
+    """The data of a run, open and checked."""
+
+    config: Config  # of the run; its stride is a number
+    accelerator: Accelerator
+    dataset: Dataset
+    first_clip: Batch  # of training, as it is read from the data set
+    calibration: Calibration | None  # if data.stride was auto and is now chosen
+    world_model: WorldModel | None  # the base, if it has chosen the stride
 
 
 @dataclass
@@ -68,6 +78,11 @@ class Run:
     state: RunState
     micro_batches: int  # of this process, per optimizer step
     calibration: Calibration | None = None  # if data.stride was auto and is now chosen
+
+    @property
+    def folder(self) -> Path:
+        """The run's folder."""
+        return Path(self.config.run_dir)
 
     @property
     def encodes(self) -> bool:
@@ -111,67 +126,69 @@ class Run:
         return self.micro_batches * self.config.training.batch_size * int(self.accelerator.num_processes)
 
 
-def set_up(
-    config: Config,
-    note: Callable[[str], None],
-    indexed: Progress | None = None,
-    accelerator: Accelerator | None = None,
-    encoding: Progress | None = None,
-    *,
-    check_only: bool = False,
-) -> Run:
-    """Open the data, load the model, attach the adapter, and restore the newest checkpoint. Cheap failures first.
+def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelerator | None = None) -> RunData:
+    """Open the data of a run, let its model choose the stride where that is auto, and read a clip of each split.
 
     Args:
         config: The run.
-        note: Receives messages for the user.
-        indexed: Called with the progress of indexing, if the data set is not indexed yet.
+        reporter: Receives messages, and the progress of indexing.
         accelerator: The result of `make_accelerator` for this config; None: it is created here.
-        encoding: Called with the number of encoded frames, if `data.cache` is auto and they are missing.
-        check_only: Do not write such a cache, and report its size.
 
     Raises:
         InputError: Something cannot be used.
     """
-    accelerator = accelerator or make_accelerator(config)
-    if config.data.stride == "auto":
+    accelerator, is_auto = accelerator or make_accelerator(config), config.data.stride == "auto"
+    if is_auto:
         require_learned(config.model)
     with accelerator.local_main_process_first():  # the others find the index of the first one on this machine
-        dataset = open_dataset(config.data, progress=indexed)
+        dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     if (duplicates := find_duplicates(dataset)).episodes:
-        note(f"Warning: {duplicates}.")
+        reporter.note(f"Warning: {duplicates}.")
     check_heads(config, dataset)
     world_model, calibration = None, None
-    if config.data.stride == "auto":
+    if is_auto:
         world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
-        calibration = broadcast_object(accelerator, choose_stride(world_model, dataset, config, accelerator, note))
+        calibration = broadcast_object(accelerator, choose_stride(world_model, dataset, config, accelerator, reporter))
         config, dataset = with_stride(config, calibration.best.stride), dataset.with_stride(calibration.best.stride)
-    first_clip = _read_one_clip_of_each_split(dataset)
-    world_model = world_model or load_base(config.model, seed=config.seed)
-    extrinsics_for(world_model, first_clip)
-    dataset = with_latents(config, dataset, world_model, accelerator, note, encoding=encoding, check_only=check_only)
-    warn_if_shared_memory_is_small(config, dataset, first_clip, accelerator, note)
-    fit_to_data(world_model, config, dataset, note)
+    return RunData(config, accelerator, dataset, _read_one_clip_of_each_split(dataset), calibration, world_model)
+
+
+def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool = False) -> Run:
+    """Load the model of a run, attach its adapter, and encode its data if `data.cache` says so: a run before step 1.
+
+    Args:
+        data: The open data of the run.
+        reporter: Receives messages, and the progress of encoding.
+        check_only: Encode nothing, and report how much that would be.
+
+    Raises:
+        InputError: Something cannot be used.
+    """
+    config, accelerator, training = data.config, data.accelerator, data.config.training
+    world_model = data.world_model or load_base(config.model, seed=config.seed)
+    extrinsics_for(world_model, data.first_clip)
+    dataset = with_latents(config, data.dataset, world_model, accelerator, reporter, check_only=check_only)
+    warn_if_shared_memory_is_small(config, dataset, data.first_clip, accelerator, reporter)
+    fit_to_data(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
-    note(str(trainable_report(world_model)))
-    world_model.set_gradient_checkpointing(config.training.gradient_checkpointing)
-    world_model.set_attention(config.training.attention)
-    world_model.set_compiled("with gradients" if config.training.compile == "blocks" else "never")
+    reporter.note(str(trainable_report(world_model)))
+    world_model.set_gradient_checkpointing(training.gradient_checkpointing)
+    world_model.set_attention(training.attention)
+    world_model.set_compiled("with gradients" if training.compile == "blocks" else "never")
     if dataset.config.is_cache:
         world_model.set_encoder_aside()
     world_model.to(accelerator.device)
-    optimizer = make_optimizer(world_model, config.training)
-    scaler = torch.amp.GradScaler(accelerator.device.type, enabled=config.training.precision == "fp16")
-    state = restore(config, accelerator, world_model, optimizer, note)
-    optimizer = shard_predictor(world_model, optimizer, config, accelerator, note)
-    restore_loss_scale(scaler, state)
-    dataset.broken.recall(state.broken)
-    report_data_changes(dataset, state, note)
-    state = best_so_far(state, measured_on(config, dataset), note)
-    micro_batches = micro_batches_of(config, state, accelerator.num_processes, note)
-    objective = Objective(world_model, config.training)
     return Run(
-        config, accelerator, world_model, objective, optimizer, scaler, dataset, state, micro_batches, calibration
+        config=config,
+        accelerator=accelerator,
+        world_model=world_model,
+        objective=Objective(world_model, training),
+        optimizer=make_optimizer(world_model, training),
+        scaler=torch.amp.GradScaler(accelerator.device.type, enabled=training.precision == "fp16"),
+        dataset=dataset,
+        state=RunState(step=0),
+        micro_batches=training.accumulation,
+        calibration=data.calibration,
     )
 
 
@@ -182,8 +199,7 @@ def batches_from(run: Run) -> Batches:
         seed=run.config.seed,
         batch_size=run.config.training.batch_size,
         start_position=run.state.clips_done,
-        rank=run.accelerator.process_index,
-        world_size=run.accelerator.num_processes,
+        share=ProcessShare(run.accelerator.process_index, run.accelerator.num_processes),
         copies=run.copies,
     )
 

@@ -2,34 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import replace
 
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibrate_model
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import Reporter
 
 
 def choose_stride(
-    world_model: WorldModel, dataset: Dataset, config: Config, accelerator: Accelerator, note: Callable[[str], None]
+    world_model: WorldModel, dataset: Dataset, config: Config, accelerator: Accelerator, reporter: Reporter
 ) -> Calibration:
     """Let the model of a run, before training, choose among the candidates on the validation episodes.
 
     Raises:
         InputError: As `calibrate`.
     """
-    note("data.stride is auto: measuring the model at each candidate stride")
+    reporter.note("data.stride is auto: measuring the model at each candidate stride")
     strides = strides_that_fit(dataset)
     for stride in set(dataset.config.strides_to_try(dataset.control_rate_hz)).difference(strides):
-        note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
+        reporter.note(f"  stride {stride}: not possible: no clip of {dataset.config.frames} frames fits")
+    candidates = replace(dataset, config=dataset.config.model_copy(update={"stride_candidates": tuple(strides)}))
     calibration = calibrate_model(
-        world_model, dataset, config, accelerator, clips=config.validation.clips, strides=strides
+        world_model, candidates, config, accelerator, ClipSample(clips=config.validation.clips)
     )
     for line in calibration.lines():
-        note(line)
+        reporter.note(line)
     return calibration
 
 

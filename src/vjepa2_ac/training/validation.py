@@ -11,13 +11,13 @@ from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import PredictionErrors
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.new_embodiment import NOT_ASKED
-from vjepa2_ac.training.reporter import NullMetricsLog, Reporter
+from vjepa2_ac.training.reporter import NullMetricsLog, TrainingReporter
 from vjepa2_ac.training.setup import Run, encode
 
 BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: planning depends on the longest horizon
 
 
-def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter: Reporter) -> bool:
+def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter: TrainingReporter) -> bool:
     """Measure and log the validation, if it is due; return whether it is the best so far."""
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
@@ -43,7 +43,7 @@ def validation_metrics(errors: PredictionErrors) -> dict[str, Any]:
     }
 
 
-def validate(run: Run, reporter: Reporter) -> PredictionErrors:
+def validate(run: Run, reporter: TrainingReporter) -> PredictionErrors:
     """Measure the held-out clips."""
     config = run.config
     run.world_model.eval()
@@ -60,18 +60,23 @@ def validate(run: Run, reporter: Reporter) -> PredictionErrors:
     return errors
 
 
-def refuse_weak_base(run: Run, errors: PredictionErrors, reporter: Reporter) -> None:
-    """Refuse to adapt a base that is no better than copying the last frame.
+def validate_base(run: Run, reporter: TrainingReporter) -> PredictionErrors | None:
+    """Measure a run before its first step, and refuse a base that is no better than copying the last frame.
+
+    None is returned of a run that goes on.
 
     Raises:
         InputError: It is not, and `training.allow_weak_base` is off.
     """
+    if run.state.step:
+        return None
+    errors = validate(run, reporter)
     config, error = run.config, one_step_over_persistence(errors).value
     if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:
-        return
+        return errors
     if run.world_model.fresh_heads is not None:
         reporter.note(NOT_ASKED)
-        return
+        return errors
     raise InputError(
         where="model.base",
         found=f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame",

@@ -25,7 +25,7 @@ from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips import dataset as opening
 from vjepa2_ac.data.clips import loader
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import clip_at, collate, training_loader, validation_batches
+from vjepa2_ac.data.clips.loader import ProcessShare, clip_at, collate, training_loader, validation_batches
 from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.data.sources.rlds.tfrecord import index_records
 from vjepa2_ac.episode import Batch, Episode
@@ -91,14 +91,14 @@ def test_resumed_run_sees_the_clips_the_uninterrupted_run_would_have(droid: Path
 def test_ranks_share_one_order_between_them(droid: Path) -> None:
     config = config_of(droid)
     alone = take(12, config)
-    ranks = [take(4, config, rank=rank, world_size=3) for rank in range(3)]
+    ranks = [take(4, config, share=ProcessShare(rank, 3)) for rank in range(3)]
     assert_same([ranks[rank][step] for step in range(4) for rank in range(3)], alone)
 
 
 def test_another_layout_goes_on_where_the_run_stopped(droid: Path) -> None:
     config = config_of(droid)
     alone = names(take(12, config))
-    ranks = [take(2, config, start_position=5, batch_size=3, rank=rank, world_size=2) for rank in range(2)]
+    ranks = [take(2, config, start_position=5, batch_size=3, share=ProcessShare(rank, 2)) for rank in range(2)]
     assert names([ranks[rank][step] for step in range(2) for rank in range(2)]) == alone[5:17]
 
 
@@ -302,7 +302,7 @@ def test_ranks_lose_no_window_and_see_none_twice_in_an_epoch(
     everything = {(f"episode {e}", s) for e, length in enumerate((9, 12, 7, 10)) for s in range(length - 4)}
     steps = -(-2 * len(everything) // (world_size * batch_size))
     ranks = [
-        first(dataset, steps, batch_size=batch_size, rank=rank, world_size=world_size) for rank in range(world_size)
+        first(dataset, steps, batch_size=batch_size, share=ProcessShare(rank, world_size)) for rank in range(world_size)
     ]
     assert {len(batch.starts) for rank in ranks for batch in rank} == {batch_size}
     row = names([ranks[rank][step] for step in range(steps) for rank in range(world_size)])

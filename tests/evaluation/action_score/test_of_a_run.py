@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from adapted_run import write_adapted_run
+from run_fixtures import SilentReporter
 from vjepa2_ac.cli import main
 from vjepa2_ac.config.loading import parse_config
-from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation import evaluate
 from vjepa2_ac.evaluation.action_score import measure
@@ -60,15 +60,10 @@ def test_plans_are_measured_on_held_out_clips_with_the_configs_settings(
     tmp_path: Path, data_folder: Path, base_folder: Path
 ) -> None:
     path = written(tmp_path, data_folder, base_folder)
-    stages: list[str] = []
+    reporter = SilentReporter()
     several = replace(asked(path, tmp_path / "out"), planning=("planning.iterations=2", "planning.cem.elites=3"))
-
-    def stage(title: str) -> Progress:
-        stages.append(title)
-        return lambda *_: None
-
-    evaluation = evaluate_subject(str(base_folder), several, stage=stage).evaluation
-    assert {"planning, base", "planning, model"} <= set(stages)
+    evaluation = evaluate_subject(str(base_folder), several, reporter).evaluation
+    assert {"planning, base", "planning, model"} <= set(reporter.tasks)
     metrics = json.loads((tmp_path / "out/metrics.json").read_text())
     assert metrics["planning"]["starts"] == 3
     settings = metrics["planning"]["one_step_settings"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from torch import Tensor
 
-from vjepa2_ac.evaluation.action_use.energy_landscape import grid_axes, measure_landscapes
+from vjepa2_ac.evaluation.action_use.energy_landscape import LandscapeGrid, grid_axes, measure_landscapes
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, start_of
 from vjepa2_ac.evaluation.result import Landscapes
 from vjepa2_ac.spaces import POSE_CHANGE
@@ -19,8 +19,8 @@ def starts(**changes: object) -> list[RolloutStart]:
 
 
 def landscapes(model: object, **changes: object) -> Landscapes:
-    options: dict[str, object] = {"space": POSE_CHANGE, "nodes": 7, "reach": 0.075, "at_once": 50} | changes
-    return measure_landscapes(model, starts(), **options)  # type: ignore[arg-type]
+    grid: dict[str, object] = {"space": POSE_CHANGE, "nodes": 7, "reach": 0.075} | changes
+    return measure_landscapes(model, starts(), LandscapeGrid(**grid), at_once=50)  # type: ignore[arg-type]
 
 
 def test_the_minimum_of_an_analytic_energy_is_at_the_true_action() -> None:
@@ -73,9 +73,8 @@ def test_the_true_action_is_a_node_and_the_grid_spans_zero_whatever_it_is(true: 
 
 
 def test_the_grid_grows_to_hold_large_actions() -> None:
-    found = measure_landscapes(
-        Oracle(), starts(actions=None, seed=3), space=POSE_CHANGE, nodes=5, reach=0.001, at_once=99
-    )
+    grid = LandscapeGrid(POSE_CHANGE, nodes=5, reach=0.001)
+    found = measure_landscapes(Oracle(), starts(actions=None, seed=3), grid, at_once=99)
     largest = max(np.abs(one.true).max() for one in found.maps)
     assert all(one.axes.max() > 0.9 * largest for one in found.maps)
 
@@ -88,9 +87,7 @@ def test_clips_that_hardly_move_along_an_axis_have_no_sign_to_agree_with() -> No
     found = measure_landscapes(
         Oracle(),
         [start_of(still, clip, 0, clip) for clip in range(CLIPS)],
-        space=POSE_CHANGE,
-        nodes=5,
-        reach=0.075,
+        LandscapeGrid(POSE_CHANGE, nodes=5, reach=0.075),
         at_once=99,
     )
     assert found.sign_clips[2] == 0

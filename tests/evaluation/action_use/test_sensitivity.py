@@ -17,10 +17,12 @@ def starts(**changes: object) -> list:
     return [start_of(batch, clip, 0, clip) for clip in range(CLIPS)]
 
 
-def pool(*, space: ActionSpace = POSE_CHANGE, reach: float = 0.075) -> ActionPool:
+def pool(
+    *, space: ActionSpace = POSE_CHANGE, reach: float = 0.075, samples: int = SAMPLES, seed: int = 0
+) -> ActionPool:
     batch = clips_batch(CLIPS)
     ids = tuple(name for name in batch.episode_ids for _ in range(TIME - 1))
-    return ActionPool(batch.actions.flatten(0, 1).double().numpy(), ids, space, reach)
+    return ActionPool(batch.actions.flatten(0, 1).double().numpy(), ids, space, reach, samples, seed)
 
 
 def test_energy_and_change_are_the_distances_of_the_world() -> None:
@@ -43,10 +45,10 @@ def test_ranks_are_counted_by_hand() -> None:
             return super().predict(latents, actions / 3, states, extrinsics)
 
     begun = starts()
-    found = measure_sensitivity(Third(), begun, pool(), samples=SAMPLES, seed=4, at_once=16)
+    found = measure_sensitivity(Third(), begun, pool(seed=4), at_once=16)
     for number, start in enumerate(begun):
         generator = start.generator(4)
-        drawn = [pool().of_others(start, SAMPLES, generator), pool().in_box(start, SAMPLES, generator)]
+        drawn = [pool().of_others(start, generator), pool().in_box(start, generator)]
         for ranking, others in zip(found.rankings, drawn, strict=True):
             true = start.action[:DIM].double().numpy()
             energies = np.abs(others[:, :DIM] / 3 - true).mean(axis=1)
@@ -59,7 +61,7 @@ def test_ranks_are_counted_by_hand() -> None:
 
 
 def test_equal_energies_share_their_places() -> None:
-    found = measure_sensitivity(Copier(), starts(), pool(), samples=SAMPLES, seed=0, at_once=16)
+    found = measure_sensitivity(Copier(), starts(), pool(), at_once=16)
     for ranking in found.rankings:
         assert set(ranking.rank) == {0.5}
         assert ranking.top[1].value == pytest.approx(1 / (SAMPLES + 1))
@@ -67,28 +69,28 @@ def test_equal_energies_share_their_places() -> None:
 
 
 def test_others_are_of_other_episodes_and_the_box_moves_only_the_hand() -> None:
-    start, drawing = starts()[0], pool()
-    others = drawing.of_others(start, 500, np.random.default_rng(0))
+    start, drawing = starts()[0], pool(samples=500)
+    others = drawing.of_others(start, np.random.default_rng(0))
     own = drawing.actions[np.array(drawing.episode_ids) == start.episode_id]
     assert not (others[:, None] == own[None]).all(axis=2).any()
-    boxed = drawing.in_box(start, 500, np.random.default_rng(0))
+    boxed = drawing.in_box(start, np.random.default_rng(0))
     assert np.array_equal(boxed[:, 3:], np.tile(start.action[3:].double().numpy(), (500, 1)))
     assert 0.07 < np.abs(boxed[:, :3]).max() <= 0.075
     assert abs(boxed[:, :3].mean()) < 0.005
-    vectors = pool(space=vector_actions(7, "change")).in_box(start, 500, np.random.default_rng(0))
+    vectors = pool(space=vector_actions(7, "change"), samples=500).in_box(start, np.random.default_rng(0))
     assert (np.abs(vectors).max(axis=0) <= np.abs(drawing.actions).max(axis=0)).all()
     assert np.abs(vectors[:, 3:]).max() > 0.05
 
 
 def test_a_start_draws_the_same_whatever_is_measured_beside_it() -> None:
-    all_of_them = measure_sensitivity(Oracle(), starts(), pool(), samples=SAMPLES, seed=0, at_once=16)
-    last = measure_sensitivity(Oracle(), starts()[-1:], pool(), samples=SAMPLES, seed=0, at_once=3)
+    all_of_them = measure_sensitivity(Oracle(), starts(), pool(), at_once=16)
+    last = measure_sensitivity(Oracle(), starts()[-1:], pool(), at_once=3)
     assert last.change_by_clip[0] == pytest.approx(all_of_them.change_by_clip[-1], rel=1e-5)
 
 
 def test_the_change_is_relative_to_what_there_is_to_predict() -> None:
     begun = starts()
-    found = measure_sensitivity(Oracle(), begun, pool(), samples=SAMPLES, seed=0, at_once=16)
+    found = measure_sensitivity(Oracle(), begun, pool(), at_once=16)
     changes = found.change_by_clip * np.array([start.persistence for start in begun])
     assert found.change.value == pytest.approx(changes.sum() / sum(start.persistence for start in begun))
     assert begun[0].persistence == pytest.approx(float(begun[0].action[:DIM].abs().mean()) * 100, rel=1e-4)

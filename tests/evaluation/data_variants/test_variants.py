@@ -19,6 +19,7 @@ from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, StepRang
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult, probe_variants, rows_of
 from vjepa2_ac.evaluation.data_variants.variants import mirrored, variants_of
 from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.geometry import actions_from_states, matrices_from_euler
 from worlds import Copier
 
@@ -112,7 +113,7 @@ def dataset_of(fault: Fault, *, episodes: int = EPISODES, steps: int = STEPS, **
 
 def probed(dataset: Dataset, model: Knowing | Copier | None = None) -> VariantProbe:
     knowing = model if isinstance(model, Knowing) else Knowing()
-    return probe_variants(model or knowing, knowing.encode, dataset, split="train", clips=16)
+    return probe_variants(model or knowing, knowing.encode, dataset, ClipSample("train", 16))
 
 
 FAULTS: dict[str, Fault] = {
@@ -198,7 +199,7 @@ def test_shifts_are_measured_as_far_as_states_reach_on_both_sides(steps: int, wi
         )
         return knowing.encode(batch)
 
-    probe = probe_variants(knowing, encode, dataset, split="train", clips=16)
+    probe = probe_variants(knowing, encode, dataset, ClipSample("train", 16))
     results = {one.name for one in probe.results}
     for shift in (1, 2, 4, 8):
         assert (f"frames {shift} step{'s' * (shift > 1)} late" in results) == (shift <= widest)
@@ -216,7 +217,7 @@ def test_long_clips_are_looked_at_in_part_where_whole_ones_fit() -> None:
         seen.append(batch)
         return knowing.encode(batch)
 
-    probe = probe_variants(knowing, encode, dataset, split="train", clips=8)
+    probe = probe_variants(knowing, encode, dataset, ClipSample("train", 8))
     assert {batch.states.shape[1] for batch in seen} == {8}
     assert {start for batch in seen for start in batch.starts} == {0}  # a latent cache has nothing else
     assert probe.clips == EPISODES
@@ -272,7 +273,7 @@ def test_of_changed_frames_persistence_is_another_one_too() -> None:
         return replace(latents, latents=latents.latents * 0.01) if is_mirrored else latents
 
     dataset = dataset_of(at(0))
-    probe = probe_variants(Copier(), encode, dataset, split="train", clips=16)
+    probe = probe_variants(Copier(), encode, dataset, ClipSample("train", 16))
     (mirrored_ones,) = [one for one in probe.results if one.name == "frames mirrored"]
     assert mirrored_ones.ratio.value == pytest.approx(1)
     assert probe.better is None

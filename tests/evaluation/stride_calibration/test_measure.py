@@ -12,8 +12,9 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.step_ranges import StepSelection
 from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, StepRanges
+from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, Progress, StepRanges, no_progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibrate
 
 
@@ -73,8 +74,9 @@ class GoesOn:
         raise AssertionError("calibration needs no rollout")
 
 
-def calibrated(model: GoesOn, source: Tracks, **options: object) -> Calibration:
-    return calibrate(model, encode, dataset_of(source), batch_size=4, **options)  # type: ignore[arg-type]
+def calibrated(model: GoesOn, source: Tracks, progress: Progress = no_progress, **options: object) -> Calibration:
+    sample = ClipSample(batch_size=4, **options)  # type: ignore[arg-type]
+    return calibrate(model, encode, dataset_of(source), sample, progress=progress)
 
 
 @pytest.mark.parametrize("learned", [4, 8, 15])
@@ -107,7 +109,7 @@ def test_every_stride_is_measured_on_the_same_starts() -> None:
         return encode(batch)
 
     source = Tracks([30, 50, 60, 80, 46])
-    calibrate(GoesOn(4), noting, dataset_of(source), batch_size=4, clips=12)
+    calibrate(GoesOn(4), noting, dataset_of(source), ClipSample(batch_size=4, clips=12))
     assert seen[4] == seen[8] == seen[15]
     assert len(set(seen[4])) == 12
     assert "track 0" not in {episode for episode, _ in seen[4]}, "a clip at stride 15 has 46 steps"
@@ -163,9 +165,9 @@ def test_where_no_stride_fits_the_first_reason_is_the_error() -> None:
 
 def test_clips_are_shortened_to_eight_frames_by_default() -> None:
     source = Tracks([130] * 4)
-    assert calibrate(GoesOn(4), encode, dataset_of(source, frames=16)).frames == 8
-    assert calibrate(GoesOn(4), encode, dataset_of(source, frames=16), frames=3).frames == 3
-    assert calibrate(GoesOn(4), encode, dataset_of(source)).frames == 4
+    assert calibrate(GoesOn(4), encode, dataset_of(source, frames=16), ClipSample()).frames == 8
+    assert calibrate(GoesOn(4), encode, dataset_of(source, frames=16), ClipSample(frames=3)).frames == 3
+    assert calibrate(GoesOn(4), encode, dataset_of(source), ClipSample()).frames == 4
 
 
 def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,12 +181,12 @@ def test_clips_that_cannot_be_read_are_left_out_and_all_of_them_are_an_error(mon
     monkeypatch.setattr(Dataset, "control_rate_hz", 15.0)
     dataset = dataset_of(Damaged([80] * 20), broken_episodes="skip")
     damaged = {int(dataset.windows("validation").episodes[0])}
-    found = calibrate(GoesOn(8), encode, dataset, clips=200, batch_size=1)
+    found = calibrate(GoesOn(8), encode, dataset, ClipSample(clips=200, batch_size=1))
     assert found.best.episodes == len(dataset.windows("validation").episodes) - 1
     assert [one.clips for one in found.results] == [found.results[0].clips] * 3
     damaged = set(range(20))
     with pytest.raises(InputError, match="none of the clips can be read; broken episodes: track"):
-        calibrate(GoesOn(8), encode, dataset, batch_size=4)
+        calibrate(GoesOn(8), encode, dataset, ClipSample(batch_size=4))
 
 
 def test_progress_counts_every_clip_of_every_stride() -> None:

@@ -17,7 +17,7 @@ from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, find_damage, re
 from vjepa2_ac.runs.mirror import upload
 from vjepa2_ac.runs.mirror.background_sync import Mirror
 from vjepa2_ac.runs.mirror.remote_checkpoints import SENDING, RemoteCheckpoints, complete
-from vjepa2_ac.runs.mirror.upload import HELD
+from vjepa2_ac.runs.mirror.upload import HELD, RemoteUpdate
 from vjepa2_ac.storage.remote import retries
 
 PLACE = "gs://bucket/run"
@@ -55,7 +55,8 @@ def write(run: Path, step: int, state: RunState | None = None, keep: int = 3) ->
 def mirror_of(run: Path, place: str = PLACE, run_id: str = "mine", **arguments: object) -> Mirror:
     minutes, seconds = arguments.pop("minutes", 0.0), arguments.pop("wait_seconds", 30.0)
     config = CheckpointConfig(keep=3, remote=place, remote_every_minutes=minutes, remote_wait_seconds=seconds)
-    return Mirror(place, run, run_id, config, **arguments)
+    update = RemoteUpdate(RemoteCheckpoints(place), run, run_id, config.keep, arguments.pop("damaged", ()))
+    return Mirror(update, config, **arguments)
 
 
 def send(run: Path, **arguments: object) -> Mirror:

@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 
 from gcs import Failure, Gcs
+from run_fixtures import SilentReporter
 from vjepa2_ac import storage
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.errors import InputError, UnreachableError
+from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, newest_checkpoint, read_state, write_checkpoint
 from vjepa2_ac.runs.folder import check_run_folder
 from vjepa2_ac.runs.lock import RunLock
@@ -19,7 +21,6 @@ from vjepa2_ac.runs.mirror.open_remote import Remote, open_remote
 from vjepa2_ac.storage.remote import filesystems
 
 PLACE = "gs://bucket/run"
-NOTHING: Callable[[str], None] = [].append
 
 
 @pytest.fixture
@@ -65,11 +66,11 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 def test_without_a_place_there_is_nothing_to_open(make_config: Callable[..., Config]) -> None:
-    assert open_remote(make_config(), NOTHING) is None
+    assert open_remote(make_config(), SILENT) is None
 
 
 def test_an_empty_place_is_tried_and_left_empty(bucket: Gcs, config: Config) -> None:
-    assert open_remote(config, NOTHING) == Remote(PLACE, config)
+    assert open_remote(config, SILENT) == Remote(PLACE, config)
     assert bucket.names("bucket") == ["other"]
     assert [r.target.split("/")[0] for r in bucket.requests if "write-check" in r.target] == ["DELETE "]
     assert len(bucket.uploads()) == 1
@@ -77,8 +78,8 @@ def test_an_empty_place_is_tried_and_left_empty(bucket: Gcs, config: Config) -> 
 
 
 def test_a_fresh_machine_gets_the_newest_checkpoint_and_the_small_files(bucket: Gcs, config: Config) -> None:
-    source, notes = run_there(bucket, config, 10, 20), []
-    remote = open_remote(config, notes.append)
+    source, reporter = run_there(bucket, config, 10, 20), SilentReporter()
+    remote = open_remote(config, reporter)
     assert remote == Remote(PLACE, config)
     newest = newest_checkpoint(local(config) / "checkpoints")
     assert newest is not None
@@ -86,7 +87,7 @@ def test_a_fresh_machine_gets_the_newest_checkpoint_and_the_small_files(bucket: 
     assert read_state(newest).run_id == "mine"
     expected = {name: data for name, data in files_of(source).items() if checkpoint_name(10) not in name}
     assert files_of(local(config)) == expected
-    assert notes == [
+    assert reporter.notes == [
         f"{PLACE} can be written: it is brought up to date every 30 minutes, and in the end.",
         f"Fetched {checkpoint_name(20)} from {PLACE}.",
     ]
@@ -98,13 +99,13 @@ def test_fetching_survives_what_passes(bucket: Gcs, config: Config, failure: Fai
     source = run_there(bucket, config, 10)
     bucket.fail_next(failure, times=4, match="/download/.*optimizer")
     bucket.fail_next(failure, times=4, match="prefix=" if failure != "short" else "never")
-    open_remote(config, NOTHING)
+    open_remote(config, SILENT)
     assert files_of(local(config)) == files_of(source)
 
 
 def test_the_best_one_comes_too(bucket: Gcs, config: Config) -> None:
     run_there(bucket, config, 10, 20, 30, best_step=10, best_error=0.5)
-    open_remote(config, NOTHING)
+    open_remote(config, SILENT)
     newest = newest_checkpoint(local(config) / "checkpoints")
     assert read_state(newest).best_step == 10
     assert sorted(path.name for path in newest.parent.iterdir()) == [checkpoint_name(10), checkpoint_name(30)]
@@ -123,7 +124,7 @@ def test_a_damaged_checkpoint_there_is_passed_over_by_name(
     else:
         data[5] ^= 1
         bucket.put(f"bucket/{victim}", bytes(data) if damage == "flip" else bytes(data[:20]))
-    remote = open_remote(config, NOTHING)
+    remote = open_remote(config, SILENT)
     assert [path.name for path in (local(config) / "checkpoints").iterdir()] == [checkpoint_name(10)]
     assert remote.damaged == (checkpoint_name(20),)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
@@ -135,15 +136,15 @@ def test_where_all_are_damaged_the_run_does_not_begin_anew_unasked(bucket: Gcs, 
     for step in (10, 20):
         bucket.put(f"bucket/run/checkpoints/{checkpoint_name(step)}/optimizer.pt", b"?")
     with pytest.raises(InputError, match="none of 2 checkpoints is whole"):
-        open_remote(config, NOTHING)
+        open_remote(config, SILENT)
     write(local(config), 5)
-    assert set(open_remote(config, NOTHING).damaged) == {checkpoint_name(10), checkpoint_name(20)}
+    assert set(open_remote(config, SILENT).damaged) == {checkpoint_name(10), checkpoint_name(20)}
 
 
 def test_half_a_checkpoint_there_does_not_count(bucket: Gcs, config: Config) -> None:
     run_there(bucket, config, 10)
     bucket.put(f"bucket/run/checkpoints/{checkpoint_name(20)}/state.json", b'{"step": 20, "run_id": "mine"}')
-    open_remote(config, NOTHING)
+    open_remote(config, SILENT)
     assert newest_checkpoint(local(config) / "checkpoints").name == checkpoint_name(10)
 
 
@@ -152,7 +153,7 @@ def test_the_further_one_is_taken(bucket: Gcs, config: Config, here: int, elsewh
     run_there(bucket, config, elsewhere)
     write(local(config), here)
     (local(config) / "config.yaml").write_text(config_as_yaml(config))
-    open_remote(config, NOTHING)
+    open_remote(config, SILENT)
     assert newest_checkpoint(local(config) / "checkpoints").name == checkpoint_name(taken)
     assert bool(bucket.bytes_read("optimizer.pt")) == (elsewhere > here)
 
@@ -160,7 +161,7 @@ def test_the_further_one_is_taken(bucket: Gcs, config: Config, here: int, elsewh
 def test_what_is_damaged_on_this_machine_is_replaced_from_there(bucket: Gcs, config: Config) -> None:
     run_there(bucket, config, 10, 20)
     (write(local(config), 20) / "optimizer.pt").write_bytes(b"?")
-    open_remote(config, NOTHING)
+    open_remote(config, SILENT)
     assert newest_checkpoint(local(config) / "checkpoints").name == checkpoint_name(20)
 
 
@@ -169,9 +170,9 @@ def test_another_config_is_refused_as_if_it_were_on_this_machine(bucket: Gcs, co
     training = config.training.model_copy(update={"learning_rate": 0.5})
     other = config.model_copy(update={"training": training})
     with pytest.raises(InputError, match=rf"{PLACE}: a run of another config; it differs in training.learning_rate"):
-        open_remote(other, NOTHING)
+        open_remote(other, SILENT)
     assert not local(config).exists(), "nothing has come"
-    open_remote(other, NOTHING, allow_config_change=True)
+    open_remote(other, SILENT, allow_config_change=True)
     assert newest_checkpoint(local(config) / "checkpoints") is not None
 
 
@@ -180,7 +181,7 @@ def test_a_stride_that_the_run_there_has_chosen_is_no_other_config(
 ) -> None:
     config = make_config(checkpoint__remote=PLACE, data__stride="auto")
     run_there(bucket, config.model_copy(update={"data": config.data.with_stride(2)}), 10)
-    open_remote(config, NOTHING)
+    open_remote(config, SILENT)
     assert newest_checkpoint(local(config) / "checkpoints") is not None
 
 
@@ -189,7 +190,7 @@ def test_another_runs_place_is_refused(bucket: Gcs, config: Config) -> None:
     before = bucket.names("bucket")
     write(local(config), 20)
     with pytest.raises(InputError, match=rf"{PLACE} holds a checkpoint of another run, {checkpoint_name(10)}.*Set an"):
-        open_remote(config, NOTHING)
+        open_remote(config, SILENT)
     assert bucket.names("bucket") == before
 
 
@@ -197,14 +198,14 @@ def test_a_place_of_two_runs_is_refused_everywhere(bucket: Gcs, config: Config) 
     run_there(bucket, config, 10, run_id="one")
     run_there(bucket, config, 20, run_id="two")
     with pytest.raises(InputError, match="another run"):
-        open_remote(config, NOTHING)
+        open_remote(config, SILENT)
 
 
 def test_a_place_that_cannot_be_reached_is_a_warning(
     bucket: Gcs, config: Config, caplog: pytest.LogCaptureFixture
 ) -> None:
     bucket.fail_next(503, times=99)
-    remote = open_remote(config, NOTHING)
+    remote = open_remote(config, SILENT)
     assert remote == Remote(PLACE, config, is_reachable=False)
     assert len(bucket.requests) == 5, "one call, and no other once it failed"
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
@@ -218,10 +219,10 @@ def test_what_is_seen_there_and_cannot_be_fetched_is_not_done_again_from_the_sta
     run_there(bucket, config, 20)
     bucket.fail_next(503, times=99, match="/download/.*optimizer")
     with pytest.raises(UnreachableError, match="optimizer"):
-        open_remote(config, NOTHING)
+        open_remote(config, SILENT)
     caplog.clear()
     write(local(config), 10)
-    assert open_remote(config, NOTHING) == Remote(PLACE, config)
+    assert open_remote(config, SILENT) == Remote(PLACE, config)
     assert f"Training goes on after step 10, though {checkpoint_name(20)} is there" in caplog.text
 
 
@@ -233,20 +234,20 @@ def test_a_place_without_permission_is_an_error_with_the_way_out(
 ) -> None:
     bucket.fail_next(failure, times=9, match=match)
     with pytest.raises(InputError, match=r"^checkpoint.remote: gs://bucket/run: no permission.*Log in.*another place"):
-        open_remote(config, NOTHING)
+        open_remote(config, SILENT)
 
 
 def test_a_bucket_that_does_not_exist_is_an_error(bucket: Gcs, make_config: Callable[..., Config]) -> None:
     assert bucket.names("bucket")
     with pytest.raises(InputError, match=r"there is no bucket buckett\..*check its name\. Or name another place"):
-        open_remote(make_config(checkpoint__remote="gs://buckett/run"), NOTHING)
+        open_remote(make_config(checkpoint__remote="gs://buckett/run"), SILENT)
 
 
 def test_a_place_that_nothing_writes_is_an_error(make_config: Callable[..., Config]) -> None:
     with pytest.raises(InputError, match="nothing reads ftpx://"):
-        open_remote(make_config(checkpoint__remote="ftpx://host/run"), NOTHING)
+        open_remote(make_config(checkpoint__remote="ftpx://host/run"), SILENT)
     with pytest.raises(InputError, match="cannot be written"):
-        open_remote(make_config(checkpoint__remote="/proc/run"), NOTHING)
+        open_remote(make_config(checkpoint__remote="/proc/run"), SILENT)
 
 
 def test_a_missing_library_is_named_with_its_install_line(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,14 +259,14 @@ def test_a_missing_library_is_named_with_its_install_line(config: Config, monkey
     monkeypatch.setattr(fsspec, "get_filesystem_class", absent)
     monkeypatch.setattr(filesystems, "_filesystems", {})
     with pytest.raises(InputError, match=r'pip install -c constraints.txt -e "\.\[gcs\]"'):
-        open_remote(config, NOTHING)
+        open_remote(config, SILENT)
 
 
 @pytest.mark.parametrize("inner", ["", "mirror"])
 def test_the_runs_own_folder_is_no_mirror(make_config: Callable[..., Config], inner: str) -> None:
     folder = local(make_config())
     with pytest.raises(InputError, match="a place outside the run's folder"):
-        open_remote(make_config(checkpoint__remote=str(folder / inner)), NOTHING)
+        open_remote(make_config(checkpoint__remote=str(folder / inner)), SILENT)
 
 
 def test_a_check_fetches_elsewhere_and_leaves_the_runs_folder_alone(
@@ -274,13 +275,13 @@ def test_a_check_fetches_elsewhere_and_leaves_the_runs_folder_alone(
     run_there(bucket, config, 10, 20)
     write(local(config), 10)
     before = files_of(local(config))
-    remote = open_remote(config, NOTHING, into=tmp_path / "trial")
+    remote = open_remote(config, SILENT, into=tmp_path / "trial")
     assert remote.config.run_dir == str(tmp_path / "trial")
     assert newest_checkpoint(tmp_path / "trial/checkpoints").name == checkpoint_name(20)
     assert files_of(local(config)) == before
     shutil.rmtree(local(config))
     write(local(config), 30)
-    assert open_remote(config, NOTHING, into=tmp_path / "other").config == config
+    assert open_remote(config, SILENT, into=tmp_path / "other").config == config
 
 
 def test_a_folder_is_claimed_before_anything_is_fetched_into_it(bucket: Gcs, config: Config) -> None:
@@ -290,10 +291,10 @@ def test_a_folder_is_claimed_before_anything_is_fetched_into_it(bucket: Gcs, con
         first.take()
         before = files_of(local(config))
         with pytest.raises(InputError, match="being trained right now"):
-            open_remote(config, NOTHING, claim=second.take)
+            open_remote(config, SILENT, claim=second.take)
         assert files_of(local(config)) == before
     with RunLock(local(config)) as lock:
-        open_remote(config, NOTHING, claim=lock.take)
+        open_remote(config, SILENT, claim=lock.take)
         with RunLock(local(config)) as other, pytest.raises(InputError, match="being trained right now"):
             other.take()
 
@@ -313,9 +314,9 @@ def test_who_is_killed_while_fetching_fetches_again(
 
     monkeypatch.setattr("vjepa2_ac.runs.mirror.remote_checkpoints.download", killed)
     with pytest.raises(KilledError):
-        open_remote(config, NOTHING)
+        open_remote(config, SILENT)
     monkeypatch.setattr("vjepa2_ac.runs.mirror.remote_checkpoints.download", storage.download)
     assert newest_checkpoint(local(config) / "checkpoints") is None
     check_run_folder(config)
-    open_remote(config, NOTHING)
+    open_remote(config, SILENT)
     assert files_of(local(config)) == files_of(source)

@@ -16,6 +16,7 @@ from vjepa2_ac.errors import RefusedError, UnreachableError
 from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, write_checkpoint
 from vjepa2_ac.runs.mirror.background_sync import Mirror
 from vjepa2_ac.runs.mirror.remote_checkpoints import RemoteCheckpoints, complete
+from vjepa2_ac.runs.mirror.upload import RemoteUpdate
 from vjepa2_ac.storage import transfer
 
 WEIGHTS, MOMENTS = 10_000, 20_000
@@ -31,7 +32,7 @@ def run(tmp_path: Path) -> Path:
 
 def mirror_of(run: Path, place: str) -> Mirror:
     config = CheckpointConfig(keep=3, remote=place, remote_every_minutes=0.0)
-    return Mirror(place, run, "mine", config)
+    return Mirror(RemoteUpdate(RemoteCheckpoints(place), run, "mine", config.keep), config)
 
 
 def go_on(run: Path, mirror: Mirror, *steps: int) -> None:

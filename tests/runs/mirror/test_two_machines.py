@@ -12,6 +12,7 @@ from vjepa2_ac.runs.checkpoint import RunState, checkpoint_name, write_checkpoin
 from vjepa2_ac.runs.folder import ENVIRONMENT, open_run_folder
 from vjepa2_ac.runs.mirror.background_sync import Mirror
 from vjepa2_ac.runs.mirror.remote_checkpoints import RemoteCheckpoints, complete
+from vjepa2_ac.runs.mirror.upload import RemoteUpdate
 
 
 class Machine:
@@ -20,7 +21,7 @@ class Machine:
     def __init__(self, folder: Path, place: str, run_id: str = "mine") -> None:
         self.folder, self.run_id = folder, run_id
         config = CheckpointConfig(keep=3, remote=place, remote_every_minutes=0.0)
-        self.mirror = Mirror(place, folder, run_id, config)
+        self.mirror = Mirror(RemoteUpdate(RemoteCheckpoints(place), folder, run_id, config.keep), config)
 
     def go_on(self, *steps: int) -> None:
         def files(folder: Path) -> None:

@@ -10,7 +10,7 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, RandomActions, farthest
-from vjepa2_ac.simulation.closed_loop.rollout import run_episode, run_task
+from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_episode, run_task
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, arm_for, make_problem
 
 LIMITS = LimitsConfig()
@@ -19,7 +19,7 @@ LIMITS = LimitsConfig()
 @pytest.mark.parametrize(("task", "domain"), [("push", DOMAIN_A), ("pick", DOMAIN_B)], ids=["push", "pick"])
 def test_the_oracle_solves_it_and_nothing_and_chance_do_not(task: str, domain) -> None:
     arm = arm_for(task, domain, height=18, width=32)
-    oracle = run_task(task, domain, oracle_for(task, LIMITS, arm), episodes=4, seed=5, arm=arm)
+    oracle = run_task(RolloutSpec(task, domain, 4, seed=5), oracle_for(task, LIMITS, arm), arm)
     assert oracle.success_rate.value == 1.0
     assert oracle.final_distance_cm.value < 3.0
     assert oracle.steps == STEPS[task]
@@ -30,7 +30,7 @@ def test_the_oracle_solves_it_and_nothing_and_chance_do_not(task: str, domain) -
         ends = np.linalg.norm(episode.blocks[-1, :3] - episode.problem.block_goal[:3])
         assert episode.distances_m[-1] == pytest.approx(ends)
     for policy in (DoNothing(), RandomActions(LIMITS)):
-        result = run_task(task, domain, policy, episodes=2, seed=5, arm=arm)
+        result = run_task(RolloutSpec(task, domain, 2, seed=5), policy, arm)
         assert result.success_rate.value == 0.0
         assert result.final_distance_cm.value > 8.0
 
@@ -48,4 +48,4 @@ def test_the_goal_image_shows_the_block_at_its_goal() -> None:
 
 def test_an_arm_without_a_block_cannot_push() -> None:
     with pytest.raises(ValueError, match="no block"):
-        run_task("push", DOMAIN_A, DoNothing(), episodes=1, arm=arm_for("reach", DOMAIN_A, height=18, width=32))
+        run_task(RolloutSpec("push", DOMAIN_A, 1), DoNothing(), arm_for("reach", DOMAIN_A, height=18, width=32))

@@ -22,7 +22,7 @@ from vjepa2_ac.simulation.closed_loop.policies import (
     shortened,
 )
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult, EpisodeResult
-from vjepa2_ac.simulation.closed_loop.rollout import run_episode, run_task, ways_along
+from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_episode, run_task, ways_along
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.kinematics import HIGH, forward_kinematics
 
@@ -57,7 +57,7 @@ def way(*numbers: float) -> np.ndarray:
 
 def test_the_oracle_succeeds_and_nothing_and_chance_do_not(arm: SimulatedArm) -> None:
     results = [
-        run_task("reach", DOMAIN_B, policy, episodes=5, arm=arm)
+        run_task(RolloutSpec("reach", DOMAIN_B, 5), policy, arm)
         for policy in (Oracle(LIMITS), DoNothing(), RandomActions(SMALL))
     ]
     oracle, nothing, chance = results
@@ -158,9 +158,8 @@ def test_a_world_model_plans_within_its_limits_and_says_why(arm: SimulatedArm) -
     config = PlanningConfig(samples=8, iterations=2, limits=SMALL, cem=CemConfig(elites=3))
     policy = Planning(Controller(tiny_model(), config), name="tiny")
     reported = []
-    result = run_task(
-        "reach", DOMAIN_B, policy, episodes=2, steps=2, keep_frames=1, arm=arm, progress=lambda *n: reported.append(n)
-    )
+    spec = RolloutSpec("reach", DOMAIN_B, episodes=2, steps=2, keep_frames=1)
+    result = run_task(spec, policy, arm, lambda *n: reported.append(n))
     assert result.policy == "tiny"
     assert result.why_counts == {"planned": 4}
     assert reported == [(1, 2), (2, 2)]

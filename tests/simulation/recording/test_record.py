@@ -15,7 +15,7 @@ from vjepa2_ac.simulation.world.kinematics import forward_kinematics
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 
-from vjepa2_ac.simulation.recording.record import episode_folder, record_dataset, record_episode
+from vjepa2_ac.simulation.recording.record import RecordingSpec, episode_folder, record_dataset, record_episode
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 
 EPISODES, STEPS = 3, 5
@@ -24,7 +24,7 @@ EPISODES, STEPS = 3, 5
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sim") / "B"
-    return record_dataset(folder, domain="B", episodes=EPISODES, steps=STEPS, seed=3, shards=2)
+    return record_dataset(folder, RecordingSpec("B", STEPS, seed=3), episodes=EPISODES, shards=2)
 
 
 def test_the_loader_reads_what_was_recorded(recorded: Path) -> None:
@@ -34,7 +34,7 @@ def test_the_loader_reads_what_was_recorded(recorded: Path) -> None:
     assert len({info.id for info in infos}) == EPISODES
     expected = {}
     for index in range(EPISODES):
-        episode = record_episode(index, domain=DOMAIN_B, steps=STEPS, seed=3)
+        episode = record_episode(index, RecordingSpec(DOMAIN_B, STEPS, 3))
         expected[f"{episode.recording_folderpath}--{episode.file_path}"] = episode
     for index, info in enumerate(infos):
         made, read = expected[info.id], source.read(index)
@@ -55,12 +55,12 @@ def test_the_images_show_the_measured_state(recorded: Path) -> None:
 
 def test_measured_poses_are_those_of_the_measured_joints() -> None:
     for domain in (DOMAIN_A, DOMAIN_B):
-        seen = record_episode(0, domain=domain, steps=STEPS, seed=0).observation
+        seen = record_episode(0, RecordingSpec(domain, STEPS, 0)).observation
         np.testing.assert_array_equal(forward_kinematics(seen.joint_position), seen.cartesian_position)
 
 
 def test_commands_differ_from_measurements_and_velocities_from_zero() -> None:
-    episode = record_episode(1, domain=DOMAIN_A, steps=9, seed=0)
+    episode = record_episode(1, RecordingSpec(DOMAIN_A, 9, 0))
     assert np.abs(episode.action[:, :3] - episode.observation.cartesian_position[:, :3]).max() > 0.005
     np.testing.assert_array_equal(episode.action[:, :6], episode.action_dict.cartesian_position)
     moved = np.diff(episode.action_dict.joint_position, axis=0) * 15.0
@@ -69,28 +69,30 @@ def test_commands_differ_from_measurements_and_velocities_from_zero() -> None:
 
 
 def test_the_same_seed_gives_the_same_bytes_in_any_number_of_processes(recorded: Path, tmp_path: Path) -> None:
-    again = record_dataset(tmp_path / "again", domain="B", episodes=EPISODES, steps=STEPS, seed=3, shards=2, workers=2)
+    again = record_dataset(
+        tmp_path / "again", RecordingSpec("B", STEPS, seed=3), episodes=EPISODES, shards=2, workers=2
+    )
     for file in sorted(recorded.iterdir()):
         assert file.read_bytes() == (again / file.name).read_bytes()
 
 
 def test_another_seed_gives_other_episodes() -> None:
-    first, second = (record_episode(0, domain=DOMAIN_A, steps=2, seed=seed) for seed in (0, 1))
+    first, second = (record_episode(0, RecordingSpec(DOMAIN_A, 2, seed)) for seed in (0, 1))
     assert first.file_path.rsplit("/", 2)[1] != second.file_path.rsplit("/", 2)[1]
     assert np.abs(first.observation.joint_position - second.observation.joint_position).max() > 0.01
 
 
 def test_another_look_changes_the_images_and_nothing_else() -> None:
     looks = DOMAIN_A, replace(DOMAIN_A, look=DOMAIN_B.look)
-    first, second = (record_episode(0, domain=domain, steps=2, seed=0) for domain in looks)
+    first, second = (record_episode(0, RecordingSpec(domain, 2, 0)) for domain in looks)
     np.testing.assert_array_equal(first.observation.joint_position, second.observation.joint_position)
     np.testing.assert_array_equal(first.action, second.action)
     assert first.images["exterior_image_1_left"] != second.images["exterior_image_1_left"]
 
 
 def test_one_camera_is_shared_by_all_three_and_three_differ() -> None:
-    shared = record_episode(0, domain=DOMAIN_A, steps=2, seed=0)
-    own = record_episode(0, domain=DOMAIN_A, steps=2, seed=0, cameras=3)
+    shared = record_episode(0, RecordingSpec(DOMAIN_A, 2, 0))
+    own = record_episode(0, RecordingSpec(DOMAIN_A, 2, 0, cameras=3))
     assert len({tuple(images) for images in shared.images.values()}) == 1
     assert len({tuple(images) for images in own.images.values()}) == 3
     assert own.images["exterior_image_1_left"] == shared.images["exterior_image_1_left"]
@@ -105,7 +107,7 @@ def test_most_episodes_succeed_and_no_two_share_a_folder() -> None:
 def test_every_episode_of_a_random_set_has_its_own_world() -> None:
     walls = []
     for index in range(3):
-        jpeg = record_episode(index, domain=DomainRanges(), steps=2, seed=0).images["exterior_image_1_left"][0]
+        jpeg = record_episode(index, RecordingSpec(DomainRanges(), 2, 0)).images["exterior_image_1_left"][0]
         walls.append(simplejpeg.decode_jpeg(jpeg)[:20, :20].reshape(-1, 3).mean(axis=0))
     assert np.ptp(walls, axis=0).max() > 20
 
@@ -113,18 +115,18 @@ def test_every_episode_of_a_random_set_has_its_own_world() -> None:
 def test_progress_is_reported_after_every_episode(tmp_path: Path) -> None:
     reported: list[tuple[int, int]] = []
     record_dataset(
-        tmp_path / "random", domain="random", episodes=2, steps=2, progress=lambda *state: reported.append(state)
+        tmp_path / "random", RecordingSpec("random", 2), episodes=2, progress=lambda *state: reported.append(state)
     )
     assert reported == [(1, 2), (2, 2)]
 
 
 def test_impossible_numbers_and_unknown_domains_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at least 1 episode"):
-        record_dataset(tmp_path / "x", domain="A", episodes=0)
+        record_dataset(tmp_path / "x", RecordingSpec("A"), episodes=0)
     with pytest.raises(InputError, match="seed -1"):
-        record_dataset(tmp_path / "x", domain="A", episodes=1, seed=-1)
+        record_dataset(tmp_path / "x", RecordingSpec("A", seed=-1), episodes=1)
     with pytest.raises(InputError, match="shards 0"):
-        record_dataset(tmp_path / "x", domain="A", episodes=1, shards=0)
+        record_dataset(tmp_path / "x", RecordingSpec("A"), episodes=1, shards=0)
     with pytest.raises(InputError, match="one of A, B, or random"):
-        record_dataset(tmp_path / "x", domain="Z", episodes=1)
+        record_dataset(tmp_path / "x", RecordingSpec("Z"), episodes=1)
     assert not (tmp_path / "x").exists()

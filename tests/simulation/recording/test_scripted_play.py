@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from vjepa2_ac.simulation.closed_loop.tasks import arm_for
 from vjepa2_ac.simulation.world.domains import DOMAIN_A
 from vjepa2_ac.simulation.world.kinematics import forward_kinematics
 
@@ -13,13 +14,20 @@ pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.simulation.recording.record import record_episode
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_episode
 from vjepa2_ac.simulation.recording.scripted_play import play
 
 
 def blocks_of(task: str, seed: int, *, script: bool, steps: int = 41) -> np.ndarray:
     seen = []
-    play(task, DOMAIN_A, steps, np.random.default_rng(seed), script=script, look=lambda arm: seen.append(arm.block))
+    play(
+        arm_for(task, DOMAIN_A),
+        task,
+        steps,
+        np.random.default_rng(seed),
+        script=script,
+        look=lambda arm: seen.append(arm.block),
+    )
     return np.array(seen)
 
 
@@ -34,7 +42,7 @@ def test_scripts_and_play_move_the_block() -> None:
 
 
 def test_measurements_follow_commands_that_are_held_for_a_model_step() -> None:
-    motion = play("push", DOMAIN_A, 9, np.random.default_rng(0), script=False)
+    motion = play(arm_for("push", DOMAIN_A), "push", 9, np.random.default_rng(0), script=False)
     for first in (0, 4):
         np.testing.assert_array_equal(motion.commanded_joints[first : first + 4], motion.commanded_joints[[first] * 4])
     assert (motion.commanded_joints[4] != motion.commanded_joints[3]).any()
@@ -43,13 +51,13 @@ def test_measurements_follow_commands_that_are_held_for_a_model_step() -> None:
 
 
 def test_an_episode_with_a_block_is_consistent_and_always_the_same() -> None:
-    first, again = (record_episode(2, domain=DOMAIN_A, steps=6, seed=1, task="pick") for _ in range(2))
+    first, again = (record_episode(2, RecordingSpec(DOMAIN_A, 6, 1, task="pick")) for _ in range(2))
     assert first.images == again.images
     seen = first.observation
     np.testing.assert_array_equal(forward_kinematics(seen.joint_position), seen.cartesian_position)
     assert all(len(film) == 6 for film in first.images.values())
     assert first.language_instruction == "pick up the block"
-    other = record_episode(2, domain=DOMAIN_A, steps=6, seed=1)
+    other = record_episode(2, RecordingSpec(DOMAIN_A, 6, 1))
     assert other.language_instruction != first.language_instruction
     assert np.abs(other.action - first.action).max() > 0.01
 
@@ -60,7 +68,7 @@ def test_every_other_episode_is_scripted(monkeypatch: pytest.MonkeyPatch) -> Non
     asked, real = [], module.play
     monkeypatch.setattr(module, "play", lambda *args, **more: asked.append(more["script"]) or real(*args, **more))
     for index in range(3):
-        record_episode(index, domain=DOMAIN_A, steps=2, seed=0, task="push")
+        record_episode(index, RecordingSpec(DOMAIN_A, 2, 0, task="push"))
     assert asked == [True, False, True]
 
 

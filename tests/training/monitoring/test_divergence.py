@@ -155,14 +155,13 @@ def _stop_behind(step: int) -> Callable[..., None]:
     return save
 
 
-def test_rows_that_a_stranger_wrote_do_no_harm(config: Config, tmp_path: Path) -> None:
+def test_rows_that_a_stranger_wrote_do_no_harm(config: Config, reporter, tmp_path: Path) -> None:
     rows: list[dict[str, object]] = [
         {"step": 0}, {"kind": "validation", "step": 0, "error_over_persistence": "bad"},
         {"kind": "warning", "step": 1, "text": 3}, {"kind": ["train"], "step": 1, "loss": {}},
     ]  # fmt: skip
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    notes: list[str] = []
-    with WatchedMetricsLog(tmp_path, config=config, note=notes.append, first_step=1) as metrics_log:
+    with WatchedMetricsLog(tmp_path, config=config, reporter=reporter, first_step=1) as metrics_log:
         metrics_log.write("validation", 2, validation(1.2))
-    assert not notes
+    assert not reporter.notes
     assert not warnings_of(tmp_path / "metrics.jsonl")

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import torch
 
+from run_fixtures import set_up
 from vjepa2_ac.data.clips import loader
 from vjepa2_ac.episode import Batch, Clip
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.training.loop import train
 from vjepa2_ac.training.monitoring import nonfinite_clips
 from vjepa2_ac.training.monitoring.nonfinite_clips import MOST_CLIPS, ClipRecorder
-from vjepa2_ac.training.setup import batches_from, set_up
+from vjepa2_ac.training.setup import batches_from
 
 
 def batch(first: int, clips: int = 2, bad: int | None = None) -> Batch:
@@ -87,7 +88,7 @@ def test_a_full_disk_is_reported_and_not_raised(tmp_path: Path, monkeypatch: pyt
 @pytest.fixture
 def bad_clip(make_config: Any, reporter: Any, monkeypatch: pytest.MonkeyPatch) -> tuple[str, int]:
     """The second clip of a run is poisoned where it is read: a state is not a number."""
-    read, batch = loader.read_clip, next(batches_from(set_up(make_config(), reporter.note)))
+    read, batch = loader.read_clip, next(batches_from(set_up(make_config(), reporter)))
     bad = (batch.episode_ids[1], batch.starts[1])
 
     def poisoned(*arguments: Any) -> Clip:

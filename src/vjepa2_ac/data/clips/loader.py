@@ -38,21 +38,31 @@ from vjepa2_ac.errors import InputError, UserError
 CLIPS_WORTH_WORKERS = 256  # starting workers takes longer than reading fewer validation clips
 
 
+@dataclass(frozen=True)
+class ProcessShare:
+    """The index of a process among those that share some work."""
+
+    rank: int = 0
+    processes: int = 1
+
+
+WHOLE = ProcessShare()
+
+
 def training_loader(
     dataset: Dataset,
     *,
     seed: int,
     batch_size: int,
     start_position: int = 0,
-    rank: int = 0,
-    world_size: int = 1,
+    share: ProcessShare = WHOLE,
     copies: Copies = NO_COPIES,
 ) -> Batches:
-    """Yield the micro-batches of one rank, endlessly, from any position of the run.
+    """Yield the micro-batches of one process, endlessly, from any position of the run.
 
     The run is one sequence of clips. Micro-batch m of rank r holds the `batch_size` clips from position
-    start_position + (m * world_size + r) * batch_size, so after m micro-batches of every rank the position to resume
-    from is start_position + m * world_size * batch_size. If `data.broken_episodes` is skip, clips that cannot be
+    start_position + (m * processes + r) * batch_size, so after m micro-batches of every rank the position to resume
+    from is start_position + m * processes * batch_size. If `data.broken_episodes` is skip, clips that cannot be
     read are missing from their micro-batch, which may even be empty; no other clip replaces them.
 
     If batches are prefetched to a device (`copies`), they are in pinned memory.
@@ -61,7 +71,7 @@ def training_loader(
         InputError: There is nothing to train on, or a clip cannot be read, also in a worker.
     """
     clips = _Clips(dataset, _TrainingClips(dataset.config, ClipOrder(dataset.windows("train"), seed)))
-    rows = _rows(start_position + rank * batch_size, batch_size, batch_size * world_size)
+    rows = _rows(start_position + share.rank * batch_size, batch_size, batch_size * share.processes)
     return _batches(clips, rows, dataset.config.workers, copies)
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from vjepa2_ac.config.planning import EnergyConfig, PlanningConfig
-from vjepa2_ac.episode import LatentBatch, Progress
+from vjepa2_ac.episode import LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.action_score.protocol import FRAMES, FRAMES_SEEN, SCORED, STEPS
 from vjepa2_ac.evaluation.action_use.one_step import clip_generator
 from vjepa2_ac.evaluation.measure import Predictor
@@ -114,7 +114,7 @@ def one_step_settings(config: PlanningConfig) -> PlanningConfig:
 
 
 def measure_plans(
-    model: Predictor, starts: Sequence[PlanningStart], config: PlanningConfig, progress: Progress | None = None
+    model: Predictor, starts: Sequence[PlanningStart], config: PlanningConfig, progress: Progress = no_progress
 ) -> Plans:
     """Plan from each start, one step and three.
 
@@ -129,11 +129,9 @@ def measure_plans(
     plans: list[tuple[Plan, Plan]] = []
     for start in starts:
         first = _plan(one, model, start, start.following, start.seeds[0])
-        if progress is not None:
-            progress(2 * len(plans) + 1, 2 * len(starts))
+        progress(2 * len(plans) + 1, 2 * len(starts))
         plans.append((first, _plan(scored, model, start, start.goal, start.seeds[1])))
-        if progress is not None:
-            progress(2 * len(plans), 2 * len(starts))
+        progress(2 * len(plans), 2 * len(starts))
     return Plans(
         one_step=np.stack([_array(first)[0] for first, _ in plans])[None],
         three_steps=np.stack([_array(second) for _, second in plans])[None],

@@ -7,11 +7,12 @@ after one step from one frame. There the grid is centred on zero; here it also h
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.intervals import Estimate, mean_of
 from vjepa2_ac.evaluation.measure import Predictor
@@ -23,42 +24,46 @@ _SAME = 1e-6  # energies this close, as a share, are equally low
 _AXES = slice(0, 3)  # of the grid: of poses, the position
 
 
+@dataclass(frozen=True)
+class LandscapeGrid:
+    """A grid of actions over their first three numbers."""
+
+    space: ActionSpace  # of the actions; positions are reported in cm
+    nodes: int  # along each axis
+    reach: float  # it spans at least -reach .. reach (metres; of vectors: in its own numbers)
+
+
 def measure_landscapes(
     model: Predictor,
     starts: Sequence[RolloutStart],
+    grid: LandscapeGrid,
     *,
-    space: ActionSpace,
-    nodes: int,
-    reach: float,
     at_once: int,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Landscapes:
     """Compute the energy over a grid of the first three numbers of the action, the others being the true ones.
 
     Args:
         model: The predictor.
         starts: One frame of each clip; one or more.
-        space: Of the actions; positions are reported in cm.
-        nodes: Along each axis.
-        reach: The grid spans at least -reach .. reach (metres; of vectors: in its own numbers).
+        grid: The actions.
         at_once: Samples per batch.
         progress: Called with the number of finished starts.
 
     Raises:
         ValueError: No starts, fewer than three nodes, or actions of fewer than three numbers.
     """
+    nodes, unit = grid.nodes, grid.space.shown_factor
     if not starts or nodes < 3 or len(starts[0].action) < 3:
         raise ValueError(f"{len(starts)} starts, {nodes} nodes")
-    unit = space.shown_factor
     trues = np.stack([start.action[_AXES].cpu().numpy().astype(np.float64) for start in starts])
-    half = max(reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
+    half = max(grid.reach, _ROOM * float(np.abs(trues).max())) or 1.0  # vectors that are all zero
     maps = []
     for done, (start, true) in enumerate(zip(starts, trues, strict=True), start=1):
         maps.append(_landscape(model, start, grid_axes(true, half, nodes), true, unit, at_once))
-        if progress is not None:
-            progress(done, len(starts))
-    first, second, third = space.names[_AXES]
-    return _summary(tuple(maps), (first, second, third), space.shown_unit, least=unit * half / (nodes - 1))
+        progress(done, len(starts))
+    first, second, third = grid.space.names[_AXES]
+    return _summary(tuple(maps), (first, second, third), grid.space.shown_unit, least=unit * half / (nodes - 1))
 
 
 def grid_axes(true: Float[np.ndarray, " 3"], half: float, nodes: int) -> Float[np.ndarray, "3 nodes"]:

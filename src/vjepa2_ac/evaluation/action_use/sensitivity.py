@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.intervals import mean_of, ratio
 from vjepa2_ac.evaluation.measure import Predictor
@@ -28,25 +28,28 @@ class ActionPool:
     episode_ids: tuple[str, ...]  # of each action
     space: ActionSpace
     reach: float  # half the width of the box along each of x, y, z, in metres; of poses only
+    samples: int  # drawn per start, from each of the two sources
+    seed: int  # a start gets the same actions whatever else is measured
 
-    def of_others(
-        self, start: RolloutStart, samples: int, generator: np.random.Generator
-    ) -> Float[np.ndarray, "samples action_dim"]:
+    def drawn_for(self, start: RolloutStart) -> Float[np.ndarray, "others action_dim"]:
+        """Draw other actions for a start: those of other episodes, then those in the box."""
+        generator = start.generator(self.seed)
+        return np.concatenate([self.of_others(start, generator), self.in_box(start, generator)])
+
+    def of_others(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
         """Draw actions of other episodes, with replacement; of the same one if there is no other."""
         others = np.flatnonzero(np.array(self.episode_ids) != start.episode_id)
-        chosen = generator.choice(others if len(others) else np.arange(len(self.actions)), size=samples)
+        chosen = generator.choice(others if len(others) else np.arange(len(self.actions)), size=self.samples)
         return np.asarray(self.actions[chosen])
 
-    def in_box(
-        self, start: RolloutStart, samples: int, generator: np.random.Generator
-    ) -> Float[np.ndarray, "samples action_dim"]:
+    def in_box(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
         """Draw uniformly: for poses (dx, dy, dz) in the box, the rest being true; for vectors every number."""
         true = start.action.cpu().numpy().astype(np.float64)
         half = np.abs(self.actions).max(axis=0)
-        drawn = generator.uniform(-1.0, 1.0, size=(samples, len(true)))
+        drawn = generator.uniform(-1.0, 1.0, size=(self.samples, len(true)))
         if self.space.position is None:
             return np.asarray(drawn * half)
-        evaluated = np.tile(true, (samples, 1))
+        evaluated = np.tile(true, (self.samples, 1))
         evaluated[:, self.space.position] = drawn[:, self.space.position] * self.reach
         return evaluated
 
@@ -64,10 +67,8 @@ def measure_sensitivity(
     starts: Sequence[RolloutStart],
     pool: ActionPool,
     *,
-    samples: int,
-    seed: int,
     at_once: int,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Sensitivity:
     """Evaluate other actions from each start.
 
@@ -75,25 +76,20 @@ def measure_sensitivity(
         model: The predictor.
         starts: One frame of each clip.
         pool: The pool of other actions.
-        samples: Others per start, from each of the two sources.
-        seed: A start gets the same actions whatever else is measured.
         at_once: Samples per batch.
         progress: Called with the number of finished starts.
     """
-    changes, persistence = [], []
+    changes, persistence, samples = [], [], pool.samples
     ranks: dict[Literal["clips", "box"], list[tuple[float, float]]] = {"clips": [], "box": []}
     for done, start in enumerate(starts, start=1):
-        generator = start.generator(seed)
         true = start.action.cpu().numpy().astype(np.float64)[None]
-        drawn = [pool.of_others(start, samples, generator), pool.in_box(start, samples, generator)]
-        evaluated = evaluate_actions(model, start, np.concatenate([true, *drawn]), at_once=at_once)
+        evaluated = evaluate_actions(model, start, np.concatenate([true, pool.drawn_for(start)]), at_once=at_once)
         own, others, boxed = np.split(evaluated.energy, [1, 1 + samples])
         ranks["clips"].append(_place(own[0], others))
         ranks["box"].append(_place(own[0], boxed))
         changes.append(float(evaluated.change[1 : 1 + samples].mean()))
         persistence.append(start.persistence)
-        if progress is not None:
-            progress(done, len(starts))
+        progress(done, len(starts))
     ids = tuple(start.episode_id for start in starts)
     clips = tuple(start.clip for start in starts)
     return Sensitivity(

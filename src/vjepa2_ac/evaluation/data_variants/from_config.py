@@ -11,14 +11,15 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_same_encoder, require_widths
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, probe_variants
+from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.stride_calibration.from_config import load_named
 
 
 def probe_config(
-    config: Config, dataset: Dataset, *, model: str, clips: int = 64, progress: Progress | None = None
+    config: Config, dataset: Dataset, *, model: str, clips: int = 64, progress: Progress = no_progress
 ) -> VariantProbe:
     """Probe the data of a config, opened at a fixed stride, with a model.
 
@@ -46,12 +47,5 @@ def probe_config(
     except InputError:
         split = "train"
     with accelerator.autocast(), torch.no_grad():
-        return probe_variants(
-            world_model,
-            encode,
-            dataset,
-            split=split,
-            clips=clips,
-            batch_size=config.validation.batch_size,
-            progress=progress,
-        )
+        sample = ClipSample(split, clips, batch_size=config.validation.batch_size)
+        return probe_variants(world_model, encode, dataset, sample, progress)

@@ -11,16 +11,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.windows import spread
-from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.data_variants.variants import ChangedSource, RememberingSource, Variant, variants_of
 from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
-from vjepa2_ac.evaluation.measure import OneStepErrors, Predictor, one_step_errors
+from vjepa2_ac.evaluation.measure import ClipSample, OneStepErrors, Predictor, one_step_errors
 
-FRAMES = 8  # of a clip, at most
 SHIFTS = (1, 2, 4, 8)  # control steps
 _CANDIDATES_PER_CLIP = 8  # windows checked per clip, since shifts need room on both sides
 _EPISODES_TO_BE_SURE = 5
@@ -84,11 +82,8 @@ def probe_variants(
     model: Predictor,
     encode: Callable[[Batch], LatentBatch],
     dataset: Dataset,
-    *,
-    split: Split = "validation",
-    clips: int = 64,
-    batch_size: int = 8,
-    progress: Progress | None = None,
+    sample: ClipSample,
+    progress: Progress = no_progress,
 ) -> VariantProbe:
     """Measure a model's one-step error on unchanged clips, and under each variant.
 
@@ -96,30 +91,27 @@ def probe_variants(
         model: The predictor.
         encode: Turns a batch of pixels into latents on the model's device.
         dataset: The source of clips, at a fixed stride.
-        split: Which episodes.
-        clips: Number of clips, at most.
-        batch_size: Clips per batch.
+        sample: The clips.
         progress: Called with (clips done, clips in total).
 
     Raises:
         InputError: The split is empty, or a clip cannot be read.
     """
-    candidates = validation_windows(
-        dataset, split, clips=clips * _CANDIDATES_PER_CLIP
-    )  # of whole clips, as a cache has them
-    dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": min(dataset.config.frames, FRAMES)}))
-    windows, shifts = _with_room(dataset, candidates, clips)
+    # Of whole clips, as a cache has them.
+    candidates = validation_windows(dataset, sample.split, clips=sample.clips * _CANDIDATES_PER_CLIP)
+    frames = sample.frames_of(dataset.config)
+    dataset = replace(dataset, config=dataset.config.model_copy(update={"frames": frames}))
+    windows, shifts = _with_room(dataset, candidates, sample.clips)
     variants = variants_of(dataset.config, shifts)
     measured: list[list[OneStepErrors]] = []
     ids: list[str] = []
-    for batch in batches_of(dataset, windows, batch_size=batch_size):
+    for batch in batches_of(dataset, windows, batch_size=sample.batch_size):
         latents = encode(batch)
         here = _of_batch(dataset, batch)
         changed = [_under(one, model, encode, *here, latents) for one in variants]
         measured.append([one_step_errors(model, latents), *changed])
         ids += batch.episode_ids
-        if progress is not None:
-            progress(len(ids), len(windows))
+        progress(len(ids), len(windows))
     plain, *others = [
         OneStepErrors(*map(np.concatenate, zip(*of_one, strict=True))) for of_one in zip(*measured, strict=True)
     ]

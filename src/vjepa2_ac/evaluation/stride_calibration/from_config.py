@@ -5,27 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 
 from vjepa2_ac.config import Config
-from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import require_same_encoder, require_widths
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, calibrate_model, require_learned
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
 
 
 def calibrate_config(
     config: Config,
+    sample: ClipSample,
     *,
     model: str | None = None,
-    split: Split = "validation",
-    clips: int = 64,
-    frames: int | None = None,
-    indexing: Progress | None = None,
-    measuring: Progress | None = None,
+    reporter: Reporter = SILENT,
 ) -> Calibration:
     """Calibrate the model of a config, or another one, on the config's data.
 
@@ -33,25 +30,20 @@ def calibrate_config(
 
     Args:
         config: The data, the model, the device and the precision.
+        sample: The clips at each stride.
         model: Another model: what `model.base` takes, or the folder of a run.
-        split: Episodes to measure on.
-        clips: Number at each stride.
-        frames: Of a clip; None: the config's, but 8 at most.
-        indexing: Called with the progress of indexing.
-        measuring: Called with the number of measured clips.
+        reporter: Shows the progress of indexing and measuring.
 
     Raises:
         InputError: The data or the model cannot be used.
     """
     accelerator = make_accelerator(config)
-    dataset = open_dataset(config.data, progress=indexing)
+    dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     world_model = load_named(config, model)
     require_widths(world_model, dataset.widths, where=model or f"model.base: {config.model.base}")
     require_same_encoder(world_model, dataset, config)
     world_model.to(accelerator.device)
-    return calibrate_model(
-        world_model, dataset, config, accelerator, clips=clips, split=split, frames=frames, progress=measuring
-    )
+    return calibrate_model(world_model, dataset, config, accelerator, sample, reporter.task("measuring clips"))
 
 
 def load_named(config: Config, model: str | None) -> WorldModel:

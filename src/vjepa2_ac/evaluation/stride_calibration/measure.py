@@ -22,14 +22,13 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.streams import NO_COPIES, Copies, copies_for
 from vjepa2_ac.encoding.batch import encode_batch
-from vjepa2_ac.episode import Batch, LatentBatch, Progress
+from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
-from vjepa2_ac.evaluation.measure import Predictor, one_step_errors
+from vjepa2_ac.evaluation.measure import ClipSample, Predictor, one_step_errors
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.spaces import ActionSpace
 
-FRAMES = 8  # of a clip at most: as the released weights were trained, and short enough for the widest stride
 _EPISODES_NEEDED = 2  # for an interval
 _EPISODES_TO_BE_SURE = 10  # an interval from fewer is too narrow
 
@@ -129,14 +128,10 @@ def calibrate(
     model: Predictor,
     encode: Callable[[Batch], LatentBatch],
     dataset: Dataset,
+    sample: ClipSample,
     *,
-    split: Split = "validation",
-    strides: Sequence[int] = (),
-    frames: int | None = None,
-    clips: int = 64,
-    batch_size: int = 8,
     copies: Copies = NO_COPIES,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Calibration:
     """Measure a model's one-step error over persistence at each stride.
 
@@ -146,30 +141,26 @@ def calibrate(
     Args:
         model: The predictor.
         encode: Turns a batch of pixels into latents on the model's device.
-        dataset: The source of clips; its own stride and number of frames do not matter.
-        split: Which episodes.
-        strides: The candidates; none: those of the config.
-        frames: Of a clip; None: the config's, but 8 at most, so that wide strides fit.
-        clips: Number at each stride.
-        batch_size: Clips per batch.
+        dataset: The source of clips; its config has the candidates, its own stride does not matter.
+        sample: The clips at each stride.
         copies: Copies them to the model's device.
         progress: Called with (clips done, clips in total).
 
     Raises:
         InputError: The split is empty, no stride fits into any of its episodes, or a clip cannot be read.
     """
-    frames = min(dataset.config.frames, FRAMES) if frames is None else frames
-    strides = sorted(set(strides or dataset.config.strides_to_try(dataset.control_rate_hz)))
+    frames, split = sample.frames_of(dataset.config), sample.split
+    strides = sorted(set(dataset.config.strides_to_try(dataset.control_rate_hz)))
     settings = dataset.config.model_copy(update={"frames": frames, "short_episodes": "skip"})
     views = {stride: replace(dataset, config=settings.with_stride(stride)) for stride in strides}
     possible, impossible = _possible(views, split)
-    chosen = validation_windows(views[possible[-1]], split, clips=clips)
+    chosen = validation_windows(views[possible[-1]], split, clips=sample.clips)
     measured = {}
     for done, stride in enumerate(possible):
-        batches = batches_of(views[stride], chosen, batch_size=batch_size, copies=copies)
+        batches = batches_of(views[stride], chosen, batch_size=sample.batch_size, copies=copies)
         parts = _measure(model, encode, batches, dataset.spaces.action)
-        report = _with_progress(progress, done * len(chosen), len(possible) * len(chosen))
-        measured[stride] = _Measured.joined(list(report(parts)))
+        before, total = done * len(chosen), len(possible) * len(chosen)
+        measured[stride] = _Measured.joined(list(_reported(parts, progress, before, total)))
     runner_up, difference = _compared(measured)
     rate = dataset.control_rate_hz
     results = tuple(one.summary(stride, stride / rate) for stride, one in measured.items())
@@ -226,18 +217,11 @@ def _measure(
         yield _Measured(errors, persistence, moved_cm, tuple(zip(batch.episode_ids, batch.starts, strict=True)))
 
 
-def _with_progress(
-    progress: Progress | None, before: int, total: int
-) -> Callable[[Iterator[_Measured]], Iterator[_Measured]]:
-    def report(parts: Iterator[_Measured]) -> Iterator[_Measured]:
-        done = before
-        for part in parts:
-            done += len(part.clips)
-            if progress is not None:
-                progress(done, total)
-            yield part
-
-    return report
+def _reported(parts: Iterator[_Measured], progress: Progress, done: int, total: int) -> Iterator[_Measured]:
+    for part in parts:
+        done += len(part.clips)
+        progress(done, total)
+        yield part
 
 
 def _possible(views: dict[int, Dataset], split: Split) -> tuple[list[int], dict[int, str]]:
@@ -294,12 +278,8 @@ def calibrate_model(
     dataset: Dataset,
     config: Config,
     accelerator: Accelerator,
-    *,
-    clips: int,
-    split: Split = "validation",
-    strides: Sequence[int] = (),
-    frames: int | None = None,
-    progress: Progress | None = None,
+    sample: ClipSample,
+    progress: Progress = no_progress,
 ) -> Calibration:
     """Calibrate a model that is on the accelerator's device, in the run's precision.
 
@@ -314,18 +294,7 @@ def calibrate_model(
             fix="Calibrate on the data set itself, with data.cache: off",
         )
     world_model.eval()
-
+    sample = replace(sample, batch_size=config.validation.batch_size)
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     with accelerator.autocast(), torch.no_grad():
-        return calibrate(
-            world_model,
-            encode,
-            dataset,
-            split=split,
-            strides=strides,
-            frames=frames,
-            clips=clips,
-            batch_size=config.validation.batch_size,
-            copies=copies_for(accelerator.device),
-            progress=progress,
-        )
+        return calibrate(world_model, encode, dataset, sample, copies=copies_for(accelerator.device), progress=progress)

@@ -24,32 +24,16 @@ class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers h
 
     model_type = "vjepa2_ac_predictor"
 
-    def __init__(
-        self,
-        *,
-        image_size: int = 256,
-        patch_size: int = 16,
-        latent_dim: int = 1408,
-        hidden_size: int = 1024,
-        num_hidden_layers: int = 24,
-        num_attention_heads: int = 16,
-        mlp_ratio: float = 4.0,
-        use_extrinsics: bool = False,
-        action_dim: int = ACTION_DIM,
-        state_dim: int = STATE_DIM,
-        **common: Any,
-    ) -> None:
-        super().__init__(**common)
-        self.image_size = image_size
-        self.patch_size = patch_size
-        self.latent_dim = latent_dim
-        self.hidden_size = hidden_size
-        self.num_hidden_layers = num_hidden_layers
-        self.num_attention_heads = num_attention_heads
-        self.mlp_ratio = mlp_ratio
-        self.use_extrinsics = use_extrinsics
-        self.action_dim = action_dim
-        self.state_dim = state_dim
+    image_size: int = 256
+    patch_size: int = 16
+    latent_dim: int = 1408
+    hidden_size: int = 1024
+    num_hidden_layers: int = 24
+    num_attention_heads: int = 16
+    mlp_ratio: float = 4.0
+    use_extrinsics: bool = False
+    action_dim: int = ACTION_DIM
+    state_dim: int = STATE_DIM
 
     @classmethod
     def from_sizes(cls, sizes: ModelSizes) -> PredictorConfig:

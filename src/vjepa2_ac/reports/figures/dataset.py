@@ -13,7 +13,7 @@ from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.transforms import crop_box
 from vjepa2_ac.data.inspection.statistics import RELEASED_STEP_CM, Inspection, ReadEpisode, idle_runs
 from vjepa2_ac.data.inspection.statistics_vectors import largest_change
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reports.figures.contact_sheet import ContactSheet, Strip, pictures_per_row, plot_contact_sheet
 
@@ -21,7 +21,7 @@ _PLACES = 6000  # points of the map, at most
 
 
 def plot_dataset(
-    dataset: Dataset, inspection: Inspection, path: Path, *, rows: int = 8, progress: Progress | None = None
+    dataset: Dataset, inspection: Inspection, path: Path, *, rows: int = 8, progress: Progress = no_progress
 ) -> Path:
     """Write the contact sheet of an inspected data set; decodes only the frames that it shows.
 
@@ -38,8 +38,7 @@ def plot_dataset(
             strips.append(_strip(dataset, inspection, one, name))
         except InputError as error:
             dataset.leave_out(one.index, error)
-        if progress is not None:
-            progress(done, len(shown))
+        progress(done, len(shown))
     return plot_contact_sheet(sheet_of(inspection, strips), path)
 
 

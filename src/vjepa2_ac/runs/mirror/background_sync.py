@@ -10,14 +10,12 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Collection
-from pathlib import Path
+from collections.abc import Callable
 from types import TracebackType
 
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import RefusedError, UnreachableError, UserError
 from vjepa2_ac.runs.folder import CHECKPOINTS
-from vjepa2_ac.runs.mirror.remote_checkpoints import RemoteCheckpoints
 from vjepa2_ac.runs.mirror.upload import ForeignRunError, OvertakenError, RemoteUpdate
 from vjepa2_ac.storage.remote import quietly
 
@@ -31,29 +29,22 @@ class Mirror:
     """Keeps another place in sync with a run's folder: in the background, one upload at a time.
 
     Args:
-        place: What `storage.place` returned.
-        folder: The run's folder.
-        run_id: The run whose checkpoints may be there.
-        config: How often, and how many checkpoints are kept in both places.
-        damaged: Names of damaged checkpoints there; they are removed.
+        update: What is brought up to date.
+        config: How often, and how long the run waits for it in the end.
         outage_reported: Whether the user was already warned that the place cannot be reached.
         now_s: Returns the time in seconds, from any origin.
     """
 
     def __init__(
         self,
-        place: str,
-        folder: Path,
-        run_id: str,
+        update: RemoteUpdate,
         config: CheckpointConfig,
         *,
-        damaged: Collection[str] = (),
         outage_reported: bool = False,
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._place, self._folder = place, folder
+        self._update = update
         self._every_minutes, self._wait_s = config.remote_every_minutes, config.remote_wait_seconds
-        self._update = RemoteUpdate(RemoteCheckpoints(place), folder, run_id, config.keep, damaged)
         self._outage_reported, self._now_s = outage_reported, now_s
         self._thread: threading.Thread | None = None
         self._hurry, self._stop = threading.Event(), threading.Event()
@@ -93,7 +84,7 @@ class Mirror:
         if not self._is_off and not (in_time and self._sent == self._update.newest_here()):
             logger.warning(
                 "%s has checkpoints up to %s; what %s has after that is on this machine only%s. A next start sends it",
-                self._place, self._sent or "those of earlier starts", self._folder / CHECKPOINTS,
+                self._update.place, self._sent or "those of earlier starts", self._update.folder / CHECKPOINTS,
                 "" if in_time else ": there was no more time",
             )  # fmt: skip
 
@@ -131,14 +122,14 @@ class Mirror:
             logger.warning(
                 "checkpoint.remote: %s holds a checkpoint of another run, %s. Nothing was written there, and nothing"
                 " will be: this run is on this machine alone. Name another place when you start it again",
-                self._place, error,
+                self._update.place, error,
             )  # fmt: skip
         except OvertakenError as error:
             self._is_off = True
             logger.warning(
                 "checkpoint.remote: %s is used by a later start of this run, %s. This one continues without it;"
                 " stop one of the two",
-                self._place, error,
+                self._update.place, error,
             )  # fmt: skip
         except (UserError, OSError) as error:
             log = logger.info if self._outage_reported else logger.warning
@@ -148,7 +139,7 @@ class Mirror:
             )  # fmt: skip
             self._outage_reported = True
         except Exception:  # no error here may stop the run
-            logger.exception("checkpoint.remote: %s is not up to date; training goes on", self._place)
+            logger.exception("checkpoint.remote: %s is not up to date; training goes on", self._update.place)
         finally:
             self._update.release()
 

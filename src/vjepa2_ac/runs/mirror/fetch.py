@@ -16,6 +16,7 @@ from pathlib import Path
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import FETCHING, checkpoint_name, remove_leavings, written_state
 from vjepa2_ac.runs.folder import CHECKPOINTS, check_run_folder, with_settled_stride
 from vjepa2_ac.runs.mirror.remote_checkpoints import RemoteCheckpoints
@@ -29,7 +30,7 @@ def fetch_newest(
     remote: RemoteCheckpoints,
     names: Sequence[str],
     config: Config,
-    note: Callable[[str], None],
+    reporter: Reporter,
     *,
     claim: Callable[[], None],
     allow_config_change: bool = False,
@@ -40,7 +41,7 @@ def fetch_newest(
         remote: Where it is.
         names: Its checkpoints that are newer than this machine's, the newest first.
         config: The run.
-        note: Called with messages for the user.
+        reporter: Receives messages for the user.
         claim: Called before the first file is written; raises if the folder belongs to another run.
         allow_config_change: The run there may have another config.
 
@@ -65,7 +66,7 @@ def fetch_newest(
         if fetched is not None:
             _fetch_best(remote, fetched, folder)
             _give_name(fetched, folder / CHECKPOINTS / name)
-            note(f"Fetched {name} from {remote.place}.")
+            reporter.note(f"Fetched {name} from {remote.place}.")
             break
         damaged.append(name)
     return damaged

@@ -12,11 +12,13 @@ from pathlib import Path
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError, RefusedError, UnreachableError
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import newest_checkpoint, step_of, written_state
 from vjepa2_ac.runs.folder import CHECKPOINTS
 from vjepa2_ac.runs.mirror.background_sync import Mirror, reason_of
 from vjepa2_ac.runs.mirror.fetch import fetch_newest
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
+from vjepa2_ac.runs.mirror.upload import RemoteUpdate
 from vjepa2_ac.storage import is_url, place, try_writing
 from vjepa2_ac.storage.remote import quietly
 
@@ -35,14 +37,13 @@ class Remote:
     def mirror(self, run_id: str) -> Mirror:
         """Return the mirror that keeps the place up to date."""
         folder, checkpoint = Path(self.config.run_dir), self.config.checkpoint
-        return Mirror(
-            self.place, folder, run_id, checkpoint, damaged=self.damaged, outage_reported=not self.is_reachable
-        )
+        update = RemoteUpdate(RemoteCheckpoints(self.place), folder, run_id, checkpoint.keep, self.damaged)
+        return Mirror(update, checkpoint, outage_reported=not self.is_reachable)
 
 
 def open_remote(
     config: Config,
-    note: Callable[[str], None],
+    reporter: Reporter,
     *,
     claim: Callable[[], None] = lambda: None,
     allow_config_change: bool = False,
@@ -54,7 +55,7 @@ def open_remote(
 
     Args:
         config: The run.
-        note: Called with messages for the user.
+        reporter: Receives messages for the user.
         claim: Called before the first file is fetched; raises if the folder belongs to another run.
         allow_config_change: The run there may have another config.
         into: The folder to fetch into, new or empty, if not the run's own.
@@ -77,14 +78,16 @@ def open_remote(
         _warn(f"{reason_of(error)}. Training begins with what is on this machine, {stand}, and tries again later")
         return replace(remote, is_reachable=False)
     minutes = config.checkpoint.remote_every_minutes
-    note(f"{remote.place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
+    reporter.note(f"{remote.place} can be written: it is brought up to date every {minutes:g} minutes, and in the end.")
     further = [name for name in complete(listing) if step is None or (step_of(name) or 0) > step]
     is_begun_there = step is None and owner is not None  # a machine was killed during its first upload or before
     if not further and not is_begun_there:
         return remote
     target = config if into is None else config.model_copy(update={"run_dir": str(into)})
     try:
-        damaged = fetch_newest(checkpoints, further, target, note, claim=claim, allow_config_change=allow_config_change)
+        damaged = fetch_newest(
+            checkpoints, further, target, reporter, claim=claim, allow_config_change=allow_config_change
+        )
     except UnreachableError as error:
         if step is None:
             raise

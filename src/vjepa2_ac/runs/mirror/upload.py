@@ -49,7 +49,8 @@ class RemoteUpdate:
     def __init__(
         self, remote: RemoteCheckpoints, folder: Path, run_id: str, keep: int, damaged: Collection[str] = ()
     ) -> None:
-        self._remote, self._folder, self._run_id, self._keep = remote, folder, run_id, keep
+        self.place, self.folder = remote.place, folder
+        self._remote, self._run_id, self._keep = remote, run_id, keep
         self._damaged = set(damaged)
         self._ours: set[str] = set()  # remote checkpoints that are known to be of this run
         self._small: dict[str, tuple[int, int]] = {}  # sizes and times of the uploaded small files
@@ -88,7 +89,7 @@ class RemoteUpdate:
 
     def release(self) -> None:
         """Remove the links."""
-        shutil.rmtree(self._folder / HELD, ignore_errors=True)
+        shutil.rmtree(self.folder / HELD, ignore_errors=True)
 
     def newest_here(self) -> str | None:
         """Return the newest local checkpoint."""
@@ -106,7 +107,7 @@ class RemoteUpdate:
         """Leave the place to the latest start: two uploaders would overwrite each other's files."""
         if self._starts is None:
             return
-        path = join(self._remote.place, ENVIRONMENT)
+        path = join(self.place, ENVIRONMENT)
         try:
             there = read_bounded(path, MOST_BYTES)
         except FileNotFoundError:
@@ -118,14 +119,14 @@ class RemoteUpdate:
     def _send_small_files(self, go_on: GoOn) -> None:
         """Upload the changed files of the run's folder in their current state: they may grow meanwhile."""
         for name in SMALL_FILES:
-            source, copy = self._folder / name, self._folder / HELD / name
+            source, copy = self.folder / name, self.folder / HELD / name
             if not source.is_file():
                 continue
             version = (source.stat().st_size, source.stat().st_mtime_ns)
             if self._small.get(name) != version:
                 go_on()
                 shutil.copyfile(source, copy)
-                upload(copy, join(self._remote.place, name))
+                upload(copy, join(self.place, name))
                 if name == ENVIRONMENT:
                     self._starts = copy.read_bytes()
                 self._small[name] = version
@@ -135,10 +136,10 @@ class RemoteUpdate:
 
     def _hold(self, name: str | None) -> Path | None:
         """Link a checkpoint's files into an own folder; None if it is incomplete, or just being removed."""
-        held = self._folder / HELD / str(name)
+        held = self.folder / HELD / str(name)
         shutil.rmtree(held, ignore_errors=True)
         try:
-            shutil.copytree(self._folder / CHECKPOINTS / str(name), held, copy_function=_link)
+            shutil.copytree(self.folder / CHECKPOINTS / str(name), held, copy_function=_link)
         except (FileNotFoundError, shutil.Error):
             return None
         return held if find_damage(held) is None else None
@@ -160,7 +161,7 @@ class RemoteUpdate:
     def _names_here(self) -> list[str]:
         """Return the local checkpoints, the newest first."""
         with contextlib.suppress(FileNotFoundError):
-            return [path.name for path in reversed(listed(self._folder / CHECKPOINTS))]
+            return [path.name for path in reversed(listed(self.folder / CHECKPOINTS))]
         return []
 
 

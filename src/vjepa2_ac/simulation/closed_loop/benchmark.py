@@ -5,21 +5,21 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import RldsData
-from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_writer import video_library
 from vjepa2_ac.planning.session import PlanningSession
+from vjepa2_ac.reporter import SILENT, Reporter
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
-from vjepa2_ac.simulation.closed_loop.rollout import run_task
+from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
 from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M, TaskName, arm_for
 from vjepa2_ac.simulation.closed_loop.video import write_film
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
@@ -64,7 +64,7 @@ class ClosedLoopBenchmark:
 
 
 def run_benchmark(
-    steering: PlanningSession, asked: BenchmarkOptions, folder: Path, *, stage: Callable[[str], Progress] | None = None
+    steering: PlanningSession, asked: BenchmarkOptions, folder: Path, reporter: Reporter = SILENT
 ) -> tuple[ClosedLoopBenchmark, tuple[Path, ...]]:
     """Let all four solve the same problems; write closed_loop.json and the video. Cheap failures first.
 
@@ -72,7 +72,7 @@ def run_benchmark(
         steering: The model and its planning settings; its `data.stride` is the length of a model step.
         asked: The options.
         folder: The output folder; created if it is missing.
-        stage: Returns a progress bar for a part of the work, by its title.
+        reporter: Shows the progress of each policy.
 
     Raises:
         InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, or a folder that is not
@@ -100,19 +100,9 @@ def run_benchmark(
     arm = arm_for(asked.task, named_domain(asked.domain), renderer=asked.renderer)
     results = []
     for policy in _policies(steering, asked, arm):
-        result = run_task(
-            asked.task,
-            arm.domain,
-            policy,
-            episodes=asked.episodes,
-            seed=asked.seed,
-            steps=asked.steps,
-            stride=stride,
-            keep_frames=asked.films if isinstance(policy, Planning) else 0,
-            arm=arm,
-            progress=stage(f"{asked.task}: {policy.name}") if stage else None,
-        )
-        results.append(result)
+        films = asked.films if isinstance(policy, Planning) else 0
+        spec = RolloutSpec(asked.task, arm.domain, asked.episodes, asked.seed, asked.steps, stride, films)
+        results.append(run_task(spec, policy, arm, reporter.task(f"{asked.task}: {policy.name}")))
     contest = ClosedLoopBenchmark(
         steering.subject,
         steering.checkpoint,

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.episode import Progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.simulation.closed_loop.policies import Moves, Policy
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult, EpisodeResult
@@ -25,50 +26,45 @@ from vjepa2_ac.simulation.world.motion import rest_joints
 _PARTS = 8  # of a displacement that cannot be completed
 
 
+@dataclass(frozen=True)
+class RolloutSpec:
+    """Problems of a task, and how long a policy may take for each."""
+
+    task: TaskName
+    domain: str | Domain  # A, B, or a domain
+    episodes: int = 50  # number of problems, from number 0 on
+    seed: int = 0  # of the problems; settings that were chosen on one seed have to be reported on another
+    steps: int | None = None  # model steps of an episode; None: the task's default
+    stride: int = 4  # control steps of a model step (15 per second)
+    keep_frames: int = 0  # number of episodes, the first ones, whose frames are stored for a video
+
+
 def run_task(
-    task: TaskName,
-    domain: str | Domain,
-    policy: Policy,
-    *,
-    episodes: int = 50,
-    seed: int = 0,
-    steps: int | None = None,
-    stride: int = 4,
-    keep_frames: int = 0,
-    arm: SimulatedArm | None = None,
-    progress: Progress | None = None,
+    spec: RolloutSpec, policy: Policy, arm: SimulatedArm | None = None, progress: Progress = no_progress
 ) -> ClosedLoopResult:
     """Let a policy do a task repeatedly. Every policy gets the same problems, so metrics can be paired by row.
 
     Args:
-        task: The task.
-        domain: A, B, or a domain.
+        spec: The problems.
         policy: The policy.
-        episodes: Number of problems, from number 0 on.
-        seed: Of the problems. Settings that were chosen on one seed have to be reported on another.
-        steps: Model steps of an episode; None: the task's default.
-        stride: Control steps of a model step (15 per second).
-        keep_frames: Number of episodes, the first ones, whose frames are stored for a video.
-        arm: In this domain, from `arm_for` of this task, to be reused; None: a new one.
+        arm: In their domain, from `arm_for` of this task, to be reused; None: a new one.
         progress: Called with the number of finished episodes.
 
     Raises:
         InputError: MuJoCo is not installed, or no such domain.
         ValueError: No episodes, or an action that is no action.
     """
-    if isinstance(domain, str):
-        domain = named_domain(domain)
-    if episodes < 1:
-        raise ValueError(f"{episodes} episodes")
-    arm, steps = arm or arm_for(task, domain), steps or STEPS[task]
+    domain = named_domain(spec.domain) if isinstance(spec.domain, str) else spec.domain
+    if spec.episodes < 1:
+        raise ValueError(f"{spec.episodes} episodes")
+    arm, steps = arm or arm_for(spec.task, domain), spec.steps or STEPS[spec.task]
     done: list[EpisodeResult] = []
-    for index in range(episodes):
-        problem = make_problem(task, domain, seed, index)
-        kept = index < keep_frames
-        done.append(run_episode(arm, policy, problem, steps=steps, stride=stride, keep_frames=kept))
-        if progress:
-            progress(index + 1, episodes)
-    return ClosedLoopResult(task, domain.name, policy.name, seed, steps, stride, tuple(done))
+    for index in range(spec.episodes):
+        problem = make_problem(spec.task, domain, spec.seed, index)
+        kept = index < spec.keep_frames
+        done.append(run_episode(arm, policy, problem, steps=steps, stride=spec.stride, keep_frames=kept))
+        progress(index + 1, spec.episodes)
+    return ClosedLoopResult(spec.task, domain.name, policy.name, spec.seed, steps, spec.stride, tuple(done))
 
 
 def run_episode(

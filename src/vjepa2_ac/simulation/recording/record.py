@@ -6,6 +6,7 @@ import itertools
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -21,6 +22,7 @@ from vjepa2_ac.data.sources.rlds.writing.droid_writer import (
     encode_jpeg,
     write_droid_rlds,
 )
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
@@ -33,20 +35,38 @@ _INSTRUCTIONS = {None: "reach around over the table", "push": "push the block", 
 _SIMULATED_CAMERAS = dict(zip(CAMERAS, ("exterior_1", "exterior_2", "wrist"), strict=True))
 
 
+@dataclass(frozen=True)
+class RecordingSpec:
+    """What an episode of a simulated data set is."""
+
+    domain: str | Domain | DomainRanges  # or its name; ranges, or `random`: another world in every episode
+    steps: int = 41  # control steps (15 per second)
+    seed: int = 0  # determines motion, outcome and worlds
+    cameras: Literal[1, 3] = 1  # 1: the three images of a step are the same one; 3: one image per camera
+    renderer: Renderer = "rays"  # it works everywhere; `opengl` needs a working `MUJOCO_GL`
+    recipe: MotionRecipe | None = None  # ranges of the motion, without a task
+    task: Literal["push", "pick"] | None = None  # with a block: half of the episodes by script, half at random
+
+    @property
+    def worlds(self) -> Domain | DomainRanges:
+        """The world of all episodes, or the ranges to draw each one's from.
+
+        Raises:
+            InputError: No domain has this name.
+        """
+        if not isinstance(self.domain, str):
+            return self.domain
+        return DomainRanges() if self.domain == "random" else named_domain(self.domain)
+
+
 def record_dataset(
     folder: str | Path,
+    spec: RecordingSpec,
     *,
-    domain: str | Domain | DomainRanges,
     episodes: int,
-    steps: int = 41,
-    seed: int = 0,
     shards: int | None = None,
-    cameras: Literal[1, 3] = 1,
     workers: int = 1,
-    renderer: Renderer = "rays",
-    recipe: MotionRecipe | None = None,
-    task: Literal["push", "pick"] | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress = no_progress,
 ) -> Path:
     """Record episodes and write them as a data set; the same arguments give the same bytes, whatever `workers`.
 
@@ -54,17 +74,10 @@ def record_dataset(
 
     Args:
         folder: The folder of the data set; must be new or empty.
-        domain: A `Domain`, or the name of one. For another world in every episode, `DomainRanges` to draw it from, or
-            `random`.
+        spec: What an episode is.
         episodes: Number of episodes.
-        steps: Control steps of each (15 per second).
-        seed: Determines motion, outcome and, for `random`, the worlds.
         shards: TFRecord files; one for every 32 episodes by default.
-        cameras: 1: the three images of a step are the same one. 3: one image per camera.
         workers: Processes. More than one needs `if __name__ == "__main__":` in a script that calls this.
-        renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
-        recipe: Ranges of the motion, without a task.
-        task: With a block on the table: half of the episodes push or pick it by script, half play around it at random.
         progress: Called with (episodes done, episodes in total).
 
     Raises:
@@ -72,65 +85,39 @@ def record_dataset(
             cannot be written.
     """
     load_mujoco()
-    if min(episodes, steps - 1, workers, 1 if shards is None else shards, seed + 1) < 1:
+    if min(episodes, spec.steps - 1, workers, 1 if shards is None else shards, spec.seed + 1) < 1:
         raise InputError(
             where="simulate record",
-            found=f"episodes {episodes}, steps {steps}, shards {shards}, workers {workers}, seed {seed}",
+            found=f"episodes {episodes}, steps {spec.steps}, shards {shards}, workers {workers}, seed {spec.seed}",
             needed="at least 1 episode, 2 steps, 1 shard, 1 worker, seed 0",
         )
-    if isinstance(domain, str):
-        domain = DomainRanges() if domain == "random" else named_domain(domain)
-    record = partial(
-        record_episode,
-        domain=domain,
-        steps=steps,
-        seed=seed,
-        cameras=cameras,
-        renderer=renderer,
-        recipe=recipe,
-        task=task,
-    )
+    record = partial(record_episode, spec=replace(spec, domain=spec.worlds))
     stream = _watched(_recorded(record, episodes, workers), episodes, progress)
     return write_droid_rlds(folder, stream, shards=shards or -(-episodes // 32))
 
 
-def record_episode(
-    index: int,
-    *,
-    domain: Domain | DomainRanges,
-    steps: int,
-    seed: int,
-    cameras: Literal[1, 3] = 1,
-    renderer: Renderer = "rays",
-    recipe: MotionRecipe | None = None,
-    task: Literal["push", "pick"] | None = None,
-) -> DroidEpisode:
-    """Return one episode, in a domain or in a world drawn from ranges: a pure function of its arguments.
+def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
+    """Return one episode: a pure function of its arguments.
 
     Raises:
-        InputError: MuJoCo or OpenGL is missing.
+        InputError: MuJoCo or OpenGL is missing, or an unknown domain.
     """
-    motion_rng, world_rng = (np.random.default_rng([seed, index, purpose]) for purpose in range(2))
-    world = domain if isinstance(domain, Domain) else sample_domain(world_rng, domain)
+    motion_rng, world_rng = (np.random.default_rng([spec.seed, index, purpose]) for purpose in range(2))
+    worlds, task = spec.worlds, spec.task
+    world = worlds if isinstance(worlds, Domain) else sample_domain(world_rng, worlds)
+    images: dict[str, list[bytes]] = {}
     if task is None:
-        motion = random_reaching(world, steps, motion_rng, recipe)
-        images = _film(world, motion, cameras, renderer)
+        motion = random_reaching(world, spec.steps, motion_rng, spec.recipe)
+        _film(SimulatedArm(world, renderer=spec.renderer), motion, images, spec.cameras)
     else:
-        from vjepa2_ac.simulation.recording.scripted_play import (
-            play,  # it imports torch, which random reaching does not need
-        )
+        # They import torch, which random reaching does not need.
+        from vjepa2_ac.simulation.closed_loop.tasks import arm_for
+        from vjepa2_ac.simulation.recording.scripted_play import play
 
-        images = {}
-        motion = play(
-            task,
-            world,
-            steps,
-            motion_rng,
-            script=index % 2 == 0,
-            renderer=renderer,
-            look=lambda arm: _take(arm, images, cameras),
-        )
-    folder = episode_folder(index, seed, world.name)
+        arm = arm_for(task, world, renderer=spec.renderer)
+        look = partial(_take, films=images, cameras=spec.cameras)
+        motion = play(arm, task, spec.steps, motion_rng, script=index % 2 == 0, look=look)
+    folder = episode_folder(index, spec.seed, world.name)
     return DroidEpisode(
         file_path=f"{folder}/trajectory.h5",
         recording_folderpath=f"{folder}/recordings/MP4",
@@ -152,13 +139,10 @@ def episode_folder(index: int, seed: int, domain_name: str) -> str:
     return f"/simulated/SIM/{'success' if succeeded else 'failure'}/2026-01-{day:02d}/{place}"
 
 
-def _film(world: Domain, motion: Motion, cameras: int, renderer: Renderer) -> dict[str, list[bytes]]:
-    arm = SimulatedArm(world, renderer=renderer)
-    films: dict[str, list[bytes]] = {}
+def _film(arm: SimulatedArm, motion: Motion, films: dict[str, list[bytes]], cameras: int) -> None:
     for joints, closedness in zip(motion.joints, motion.gripper, strict=True):
         arm.set_joints(joints, float(closedness))
         _take(arm, films, cameras)
-    return films
 
 
 def _take(arm: SimulatedArm, films: dict[str, list[bytes]], cameras: int) -> None:
@@ -203,10 +187,7 @@ def _recorded(record: Callable[[int], DroidEpisode], episodes: int, workers: int
             waiting += [pool.submit(record, index) for index in itertools.islice(indices, 1)]
 
 
-def _watched(
-    stream: Iterator[DroidEpisode], episodes: int, progress: Callable[[int, int], None] | None
-) -> Iterator[DroidEpisode]:
+def _watched(stream: Iterator[DroidEpisode], episodes: int, progress: Progress) -> Iterator[DroidEpisode]:
     for done, episode in enumerate(stream, start=1):
         yield episode
-        if progress:
-            progress(done, episodes)
+        progress(done, episodes)

@@ -17,9 +17,8 @@ from vjepa2_ac.geometry import apply_action
 from vjepa2_ac.simulation.closed_loop.oracles import oracle_for
 from vjepa2_ac.simulation.closed_loop.policies import shortened
 from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, arm_for, make_problem
-from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
-from vjepa2_ac.simulation.world.domains import Domain
+from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, make_problem
+from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.kinematics import OutOfReachError, inverse_kinematics
 from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, rest_joints
 
@@ -30,32 +29,29 @@ _AREA = np.array([[0.30, -0.28], [0.64, 0.28]])  # of the flange while playing, 
 
 
 def play(
+    arm: SimulatedArm,
     task: Literal["push", "pick"],
-    domain: Domain,
     steps: int,
     rng: np.random.Generator,
     *,
     script: bool,
-    renderer: Renderer = "rays",
     look: Callable[[SimulatedArm], None] | None = None,
 ) -> Motion:
     """Return a demonstration of `steps` control steps with an arm that touches the block.
 
     Args:
+        arm: From `arm_for` of this task.
         task: The problem at the start, and whether the gripper is used.
-        domain: The world.
         steps: Control steps.
         rng: The only source of randomness.
         script: Whether an oracle solves the problem, with noise; otherwise, random play.
-        renderer: Of the arm's cameras.
         look: Called at every control step, at the time of its measurements.
 
     Raises:
         InputError: MuJoCo or OpenGL is missing.
     """
     recipe = MotionRecipe()
-    arm = arm_for(task, domain, renderer=renderer)
-    problem = make_problem(task, domain, int(rng.integers(2**31)), 0)
+    problem = make_problem(task, arm.domain, int(rng.integers(2**31)), 0)
     limits = LimitsConfig(xyz=(recipe.reach_m,) * 3)
     oracle = oracle_for(task, limits, arm)
     put(arm, problem.start, problem.block_start)

@@ -8,11 +8,12 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from vjepa2_ac.config import Config
+from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.metrics_log import WARNING, MetricsLog, read_metrics_log
 from vjepa2_ac.runs.trackers import Trackers
 
@@ -32,7 +33,7 @@ class WatchedMetricsLog(MetricsLog):
     Args:
         run_dir: The run's folder.
         config: Its config, for the knobs to change.
-        note: Receives messages for the user.
+        reporter: Receives messages for the user.
         first_step: As of `MetricsLog`.
         trackers: As of `MetricsLog`.
     """
@@ -42,12 +43,12 @@ class WatchedMetricsLog(MetricsLog):
         run_dir: Path,
         *,
         config: Config,
-        note: Callable[[str], None],
+        reporter: Reporter,
         first_step: int,
         trackers: Trackers | None = None,
     ) -> None:
         super().__init__(run_dir, first_step=first_step, trackers=trackers)
-        self._watch, self._note = Watch(config), note
+        self._watch, self._reporter = Watch(config), reporter
         for row in read_metrics_log(self.path):
             self._watch(str(row.get("kind")), row["step"], row)
 
@@ -56,7 +57,7 @@ class WatchedMetricsLog(MetricsLog):
         super().write(kind, step, metrics)
         for text in self._watch(kind, step, metrics):
             super().write(WARNING, step, {"text": text})
-            self._note(f"Warning: {text}")
+            self._reporter.note(f"Warning: {text}")
 
 
 class Watch:

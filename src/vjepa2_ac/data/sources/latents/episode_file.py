@@ -54,31 +54,30 @@ class EpisodeLayout:
     dim: int
 
 
-def write_episode_file(
-    path: str | Path,
-    layout: EpisodeLayout,
-    episode: Episode,
-    camera: str,
-    *,
-    steps: Sequence[int],
-    latents: StoredLatents,
-    pictures: UInt8[np.ndarray, "frames height width 3"],
-) -> int:
+@dataclass(frozen=True, eq=False)
+class EncodedEpisode:
+    """An episode with latents of frames of one camera."""
+
+    episode: Episode  # its states and other data for clips; no frame is read
+    camera: str
+    steps: Sequence[int]  # control steps of the frames, ascending; there may be none
+    latents: StoredLatents  # of these frames, see `dtypes.pack_latents`
+    pictures: UInt8[np.ndarray, "frames height width 3"]  # these frames, square as the encoder sees them and small
+
+
+def write_episode_file(path: str | Path, layout: EpisodeLayout, encoded: EncodedEpisode) -> int:
     """Write the file of an episode and camera atomically, and return its size.
 
     Args:
         path: The file; missing folders are created.
-        layout: The layout of the cache.
-        episode: Its states and other data for clips; no frame is read.
-        camera: The camera of the latents.
-        steps: Control steps of the frames, ascending; there may be none.
-        latents: Of these frames, in the type of the layout (see `dtypes.pack_latents`).
-        pictures: These frames, square as the encoder sees them and small.
+        layout: The layout of the cache, which says the type of the latents.
+        encoded: Its content.
 
     Raises:
         InputError: The file cannot be written, or the disk is full.
         ValueError: The arguments do not fit together.
     """
+    episode, steps, latents, pictures = encoded.episode, encoded.steps, encoded.latents, encoded.pictures
     values, scales = latents.values.detach().cpu(), None if latents.scales is None else latents.scales.cpu()
     if list(values.shape) != [len(steps), layout.tokens, layout.dim] or len(pictures) != len(steps):
         raise ValueError(f"{len(steps)} steps, latents {tuple(values.shape)}, pictures {pictures.shape}")
@@ -93,7 +92,7 @@ def write_episode_file(
     about = {
         "format": FORMAT,
         "id": episode.info.id,
-        "camera": camera,
+        "camera": encoded.camera,
         "num_steps": str(episode.info.num_steps),
         "control_rate_hz": repr(float(episode.control_rate_hz)),
         "metadata": json.dumps(dict(episode.metadata), sort_keys=True),
