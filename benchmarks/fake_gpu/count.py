@@ -5,7 +5,6 @@ from __future__ import annotations
 import linecache
 import re
 import sys
-import weakref
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import reduce
@@ -22,6 +21,8 @@ from torch._subclasses.fake_tensor import DataDependentOutputException, FakeTens
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
+
+from vjepa2_ac.training.cost.live_storages import LiveStorages
 
 _BLOCK = 512  # bytes: what the allocator rounds to
 _OURS = ("vjepa2_ac", "peft", "transformers")
@@ -73,17 +74,26 @@ class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
     def __init__(self, machine: Machine) -> None:
         super().__init__()  # type: ignore[no-untyped-call]  # torch
         self.machine = machine
-        self.live = 0
         self.times = 1.0  # how often what comes now is counted
-        self._sizes: dict[int, int] = {}  # of live storages
+        self._storages = LiveStorages(_BLOCK)
         self.reset()
 
     def reset(self) -> None:
         """Forget all but what is live."""
-        self.peak = self.live
+        self._storages.reset_peak()
         self.waits: dict[str, float] = defaultdict(float)  # by place
         self.costs: dict[tuple[str, str], Cost] = defaultdict(Cost)  # by operation and place
         self._read: int | None = None  # the storage whose numbers were read last
+
+    @property
+    def live(self) -> int:
+        """Bytes of tensors that exist now."""
+        return self._storages.live
+
+    @property
+    def peak(self) -> int:
+        """Bytes of tensors that existed at once, at most."""
+        return self._storages.peak
 
     @property
     def total(self) -> Cost:
@@ -105,7 +115,7 @@ class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
         made = _tensors(out)
         on_device = [one for one in (*given, *made) if _device(one) == "cuda"]
         for tensor in on_device:
-            self._hold(tensor)
+            self._storages.hold(tensor)
         known = {_storage(one) for one in given}
         if on_device and (func._schema.is_mutable or any(_storage(one) not in known for one in made)):
             self._launch(func, args, kwargs, out)
@@ -137,18 +147,6 @@ class Count(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
         except DataDependentOutputException:
             kind = given[0].dtype
             return True if kind == torch.bool or func is _aten.equal.default else 1.0 if kind.is_floating_point else 1
-
-    def _hold(self, tensor: Tensor) -> None:
-        storage = tensor.untyped_storage()
-        key = storage._cdata
-        if key not in self._sizes:
-            self._sizes[key] = -(-storage.nbytes() // _BLOCK) * _BLOCK
-            self.live += self._sizes[key]
-            self.peak = max(self.peak, self.live)
-            weakref.finalize(storage, self._let_go, key)
-
-    def _let_go(self, key: int) -> None:
-        self.live -= self._sizes.pop(key)
 
 
 def place(*, text: bool = False) -> str:

@@ -12,11 +12,13 @@ import torch
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode
 from torch.nn.functional import pad
+from torch.utils._python_dispatch import _disable_current_modes
 
 from vjepa2_ac.model.network import attention
 
 FAKE = FakeTensorMode()  # one for all rows: our code keeps tables from one call to the next
 _MASK_ALIGNMENT = 16  # numbers
+_replaced: list[tuple[object, str, Any]] = []
 _seen_by_flex: dict[tuple[int, int], float] = {}  # by the numbers of queries and keys
 
 
@@ -38,10 +40,24 @@ def fake_gpu() -> Iterator[None]:
         (FakeTensor, "__deepcopy__", _copied),
         (nn.Module, "_apply", _applied),
     ]
+    _replaced[:] = [(place, name, getattr(place, name)) for place, name, _ in changes]
+    with _replacing(changes), FAKE:
+        yield
+    _replaced.clear()
+
+
+@contextmanager
+def no_fake_gpu() -> Iterator[None]:
+    """Put back what `fake_gpu` replaced: `training.cost` measures on fake tensors of its own."""
+    with _replacing(_replaced), _disable_current_modes():
+        yield
+
+
+@contextmanager
+def _replacing(changes: list[tuple[object, str, Any]]) -> Iterator[None]:
     with ExitStack() as stack:
         for place, name, instead in changes:
             stack.enter_context(mock.patch.object(place, name, instead))
-        stack.enter_context(FAKE)
         yield
 
 

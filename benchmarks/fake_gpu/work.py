@@ -17,7 +17,7 @@ import train_step_variants
 from count import Count
 from official_predictor import Official
 from random_models import no_fingerprints
-from stand_ins import FAKE
+from stand_ins import FAKE, no_fake_gpu
 from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
@@ -151,12 +151,15 @@ def _step(bench: _Steps, setting: train_step_variants.Setting, way: str, batch: 
     setting = replace(setting, batch=batch)
     step = bench.step(setting, way)
     source, again = "pixels" if setting.encoder else "cache", "on" if setting.checkpointing else "off"
+    with no_fake_gpu():
+        flops = batch * bench.flops_per_clip(setting, way)
+        doctor_gb = None if way in OFFICIALS else bench.estimated_gb(setting)
     return Work(
         f"{source}, {setting.frames} frames, batch {batch}, checkpointing {again}, {way}",
         {"source": source, "frames": setting.frames, "batch": batch, "checkpointing": again, "attention": way},
-        batch * bench.flops_per_clip(setting, way),
+        flops,
         lambda _: step(),
-        None if way in OFFICIALS else bench.estimated_gb(setting),
+        doctor_gb,
     )
 
 
@@ -164,7 +167,8 @@ def _encoding(bench: _Steps, frames: int) -> Work:
     shortest = bench.options.rollout_steps + 1  # of a clip, which is what doctor knows of
     config = bench.config(train_step_variants.Setting(max(shortest, frames), 1, checkpointing=False, encoder=True))
     config = config.model_copy(update={"model": config.model.model_copy(update={"encode_chunk": frames})})
-    estimate = estimate_memory(config, bench.sizes)
+    with no_fake_gpu():
+        estimate, flops = estimate_memory(config, bench.sizes), frames * frame_flops(bench.sizes)
     pixels = torch.empty(1, frames, 3, bench.sizes.image_size, bench.sizes.image_size, device="cuda")
     model = bench.model
 
@@ -173,13 +177,16 @@ def _encoding(bench: _Steps, frames: int) -> Work:
             model.encode(pixels, frames)
 
     estimated = (estimate.encoder_weights + estimate.encoding) / 1e9 if frames >= shortest else None
-    return Work(f"{frames} frames", {"batch": frames}, frames * frame_flops(bench.sizes), encode, estimated)
+    return Work(f"{frames} frames", {"batch": frames}, flops, encode, estimated)
 
 
 def _decision(bench: _Decisions, horizon: int, way: planning_variants.Way) -> Work:
     samples, iterations, at_once = bench.options.samples, bench.options.iterations, way.at_once
     if way.has_adapter:
         _ = bench.adapted  # what loading it takes is not counted
+
+    with no_fake_gpu():
+        flops = bench.flops(horizon)
 
     def decide(count: Count, samples: int = samples, iterations: int = min(_ITERATIONS, iterations)) -> None:
         bench.count = count
@@ -193,7 +200,7 @@ def _decision(bench: _Decisions, horizon: int, way: planning_variants.Way) -> Wo
             "horizon": horizon, "samples": samples, "iterations": iterations, "at_once": at_once,
             "adapter": way.has_adapter,
         },
-        bench.flops(horizon),
+        flops,
         decide,
         warm_up=lambda count: decide(count, min(samples, at_once), 1),
     )  # fmt: skip

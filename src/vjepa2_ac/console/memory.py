@@ -6,8 +6,8 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.training.cost.memory import ALLOWANCE, GIGABYTE, MemoryEstimate
 
 UNTESTED = (
-    "This is arithmetic. It was compared with what PyTorch keeps on a CPU and with what lives at once on an imagined"
-    " GPU, not yet with a GPU's measured peak."
+    "Measured on tensors without numbers. It was compared with what PyTorch keeps on a CPU and with what lives at once"
+    " on an imagined GPU, not yet with a GPU's measured peak."
 )
 
 
@@ -15,9 +15,9 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
     """Return one line for every part, then both totals."""
     training, counts = config.training, estimate.parameters
     clips = f"{training.batch_size} clips of {config.data.frames} frames"
-    fed_back = training.rollout_steps - 1 if estimate.rollout else 0
+    stored, again = estimate.step.stored, estimate.step.checkpointed
+    fed_back = training.rollout_steps - 1 if stored.rollout else 0
     eight_bits = "8 bits where a tensor has 4,096 elements" if training.optimizer == "adamw_8bit" else "float32"
-    gradients = f"gradients on their way back{', and a weight measured by DoRA' if config.adapter.dora else ''}"
     parts = [
         (
             "encoder, frozen", estimate.encoder_weights,
@@ -34,12 +34,12 @@ def memory_lines(config: Config, estimate: MemoryEstimate) -> list[str]:
         ("next batch", estimate.arriving, "on its way while this one is computed"),
         ("latents", estimate.latents, f"{clips}, float32"),
         ("encoder, at work", estimate.encoding, f"{config.model.encode_chunk} frames at once; before the predictor"),
-        ("predictor, teacher forcing", estimate.teacher_forcing, "kept for the backward pass, without checkpointing"),
-        ("predictor, rollout", estimate.rollout, f"{fed_back} x one step more, without checkpointing"),
-        ("losses", estimate.losses, "without checkpointing"),
-        ("all three, checkpointed", estimate.checkpointed, "instead: inputs of blocks, and one block computed again"),
-        ("copies", estimate.cast_cache, f"of trained weights in {training.precision}"),
-        ("temporaries", estimate.temporaries, gradients),
+        ("predictor, teacher forcing", stored.teacher_forcing, "kept for the backward pass, without checkpointing"),
+        ("predictor, rollout", stored.rollout, f"{fed_back} x one step more, without checkpointing"),
+        ("losses", stored.losses, "without checkpointing"),
+        ("temporaries", stored.peak - stored.saved, "beside all three where most lives at once"),
+        ("all four, checkpointed", again.peak, "instead: inputs of blocks, and one block computed again"),
+        ("copies", estimate.step.casts, f"of adapters in {training.precision}"),
         (
             "validation", estimate.validating,
             f"instead of all that: {config.validation.batch_size} clips, and the keys and values of their rollout",

@@ -14,8 +14,8 @@ from torch.nn.functional import smooth_l1_loss
 from vjepa2_ac.config import TrainingConfig
 from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.model.network.dynamics import LatentDynamics
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
-from vjepa2_ac.model.network.world_model import WorldModel
 
 Distance = Callable[[Tensor, Tensor], Tensor]  # of predicted and true latents, number by number
 
@@ -43,7 +43,7 @@ class Objective(nn.Module):
     Source: facebookresearch/vjepa2 @ c2963a4, app/vjepa_droid/train.py, forward_predictions and loss_fn.
     """
 
-    def __init__(self, world_model: WorldModel, training: TrainingConfig) -> None:
+    def __init__(self, world_model: LatentDynamics, training: TrainingConfig) -> None:
         super().__init__()
         self.world_model = world_model
         self.weights = (training.teacher_forcing_weight, training.rollout_weight)
@@ -61,7 +61,7 @@ class Objective(nn.Module):
 
 
 def prediction_losses(
-    world_model: WorldModel, batch: LatentBatch, rollout_steps: int, distance: Distance = absolute_difference
+    world_model: LatentDynamics, batch: LatentBatch, rollout_steps: int, distance: Distance = absolute_difference
 ) -> Losses:
     """Return both parts of the loss of one batch, without weights; the distance is L1 unless given.
 

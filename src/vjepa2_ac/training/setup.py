@@ -27,7 +27,7 @@ from vjepa2_ac.encoding.training_cache import with_latents
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, require_learned
 from vjepa2_ac.model.adapter.lora import add_adapter, save_trained, trainable_report
-from vjepa2_ac.model.adapter.lora_linear import CastMatrices
+from vjepa2_ac.model.adapter.low_rank import CastMatrices
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter

@@ -17,7 +17,7 @@ from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.lora import add_adapter, has_adapter, load_trained, save_trained, trainable_report
 from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
-from vjepa2_ac.model.network import predictor
+from vjepa2_ac.model.network import predictor_network
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
 from vjepa2_ac.model.network.world_model import WorldModel
 
@@ -423,7 +423,7 @@ def test_only_with_dropout_a_block_computed_again_needs_the_state_of_random_numb
         kept.append(preserve_rng_state)
         return checkpoint(block, *given, preserve_rng_state=preserve_rng_state, **how)
 
-    monkeypatch.setattr(predictor, "checkpoint", watched)
+    monkeypatch.setattr(predictor_network, "checkpoint", watched)
     model = fresh()
     model.set_gradient_checkpointing(True)  # before there is an adapter
     add_adapter(model, AdapterConfig(rank=2, dropout=dropout), seed=0)

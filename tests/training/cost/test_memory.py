@@ -1,7 +1,5 @@
 """The memory estimate adds up what is allocated at once, depends on every relevant knob, and doctor prints it."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
@@ -71,16 +69,7 @@ def test_other_trained_layers_are_counted() -> None:
     )
     assert pissa == plain  # what PiSSA started from stays on the CPU
     assert dora.trained > plain.trained
-    assert dora.teacher_forcing > plain.teacher_forcing
-    assert dora.temporaries > plain.temporaries
-
-
-def test_fp16_keeps_copies_of_bfloat16_weights_and_float32_copies_for_norms() -> None:
-    estimates = [estimate_memory(run_config(training__precision=name), ModelSizes()) for name in ("bf16", "fp16")]
-    copies = 24 * 12 * 1024**2 * 2 + 2 * 1408 * 1024 - 3 * 1024**2 * 2  # none for latents
-    tokens, patches = 2 * 5 * 258, 2 * 5 * 256
-    norms = 47 * tokens * 1026 * 2 + (patches * 4 - tokens * 2) * 1024 + patches * 2 * 2  # of blocks, and the last
-    assert estimates[1].teacher_forcing - estimates[0].teacher_forcing == copies + norms
+    assert dora.step.stored.peak > plain.step.stored.peak
 
 
 def test_a_run_that_fits_needs_no_knob_and_a_large_one_names_them() -> None:
@@ -92,11 +81,6 @@ def test_a_run_that_fits_needs_no_knob_and_a_large_one_names_them() -> None:
     checked = run_config(data__frames=16, training__batch_size=8, training__gradient_checkpointing=True)
     assert estimate_memory(checked, sizes).total(checkpointing=True) <= USUAL_GPU
     assert ways_to_fit(large, sizes, 10**9) is None
-
-
-def test_the_arithmetic_does_without_torch() -> None:
-    code = "import sys, vjepa2_ac.training.cost.memory; assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize(("batch", "status", "word"), [(2, 0, "It fits on"), (8, 1, "gradient_checkpointing=true")])

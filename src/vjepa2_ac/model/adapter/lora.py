@@ -109,6 +109,20 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Pa
     measure_magnitudes(layers)
 
 
+def with_adapter(predictor: nn.Module, config: AdapterConfig, unused: tuple[str, ...] = ()) -> nn.Module:
+    """Return a predictor with a LoRA adapter, as `add_adapter` makes it, but without initial values.
+
+    Args:
+        predictor: The predictor, not adapted.
+        config: What is trained.
+        unused: Layers without input.
+
+    Raises:
+        InputError: A knob does not fit the predictor.
+    """
+    return _with_peft(predictor, LoraConfig(**lora_arguments(predictor, config, unused)))
+
+
 def trainable_report(model: WorldModel) -> TrainableReport:
     """Return the number of trained parameters, of the predictor's own, and of the model's without an adapter."""
     own = sum(value.numel() for value in base_weights(model.base_predictor).values())
@@ -203,18 +217,22 @@ def _train_everything(model: WorldModel) -> None:
 
 def _wrap(model: WorldModel, config: LoraConfig) -> None:
     base = model.predictor_fingerprint()
-    config._register_custom_module({nn.Linear: LoraLinear})
     checkpointing = model.base_predictor.gradient_checkpointing
     model.set_gradient_checkpointing(False)  # or PEFT hooks the input: not needed without re-entrance
-    init, config.init_lora_weights = config.init_lora_weights, True  # or PEFT cuts PiSSA out of the base, in its type
-    training = model.predictor.training
-    model.predictor = get_peft_model(model.predictor, config).train(training)  # PEFT's dropout is enabled at first
-    config.init_lora_weights = init
+    model.predictor = _with_peft(model.predictor, config)
     model.set_gradient_checkpointing(checkpointing)
     model.adaptation = Adaptation("lora", base, model.encoder_fingerprint())
-    for name, value in model.predictor.named_parameters():
+
+
+def _with_peft(predictor: nn.Module, config: LoraConfig) -> nn.Module:
+    config._register_custom_module({nn.Linear: LoraLinear})
+    init, config.init_lora_weights = config.init_lora_weights, True  # or PEFT cuts PiSSA out of the base, in its type
+    wrapped = get_peft_model(predictor, config).train(predictor.training)  # PEFT's dropout is enabled at first
+    config.init_lora_weights = init
+    for name, value in wrapped.named_parameters():
         if _is_trained(name):
             value.data = value.data.float()
+    return wrapped  # type: ignore[no-any-return]  # PEFT has no types
 
 
 def _is_trained(name: str) -> bool:

@@ -84,6 +84,11 @@ def chosen_targets(config: AdapterConfig, linear: set[str]) -> tuple[str, ...]:
     return targets
 
 
+def rank_of(config: AdapterConfig, layer: str) -> int:
+    """Return the rank that PEFT gives a layer: that of the first pattern that fits the end of its name."""
+    return next((rank for key, rank in config.rank_pattern.items() if _matches(key, layer)), config.rank)
+
+
 def _check_patterns(knob: str, patterns: Mapping[str, object], adapted: Iterable[str]) -> None:
     for pattern in patterns:
         require_quick(pattern, where=f"adapter.{knob}")
@@ -97,7 +102,7 @@ def _check_patterns(knob: str, patterns: Mapping[str, object], adapted: Iterable
 
 def _check_ranks(config: AdapterConfig, adapted: Mapping[str, nn.Linear]) -> None:
     for name, layer in adapted.items():
-        rank = next((rank for key, rank in config.rank_pattern.items() if _matches(key, name)), config.rank)
+        rank = rank_of(config, name)
         most = min(layer.in_features, layer.out_features)
         if rank > most:
             raise InputError(

@@ -1,22 +1,15 @@
-"""The action-conditioned predictor of V-JEPA 2-AC: the latents of the next step."""
+"""The action-conditioned predictor of V-JEPA 2-AC as transformers stores and loads it, and its initial weights."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
-from einops import rearrange
-from jaxtyping import Float
-from torch import Generator, Tensor, nn
-from torch.utils.checkpoint import checkpoint
+from torch import Generator, nn
 from transformers import PreTrainedConfig, PreTrainedModel
 
 from vjepa2_ac.config import ModelSizes
-from vjepa2_ac.episode import ACTION_DIM, EXTRINSICS_DIM, STATE_DIM
-from vjepa2_ac.model.network.attention import AttentionKind
-from vjepa2_ac.model.network.blocks import NORM_EPSILON, Block, hidden_width, initialise, normalised
-from vjepa2_ac.model.network.kv_cache import KeyValueCache
-from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
+from vjepa2_ac.episode import ACTION_DIM, STATE_DIM
+from vjepa2_ac.model.network.blocks import initialise
+from vjepa2_ac.model.network.predictor_network import PredictorNetwork, predictor_fields
 
 
 class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers has no types
@@ -38,27 +31,11 @@ class PredictorConfig(PreTrainedConfig):  # type: ignore[misc]  # transformers h
     @classmethod
     def from_sizes(cls, sizes: ModelSizes) -> PredictorConfig:
         """Return the sizes of the predictor of a world model."""
-        return cls(
-            image_size=sizes.image_size,
-            patch_size=sizes.patch_size,
-            latent_dim=sizes.encoder.width,
-            hidden_size=sizes.predictor.width,
-            num_hidden_layers=sizes.predictor.depth,
-            num_attention_heads=sizes.predictor.heads,
-            mlp_ratio=sizes.predictor.mlp_ratio,
-            use_extrinsics=sizes.predictor.use_extrinsics,
-            action_dim=sizes.predictor.action_dim,
-            state_dim=sizes.predictor.state_dim,
-        )
+        return cls(**predictor_fields(sizes))
 
 
-class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # transformers has no types
-    """Predicts, for every step, the latents of the next one from the latents, states and actions up to it.
-
-    The tokens of a step, in order: action, state, (extrinsics), patches. Output: patches only, not normalised.
-
-    Source: facebookresearch/vjepa2 @ c2963a4, src/models/ac_predictor.py, VisionTransformerPredictorAC.
-    """
+class ActionConditionedPredictor(PredictorNetwork, PreTrainedModel):  # type: ignore[misc]  # transformers has no types
+    """The predictor in the form that transformers stores and loads; its pass is the network's."""
 
     config_class = PredictorConfig
     base_model_prefix = "predictor"
@@ -68,58 +45,8 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
 
     def __init__(self, config: PredictorConfig) -> None:
         super().__init__(config)
-        width = config.hidden_size
-        hidden = hidden_width(width, config.mlp_ratio)
-        self.predictor_embed = nn.Linear(config.latent_dim, width)
-        self.action_encoder = nn.Linear(config.action_dim, width)
-        self.state_encoder = nn.Linear(config.state_dim, width)
-        self.extrinsics_encoder = nn.Linear(EXTRINSICS_DIM, width)  # always exists, as in the official checkpoint
-        self.blocks = nn.ModuleList(
-            Block(width, config.num_attention_heads, hidden, layer=index + 1)
-            for index in range(config.num_hidden_layers)
-        )
-        self.predictor_norm = nn.LayerNorm(width, eps=NORM_EPSILON)
-        self.predictor_proj = nn.Linear(width, config.latent_dim)
-        self.attention: AttentionKind = "auto"
-        self.gradient_checkpointing = False  # the name transformers switches
-        self.has_dropout = False  # in its blocks: then recomputed blocks draw the same masks
-        self.post_init()
-
-    @property
-    def grid(self) -> int:
-        """Patches along one side of a frame."""
-        return int(self.config.image_size // self.config.patch_size)
-
-    def forward(
-        self,
-        latents: Float[Tensor, "batch time tokens dim"],
-        actions: Float[Tensor, "batch time action_dim"],
-        states: Float[Tensor, "batch time state_dim"],
-        extrinsics: Float[Tensor, "batch time 6"] | None = None,
-        cache: KeyValueCache | None = None,
-        keep: int | None = None,
-    ) -> Float[Tensor, "batch time tokens dim"]:
-        """Return, at each step, the prediction of the next step's latents, not yet normalised.
-
-        Inputs of any float type are cast to the weights' type.
-
-        Args:
-            latents: Latents of consecutive steps.
-            actions: The action of each.
-            states: The state of each.
-            extrinsics: The camera of each, where the model uses it.
-            cache: The steps come after those in the cache, and see them; then they are added to it.
-            keep: How many of the steps are added, from the first; None: all.
-
-        Raises:
-            ValueError: The tokens do not match the image size, or extrinsics are missing or unexpected.
-        """
-        tokens, layout = self._assemble(latents, actions, states, extrinsics, cache)
-        tokens = self._through_blocks(tokens, layout, cache, keep)
-        patches = rearrange(tokens, "batch (time token) width -> batch time token width", time=layout.steps)[
-            :, :, layout.conditioning :
-        ]
-        return _in_own_type(self.predictor_proj, normalised(self.predictor_norm, patches), self._dtype)
+        self.add_layers(config)
+        self.post_init()  # type: ignore[operator]  # transformers has no types
 
     def initialise(self, generator: Generator) -> None:
         """Initialise every weight; the generator determines the values."""
@@ -141,71 +68,11 @@ class ActionConditionedPredictor(PreTrainedModel):  # type: ignore[misc]  # tran
             self.predictor_embed.weight.copy_(rotation if shape[0] >= shape[1] else rotation.T)
             self.predictor_proj.weight.copy_(self.predictor_embed.weight.T)
 
-    def _assemble(
-        self,
-        latents: Tensor,
-        actions: Tensor,
-        states: Tensor,
-        extrinsics: Tensor | None,
-        cache: KeyValueCache | None = None,
-    ) -> tuple[Tensor, TokenLayout]:
-        """Return the sequence of tokens, step by step, and its layout."""
-        if latents.shape[2] != self.grid**2:
-            raise ValueError(
-                f"{latents.shape[2]} tokens a step do not make a frame of {self.config.image_size} px with patches of"
-                f" {self.config.patch_size} px ({self.grid} x {self.grid} = {self.grid**2} tokens)"
-            )
-        if self.config.use_extrinsics != (extrinsics is not None):
-            raise ValueError(
-                f"use_extrinsics is {self.config.use_extrinsics}, extrinsics given: {extrinsics is not None}"
-            )
-        given = [(self.action_encoder, actions), (self.state_encoder, states)]
-        given += [] if extrinsics is None else [(self.extrinsics_encoder, extrinsics)]
-        conditions = [_in_own_type(layer, values, self._dtype) for layer, values in given]
-        patches = _in_own_type(self.predictor_embed, latents, self._dtype)
-        tokens = torch.cat([torch.stack(conditions, dim=2), patches], dim=2)
-        start = 0 if cache is None else cache.tokens // tokens.shape[2]
-        return tokens.flatten(1, 2), TokenLayout(latents.shape[1], self.grid, len(conditions), start)
-
-    def _through_blocks(
-        self, tokens: Tensor, layout: TokenLayout, cache: KeyValueCache | None, keep: int | None
-    ) -> Tensor:
-        """Return the tokens after all blocks, which see the cache; new keys and values are added to it."""
-        tables = rotary_tables(layout, tokens.shape[-1] // self.config.num_attention_heads, tokens.device)
-        how = (tables, layout.tokens_per_step, self.attention)
-        steps = layout.steps if keep is None else min(keep, layout.steps)
-        kept_tokens = 0 if cache is None else steps * layout.tokens_per_step
-        added: list[Tensor] = []
-        for index, block in enumerate(self.blocks):
-            past = () if cache is None else cache.layer(index)
-            if self.gradient_checkpointing and torch.is_grad_enabled():
-                given = (tokens, *how, kept_tokens, *past)
-                tokens, kept = checkpoint(block, *given, use_reentrant=False, preserve_rng_state=self.has_dropout)
-            else:
-                tokens, kept = block(tokens, *how, kept_tokens, *past)
-            if kept is not None:
-                added.append(kept)
-        if cache is not None and added:
-            cache.append(added)
-        return tokens
-
     def _init_weights(self, module: nn.Module) -> None:
         """Initialise one module: called by transformers for weights that a checkpoint lacks."""
         initialise(module)
 
     @property
-    def _dtype(self) -> torch.dtype:
-        """The base's type; a directly trained head may have another."""
-        return self.predictor_norm.weight.dtype
-
-    @property
     def is_gradient_checkpointing(self) -> bool:
         """Whether blocks are recomputed in the backward pass; PEFT reads this, and transformers' own property warns."""
         return self.gradient_checkpointing
-
-
-def _in_own_type(layer: Any, values: Tensor, dtype: torch.dtype) -> Tensor:
-    """Apply a layer that may be trained, hence float32, in a predictor of another type; autocast casts by itself."""
-    if torch.is_autocast_enabled(values.device.type):
-        return layer(values)  # type: ignore[no-any-return]  # PEFT may be around it, untyped
-    return layer(values.to(layer.weight.dtype)).to(dtype)  # type: ignore[no-any-return]  # the same

@@ -1,1 +1,1 @@
-"""The cost of a run before it starts: trained parameters, memory, FLOPs. Computed without torch."""
+"""The cost of a run before it starts: trained parameters and FLOPs by arithmetic, memory measured on fake tensors."""

@@ -1,4 +1,4 @@
-"""FLOPs of one clip or one plan, by formula: no model is built and torch is not needed.
+"""FLOPs of one clip or one plan, by formula: counting them on fake tensors takes seconds, at the start of every run.
 
 Model FLOPs are counted: only what the mathematics requires, once. A matrix product is two operations per pair of
 numbers; forward, backward with respect to inputs wherever a gradient has to pass, and with respect to weights only for

@@ -1,7 +1,9 @@
-"""GPU memory of a run, part by part, by arithmetic: no model is built and torch is not needed.
+"""GPU memory of a run, part by part: what a step on fake tensors keeps, and arithmetic for the rest.
 
-The parameter counts are exact. What autograd saves (`training.cost.activations`) is tested against what PyTorch saves
-on a CPU. The total has not yet been compared with the peak that a GPU measures.
+The predictor's part is measured (`training.cost.fake_step`). Calculated is what needs no pass through it: weights and
+moments from the counts of parameters (bitsandbytes' kernels take no fake tensors), the next batch from its sizes, and
+the encoder at work, whose code would take seconds to import. The total has not yet been compared with the peak that a
+GPU measures.
 """
 
 from __future__ import annotations
@@ -11,20 +13,15 @@ from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.encoding.disk_space import FRAMES_AT_ONCE
-from vjepa2_ac.training.cost.activations import Activations
-from vjepa2_ac.training.cost.block_activations import FLOAT32, HALF, Kind
-from vjepa2_ac.training.cost.parameters import (
-    CONDITIONS,
-    Parameters,
-    adapter_ranks,
-    count_parameters,
-    linear_layers,
-    trained_tensors,
-)
+from vjepa2_ac.training.cost.fake_step import Kind, StepBytes, measure_step
+from vjepa2_ac.training.cost.parameters import Parameters, count_parameters, trained_tensors
 
 GIGABYTE = 10**9
 ALLOWANCE = 3 * GIGABYTE // 2  # CUDA context 0.5, cuBLAS workspaces, fragmentation: not computed but assumed
 USUAL_GPU = 24 * GIGABYTE
+
+FLOAT32 = 4
+HALF = 2  # bfloat16 and float16
 
 _BYTES_OF_CACHED = {"int8": 1, "bf16": HALF, "fp32": FLOAT32}
 _SMALLEST_IN_8_BITS, _ELEMENTS_OF_A_SCALE = 4096, 256  # of bitsandbytes
@@ -44,12 +41,7 @@ class MemoryEstimate:
     arriving: int  # the next batch, on its way to the GPU; frames as if they were of the model's size
     latents: int
     encoding: int  # activations of the encoder, for one chunk of frames, and the frames
-    teacher_forcing: int
-    rollout: int
-    losses: int
-    cast_cache: int  # copies of trained weights in the arithmetic's type
-    checkpointed: int  # all of teacher forcing, rollout and losses, when blocks are recomputed
-    temporaries: int
+    step: StepBytes  # the predictor's
     optimizer_temporaries: int  # AdamW is fused; but on logged steps `update_to_weight` needs the old weights
     validating: int  # all of a batch of validation
     caching: int  # all of encoding a cache, which ends before the rest begins
@@ -62,8 +54,8 @@ class MemoryEstimate:
 
     def total(self, *, checkpointing: bool) -> int:
         """Return the peak with or without gradient checkpointing."""
-        kept = self.checkpointed if checkpointing else self.teacher_forcing + self.rollout + self.losses
-        predicting = self.latents + kept + self.cast_cache + self.temporaries
+        passes = self.step.checkpointed if checkpointing else self.step.stored
+        predicting = self.latents + self.step.casts + passes.peak
         training = self.gradients + max(self.latents + self.encoding, predicting, self.optimizer_temporaries)
         return max(self.standing + max(training, self.validating), self.caching)
 
@@ -75,10 +67,12 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
         config: The run.
         sizes: Sizes of its model, such as `model.base_model.base_sizes` gives.
         device: The device type whose rules for saved tensors apply.
+
+    Raises:
+        InputError: A knob of the adapter does not fit the predictor.
     """
-    parameters = count_parameters(config, sizes)
-    number = 2 if config.model.dtype == "bfloat16" else FLOAT32
-    kept = Activations(config, sizes, device)
+    parameters, step = count_parameters(config, sizes), measure_step(config, sizes, device)
+    number = HALF if config.model.dtype == "bfloat16" else FLOAT32
     return MemoryEstimate(
         parameters=parameters,
         checkpointing=config.training.gradient_checkpointing,
@@ -86,18 +80,13 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
         predictor_weights=parameters.predictor * number if config.adapter.kind == "lora" else 0,
         trained=parameters.trained * FLOAT32,
         gradients=parameters.trained * FLOAT32,
-        moments=sum(_moments(config, size) for size in trained_tensors(config, sizes)),
+        moments=sum(_moments(config, elements) for elements in trained_tensors(config, sizes)),
         arriving=_arriving(config, sizes),
         latents=_latents(config, sizes, config.training.batch_size),
         encoding=_encoding(config, sizes, config.training.batch_size),
-        teacher_forcing=kept.teacher_forcing(),
-        rollout=kept.rollout(),
-        losses=kept.losses(),
-        cast_cache=kept.cast_cache(),
-        checkpointed=kept.with_checkpointing(),
-        temporaries=_temporaries(config, sizes, config.training.batch_size) + _dora_temporaries(config, sizes),
+        step=step,
         optimizer_temporaries=parameters.trained * FLOAT32,
-        validating=_validating(config, sizes),
+        validating=_validating(config, sizes, step),
         caching=parameters.encoder * number + _caching(config, sizes) if config.data.cache != "off" else 0,
     )
 
@@ -201,40 +190,12 @@ def _at_work(config: Config, sizes: ModelSizes, frames: int) -> int:
     return tokens * max(attention, mlp) + pixels + features
 
 
-def _temporaries(config: Config, sizes: ModelSizes, clips: int) -> int:
-    """Return what lives for a moment where most does: at the MLP's second layer, on the way back.
-
-    Plain LoRA: two gradients as wide as the MLP, two as wide as a token. Else four as wide as the MLP, in float32.
-    """
-    width, hidden = sizes.predictor.width, int(sizes.predictor.width * sizes.predictor.mlp_ratio)
-    plain = config.adapter.kind == "lora" and not config.adapter.dora
-    token = (2 * hidden + 2 * width) * _number(config) if plain else 4 * hidden * FLOAT32
-    return _tokens(config, sizes, clips) * token
-
-
-def _tokens(config: Config, sizes: ModelSizes, clips: int) -> int:
-    """Return the tokens of all steps that the predictor sees at once."""
-    return clips * (config.data.frames - 1) * (_tokens_per_frame(sizes) + CONDITIONS + sizes.predictor.use_extrinsics)
-
-
-def _dora_temporaries(config: Config, sizes: ModelSizes) -> int:
-    """Return what PEFT makes to measure the rows of the largest weight: an identity, the update, and their sums."""
-    if not config.adapter.dora or config.adapter.kind == "none":
-        return 0
-    cast = HALF if _number(config) == HALF else 0
-    layers = linear_layers(sizes)
-    adapted = [layers[name] for name in adapter_ranks(config, sizes)]
-    return max(layer.inputs**2 * (FLOAT32 + cast) + layer.weight * (cast + 4 * FLOAT32) for layer in adapted)
-
-
-def _validating(config: Config, sizes: ModelSizes) -> int:
+def _validating(config: Config, sizes: ModelSizes, step: StepBytes) -> int:
     """Return the bytes of a batch of validation, without gradients.
 
-    Either it is encoded, or predicted: true latents, two predictions of them, and the larger of what a block makes of
-    all steps at once (MLP) and the keys and values that the rollout keeps of all steps but the last two.
+    Either it is encoded, or predicted: true latents, two predictions of them, and the larger of what a prediction of
+    all steps at once takes and the keys and values that the rollout keeps of all steps but the last two.
     """
     clips = config.validation.batch_size
-    latents, steps = _latents(config, sizes, clips), config.data.frames - 1
-    cached = 2 * sizes.predictor.depth * sizes.predictor.width * _number(config)
-    cached *= _tokens(config, sizes, clips) * (steps - 1) // steps
-    return latents + max(_encoding(config, sizes, clips), 2 * latents + max(cached, _temporaries(config, sizes, clips)))
+    latents = _latents(config, sizes, clips)
+    return latents + max(_encoding(config, sizes, clips), 2 * latents + max(step.cached, step.predicting))

@@ -1,16 +1,15 @@
-"""Parameter counts: how many a model has, and which are trained. By arithmetic: no model is built."""
+"""Parameter counts: how many a model has, and which are trained. By arithmetic, as `flops`: no model is built."""
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
-from vjepa2_ac.config import AdapterConfig, Config, ModelSizes
+from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.episode import EXTRINSICS_DIM
+from vjepa2_ac.model.adapter.targets import ATTENTION, MLP, rank_of
 
 CONDITIONS = 2  # tokens of a step besides its patches: action and state
 
-_ATTENTION, _MLP = ("q", "k", "v", "o"), ("fc1", "fc2")
 _TUBELET = 2  # frames that the encoder's first layer takes at once
 
 
@@ -71,7 +70,7 @@ def linear_layers(sizes: ModelSizes) -> dict[str, Layer]:
         "extrinsics_encoder": Layer(EXTRINSICS_DIM, width),
     }
     for index in range(sizes.predictor.depth):
-        layers |= {f"blocks.{index}.attn.{name}": Layer(width, width) for name in _ATTENTION}
+        layers |= {f"blocks.{index}.attn.{name}": Layer(width, width) for name in ATTENTION}
         layers[f"blocks.{index}.mlp.fc1"] = Layer(width, hidden)
         layers[f"blocks.{index}.mlp.fc2"] = Layer(hidden, width)
     layers["predictor_proj"] = Layer(width, latent)
@@ -85,15 +84,9 @@ def adapter_ranks(config: Config, sizes: ModelSizes) -> dict[str, int]:
         return {}
     names = [name for name in linear_layers(sizes) if sizes.predictor.use_extrinsics or name != "extrinsics_encoder"]
     everything = {_last(name) for name in names} - set(adapter.modules_to_save)
-    sets = {"attention": _ATTENTION, "mlp": _MLP, "all": tuple(everything)}
+    sets = {"attention": ATTENTION, "mlp": MLP, "all": tuple(everything)}
     targets = {layer for target in adapter.targets for layer in sets.get(target, (target,))}
-    return {name: _rank(adapter, name) for name in names if _last(name) in targets}
-
-
-def _rank(adapter: AdapterConfig, name: str) -> int:
-    """Return the rank that PEFT gives a layer: that of the first pattern that fits the end of its name."""
-    fitting = (rank for pattern, rank in adapter.rank_pattern.items() if re.match(rf"(.*\.)?({pattern})$", name))
-    return next(fitting, adapter.rank)
+    return {name: rank_of(adapter, name) for name in names if _last(name) in targets}
 
 
 def _predictor_tensors(sizes: ModelSizes, *, used_only: bool = False) -> list[int]:

@@ -1,0 +1,124 @@
+"""Fake models: the predictor of a run with what it trains, without numbers, memory or weights.
+
+The layers are those that train. Plain LoRA is built here from the product that it trains with, because PEFT and
+transformers take several seconds to import; DoRA and heads that are trained whole are PEFT's own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from vjepa2_ac.config import Config, ModelSizes
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.model.adapter.low_rank import LowRankLayer, low_rank_linear
+from vjepa2_ac.model.adapter.targets import lora_arguments, rank_of
+from vjepa2_ac.model.network.dynamics import LatentDynamics
+from vjepa2_ac.model.network.predictor_network import PredictorNetwork, predictor_fields
+from vjepa2_ac.model.network.rotary import rotary_tables
+
+
+class FakeModel(LatentDynamics):
+    """The predictor of a run on fake tensors, in training mode; only within `fake_tensors`.
+
+    Args:
+        config: The run.
+        sizes: Of its model.
+        predictor: What `meta_predictor` returned for both, outside of `fake_tensors`; its weights are replaced.
+    """
+
+    def __init__(self, config: Config, sizes: ModelSizes, predictor: nn.Module) -> None:
+        super().__init__()
+        self.sizes, self.predictor = sizes, predictor
+        frozen = torch.bfloat16 if config.model.dtype == "bfloat16" else torch.float32
+        for part in self.predictor.modules():
+            for name, old in part._parameters.items():
+                if old is not None:
+                    is_float = old.requires_grad or config.adapter.kind == "none"
+                    new = torch.empty(old.shape, dtype=torch.float32 if is_float else frozen, device="cpu")
+                    part._parameters[name] = nn.Parameter(new, old.requires_grad)
+        self.set_attention(config.training.attention)
+
+    def batch(self, clips: int, frames: int) -> LatentBatch:
+        """Return so many clips of latents."""
+        sizes = self.sizes
+        latents = torch.empty(clips, frames, (sizes.image_size // sizes.patch_size) ** 2, sizes.encoder.width)
+        states = torch.empty(clips, frames, sizes.predictor.state_dim)
+        actions = torch.empty(clips, frames - 1, sizes.predictor.action_dim)
+        extrinsics = torch.empty(clips, frames, 6) if sizes.predictor.use_extrinsics else None
+        return LatentBatch(latents, states, actions, extrinsics, ("",) * clips, (0,) * clips)
+
+
+@contextmanager
+def fake_tensors() -> Iterator[None]:
+    """Let tensors have shapes and types only; tables that are cached between calls do not get in or out."""
+    rotary_tables.cache_clear()
+    try:
+        with FakeTensorMode():
+            yield
+    finally:
+        rotary_tables.cache_clear()
+
+
+def meta_predictor(config: Config, sizes: ModelSizes) -> nn.Module:
+    """Return the predictor with what a run trains, on the meta device, in float32; the rest is frozen.
+
+    Raises:
+        InputError: A knob of the adapter does not fit the predictor.
+    """
+    unused = () if sizes.predictor.use_extrinsics else ("extrinsics_encoder",)
+    adapter = config.adapter
+    with torch.device("meta"):
+        predictor = _Network(sizes)
+        if adapter.kind == "none":
+            for name in unused:
+                predictor.get_submodule(name).requires_grad_(False)
+            return predictor
+        predictor.requires_grad_(False)
+        if adapter.dora or adapter.modules_to_save:
+            from vjepa2_ac.model.adapter.lora import with_adapter
+
+            return with_adapter(predictor, adapter, unused)
+        targets = lora_arguments(predictor, adapter, unused)["target_modules"]
+        for name, layer in list(predictor.named_modules()):
+            if isinstance(layer, nn.Linear) and name.rpartition(".")[2] in targets:
+                predictor.set_submodule(name, _PlainLora(layer, rank_of(adapter, name), adapter.dropout))
+    return predictor
+
+
+class _Network(PredictorNetwork):
+    def __init__(self, sizes: ModelSizes) -> None:
+        super().__init__()
+        self.config = SimpleNamespace(**predictor_fields(sizes))
+        self.add_layers(self.config)
+
+
+class _PlainLora(LowRankLayer, nn.Module):
+    """What `LoraLinear` computes of plain LoRA, without PEFT."""
+
+    def __init__(self, layer: nn.Linear, rank: int, dropout: float) -> None:
+        super().__init__()
+        self.layer, self.dropout = layer, nn.Dropout(dropout) if dropout else None
+        self.first = nn.Parameter(torch.empty(rank, layer.in_features))
+        self.second = nn.Parameter(torch.empty(layer.out_features, rank))
+
+    def forward(self, tokens: Float[Tensor, "*batch inputs"]) -> Tensor:
+        """Return the output of the layer and its adapter for each token."""
+        under_autocast = torch.is_autocast_enabled("cpu")
+        dtype = torch.get_autocast_dtype("cpu") if under_autocast else tokens.dtype
+        return low_rank_linear(tokens.to(dtype), self.layer, self, self.dropout, scale=1.0)
+
+    @property
+    def weight(self) -> Tensor:
+        """The frozen layer's."""
+        return self.layer.weight
+
+    def matrices(self) -> tuple[Tensor, ...]:
+        """Return the two matrices."""
+        return self.first, self.second
