@@ -33,6 +33,7 @@ OTHERS = {
     "data.augment.crop_scale": (0.5, 1.0),
     "data.stride_candidates": (2, 3),
     "planning.budget_s": 1.0,
+    "planning.limits.axes": (0.1,),
     "data.idle.ranges": "ranges.json",
     "data.fields.cameras": {"exterior_1_left": "steps/observation/exterior_image_2_left"},
     "data.lerobot.state": ("observation.state.gripper_position", "observation.state.cartesian_position"),

@@ -12,7 +12,7 @@ import pytest
 
 from recordings import write_mp4
 from synthetic import draw_frame, synthetic_states
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.media import video_reader
 from vjepa2_ac.media.frame_targets import FrameTargets
 from vjepa2_ac.media.video_reader import Clock, count_frames, read_frames
@@ -183,7 +183,7 @@ def test_no_steps_or_one_before_the_first_are_the_programmers_errors(tmp_path: P
 
 def test_without_pyav_the_way_to_install_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(InputError, match=r"pip install .*\[video\]"):
+    with pytest.raises(UnreachableError, match=r"pip install .*\[video\]"):
         read_frames(tmp_path / "a.mp4", [0], where="a")
 
 
@@ -207,5 +207,7 @@ def test_a_clock_too_coarse_for_its_frames_shows_none_twice(tmp_path: Path) -> N
     scale = data.index(b"mdhd") + 16
     data[scale : scale + 4] = bytes(4)
     path.write_bytes(data)
-    with pytest.raises(InputError, match=r"times in units of 1 s for 15 frames a second\. needed: a time for each"):
+    with pytest.raises(
+        UnreachableError, match=r"times in units of 1 s for 15 frames a second\. needed: a time for each"
+    ):
         read_frames(path, [0, 5], where="a", clock=Clock(0.0, 15.0))

@@ -11,7 +11,7 @@ from torch.nn.functional import layer_norm
 from vjepa2_ac.config import AdapterConfig, EncoderSizes, ModelSizes, PredictorSizes
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.model.adapter.lora import add_adapter
-from vjepa2_ac.model.network import world_model
+from vjepa2_ac.model.network import dynamics
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.training.loss import prediction_losses
 
@@ -77,7 +77,7 @@ def with_gradients(model: WorldModel, parts: Any) -> list[Tensor]:
 @pytest.fixture
 def exact(monkeypatch: pytest.MonkeyPatch) -> None:
     """Float64 throughout: predictions are normalised in float32 otherwise, whatever the weights."""
-    monkeypatch.setattr(world_model, "_normalise", lambda features: layer_norm(features, features.shape[-1:]))
+    monkeypatch.setattr(dynamics, "normalise_latents", lambda features: layer_norm(features, features.shape[-1:]))
 
 
 def distance(predicted: Tensor, true: Tensor) -> Tensor:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.model.checkpoints import download as module
 from vjepa2_ac.model.checkpoints.download import download
 from vjepa2_ac.storage.remote.retries import RetryPolicy
@@ -96,7 +96,7 @@ def test_a_part_from_an_earlier_call_is_gone_on_with(serve, tmp_path: Path) -> N
     behaviour = Behaviour(cut_after=[1000], answers=[])
     url = serve(behaviour)
     behaviour.cut_after = [1000, 0, 0]
-    with pytest.raises(InputError, match=r"not reached in 2 attempts.*1000 bytes are in .*model\.pt\.part"):
+    with pytest.raises(UnreachableError, match=r"not reached in 2 attempts.*1000 bytes are in .*model\.pt\.part"):
         download(url, tmp_path / "model.pt", policy=twice)
     assert not (tmp_path / "model.pt").exists()
     assert download(url, tmp_path / "model.pt").read_bytes() == CONTENT
@@ -121,7 +121,7 @@ def test_a_server_that_cannot_resume_sends_everything_again(serve, tmp_path: Pat
 
 def test_a_busy_server_is_asked_again_and_given_up_on_in_the_end(serve, tmp_path: Path) -> None:
     assert download(serve(Behaviour(answers=[503, 503])), tmp_path / "a.pt", policy=at_once).read_bytes() == CONTENT
-    with pytest.raises(InputError, match=r"not reached in 3 attempts.*HTTP 503: .*Service Unavailable"):
+    with pytest.raises(UnreachableError, match=r"not reached in 3 attempts.*HTTP 503: .*Service Unavailable"):
         download(
             serve(Behaviour(answers=[503] * 3)), tmp_path / "b.pt", policy=RetryPolicy(attempts=3, first_wait_s=0.0)
         )
@@ -129,14 +129,14 @@ def test_a_busy_server_is_asked_again_and_given_up_on_in_the_end(serve, tmp_path
 
 def test_a_refusal_is_final(serve, tmp_path: Path) -> None:
     behaviour = Behaviour(answers=[404])
-    with pytest.raises(InputError, match=r"cannot be read \(HTTP 404: .*Not Found"):
+    with pytest.raises(UnreachableError, match=r"cannot be read \(HTTP 404: .*Not Found"):
         download(serve(behaviour), tmp_path / "model.pt", policy=at_once)
     assert behaviour.seen == [0]
     assert list(tmp_path.iterdir()) == []
 
 
 def test_no_network_is_said_clearly(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"not reached in 2 attempts.*refused.* Check the network"):
+    with pytest.raises(UnreachableError, match=r"not reached in 2 attempts.*refused.* Check the network"):
         download("http://127.0.0.1:9/model.pt", tmp_path / "model.pt", policy=twice)
 
 
