@@ -355,7 +355,7 @@ def test_merged_it_predicts_the_same_and_is_a_plain_model_again(
     model = trained(config, dtype)
     adapted = predict(model, inputs)
     merge_adapter(model)
-    rounding = 1e-5 if dtype == torch.float32 else 0.15
+    rounding = 3e-5 if dtype == torch.float32 else 0.15  # of predictions near 1; PyTorch 2.11 rounds by 1.6e-5
     torch.testing.assert_close(predict(model, inputs), adapted, rtol=0, atol=rounding)
     assert type(model.predictor) is ActionConditionedPredictor
     assert {value.dtype for value in model.parameters()} == {dtype}
