@@ -36,9 +36,14 @@ def actions_from_states(states: Float[np.ndarray, "time 7"]) -> Float[np.ndarray
     """
     if len(states) < 2:
         raise ValueError(f"an action needs two states; got {len(states)}")
-    rotations = matrices_from_euler(states[:, 3:6])
-    delta = euler_from_matrices(rotations[1:] @ rotations[:-1].swapaxes(-1, -2))
+    delta = rotation_differences(states[:, 3:6])
     return np.concatenate([np.diff(states[:, :3], axis=0), delta, np.diff(states[:, 6:], axis=0)], axis=-1)
+
+
+def rotation_differences(angles: Float[np.ndarray, "time 3"]) -> Float[np.ndarray, "time-1 3"]:
+    """Return R[t+1] @ R[t].T as extrinsic xyz Euler angles."""
+    rotations = matrices_from_euler(angles)
+    return euler_from_matrices(rotations[1:] @ rotations[:-1].swapaxes(-1, -2))
 
 
 def apply_action(

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.geometry import euler_from_matrices, matrices_from_euler
+from vjepa2_ac.geometry import rotation_differences
 
 REACH_M = 5.0  # larger positions are not in metres
 ANGLE_RAD = 2 * math.pi + 0.1  # larger angles are not in radians
@@ -39,8 +39,8 @@ class Space:
 
     @property
     def is_pose(self) -> bool:
-        """Whether it has all parts of a pose in space: position, rotation and gripper."""
-        return self.gripper is not None and self.rotation is not None and self.position == slice(0, 3)
+        """Whether it has the parts of a pose, position, rotation and gripper, where a pose has them."""
+        return (self.position, self.rotation, self.gripper) == (slice(0, 3), slice(3, 6), 6)
 
     @property
     def sized(self) -> slice:
@@ -83,8 +83,7 @@ class StateSpace(Space):
             raise ValueError(f"a difference needs two states; got {len(states)}")
         changes = np.diff(states, axis=0)
         if self.rotation is not None:
-            rotations = matrices_from_euler(states[:, self.rotation])
-            changes[:, self.rotation] = euler_from_matrices(rotations[1:] @ rotations[:-1].swapaxes(-1, -2))
+            changes[:, self.rotation] = rotation_differences(states[:, self.rotation])
         return changes
 
     def require_plausible(self, states: Float[np.ndarray, "steps dim"], where: str, *, fix: str = "") -> None:

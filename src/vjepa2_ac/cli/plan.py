@@ -116,19 +116,19 @@ def _plan(options: argparse.Namespace) -> int:
 
     question = PlanRequest(images.start, state, images.goals, durations, images.mask)
     say_places_elsewhere(options.subject)
-    steering = load_to_plan(
+    session = load_to_plan(
         options.subject, checkpoint=options.checkpoint, config=options.config, overrides=options.overrides
     )
     if not options.durations:
-        question = question.with_equal_durations(steering.config.planning.horizon)
+        question = question.with_equal_durations(session.config.planning.horizon)
     with ConsoleReporter() as reporter:
         progress = reporter.task("planning, iterations")
-        controller = steering.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
+        controller = session.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
         found = decide(controller, question, nodes=options.nodes)
     images_given = {"start": options.start, "goals": options.goal, "mask": options.mask}
     with user_can_write(options.out):
         written = [
-            write_plan(found, steering.as_dict() | images_given, options.out / PLAN_FILE),
+            write_plan(found, session.as_dict() | images_given, options.out / PLAN_FILE),
             plot_plan(found, options.out / PLAN_IMAGE),
         ]
     console.print(plan_table(found))

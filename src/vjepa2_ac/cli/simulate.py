@@ -171,7 +171,7 @@ def _steer(options: argparse.Namespace) -> int:
         films=min(options.films, options.episodes),
         renderer=options.renderer,
     )
-    steering = load_to_plan(
+    session = load_to_plan(
         options.subject, checkpoint=options.checkpoint, config=options.config, overrides=options.overrides
     )
     name = f"closed_loop/{asked.task}-{asked.domain}"
@@ -180,9 +180,9 @@ def _steer(options: argparse.Namespace) -> int:
     home = Path(options.subject) if is_run(options.subject) else Path()
     folder = options.out or home / name
     with ConsoleReporter() as reporter:
-        contest, files = run_benchmark(steering, asked, folder, reporter)
-    if steering.checkpoint:
-        console.print(f"{options.subject}: checkpoint {steering.checkpoint}")
+        contest, files = run_benchmark(session, asked, folder, reporter)
+    if session.checkpoint:
+        console.print(f"{options.subject}: checkpoint {session.checkpoint}")
     console.print(contest_table(contest))
     for note in contest_notes(contest):
         console.print(note)

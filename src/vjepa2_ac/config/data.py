@@ -124,7 +124,7 @@ class DataConfig(Section):
     same_identity_fix: ClassVar[str] = ""  # the way out where two episodes are named alike
     gripper_fix: ClassVar[str] = "write 1 - gripper"  # the way out where the gripper is inverted
 
-    source: Annotated[str, Affects.INDEX | Affects.IDLE | Affects.LATENTS | Affects.RUN]
+    source: Annotated[str, Affects.FORM]
     """Form of the data set."""
     path: Annotated[Place, Affects.NOTHING]
     """Folder of the data set: on this machine, or a URL such as gs://bucket/folder or hf://datasets/owner/name. A run

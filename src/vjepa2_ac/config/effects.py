@@ -27,7 +27,8 @@ class Affects(Flag):
     RUN = auto()  # what a run computes: it does not go on with another value
     PLAN = auto()  # a decision: planning has no use for the others
     CLIPS = LATENTS | MEASURED | RUN
-    EPISODES = INDEX | IDLE | CLIPS
+    FORM = INDEX | IDLE | LATENTS | RUN
+    EPISODES = FORM | CLIPS
 
 
 @cache

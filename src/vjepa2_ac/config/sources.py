@@ -96,9 +96,6 @@ class LeRobotFields(Section):
         return self
 
 
-_KIND = Affects.INDEX | Affects.IDLE | Affects.LATENTS | Affects.RUN
-
-
 class RldsData(DataConfig):
     """TFRecord shards with a dataset_info.json, as TFDS writes them."""
 
@@ -107,7 +104,7 @@ class RldsData(DataConfig):
     gripper_fix: ClassVar[str] = "set data.fields.gripper to the other convention"
     same_identity_fix: ClassVar[str] = "Add a feature to data.fields.identity that differs between them"
 
-    source: Annotated[Literal["rlds"], _KIND] = "rlds"
+    source: Annotated[Literal["rlds"], Affects.FORM] = "rlds"
     """rlds: TFRecord shards with a dataset_info.json, as TFDS writes them."""
     fields: RldsFields = RldsFields()
     """Names of the features."""
@@ -134,7 +131,7 @@ class RawDroidData(DataConfig):
     reader: ClassVar[str] = "vjepa2_ac.data.sources.droid_raw.source:RawDroidSource"
     has_vectors: ClassVar[bool] = False
 
-    source: Annotated[Literal["droid_raw"], _KIND] = "droid_raw"
+    source: Annotated[Literal["droid_raw"], Affects.FORM] = "droid_raw"
     """droid_raw: DROID's folders with trajectory.h5 and MP4."""
     droid_raw: RawDroidOptions = RawDroidOptions()
     """Which steps are used."""
@@ -157,7 +154,7 @@ class LeRobotData(DataConfig):
     gripper_fix: ClassVar[str] = "exchange data.lerobot.gripper_open and gripper_closed"
     has_camera_poses: ClassVar[bool] = False
 
-    source: Annotated[Literal["lerobot"], _KIND] = "lerobot"
+    source: Annotated[Literal["lerobot"], Affects.FORM] = "lerobot"
     """lerobot: LeRobotDataset v2.1 or v3.0."""
     lerobot: LeRobotFields = LeRobotFields()
     """Names and conventions of the columns."""
@@ -188,7 +185,7 @@ class NpzData(DataConfig):
 
     reader: ClassVar[str] = "vjepa2_ac.data.sources.npz.source:NpzSource"
 
-    source: Annotated[Literal["npz"], _KIND] = "npz"
+    source: Annotated[Literal["npz"], Affects.FORM] = "npz"
     """npz: a folder of .npz episodes."""
 
     @property
@@ -204,7 +201,7 @@ class LatentsData(DataConfig):
     is_cache: ClassVar[bool] = True
     gripper_fix: ClassVar[str] = "change the convention of the data set that the cache was made from"
 
-    source: Annotated[Literal["latents"], _KIND] = "latents"
+    source: Annotated[Literal["latents"], Affects.FORM] = "latents"
     """latents: a latent cache alone, without the data set that it was made from."""
 
     @property

@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
@@ -125,13 +126,29 @@ class Controller:
         """
         its = run.config if config is None else run.config.model_copy(update={"planning": config})
         its = with_taught_limits(its, Path(its.run_dir))
+        return cls.of_config(run.world_model, its, seed=seed, extrinsics=extrinsics)
+
+    @classmethod
+    def of_config(
+        cls,
+        world_model: WorldModel,
+        config: Config,
+        *,
+        seed: int | None = None,
+        extrinsics: Float[np.ndarray, " 6"] | None = None,
+    ) -> Controller:
+        """Return the controller of a model by a config: its settings, crop, spaces and, unless another is given, seed.
+
+        Raises:
+            InputError: As `Controller`.
+        """
         return cls(
-            run.world_model,
-            its.planning,
-            seed=its.seed if seed is None else seed,
-            crop=its.data.crop,
+            world_model,
+            config.planning,
+            seed=config.seed if seed is None else seed,
+            crop=config.data.crop,
             extrinsics=extrinsics,
-            spaces=spaces_of(its.data, widths_of_model(run.world_model.sizes)),
+            spaces=spaces_of(config.data, widths_of_model(world_model.sizes)),
         )
 
     @property

@@ -13,13 +13,11 @@ from jaxtyping import Float
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
-from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.distributed.device import has_bf16, is_on_cpu, require_type_of_weights
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.planning.controller import Controller
@@ -73,14 +71,7 @@ class PlanningSession:
         Raises:
             InputError: As `Controller`.
         """
-        controller = Controller(
-            self.world_model,
-            self.config.planning,
-            seed=self.config.seed if seed is None else seed,
-            crop=self.config.data.crop,
-            extrinsics=extrinsics,
-            spaces=spaces_of(self.config.data, widths_of_model(self.world_model.sizes)),
-        )
+        controller = Controller.of_config(self.world_model, self.config, seed=seed, extrinsics=extrinsics)
         controller.planner.progress = progress
         return controller
 

@@ -64,12 +64,12 @@ class ClosedLoopBenchmark:
 
 
 def run_benchmark(
-    steering: PlanningSession, asked: BenchmarkOptions, folder: Path, reporter: Reporter = SILENT
+    session: PlanningSession, asked: BenchmarkOptions, folder: Path, reporter: Reporter = SILENT
 ) -> tuple[ClosedLoopBenchmark, tuple[Path, ...]]:
     """Let all four solve the same problems; write closed_loop.json and the video. Cheap failures first.
 
     Args:
-        steering: The model and its planning settings; its `data.stride` is the length of a model step.
+        session: The model and its planning settings; its `data.stride` is the length of a model step.
         asked: The options.
         folder: The output folder; created if it is missing.
         reporter: Shows the progress of each policy.
@@ -78,7 +78,7 @@ def run_benchmark(
         InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, or a folder that is not
             writable.
     """
-    stride = steering.config.data.stride
+    stride = session.config.data.stride
     if stride == "auto":
         raise InputError(
             where="data.stride",
@@ -86,37 +86,37 @@ def run_benchmark(
             needed="a number of control steps, to steer",
             fix="Say which, as data.stride=4",
         )
-    if steering.config.data.pose_frame != "base":
+    if session.config.data.pose_frame != "base":
         raise InputError(
-            where=f"data.pose_frame: {steering.config.data.pose_frame}",
+            where=f"data.pose_frame: {session.config.data.pose_frame}",
             found="a model of states in another frame",
             needed="base: the simulated arm is steered in the frame of its base",
         )
-    _require_measured(steering)
+    _require_measured(session)
     if asked.films:
         video_library()
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
     arm = arm_for(asked.task, named_domain(asked.domain), renderer=asked.renderer)
     results = []
-    for policy in _policies(steering, asked, arm):
+    for policy in _policies(session, asked, arm):
         films = asked.films if isinstance(policy, Planning) else 0
         spec = RolloutSpec(asked.task, arm.domain, asked.episodes, asked.seed, asked.steps, stride, films)
         results.append(run_task(spec, policy, arm, reporter.task(f"{asked.task}: {policy.name}")))
     contest = ClosedLoopBenchmark(
-        steering.subject,
-        steering.checkpoint,
+        session.subject,
+        session.checkpoint,
         asked,
-        steering.config.planning.model_dump(mode="json"),
-        steering.config.seed,
+        session.config.planning.model_dump(mode="json"),
+        session.config.seed,
         tuple(results),
     )
     return contest, _written(contest, folder)
 
 
-def _require_measured(steering: PlanningSession) -> None:
+def _require_measured(session: PlanningSession) -> None:
     """Refuse a model of vectors that are not what the simulated arm measures."""
-    data = steering.config.data
+    data = session.config.data
     if data.states == "vector" and not (isinstance(data, RldsData) and data.fields.state == JOINT_FIELDS):
         raise InputError(
             where="data.states: vector",
@@ -146,11 +146,11 @@ def benchmark_as_dict(contest: ClosedLoopBenchmark) -> dict[str, Any]:
     }
 
 
-def _policies(steering: PlanningSession, asked: BenchmarkOptions, arm: SimulatedArm) -> Sequence[Policy]:
-    limits = steering.config.planning.limits
-    uses_camera = steering.world_model.sizes.predictor.use_extrinsics
-    controller = steering.controller(extrinsics=arm.extrinsics() if uses_camera else None)
-    name = Path(steering.subject).name or steering.subject
+def _policies(session: PlanningSession, asked: BenchmarkOptions, arm: SimulatedArm) -> Sequence[Policy]:
+    limits = session.config.planning.limits
+    uses_camera = session.world_model.sizes.predictor.use_extrinsics
+    controller = session.controller(extrinsics=arm.extrinsics() if uses_camera else None)
+    name = Path(session.subject).name or session.subject
     taken = {DoNothing.name, RandomActions.name, Oracle.name}
     model = Planning(controller, name if name not in taken else f"model {name}")
     return model, DoNothing(), RandomActions(limits, seed=asked.seed), oracle_for(asked.task, limits, arm)
