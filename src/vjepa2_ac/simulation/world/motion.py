@@ -27,6 +27,7 @@ class MotionRecipe:
 
     stride: int = 4  # control steps per model step
     reach_m: float = 0.075  # largest displacement per axis and model step
+    drift_m: tuple[float, float, float] | None = None  # displacement of every model step, instead of a random one
     low_m: tuple[float, float, float] = (0.32, -0.24, 0.20)
     high_m: tuple[float, float, float] = (0.60, 0.24, 0.48)
     turn_rad: float = 0.12  # largest rotation about the vertical per model step
@@ -116,10 +117,11 @@ def _waypoints(
 ) -> tuple[Float[np.ndarray, "ways 3"], Float[np.ndarray, " ways"], Float[np.ndarray, " ways"]]:
     """Return positions, rotations about the vertical and closedness; a step out of the box is mirrored back."""
     low, high = np.append(recipe.low_m, -recipe.max_turn_rad), np.append(recipe.high_m, recipe.max_turn_rad)
-    reach = np.array([recipe.reach_m] * 3 + [recipe.turn_rad])
-    points, closed = [rng.uniform(low, high)], [float(rng.uniform() < 0.5)]
+    drift = np.append(recipe.drift_m or np.zeros(3), 0.0)
+    reach = np.append(0.3 * drift[:3] if recipe.drift_m else [recipe.reach_m] * 3, recipe.turn_rad)
+    points, closed = [rng.uniform(low, high - ways * drift)], [float(rng.uniform() < 0.5)]
     for _ in range(ways):
-        way = rng.uniform(-reach, reach)
+        way = drift + rng.uniform(-reach, reach)
         outside = (points[-1] + way < low) | (points[-1] + way > high)
         points.append(points[-1] + np.where(outside, -way, way))
         closed.append(1.0 - closed[-1] if rng.uniform() < recipe.gripper_share else closed[-1])
