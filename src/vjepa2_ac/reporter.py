@@ -43,7 +43,7 @@ class NullReporter:
     def stepped(self, step: int, metrics: Any) -> None:
         """Show nothing."""
 
-    def validated(self, step: int, errors: Any) -> None:
+    def validated(self, step: int, found: Any) -> None:
         """Show nothing."""
 
 

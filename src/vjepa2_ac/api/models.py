@@ -59,12 +59,12 @@ def load_model(
     return model.to(place).eval()
 
 
-def load_run(folder: str | Path, checkpoint: str | int = "newest", *, device: Device = _AUTO) -> loading.TrainedRun:
+def load_run(folder: str | Path, checkpoint: str | int = "selected", *, device: Device = _AUTO) -> loading.TrainedRun:
     """Load the model of a trained run, in eval mode: its base with the adapter of a complete checkpoint.
 
     Args:
         folder: The run, as `train` returns it.
-        checkpoint: newest, best (by validation), or a number of optimizer steps.
+        checkpoint: selected (the best by validation, else the newest), newest, best, or a number of optimizer steps.
         device: As of `load_model`. The type of the base's weights is the run's `model.dtype`.
 
     Returns:

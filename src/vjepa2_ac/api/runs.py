@@ -10,7 +10,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.estimates import over_persistence
 from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
-from vjepa2_ac.evaluation.result import PredictionErrors
+from vjepa2_ac.evaluation.result import Validation
 from vjepa2_ac.reporter import NullReporter
 from vjepa2_ac.reports.write import Evaluated, evaluate_subject
 from vjepa2_ac.training import loop
@@ -58,7 +58,7 @@ def evaluate(
     data: Config | None = None,
     out: str | Path | None = None,
     clips: int = 256,
-    checkpoint: str | int = "newest",
+    checkpoint: str | int = "selected",
     probes: bool = True,
 ) -> Evaluated:
     """Measure a run or a model on held-out episodes, as `vjepa2-ac evaluate` does, and write the report.
@@ -70,7 +70,7 @@ def evaluate(
         data: A config with other data than the run's own; a model has none of its own.
         out: Folder for metrics.json, report.html and evaluation.png; None: the run's. Needed with `data`.
         clips: At most as many, spread over the test episodes.
-        checkpoint: Of a run: newest, best, or a number of optimizer steps.
+        checkpoint: Of a run: selected (the best, else the newest), newest, best, or a number of steps.
         probes: Whether the use of the actions is measured in detail, which takes most of the time: other actions,
             energy landscapes, examples.
 
@@ -118,6 +118,7 @@ class _Told(NullReporter):
         if self._on_step is not None:
             self._on_step(step, metrics)
 
-    def validated(self, step: int, errors: PredictionErrors) -> None:
-        by_horizon = ", ".join(f"{ratio.value:.3f}" for ratio in over_persistence(errors, "rollout"))
-        self._note(f"Validation at step {step}: error over persistence by horizon {by_horizon}")
+    def validated(self, step: int, found: Validation) -> None:
+        by_horizon = ", ".join(f"{ratio.value:.3f}" for ratio in over_persistence(found.errors, "rollout"))
+        ranked = f"; mean rank of the true action {found.ranking.rank}" if found.ranking else ""
+        self._note(f"Validation at step {step}: error over persistence by horizon {by_horizon}{ranked}")

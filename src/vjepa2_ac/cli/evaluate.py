@@ -39,9 +39,9 @@ def add_checkpoint(parser: argparse._ActionsContainer) -> None:
     """Add the option that selects a checkpoint of a run."""
     parser.add_argument(
         "--checkpoint",
-        default="newest",
-        metavar="newest|best|STEP",
-        help="which one: the newest (default), the best by validation, or that of a step",
+        default="selected",
+        metavar="selected|newest|best|STEP",
+        help="which one: the selected (default: the best by validation, else the newest), or that of a step",
     )
 
 

@@ -26,7 +26,7 @@ _STEERING = {
     "steps": None,
     "task": "reach",
     "films": 6,
-    "checkpoint": "newest",
+    "checkpoint": "selected",
     "config": None,
     "out": None,
 }

@@ -64,6 +64,10 @@ class Config(Section):
             raise ValueError("training.compile blocks cannot trace adapter.dora; set one of them off")
         if self.training.cuda_graph and (self.training.precision == "fp16" or self.adapter.dropout):
             raise ValueError("training.cuda_graph needs adapter.dropout 0, and bf16 or fp32")
+        if self.checkpoint.keep_best == "ranking" and not self.validation.ranking_clips:
+            raise ValueError("checkpoint.keep_best ranking needs validation.ranking_clips of 1 or more")
+        if self.training.patience is not None and self.checkpoint.keep_best == "off":
+            raise ValueError("training.patience waits for a better checkpoint, and checkpoint.keep_best is off")
         sizes = self.model.random or self.model.sizes
         if sizes.predictor.use_extrinsics and not self.data.has_camera_poses:
             raise ValueError(

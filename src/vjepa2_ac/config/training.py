@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.section import OFF, Place, PositiveInt, Section
+
+
+def _earlier_keep_best(value: object) -> object:
+    """Accept what earlier versions wrote: true was by error. YAML reads off as false."""
+    return {True: "error", False: "off"}[value] if isinstance(value, bool) else value
 
 
 class TrainingConfig(Section):
@@ -69,6 +74,8 @@ class TrainingConfig(Section):
     """auto: CUDA where there is one."""
     allow_weak_base: Annotated[bool, Affects.NOTHING] = False
     """Train even if the base is no better than persistence (copy the last frame) on the validation clips."""
+    patience: Annotated[PositiveInt | None, Affects.NOTHING] = None
+    """Validations without a better one (`checkpoint.keep_best`) after which training ends; null: all steps are done."""
     log_every: Annotated[PositiveInt, Affects.NOTHING] = 10
     """Optimizer steps between lines in metrics.jsonl."""
 
@@ -102,6 +109,13 @@ class ValidationConfig(Section):
     """Clips of held-out episodes, always the same ones."""
     batch_size: Annotated[int, Field(ge=2)] = 4
     """Clips that are evaluated at once."""
+    ranking_clips: Annotated[int, Field(ge=0), Affects.MEASURED] = 32
+    """Of these clips, how many have the true action of a move ranked among others: what planning needs (docs/
+    evaluation.md). Two moves each, as large as planned ones, forwards and backwards. 0: none."""
+    ranking_samples: Annotated[PositiveInt, Affects.MEASURED] = 32
+    """Other actions per move, drawn in each of two ways: in a box, and of the same length in any direction."""
+    ranking_reach_cm: Annotated[float, Field(gt=0.0, le=100.0), Affects.MEASURED] = 7.5
+    """Half the width of the box along x, y and z: as far as plans should move in a model step."""
 
 
 class CheckpointConfig(Section):
@@ -113,8 +127,13 @@ class CheckpointConfig(Section):
     """Minutes after which a checkpoint is written in any case; null: by steps only."""
     keep: PositiveInt = 5
     """Number of newest checkpoints that are kept."""
-    keep_best: bool = True
-    """Write one after the best validation (rollout error over persistence at the last horizon), and keep it."""
+    keep_best: Annotated[Literal["ranking", "error", "off"], BeforeValidator(_earlier_keep_best), Affects.MEASURED] = (
+        "ranking"
+    )
+    """By what the best checkpoint is selected; it is written and kept, and evaluated, exported and planned with unless
+    another is asked for. ranking: the lowest mean rank of the true action (`validation.ranking_clips`), the base being
+    a candidate: a lower error may go with worse plans. error: the rollout error over persistence at the last horizon,
+    as earlier versions did. off: the newest counts."""
     remote: Place | None = None
     """Where the run is copied to during training: gs://bucket/folder, another URL of fsspec that can be written, or a
     folder (a mounted disk). A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from vjepa2_ac.console.progress import ConsoleReporter, console
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.result import ACTIONS, PredictionErrors
+from vjepa2_ac.evaluation.result import ACTIONS, Validation
 
 _MUCH_WAITING = 0.2  # share of a step's time; above it more data.workers, or a nearer copy of the data, would help
 
@@ -34,8 +34,9 @@ class TrainingConsole(ConsoleReporter):
             words.append(f"waits for data {metrics['data_wait_share']:.0%} of the time")
         self._bar(step, self._steps, "  ".join(word for word in words if word))
 
-    def validated(self, step: int, errors: PredictionErrors) -> None:
+    def validated(self, step: int, found: Validation) -> None:
         """Print a line of the validation's metrics."""
+        errors = found.errors
         true, zero, shuffled = (one_step_over_persistence(errors, actions).value for actions in ACTIONS)
         self._validation = f"error/persistence {true:.3f}"
         horizons = "  ".join(f"{h}: {r.value:.3f}" for h, r in enumerate(over_persistence(errors, "rollout"), start=1))
@@ -44,3 +45,9 @@ class TrainingConsole(ConsoleReporter):
             f" (zero actions {zero:.3f}, shuffled {shuffled:.3f});"
             f" rollout by horizon  {horizons}"
         )
+        if found.ranking is not None:
+            ranking = found.ranking
+            console.print(
+                f"  mean rank of the true action {ranking.rank} (0 best, 0.5 chance): in a box {ranking.box.value:.3f},"
+                f" among other directions {ranking.shell.value:.3f}; spread of the energy {ranking.spread.value:.3f}"
+            )

@@ -10,7 +10,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, config_from
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_score.protocol import FRAMES
-from vjepa2_ac.runs.checkpoint_selection import NEWEST
+from vjepa2_ac.runs.checkpoint_selection import SELECTED
 from vjepa2_ac.runs.folder import is_run, read_run_config
 from vjepa2_ac.runs.relative_paths import DATA, with_paths_from_start
 
@@ -36,7 +36,7 @@ class EvaluationOptions:
 
     split: Split = "test"
     clips: int = 256  # at most, spread over the episodes
-    checkpoint: str = NEWEST  # of a run: newest, best, or a number of optimizer steps
+    checkpoint: str = SELECTED  # of a run: selected, newest, best, or a number of optimizer steps
     data: Config | None = None  # data other than the run's own; a model has none of its own
     against: tuple[str, ...] | None = None  # base, runs, models; None: the base of a run, nothing for a model
     out: Path | None = None  # output folder; None: the run's

@@ -114,6 +114,32 @@ class Sensitivity:
 
 
 @dataclass(frozen=True)
+class ActionRanking:
+    """The rank of the true action by energy among those that a planner would try: what planning needs of a model.
+
+    It is measured on moves (`one_step.moves_of`) that are as large as planned ones, forwards and backwards in time.
+    Chance: 0.5; a perfect model: 0. Two of the same moves may be compared pair by pair.
+    """
+
+    samples: int  # others per move, in the box and on the shell
+    reach: float  # half the width of the box along each of x, y, z, in metres
+    episode_ids: tuple[str, ...]  # of each move
+    ranks: Float[np.ndarray, " moves"]  # mean of the two
+    rank: Estimate
+    box: Estimate  # among actions that are uniform in the box
+    shell: Estimate  # among actions as long as the true one, in any direction: tells direction from "nothing moves"
+    spread: Estimate  # standard deviation of the energy over the box, over the energy now; 0: nothing to plan by
+
+
+@dataclass(frozen=True)
+class Validation:
+    """What a validation of a run measures."""
+
+    errors: PredictionErrors
+    ranking: ActionRanking | None  # None: not asked for
+
+
+@dataclass(frozen=True)
 class Landscape:
     """The L1 energy of one clip's first step over a grid of (dx, dy, dz); the rest of the action is the true one.
 

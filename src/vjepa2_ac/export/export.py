@@ -25,7 +25,7 @@ from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import ADAPTER, read_state
-from vjepa2_ac.runs.checkpoint_selection import NEWEST
+from vjepa2_ac.runs.checkpoint_selection import SELECTED
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import TrainedRun, load_run
 from vjepa2_ac.runs.torch_file import write_torch
@@ -46,7 +46,7 @@ class Exported:
     checkpoint: str  # the one it was made from, as text
 
 
-def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoint: str = NEWEST) -> Exported:
+def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoint: str = SELECTED) -> Exported:
     """Export a trained run, atomically.
 
     An adapter is merged in float32, then cast to the type of the base's weights (`model.dtype`).
@@ -56,7 +56,7 @@ def export_run(folder: Path, destination: Path, form: Form = "merged", checkpoin
         destination: A new or empty folder; for official also a file ending in `.pt`, which must not exist.
         form: merged: the model as a folder, which `model.base` takes. official: one `.pt` with Meta's names, q, k
             and v fused, for the official code. hub: the adapter in PEFT's format with a model card, ready to upload.
-        checkpoint: newest, best (by validation), or a number of optimizer steps.
+        checkpoint: selected (the best, else the newest), newest, best, or a number of optimizer steps.
 
     Raises:
         InputError: As `load_run`; the destination is occupied or cannot be written; official: the model is of another

@@ -22,7 +22,7 @@ from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.settings import planning_settings
-from vjepa2_ac.runs.checkpoint_selection import NEWEST
+from vjepa2_ac.runs.checkpoint_selection import SELECTED
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.storage.structured import utc_now
@@ -96,7 +96,7 @@ class PlanningSession:
 
 
 def load_to_plan(
-    subject: str, *, checkpoint: str = NEWEST, config: str | Path | None = None, overrides: Sequence[str] = ()
+    subject: str, *, checkpoint: str = SELECTED, config: str | Path | None = None, overrides: Sequence[str] = ()
 ) -> PlanningSession:
     """Load a run or a model for planning.
 
@@ -106,7 +106,7 @@ def load_to_plan(
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
-        checkpoint: Of a run: newest, best, or a number of optimizer steps.
+        checkpoint: Of a run: selected, newest, best, or a number of optimizer steps.
         config: A config file, for a model.
         overrides: Such as planning.horizon=2.
 
@@ -121,7 +121,7 @@ def load_to_plan(
         known = Fingerprints.of(run.world_model)
         merge_adapter(run.world_model)
         return PlanningSession(run.world_model.to(device).eval(), its, subject, run.chosen, known)
-    if checkpoint != NEWEST:
+    if checkpoint != SELECTED:
         raise InputError(
             where=f"--checkpoint {checkpoint}",
             found=f"{subject}, which is not the folder of a run",

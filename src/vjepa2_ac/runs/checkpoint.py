@@ -40,6 +40,7 @@ _NEEDED = "where a run stood, as this program wrote it"
 _FIX = "Delete this checkpoint, to use an older one"
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 @dataclass(frozen=True)
@@ -54,17 +55,27 @@ class RunState:
     processes: PositiveInt = 1
     broken: Mapping[str, str] = field(default_factory=dict)  # episodes whose clips could not be read, and why
     windows: Count | None = None  # clips of an epoch: their order depends on the number
-    best_step: Count | None = None  # the best validation, if checkpoint.keep_best is set
-    best_error: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    best_step: Count | None = None  # the best validation by checkpoint.keep_best; 0: the base's
+    best_error: Finite | None = None  # its rollout error
+    best_rank: Finite | None = None  # its mean rank of the true action, if that selects
     measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.best_checkpoint`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
     data: str | None = None  # the fingerprint of the episodes
 
-    def measured(self, error: float) -> RunState:
-        """Return the state after a validation at its step: changed only if it was better than all before."""
-        if not math.isfinite(error) or (self.best_error is not None and error >= self.best_error):
+    def measured(self, error: float, rank: float | None = None) -> RunState:
+        """Return the state after a validation at its step: changed only if it was better than all before.
+
+        Args:
+            error: What decides, if there is no rank; and between equal ranks.
+            rank: What decides.
+        """
+        found = (error,) if rank is None else (rank, error)
+        best = (self.best_error,) if rank is None else (self.best_rank, self.best_error)
+        if not all(map(math.isfinite, found)):
             return self
-        return replace(self, best_step=self.step, best_error=error)
+        if self.best_step is not None and None not in best and found >= best:
+            return self
+        return replace(self, best_step=self.step, best_error=error, best_rank=rank)
 
 
 class CheckpointClock:
@@ -191,7 +202,7 @@ def read_state(checkpoint: Path) -> RunState:
         or find_damage(checkpoint.parent / checkpoint_name(state.best_step)) is None
     ):
         return state
-    return replace(state, best_step=None, best_error=None)
+    return replace(state, best_step=None, best_error=None, best_rank=None)
 
 
 def written_state(checkpoint: Path) -> RunState:

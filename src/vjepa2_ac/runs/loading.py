@@ -10,7 +10,7 @@ from vjepa2_ac.model.adapter.lora import load_trained
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.runs.checkpoint import ADAPTER
-from vjepa2_ac.runs.checkpoint_selection import NEWEST, select_checkpoint
+from vjepa2_ac.runs.checkpoint_selection import SELECTED, select_checkpoint
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.relative_paths import BASE, with_paths_from_start
 
@@ -25,12 +25,12 @@ class TrainedRun:
     chosen: str  # which checkpoint it is, as text
 
 
-def load_run(folder: Path, checkpoint: str = NEWEST, config: Config | None = None) -> TrainedRun:
+def load_run(folder: Path, checkpoint: str = SELECTED, config: Config | None = None) -> TrainedRun:
     """Load the model of a run, on the CPU: its base with the trained weights of a complete checkpoint.
 
     Args:
         folder: The run.
-        checkpoint: newest, best, or a number of optimizer steps; see `runs.checkpoint_selection`.
+        checkpoint: selected, newest, best, or a number of optimizer steps; see `runs.checkpoint_selection`.
         config: The run's config, with changed settings for loading; None: unchanged.
 
     Raises:

@@ -15,6 +15,8 @@ from vjepa2_ac.data.clips.loader import validation_windows
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState
 
+_SELECTS = "checkpoint.keep_best"
+
 
 def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
     """Return what determines the measurements of a validation, by readable names."""
@@ -26,12 +28,13 @@ def measured_on(config: Config, dataset: Dataset) -> Mapping[str, str]:
 
 
 def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> RunState:
-    """Return the state to resume from: a best error of other measurements is dropped, with a message.
+    """Return the state to resume from: a best validation by other measurements is dropped, with a message.
 
-    What a state of an earlier version does not record, or records beyond what matters now, is accepted.
+    What a state of an earlier version does not record, or records beyond what matters now, is accepted; those selected
+    by error.
     """
-    before = state.measured_on
-    differing = sorted(key for key in (before or {}).keys() & now if before and before[key] != now[key])
+    before = {_SELECTS: '"error"', **(state.measured_on or {})}
+    differing = sorted(key for key in before.keys() & now if before[key] != now[key])
     state = replace(state, measured_on=dict(now))
     if not differing or state.best_error is None:
         return state
@@ -39,4 +42,4 @@ def best_so_far(state: RunState, now: Mapping[str, str], reporter: Reporter) -> 
         f"Validation measures something else than before (other: {', '.join(differing)}): the error"
         f" {state.best_error:.4g} of step {state.best_step}, the best so far, does not compare and no longer counts."
     )
-    return replace(state, best_step=None, best_error=None)
+    return replace(state, best_step=None, best_error=None, best_rank=None)

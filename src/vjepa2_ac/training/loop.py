@@ -23,7 +23,7 @@ from vjepa2_ac.distributed.collectives import all_reduce_max, broadcast_object, 
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.distributed.preemption import StoppedError, stop_on_signals
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.result import PredictionErrors
+from vjepa2_ac.evaluation.result import Validation
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.checkpoint import CheckpointClock
 from vjepa2_ac.runs.folder import CALIBRATION, CHANGES
@@ -40,7 +40,13 @@ from vjepa2_ac.training.reporter import NullMetricsLog, TrainingReporter
 from vjepa2_ac.training.resume import require_same_data, restore
 from vjepa2_ac.training.setup import Run, batches_from, open_data, open_model, save_checkpoint
 from vjepa2_ac.training.step import gradients, training_step
-from vjepa2_ac.training.validation import validate_base, validate_if_due, validation_metrics
+from vjepa2_ac.training.validation import (
+    is_out_of_patience,
+    record,
+    validate_base,
+    validate_if_due,
+    validation_metrics,
+)
 
 _IN_PLACE = "Everything is in place: data, model, validation and gradients were checked; nothing was written."
 
@@ -89,13 +95,14 @@ def train(
     return run.folder
 
 
-def _train(run: Run, opened: OpenRun, first: PredictionErrors | None, reporter: TrainingReporter) -> None:
+def _train(run: Run, opened: OpenRun, first: Validation | None, reporter: TrainingReporter) -> None:
     if opened.writes:
         _write_measured(run)
     try:
         with _open_metrics_log(run, reporter) as metrics_log, opened.mirror(run.state.run_id) as mirror:
-            if first is not None:
-                metrics_log.write("validation", 0, validation_metrics(first))
+            if first is not None and record(run, validation_metrics(first), metrics_log):
+                with metrics_log.before_a_checkpoint():
+                    save_checkpoint(run, run.folder)  # the base: nothing that is worse is ever selected
             _loop(run, metrics_log, mirror, reporter)
     except StoppedError:
         run.accelerator.end_training()
@@ -133,6 +140,9 @@ def _loop(
     with stop_on_signals() as stop, contextlib.closing(batches_from(run)) as batches:
         timed = TimedBatches(batches, stopwatch_for(device))
         for step in range(run.state.step + 1, training.steps + 1):
+            if is_out_of_patience(run):
+                reporter.note(_out_of_patience(run))
+                break
             last = step == training.steps
             is_logged = step % training.log_every == 0 or last
             metrics = _timed_step(run, timed, step, throughput, measure_update=is_logged)
@@ -141,6 +151,7 @@ def _loop(
                 metrics_log.write("train", step, metrics)
             run.state = replace(run.state, step=step, clips_done=run.state.clips_done + run.clips_per_step)
             is_best = validate_if_due(run, metrics_log, reporter)
+            last = last or is_out_of_patience(run)
             # Agreed among all processes, and read once: a signal after this takes effect at the next step.
             is_due = clock.is_due(step) or is_best or last or metrics_log.is_behind
             stopped_by, due = all_reduce_max(run.accelerator, [stop.number, is_due])
@@ -155,6 +166,14 @@ def _loop(
                 raise StoppedError(folder, step, signal.Signals(stopped_by).name)
         mirror.finish(lambda: stop.reason is not None)
     run.accelerator.wait_for_everyone()
+
+
+def _out_of_patience(run: Run) -> str:
+    best, patience = run.state.best_step, run.config.training.patience
+    return (
+        f"Training ends at step {run.state.step:,}: step {best:,} is the best, and {patience} validations after it were"
+        " no better (training.patience)."
+    )
 
 
 def _timed_step(

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Protocol, runtime_checkable
 
-from vjepa2_ac.evaluation.result import PredictionErrors
+from vjepa2_ac.evaluation.result import Validation
 from vjepa2_ac.reporter import Reporter
 
 
@@ -22,7 +22,7 @@ class TrainingReporter(Reporter, Protocol):
         """An optimizer step is done."""
         ...
 
-    def validated(self, step: int, errors: PredictionErrors) -> None:
+    def validated(self, step: int, found: Validation) -> None:
         """Held-out clips were measured after `step` optimizer steps."""
         ...
 

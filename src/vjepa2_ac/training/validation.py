@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from typing import Any
 
-from vjepa2_ac.data.clips.loader import validation_batches
+import numpy as np
+
+from vjepa2_ac.data.clips.loader import validation_batches, validation_windows
+from vjepa2_ac.data.clips.windows import spread
+from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, moves_of
+from vjepa2_ac.evaluation.action_use.ranking import rank_actions
+from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.measure import prediction_errors
-from vjepa2_ac.evaluation.result import PredictionErrors
+from vjepa2_ac.evaluation.result import ActionRanking, Validation
 from vjepa2_ac.runs.metrics_log import MetricsLog
 from vjepa2_ac.training.new_embodiment import NOT_ASKED
 from vjepa2_ac.training.reporter import NullMetricsLog, TrainingReporter
 from vjepa2_ac.training.setup import Run, encode
 
-BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best: planning depends on the longest horizon
+BEST_BY = "rollout_over_persistence_last"  # checkpoint.keep_best error: planning depends on the longest horizon
+RANK = "action_rank"  # checkpoint.keep_best ranking
+_AT_ONCE = 64  # samples per batch: as many tokens as the clips of a small micro-batch
 
 
 def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter: TrainingReporter) -> bool:
@@ -22,45 +32,87 @@ def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter
     step, config = run.state.step, run.config
     if step % config.validation.every != 0 and step != config.training.steps:
         return False
-    metrics = validation_metrics(validate(run, reporter))
-    metrics_log.write("validation", step, metrics)
-    if not config.checkpoint.keep_best:
-        return False
-    before = run.state
-    run.state = before.measured(metrics[BEST_BY])
+    return record(run, validation_metrics(validate(run, reporter)), metrics_log)
+
+
+def record(run: Run, metrics: dict[str, Any], metrics_log: MetricsLog | NullMetricsLog) -> bool:
+    """Log a validation's metrics; return whether it is the best so far, by `checkpoint.keep_best`."""
+    metrics_log.write("validation", run.state.step, metrics)
+    by, before = run.config.checkpoint.keep_best, run.state
+    if by != "off":
+        run.state = before.measured(metrics[BEST_BY], metrics[RANK] if by == "ranking" else None)
     return run.state != before
 
 
-def validation_metrics(errors: PredictionErrors) -> dict[str, Any]:
+def is_out_of_patience(run: Run) -> bool:
+    """Return whether training ends early: too many validations without a better one."""
+    patience, state = run.config.training.patience, run.state
+    if patience is None or state.best_step is None:
+        return False
+    return state.step - state.best_step >= patience * run.config.validation.every
+
+
+def validation_metrics(found: Validation) -> dict[str, Any]:
     """Return what a validation writes into the metrics log."""
-    by_horizon = over_persistence(errors, "rollout")
-    return {
+    errors, by_horizon = found.errors, over_persistence(found.errors, "rollout")
+    metrics: dict[str, Any] = {
         "error_over_persistence": one_step_over_persistence(errors).value,
         "error_over_persistence_zero_actions": one_step_over_persistence(errors, "zero").value,
         "error_over_persistence_shuffled_actions": one_step_over_persistence(errors, "shuffled").value,
         "rollout_over_persistence": [r.value for r in by_horizon],
         "rollout_over_persistence_last": by_horizon[-1].value,
     }
+    if (ranking := found.ranking) is not None:
+        of = {RANK: ranking.rank, f"{RANK}_box": ranking.box, f"{RANK}_shell": ranking.shell}
+        for name, one in {**of, "energy_spread": ranking.spread}.items():
+            metrics |= {name: one.value, f"{name}_low": one.low, f"{name}_high": one.high}
+    return metrics
 
 
-def validate(run: Run, reporter: TrainingReporter) -> PredictionErrors:
-    """Measure the held-out clips."""
+def validate(run: Run, reporter: TrainingReporter) -> Validation:
+    """Measure the held-out clips, and rank the true actions of moves in some of them."""
     config = run.config
     run.world_model.eval()
-    batches = validation_batches(
-        run.dataset,
-        "validation",
-        clips=config.validation.clips,
-        batch_size=config.validation.batch_size,
-        copies=run.copies,
-    )
+    clips, size = config.validation.clips, config.validation.batch_size
+    batches = validation_batches(run.dataset, "validation", clips=clips, batch_size=size, copies=run.copies)
+    count = len(validation_windows(run.dataset, "validation", clips=clips))
+    moves: list[RolloutStart] = []
     with run.accelerator.autocast():
-        errors = prediction_errors(run.world_model, (encode(run, batch) for batch in batches))
-    reporter.validated(run.state.step, errors)
-    return errors
+        encoded = (encode(run, batch) for batch in batches)
+        errors = prediction_errors(run.world_model, _moves_kept(run, encoded, count, moves))
+        found = Validation(errors, _ranking(run, moves) if moves else None)
+    reporter.validated(run.state.step, found)
+    return found
 
 
-def validate_base(run: Run, reporter: TrainingReporter) -> PredictionErrors | None:
+def _moves_kept(
+    run: Run, batches: Iterable[LatentBatch], count: int, moves: list[RolloutStart]
+) -> Iterator[LatentBatch]:
+    """Yield batches of `count` clips in all, and append the moves of those that are chosen for the ranking."""
+    config, spaces, first = run.config.validation, run.dataset.spaces, 0
+    chosen = set(spread(count, config.ranking_clips)) if config.ranking_clips else set()
+    for batch in batches:
+        for row in range(len(batch.starts)):
+            if first + row in chosen:
+                moves += moves_of(batch, row, first + row, spaces, config.ranking_reach_cm / 100)
+        first += len(batch.starts)
+        yield batch
+
+
+def _ranking(run: Run, moves: list[RolloutStart]) -> ActionRanking:
+    config = run.config.validation
+    pool = ActionPool(
+        actions=np.stack([move.action.cpu().numpy().astype(np.float64) for move in moves]),
+        episode_ids=tuple(move.episode_id for move in moves),
+        space=run.dataset.spaces.action,
+        reach=config.ranking_reach_cm / 100,
+        samples=config.ranking_samples,
+        seed=0,
+    )
+    return rank_actions(run.world_model, moves, pool, at_once=_AT_ONCE)
+
+
+def validate_base(run: Run, reporter: TrainingReporter) -> Validation | None:
     """Measure a run before its first step, and refuse a base that is no better than copying the last frame.
 
     None is returned of a run that goes on.
@@ -70,13 +122,13 @@ def validate_base(run: Run, reporter: TrainingReporter) -> PredictionErrors | No
     """
     if run.state.step:
         return None
-    errors = validate(run, reporter)
-    config, error = run.config, one_step_over_persistence(errors).value
+    found = validate(run, reporter)
+    config, error = run.config, one_step_over_persistence(found.errors).value
     if error < 1.0 or config.training.allow_weak_base or config.model.random is not None:
-        return errors
+        return found
     if run.world_model.fresh_heads is not None:
         reporter.note(NOT_ASKED)
-        return errors
+        return found
     raise InputError(
         where="model.base",
         found=f"on the validation clips its one-step error is {error:.2f} times that of copying the last frame",

@@ -13,6 +13,7 @@ from torch import Tensor
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.measure import Predictor
+from vjepa2_ac.spaces import Spaces, StateSpace
 
 
 @dataclass(frozen=True)
@@ -66,6 +67,32 @@ def start_of(batch: LatentBatch, row: int, step: int, clip: int) -> RolloutStart
     )
 
 
+def moves_of(batch: LatentBatch, row: int, clip: int, spaces: Spaces, reach: float) -> tuple[RolloutStart, ...]:
+    """Return two moves of a clip as starts: the longest within reach, from one of its frames to another, and back.
+
+    The world around an arm that moves slowly is what its pose makes it: frames that are several steps apart show what
+    one larger action does, and in reverse order what the opposite one does. (What falls or was dropped does not go
+    back: such clips are harder for every model alike.) If all moves are longer, the shortest is taken. Commands that
+    are no changes of the state cannot be joined or turned back: then it is the clip's largest step, as it is.
+
+    Args:
+        batch: Of clips.
+        row: The clip's, in the batch.
+        clip: Its index.
+        spaces: Of its states and actions.
+        reach: Of a move, in metres; of vectors every move is within it.
+    """
+    if spaces.action.follows != "change":
+        return (start_of(batch, row, int(batch.actions[row].norm(dim=-1).argmax()), clip),)
+    states = batch.states[row].cpu().numpy().astype(np.float64)
+    pairs = [(first, last) for first in range(len(states)) for last in range(first + 1, len(states))]
+    changes = np.concatenate([spaces.state.differences(states[[first, last]]) for first, last in pairs])
+    lengths = np.linalg.norm(changes[:, spaces.state.sized], axis=1)
+    within = lengths <= (np.inf if spaces.state.position is None else reach)
+    ends = pairs[int(np.where(within, lengths, -1.0).argmax() if within.any() else lengths.argmin())]
+    return tuple(_move(batch, row, clip, pair, spaces.state) for pair in (ends, ends[::-1]))
+
+
 @torch.no_grad()
 def evaluate_actions(
     model: Predictor, start: RolloutStart, actions: Float[np.ndarray, "samples action_dim"], *, at_once: int
@@ -85,6 +112,21 @@ def evaluate_actions(
         energies.append(absolute_difference(predicted, start.following).mean(dim=(1, 2)))
         changes.append(absolute_difference(predicted, expected).mean(dim=(1, 2)))
     return EvaluatedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
+
+
+def _move(batch: LatentBatch, row: int, clip: int, ends: tuple[int, int], space: StateSpace) -> RolloutStart:
+    first, last = ends
+    change = space.differences(batch.states[row, [first, last]].cpu().numpy().astype(np.float64))[0]
+    return RolloutStart(
+        clip=clip,
+        episode_id=batch.episode_ids[row],
+        first_step=batch.starts[row],
+        frame=batch.latents[row, first].clone(),
+        following=batch.latents[row, last].clone(),
+        state=batch.states[row, first],
+        action=torch.from_numpy(change).to(batch.actions),
+        extrinsics=None if batch.extrinsics is None else batch.extrinsics[row, first],
+    )
 
 
 def _predict(

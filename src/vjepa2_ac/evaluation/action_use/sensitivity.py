@@ -53,6 +53,23 @@ class ActionPool:
         evaluated[:, self.space.position] = drawn[:, self.space.position] * self.reach
         return evaluated
 
+    def on_shell(self, start: RolloutStart, generator: np.random.Generator) -> Float[np.ndarray, "samples action_dim"]:
+        """Draw actions as long as the true one, in any direction: of poses (dx, dy, dz), the rest being true.
+
+        A model that only knows whether the robot moves ranks the true action high in the box, and by chance here. Each
+        number of a vector is measured in its largest size.
+        """
+        true = start.action.cpu().numpy().astype(np.float64)
+        moved, unit = self.space.sized, np.ones(len(true))
+        if self.space.position is None:
+            unit = np.abs(self.actions).max(axis=0)
+        unit = unit[moved]
+        drawn = generator.normal(size=(self.samples, len(unit))) * (unit > 0)
+        length = np.linalg.norm(true[moved] / np.where(unit > 0, unit, 1.0))
+        evaluated = np.tile(true, (self.samples, 1))
+        evaluated[:, moved] = drawn * unit * length / np.maximum(np.linalg.norm(drawn, axis=1), 1e-12)[:, None]
+        return evaluated
+
     def words(self, drawn_from: Literal["clips", "box"]) -> str:
         """Return as text where actions are drawn from."""
         if drawn_from == "clips":
@@ -85,8 +102,8 @@ def measure_sensitivity(
         true = start.action.cpu().numpy().astype(np.float64)[None]
         evaluated = evaluate_actions(model, start, np.concatenate([true, pool.drawn_for(start)]), at_once=at_once)
         own, others, boxed = np.split(evaluated.energy, [1, 1 + samples])
-        ranks["clips"].append(_place(own[0], others))
-        ranks["box"].append(_place(own[0], boxed))
+        ranks["clips"].append(place_of(own[0], others))
+        ranks["box"].append(place_of(own[0], boxed))
         changes.append(float(evaluated.change[1 : 1 + samples].mean()))
         persistence.append(start.persistence)
         progress(done, len(starts))
@@ -99,7 +116,7 @@ def measure_sensitivity(
     )
 
 
-def _place(true: float, others: Float[np.ndarray, " samples"]) -> tuple[float, float]:
+def place_of(true: float, others: Float[np.ndarray, " samples"]) -> tuple[float, float]:
     """Return how many others have a lower energy, and how many an equal one."""
     same = np.abs(others - true) <= _SAME * max(abs(true), 1e-12)
     return float(((others < true) & ~same).sum()), float(same.sum())

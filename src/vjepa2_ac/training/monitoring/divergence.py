@@ -71,6 +71,7 @@ class Watch:
         self._config = config
         self._reported: set[str] = set()
         self._at_start: dict[str, float] = {}
+        self._rank_at_start: Mapping[str, Any] = {}
         self._losses: deque[float] = deque(maxlen=_LOSSES)
         self._lowest = math.inf
 
@@ -84,8 +85,9 @@ class Watch:
     def _of_validation(self, step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         now = {name: _number(metrics.get(key)) for key, name in _MEASURES.items()}
         if step == 0:
-            self._at_start = now
+            self._at_start, self._rank_at_start = now, metrics
             return
+        yield from self._of_ranking(now, metrics)
         if not all(map(math.isfinite, now.values())):
             yield "not finite", "an error of the validation is not a finite number"
         starts = {name: self._at_start.get(name, math.nan) for name in now}
@@ -97,6 +99,21 @@ class Watch:
         copying = "; copying the last frame would be better" if beyond else ""
         last = step == self._config.training.steps
         yield f"{worse} {beyond} {last}", f"{errors} of persistence's in the validation{copying}"
+
+    def _of_ranking(self, now: Mapping[str, float], metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """Warn of a model that planning would not want, though it may predict better: the intervals are apart."""
+        rank, low = (_number(metrics.get(key)) for key in ("action_rank", "action_rank_low"))
+        before, high = (_number(self._rank_at_start.get(key)) for key in ("action_rank", "action_rank_high"))
+        if low > high:
+            better = all(value < self._at_start.get(name, math.nan) for name, value in now.items())
+            words = "predicts better and plans worse than the base" if better else "plans worse than the base"
+            yield (
+                "rank",
+                (
+                    f"the model {words}: the mean rank of the true action among others is {rank:.3f} (before training"
+                    f" {before:.3f}; 0 is best, 0.5 chance). Is the motion of the data varied? See `vjepa2-ac data check`"
+                ),
+            )
 
     def _of_loss(self, step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         del step
@@ -121,7 +138,7 @@ def advice(config: Config) -> str:
     if training.max_grad_norm is None:
         knobs.append("set training.max_grad_norm=1")
     knobs.append(f"raise training.warmup_steps ({training.warmup_steps:,})")
-    best = "; the best checkpoint is kept: --checkpoint best" if config.checkpoint.keep_best else ""
+    best = "; the best checkpoint is kept: --checkpoint best" if config.checkpoint.keep_best != "off" else ""
     return f"If it stays so: {', '.join(knobs)}{best}"
 
 
