@@ -71,6 +71,8 @@ def another(value: Any, annotation: Any) -> Any:
         return value[:-1] or tuple(options[:1]) or ("else",)
     if isinstance(value, dict):
         return {**value, "else": 3}
+    if any(int in (inner, *get_args(inner)) for inner in get_args(annotation)):
+        return 5
     return options[-1] if options else "else"
 
 

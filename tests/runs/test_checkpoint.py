@@ -275,7 +275,7 @@ def files_end_at(size: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("init", ["default", "pissa"])
 def test_a_disk_that_fills_up_in_any_file_is_the_users_error_and_changes_nothing(make_config, reporter, init) -> None:
-    config = make_config(training__steps=1, adapter__init=init)
+    config = make_config(training__steps=1, adapter__init=init, checkpoint__keep_best="off")
     folder = train(config, reporter)
     run = set_up(config, reporter)
     older = newest_checkpoint(folder / "checkpoints")

@@ -29,7 +29,8 @@ def run(tmp_path: Path) -> Path:
     ("by", "words"),
     [
         ("newest", "step-00000030 (the newest)"),
-        ("best", "step-00000020 (the best)"),
+        ("selected", "step-00000020 (the best by error)"),
+        ("best", "step-00000020 (the best by error)"),
         ("10", "step-00000010 (as asked for)"),
     ],
 )
@@ -50,7 +51,7 @@ def test_the_newest_the_best_and_that_of_a_step_are_found(run: Path, by: str, wo
 )
 def test_one_that_is_not_there_is_an_error_that_names_those_that_are(run: Path, by: str, found: str) -> None:
     with pytest.raises(
-        InputError, match=rf"checkpoints: {found}.*\. needed: newest, best or one of the steps 10, 20, 30"
+        InputError, match=rf"checkpoints: {found}.*\. needed: selected, newest, best or one of the steps 10, 20, 30"
     ):
         select_checkpoint(run, by)
 
@@ -62,8 +63,19 @@ def test_a_damaged_one_is_not_used_in_place_of_what_was_asked_for(run: Path) -> 
             select_checkpoint(run, by)
 
 
+def test_a_base_that_is_better_than_all_is_selected_and_called_so(tmp_path: Path) -> None:
+    folder = tmp_path / "checkpoints"
+    for step in (0, 10):
+        state = RunState(step, best_step=0, best_error=0.9, best_rank=0.03)
+        write_checkpoint(folder, state, lambda inner: (inner / "weights").touch(), keep=9)
+    assert str(select_checkpoint(tmp_path)) == (
+        "step-00000000 (the base: none of its checkpoints is better by action ranking)"
+    )
+
+
 def test_without_validations_there_is_no_best(tmp_path: Path) -> None:
     write(tmp_path, 10)
+    assert str(select_checkpoint(tmp_path)) == "step-00000010 (the newest: none was selected)"
     with pytest.raises(InputError, match=r"no best checkpoint.*one of the steps 10"):
         select_checkpoint(tmp_path, "best")
 

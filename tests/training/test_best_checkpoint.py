@@ -23,7 +23,7 @@ def test_the_best_of_other_frames_no_longer_counts_and_the_reason_is_named(make_
     errors = iter([0.9, 0.2, 0.3, 0.8, 0.6])  # the first is the base's
     for module in (loop, validation):
         monkeypatch.setattr(module, "validation_metrics", lambda _: {validation.BEST_BY: next(errors)})
-    every = {"validation__every": 1, "checkpoint__every": 1, "training__steps": 2}
+    every = {"validation__every": 1, "checkpoint__every": 1, "training__steps": 2, "checkpoint__keep_best": "error"}
     folder = train(make_config(**every), reporter) / "checkpoints"
     assert read_state(newest_checkpoint(folder)).best_error == 0.2
     train(make_config(**{**every, "training__steps": 4}, data__frames=5), reporter, allow_config_change=True)
@@ -36,14 +36,38 @@ def test_the_best_of_other_frames_no_longer_counts_and_the_reason_is_named(make_
 
 
 def test_the_best_checkpoint_stays_when_a_run_is_resumed_unchanged(make_config, reporter) -> None:
-    now = of(make_config())
+    now = of(make_config(checkpoint__keep_best="error"))
     known = replace(BEST, measured_on=now)
     moved = make_config(
-        training__steps=9, training__learning_rate=1e-4, data__workers=1, validation__every=1, validation__batch_size=4
+        checkpoint__keep_best="error",
+        training__steps=9,
+        training__learning_rate=1e-4,
+        data__workers=1,
+        validation__every=1,
+        validation__batch_size=4,
     )
     assert best_so_far(known, of(moved), reporter.note) == known
     assert best_so_far(BEST, now, reporter.note) == known, "an earlier version did not say"
     assert reporter.notes == []
+
+
+def test_the_best_by_error_is_not_the_best_by_ranking(make_config, reporter) -> None:
+    for before in (BEST, replace(BEST, measured_on=of(make_config(checkpoint__keep_best="error")))):
+        state = best_so_far(before, of(make_config()), reporter)
+        assert (state.best_step, state.best_error, state.best_rank) == (None, None, None)
+        assert "other: checkpoint.keep_best" in reporter.notes.pop()
+
+
+def test_a_rank_decides_and_the_error_between_equal_ones() -> None:
+    state = RunState(0).measured(0.9, 0.3)
+    assert (state.best_step, state.best_rank) == (0, 0.3), "the base is a candidate"
+    state = replace(state, step=10)
+    assert state.measured(0.1, 0.31) == state, "a lower error with a worse rank"
+    assert state.measured(0.9, 0.3) == state
+    assert state.measured(float("nan"), 0.1) == state
+    assert state.measured(0.1, float("nan")) == state
+    assert state.measured(0.8, 0.3).best_step == 10
+    assert state.measured(1.5, 0.2).best_error == 1.5
 
 
 @pytest.mark.parametrize(
@@ -54,6 +78,8 @@ def test_the_best_checkpoint_stays_when_a_run_is_resumed_unchanged(make_config, 
         ({"data__crop": "square"}, {"data.crop"}),
         ({"data__fields": {"gripper": "openness"}}, {"data.fields.gripper"}),
         ({"validation__clips": 2}, {"its clips"}),
+        ({"validation__ranking_samples": 5}, {"validation.ranking_samples"}),
+        ({"checkpoint__keep_best": "off"}, {"checkpoint.keep_best"}),
         ({"data__validation_share": 0.75}, {"its clips"}),
         ({"data__split_by": r"episode_(\d+)"}, {"its clips"}),
     ],

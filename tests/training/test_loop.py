@@ -112,8 +112,8 @@ def test_the_best_by_validation_is_written_kept_and_remembered(make_config, repo
 
     for module in (loop, validation):
         monkeypatch.setattr(module, "validation_metrics", measured)
-    config = make_config(validation__every=1, checkpoint__every=100, checkpoint__keep=1)
-    values = iter([0.1, 0.9, 0.7, 0.8, 0.75])  # the first is the base's
+    config = make_config(validation__every=1, checkpoint__every=100, checkpoint__keep=1, checkpoint__keep_best="error")
+    values = iter([0.95, 0.9, 0.7, 0.8, 0.75])  # the first is the base's
     with pytest.raises(KilledError):
         train(config, dying_reporter(type(reporter)(), 5))
     values = iter([0.71, 0.8, 0.9, 0.72])

@@ -14,7 +14,8 @@ from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_score.measure import PlanningStart, measure_plans, planning_start, study_of
 from vjepa2_ac.evaluation.action_use.energy_landscape import LandscapeGrid, measure_landscapes
-from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, start_of
+from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, moves_of, start_of
+from vjepa2_ac.evaluation.action_use.ranking import pool_of, rank_actions
 from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sensitivity
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.examples import chosen_clips, make_example, predicted_rollout
@@ -23,6 +24,7 @@ from vjepa2_ac.evaluation.metrics import METRICS, Metric
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import (
     About,
+    ActionRanking,
     Clips,
     Evaluation,
     Example,
@@ -103,6 +105,7 @@ def evaluate(
             models[contender.name] = replace(
                 result,
                 sensitivity=_sensitivity(contender, seen.starts, pool, probes, reporter),
+                ranking=_ranking(contender, seen.moves, about, probes, reporter),
                 landscapes=_landscapes(contender, seen.starts, known, pool, probes, reporter),
                 plans=_plans(contender, seen.planned, probes, reporter),
             )
@@ -147,6 +150,7 @@ class _Seen:
     actions: Float[np.ndarray, "clips horizon action_dim"]
     errors: dict[str, list[PredictionErrors]]  # by model
     starts: list[RolloutStart]
+    moves: list[RolloutStart] = field(default_factory=list)
     planned: list[PlanningStart] = field(default_factory=list)
 
 
@@ -174,6 +178,7 @@ def _collect(
         for row in range(len(batch.starts)):
             if first + row in probed:
                 seen.starts.append(start_of(batch, row, _largest_step(batch.actions[row], about), first + row))
+                seen.moves += moves_of(batch, row, first + row, about.space, probes.reach_cm / 100)
             if first + row in planned:
                 seen.planned.append(planning_start(batch, row, first + row, about.seed))
         actions.append(batch.actions.cpu().numpy().astype(np.float64))
@@ -198,6 +203,16 @@ def _sensitivity(
         return None
     progress = reporter.task(f"other actions, {contender.name}")
     return measure_sensitivity(contender.model, starts, pool, at_once=probes.at_once, progress=progress)
+
+
+def _ranking(
+    contender: Contender, moves: Sequence[RolloutStart], about: About, probes: ProbeOptions, reporter: Reporter
+) -> ActionRanking | None:
+    if not moves:
+        return None
+    pool = pool_of(moves, about.space, reach=probes.reach_cm / 100, samples=probes.samples, seed=about.seed)
+    progress = reporter.task(f"action ranking, {contender.name}")
+    return rank_actions(contender.model, moves, pool, at_once=probes.at_once, progress=progress)
 
 
 def _landscapes(

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-import numpy as np
-
 from vjepa2_ac.data.clips.loader import validation_batches, validation_windows
 from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, moves_of
-from vjepa2_ac.evaluation.action_use.ranking import rank_actions
-from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool
+from vjepa2_ac.evaluation.action_use.ranking import pool_of, rank_actions
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import ActionRanking, Validation
@@ -89,26 +86,20 @@ def _moves_kept(
     run: Run, batches: Iterable[LatentBatch], count: int, moves: list[RolloutStart]
 ) -> Iterator[LatentBatch]:
     """Yield batches of `count` clips in all, and append the moves of those that are chosen for the ranking."""
-    config, spaces, first = run.config.validation, run.dataset.spaces, 0
+    config, space, first = run.config.validation, run.dataset.spaces.action, 0
     chosen = set(spread(count, config.ranking_clips)) if config.ranking_clips else set()
     for batch in batches:
         for row in range(len(batch.starts)):
             if first + row in chosen:
-                moves += moves_of(batch, row, first + row, spaces, config.ranking_reach_cm / 100)
+                moves += moves_of(batch, row, first + row, space, config.ranking_reach_cm / 100)
         first += len(batch.starts)
         yield batch
 
 
 def _ranking(run: Run, moves: list[RolloutStart]) -> ActionRanking:
     config = run.config.validation
-    pool = ActionPool(
-        actions=np.stack([move.action.cpu().numpy().astype(np.float64) for move in moves]),
-        episode_ids=tuple(move.episode_id for move in moves),
-        space=run.dataset.spaces.action,
-        reach=config.ranking_reach_cm / 100,
-        samples=config.ranking_samples,
-        seed=0,
-    )
+    reach, samples = config.ranking_reach_cm / 100, config.ranking_samples
+    pool = pool_of(moves, run.dataset.spaces.action, reach=reach, samples=samples, seed=0)
     return rank_actions(run.world_model, moves, pool, at_once=_AT_ONCE)
 
 

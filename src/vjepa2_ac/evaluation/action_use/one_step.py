@@ -13,7 +13,7 @@ from torch import Tensor
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.measure import Predictor
-from vjepa2_ac.spaces import Spaces, StateSpace
+from vjepa2_ac.spaces import POSE, ActionSpace, StateSpace, vector_states
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def start_of(batch: LatentBatch, row: int, step: int, clip: int) -> RolloutStart
     )
 
 
-def moves_of(batch: LatentBatch, row: int, clip: int, spaces: Spaces, reach: float) -> tuple[RolloutStart, ...]:
+def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach: float) -> tuple[RolloutStart, ...]:
     """Return two moves of a clip as starts: the longest within reach, from one of its frames to another, and back.
 
     The world around an arm that moves slowly is what its pose makes it: frames that are several steps apart show what
@@ -79,18 +79,19 @@ def moves_of(batch: LatentBatch, row: int, clip: int, spaces: Spaces, reach: flo
         batch: Of clips.
         row: The clip's, in the batch.
         clip: Its index.
-        spaces: Of its states and actions.
+        space: Of its actions.
         reach: Of a move, in metres; of vectors every move is within it.
     """
-    if spaces.action.follows != "change":
+    if space.follows != "change":
         return (start_of(batch, row, int(batch.actions[row].norm(dim=-1).argmax()), clip),)
     states = batch.states[row].cpu().numpy().astype(np.float64)
+    kind = vector_states(states.shape[1]) if space.position is None else POSE
     pairs = [(first, last) for first in range(len(states)) for last in range(first + 1, len(states))]
-    changes = np.concatenate([spaces.state.differences(states[[first, last]]) for first, last in pairs])
-    lengths = np.linalg.norm(changes[:, spaces.state.sized], axis=1)
-    within = lengths <= (np.inf if spaces.state.position is None else reach)
+    changes = np.concatenate([kind.differences(states[[first, last]]) for first, last in pairs])
+    lengths = np.linalg.norm(changes[:, kind.sized], axis=1)
+    within = lengths <= (np.inf if space.position is None else reach)
     ends = pairs[int(np.where(within, lengths, -1.0).argmax() if within.any() else lengths.argmin())]
-    return tuple(_move(batch, row, clip, pair, spaces.state) for pair in (ends, ends[::-1]))
+    return tuple(_move(batch, row, clip, pair, kind) for pair in (ends, ends[::-1]))
 
 
 @torch.no_grad()

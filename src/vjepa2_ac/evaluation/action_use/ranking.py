@@ -17,6 +17,13 @@ from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, place_of
 from vjepa2_ac.evaluation.intervals import Estimate, mean_of, ratio
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import ActionRanking
+from vjepa2_ac.spaces import ActionSpace
+
+
+def pool_of(moves: Sequence[RolloutStart], space: ActionSpace, *, reach: float, samples: int, seed: int) -> ActionPool:
+    """Return how other actions are drawn for moves: of vectors, the largest of each number bounds the box."""
+    actions = np.stack([move.action.cpu().numpy().astype(np.float64) for move in moves])
+    return ActionPool(actions, tuple(move.episode_id for move in moves), space, reach, samples, seed)
 
 
 def rank_actions(

@@ -111,7 +111,7 @@ class Watch:
                 "rank",
                 (
                     f"the model {words}: the mean rank of the true action among others is {rank:.3f} (before training"
-                    f" {before:.3f}; 0 is best, 0.5 chance). Is the motion of the data varied? See `vjepa2-ac data check`"
+                    f" {before:.3f}; 0 is best, 0.5 chance). `vjepa2-ac data check` says how varied the motion is"
                 ),
             )
 
