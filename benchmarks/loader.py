@@ -16,6 +16,7 @@ import argparse
 import multiprocessing
 import statistics
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -34,8 +35,6 @@ from vjepa2_ac.data.clips.windows import ClipOrder, windows_of
 from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
 from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
 from vjepa2_ac.data.index.index_cache import get_or_build
-from vjepa2_ac.data.sources.rlds.dataset_info import find_shards, index_shards
-from vjepa2_ac.data.sources.rlds.tfrecord import decode_example, read_record
 from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
 from vjepa2_ac.episode import EpisodeInfo
 
@@ -101,7 +100,10 @@ def main() -> None:
 
 def measure_clips(config: DataConfig, clips: int, tfds_python: str | None) -> None:
     """Time every way of reading the same number of clips, and print clips per second and ratios."""
-    spans = index_shards(find_shards(config.path))
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+    from tfrecords import decode_example, index_set, read_record
+
+    spans = index_set(config.path)
     start = time.perf_counter()
     dataset = open_dataset(config)
     order = ClipOrder(dataset.windows("train"), seed=0)
@@ -114,7 +116,7 @@ def measure_clips(config: DataConfig, clips: int, tfds_python: str | None) -> No
 
     def everything(position: int) -> None:
         episode, first = order.window(position)
-        features = decode_example(read_record(spans[episode]), where="")
+        features = decode_example(read_record(spans[episode]))
         for name in config.fields.cameras.values():
             frames = np.stack([simplejpeg.decode_jpeg(picture, fastdct=True) for picture in features[name][1]])
             frames[first : first + config.clip_steps : config.model_stride].copy()

@@ -34,7 +34,7 @@ ORDERS: dict[str, list[str]] = {
         "cli",
     ],
     "data": ["picture_file", "index", "cache filters", "sources", "clips", "inspection"],
-    "data.sources": ["listing configured_spaces", "rlds droid_raw lerobot npz latents", "registry"],
+    "data.sources": ["listing configured_spaces indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
     "model": [
         "finite sizes quiet_imports",
         "base_model",

@@ -21,13 +21,13 @@ import torch
 from memory_source import MemorySource
 from recording_cuda import Pinning, RecordingCuda, recorded_copies
 from synthetic import synthetic_states, write_synthetic_droid
+from tfrecords import index_records
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips import dataset as opening
 from vjepa2_ac.data.clips import loader
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import ProcessShare, clip_at, collate, training_loader, validation_batches
 from vjepa2_ac.data.clips.streams import copies_for
-from vjepa2_ac.data.sources.rlds.tfrecord import index_records
 from vjepa2_ac.episode import Batch, Episode
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.geometry import actions_from_states, apply_action, matrices_from_euler, states_in_camera_frame

@@ -58,12 +58,16 @@ def within(folder: str, name: str) -> str:
     return f"{folder}/{name}" if folder else name
 
 
-def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> list[Result]:
-    """Apply a function to every item in several threads; return the results in order, or raise the first error."""
+def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> Iterator[Result]:
+    """Yield the result of a function for every item, in order, from several threads; or raise the first error."""
     if connections == 1 or len(items) < 2:
-        return [function(item) for item in items]
-    with ThreadPoolExecutor(max_workers=connections) as pool:
-        return list(pool.map(function, items))
+        yield from map(function, items)
+        return
+    pool = ThreadPoolExecutor(min(connections, len(items)))
+    try:
+        yield from pool.map(function, items)
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def _require_text(name: str, place: str) -> None:

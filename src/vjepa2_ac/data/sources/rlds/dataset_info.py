@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan, index_records
+from vjepa2_ac.data.sources.rlds.shard_reader import Shard
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import read_json_object
 
@@ -14,21 +14,6 @@ _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 _MOST_NAMES = 5
 _MOST_EPISODES = 100_000  # of a shard; DROID's have some 50
-
-
-@dataclass(frozen=True)
-class Shard:
-    """One TFRecord file of a data set, and its expected number of episodes."""
-
-    path: str
-    episodes: int
-    size: int = 0  # bytes
-    version: str = ""  # as from `storage.list_files`: changes with the content
-
-    @property
-    def name(self) -> str:
-        """The file's name."""
-        return self.path.replace("\\", "/").rsplit("/", 1)[-1]
 
 
 def find_shards(folder: str) -> list[Shard]:
@@ -52,26 +37,6 @@ def find_shards(folder: str) -> list[Shard]:
     if not shards:
         raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
     return _as_listed(folder, shards)
-
-
-def index_shards(shards: list[Shard]) -> list[RecordSpan]:
-    """Return the position of every episode, shard by shard.
-
-    Raises:
-        InputError: A shard is not a TFRecord, is truncated, or has another number of episodes than expected.
-    """
-    spans: list[RecordSpan] = []
-    for shard in shards:
-        found = index_records(shard.path)
-        if len(found) != shard.episodes:
-            raise InputError(
-                where=shard.path,
-                found=f"{len(found)} records",
-                needed=f"{shard.episodes}, says {_INFO}",
-                fix="Download the file again",
-            )
-        spans += found
-    return spans
 
 
 def _read_info(folder: str, where: str) -> dict[str, Any]:

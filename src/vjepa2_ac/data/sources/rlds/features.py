@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
@@ -50,6 +52,27 @@ def num_steps_of(record: ExampleRecord, config: RldsData) -> int:
     if STEP_FLAG in record.located:
         return record.count_integers(STEP_FLAG)
     return sum(len(record.floats(name)) for name in config.fields.state) // STATE_DIM
+
+
+def check_record(
+    record: ExampleRecord, config: RldsData, cameras: Sequence[str], where: str
+) -> tuple[int, Float[np.ndarray, "steps state_dim"]]:
+    """Return number of steps and states of a record that has everything an episode needs.
+
+    Args:
+        record: The record.
+        config: Names of the features, and what a state is.
+        cameras: Image features that it must have.
+        where: File, record and identity, for messages.
+
+    Raises:
+        InputError: A feature is missing, has no uniform shape over all steps, or has implausible numbers.
+    """
+    record.require([*config.fields.identity, *features_of_steps(config), *cameras])
+    steps = num_steps_of(record, config)
+    states = states_of(record, config, steps, where)
+    commands_of(record, config, steps, where)
+    return steps, states
 
 
 def states_of(record: ExampleRecord, config: RldsData, steps: int, where: str) -> Float[np.ndarray, "steps state_dim"]:
