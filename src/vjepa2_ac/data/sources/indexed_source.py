@@ -6,14 +6,17 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
 
+from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
 from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.episode import EpisodeInfo, Progress
+from vjepa2_ac.episode import EpisodeInfo, Progress, no_progress
 from vjepa2_ac.errors import InputError
 
 
@@ -50,16 +53,25 @@ class IndexedSource(ABC, Generic[Config, State]):
             InputError: No data set, one that does not fit the config, or no episode that can be used.
             OSError: Data behind a URL cannot be read.
         """
-        return self._open(progress).table
+        return self._open(progress or no_progress).table
 
-    def _open(self, progress: Progress | None = None) -> State:
+    @cached_property
+    def _files(self) -> EpisodeFiles:
+        return EpisodeFiles(self._config)
+
+    @property
+    def _connections(self) -> int:
+        """How many files are read at once: behind a URL, where each is waited for, several."""
+        return self._config.connections if storage.is_url(self._config.path) else 1
+
+    def _open(self, progress: Progress = no_progress) -> State:
         with self._opening:
             if self._known is None:
                 self._known = self._look(progress)
             return self._known
 
     @abstractmethod
-    def _look(self, progress: Progress | None) -> State:
+    def _look(self, progress: Progress) -> State:
         """Open the data set: read its index from the cache, or scan it."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from jaxtyping import UInt8
@@ -16,24 +17,28 @@ from vjepa2_ac.media.jpeg import decode_jpegs
 
 def images_in_memory(read: Read, feature: Located, num_steps: int, where: str) -> FramesByStep:
     """Return the reader of the images in a record in memory; `where`: file, record, identity and feature."""
-
-    def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        offsets, lengths = items_of(read, feature, where, max(steps) + 1)
-        if len(offsets) <= max(steps):
-            raise wrong_count(len(offsets), num_steps, where)
-        return decode_jpegs([read(offsets[step], lengths[step]) for step in steps], steps, where)
-
-    return FramesByStep(num_steps, where, decode)
+    return FramesByStep(num_steps, where, partial(_decoded, read, feature, num_steps, where))
 
 
 def images_in_file(shard: Shard, feature: Located, num_steps: int, where: str) -> FramesByStep:
     """Return the reader of the images in a local shard; it skips over those that are not requested."""
+    return FramesByStep(num_steps, where, partial(_decoded_from_file, shard, feature, num_steps, where))
 
-    def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        with open_shard(shard) as read:
-            return images_in_memory(read, feature, num_steps, where)(steps)
 
-    return FramesByStep(num_steps, where, decode)
+def _decoded_from_file(
+    shard: Shard, feature: Located, num_steps: int, where: str, steps: Sequence[int]
+) -> UInt8[np.ndarray, "time height width 3"]:
+    with open_shard(shard) as read:
+        return _decoded(read, feature, num_steps, where, steps)
+
+
+def _decoded(
+    read: Read, feature: Located, num_steps: int, where: str, steps: Sequence[int]
+) -> UInt8[np.ndarray, "time height width 3"]:
+    offsets, lengths = items_of(read, feature, where, max(steps) + 1)
+    if len(offsets) <= max(steps):
+        raise wrong_count(len(offsets), num_steps, where)
+    return decode_jpegs([read(offsets[step], lengths[step]) for step in steps], steps, where)
 
 
 def items_of(read: Read, feature: Located, where: str, count: int | None = None) -> tuple[list[int], list[int]]:

@@ -38,7 +38,7 @@ Examine = Callable[[Read, RecordSpan, str], Found]  # of a record, and its name 
 
 
 def index_local(
-    shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], *, threads: int, progress: Progress | None
+    shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], *, threads: int, progress: Progress
 ) -> EpisodeTable:
     """Return every episode of local shards; its states are checked, of its images only the presence.
 
@@ -99,7 +99,7 @@ def _other_count(shard: Shard, number: int, found: str) -> EpisodeProblem:
     return EpisodeProblem(name, where, found, needed, "Download the file again")
 
 
-def table_of(shards: Sequence[Shard], found: Iterator[list[Found]], progress: Progress | None) -> EpisodeTable:
+def table_of(shards: Sequence[Shard], found: Iterator[list[Found]], progress: Progress) -> EpisodeTable:
     """Return the table of the results, shard by shard; of episodes with one identity the first stays.
 
     Args:
@@ -124,8 +124,7 @@ def table_of(shards: Sequence[Shard], found: Iterator[list[Found]], progress: Pr
                 usable[one.info.id] = one
                 numbers.append(number)
         done += shard.episodes
-        if progress is not None:
-            progress(done, total)
+        progress(done, total)
     if not usable:
         raise as_error(problems[0])
     logger.info("%d episodes in %d shards; %d cannot be used", len(usable), len(shards), len(problems))

@@ -59,7 +59,7 @@ class RecordLayout:
 
 
 def index_remote(
-    shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], *, threads: int, progress: Progress | None
+    shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], *, threads: int, progress: Progress
 ) -> EpisodeTable:
     """Return every episode of shards behind a URL, by identity and number of steps.
 

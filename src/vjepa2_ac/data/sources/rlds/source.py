@@ -122,7 +122,7 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
         """Return the features with the images of the config's cameras."""
         return [self._config.fields.cameras[camera] for camera in self._config.cameras]
 
-    def _look(self, progress: Progress | None) -> _Opened:
+    def _look(self, progress: Progress) -> _Opened:
         config, fields = self._config, self._config.fields
         shards = tuple(find_shards(config.path))
         parts = {
