@@ -107,12 +107,10 @@ def read_episodes(
     rows.sort(key=lambda row: row.index)
     numbers = [row.index for row in rows]
     if len(set(numbers)) != len(numbers) or len(rows) != info.episodes:
-        raise InputError(
-            where=storage.join(info.root, tables[0] if tables else "meta"),
-            found=f"{len(rows)} episodes, of {len(set(numbers))} numbers",
-            needed=f"{info.episodes} of as many numbers, says {info.where}",
-            fix=_FIX,
-        )
+        where = storage.join(info.root, tables[0] if tables else "meta")
+        found = f"{len(rows)} episodes, of {len(set(numbers))} numbers"
+        needed = f"{info.episodes} of as many numbers, says {info.where}"
+        raise InputError(where=where, found=found, needed=needed, fix=_FIX)
     return rows
 
 
@@ -145,14 +143,8 @@ def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[Episode
 def _episode_of_line(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str]) -> EpisodeRow:
     index = _count(row["episode_index"])
     chunk = index // info.chunk_episodes
-    return EpisodeRow(
-        index=index,
-        length=_count(row["length"]),
-        tasks=_texts(row.get("tasks")),
-        chunk=chunk,
-        file=index,
-        videos={key: VideoPlace(chunk, index, 0.0, None) for key in videos},
-    )
+    places = {key: VideoPlace(chunk, index, 0.0, None) for key in videos}
+    return EpisodeRow(index, _count(row["length"]), _texts(row.get("tasks")), chunk, index, places)
 
 
 def _rows_of_table(

@@ -48,10 +48,21 @@ class ExampleRecord:
             raise not_an_example(self._span, error) from None
 
     def require(self, names: Iterable[str]) -> None:
-        """Refuse a record that lacks a feature."""
+        """Refuse a record that lacks a feature.
+
+        Raises:
+            InputError: It does; names the features that it has.
+        """
+        known = sorted(self.located)
         for name in names:
             if name not in self.located:
-                raise self._missing(name)
+                close = difflib.get_close_matches(name, known, n=1)
+                raise InputError(
+                    where=str(self._span),
+                    found=f"no feature {name}; the record has {', '.join(known) or 'none'}",
+                    needed="the features that data.fields names",
+                    fix=f"Did you mean {close[0]}? Set data.fields" if close else "Set data.fields",
+                )
 
     def floats(self, name: str) -> Float32[np.ndarray, " values"]:
         """Return the numbers of a feature.
@@ -125,21 +136,9 @@ class ExampleRecord:
         offset, length = self.located[name]
         data = self._read(offset, length)
         if len(data) < length:
-            raise InputError(
-                where=f"{self._span}: {name}", found=f"{len(data)} bytes at {offset}", needed=f"{length} bytes"
-            )
+            where, found = f"{self._span}: {name}", f"{len(data)} bytes at {offset}"
+            raise InputError(where=where, found=found, needed=f"{length} bytes")
         return data
-
-    def _missing(self, name: str) -> InputError:
-        names = sorted(self.located)
-        close = difflib.get_close_matches(name, names, n=1)
-        hint = f"Did you mean {close[0]}? " if close else ""
-        return InputError(
-            where=str(self._span),
-            found=f"no feature {name}; the record has {', '.join(names) or 'none'}",
-            needed="the features that data.fields names",
-            fix=f"{hint}Set data.fields",
-        )
 
 
 def not_an_example(span: RecordSpan, error: NotAnExampleError) -> InputError:

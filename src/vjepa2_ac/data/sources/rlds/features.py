@@ -91,9 +91,8 @@ def states_of(record: ExampleRecord, config: RldsData, steps: int, where: str) -
         return states
     if states.shape[1] != STATE_DIM:
         found = " + ".join(f"{name} [{column.shape[1]}]" for name, column in zip(fields.state, columns, strict=True))
-        raise InputError(
-            where=f"{where}: data.fields.state", found=found, needed=f"{STATE_DIM} numbers a step: xyz, Euler, gripper"
-        )
+        needed = f"{STATE_DIM} numbers a step: xyz, Euler, gripper"
+        raise InputError(where=f"{where}: data.fields.state", found=found, needed=needed)
     POSE.require_plausible(states, where, fix="Check data.fields.state")
     if fields.gripper == "openness":
         states[:, POSE.gripper] = 1.0 - states[:, POSE.gripper]
@@ -142,7 +141,6 @@ def language_of(record: ExampleRecord, fields: RldsFields) -> dict[str, str]:
 def _of_every_step(record: ExampleRecord, name: str, steps: int, where: str) -> Float[np.ndarray, "steps width"]:
     values = record.floats(name).astype(np.float64)
     if len(values) == 0 or len(values) % steps:
-        raise InputError(
-            where=f"{where}: {name}", found=f"{len(values)} numbers", needed=f"as many for each of {steps} steps"
-        )
+        found, needed = f"{len(values)} numbers", f"as many for each of {steps} steps"
+        raise InputError(where=f"{where}: {name}", found=found, needed=needed)
     return values.reshape(steps, -1)

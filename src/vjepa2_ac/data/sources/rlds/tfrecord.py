@@ -70,11 +70,8 @@ def span_at(header: bytes, path: str, number: int, offset: int, size: int) -> Re
         raise _truncated(where, size, offset + HEADER_BYTES)
     length, crc = struct.unpack_from("<QI", header)
     if crc != _masked_crc(header[:8]):
-        raise InputError(
-            where=where,
-            found="the CRC of the length does not match: not a TFRecord file, or a damaged one",
-            needed="a TFRecord file as TFDS writes it",
-        )
+        found = "the CRC of the length does not match: not a TFRecord file, or a damaged one"
+        raise InputError(where=where, found=found, needed="a TFRecord file as TFDS writes it")
     span = RecordSpan(path=path, number=number, offset=offset, length=length)
     if span.end > size:
         raise _truncated(where, size, span.end)
@@ -138,12 +135,8 @@ def decode_feature(data: bytes, *, where: str) -> tuple[Kind | None, Sequence[An
 
 
 def _truncated(where: str, size: int, needed: int) -> InputError:
-    return InputError(
-        where=where,
-        found=f"the file ends after {size:,} bytes, within this record: it is truncated",
-        needed=f"at least {needed:,} bytes",
-        fix="Download the file again",
-    )
+    found = f"the file ends after {size:,} bytes, within this record: it is truncated"
+    return InputError(where=where, found=found, needed=f"at least {needed:,} bytes", fix="Download the file again")
 
 
 def _masked_crc(data: bytes) -> int:
