@@ -20,9 +20,6 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.tfrecord import Kind, encode_example, write_record
 from vjepa2_ac.data.sources.rlds.writing.droid_schema import dataset_info, droid_features
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.jpeg import encode_jpeg
-
-__all__ = ["CAMERAS", "DroidCommands", "DroidEpisode", "DroidMeasurements", "encode_jpeg", "write_droid_rlds"]
 
 CAMERAS = ("exterior_image_1_left", "exterior_image_2_left", "wrist_image_left")
 
