@@ -6,7 +6,7 @@ from typing import Any
 
 from vjepa2_ac.data.sources.rlds.dataset_info import find_shards
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Kind, RecordSpan, decode_feature, require_intact, span_at
-from vjepa2_ac.data.sources.rlds.wire_format import locate_features
+from vjepa2_ac.data.sources.rlds.wire_format import iterate_features
 
 
 def index_records(path: str | Path) -> list[RecordSpan]:
@@ -37,5 +37,5 @@ def read_record(span: RecordSpan) -> bytes:
 
 def decode_example(data: bytes) -> dict[str, tuple[Kind | None, Sequence[Any]]]:
     """Return kind and values of every feature of a serialised tf.train.Example."""
-    located = locate_features(lambda offset, length: data[offset : offset + length], 0, len(data))
+    located = dict(iterate_features(lambda offset, length: data[offset : offset + length], 0, len(data)))
     return {name: decode_feature(data[start : start + size], where=name) for name, (start, size) in located.items()}

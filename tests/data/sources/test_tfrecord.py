@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tfrecords import decode_example, index_records, read_record
 from vjepa2_ac.data.sources.rlds.tfrecord import decode_feature, encode_example, write_record
-from vjepa2_ac.data.sources.rlds.wire_format import NotAnExampleError, features_behind, locate_features
+from vjepa2_ac.data.sources.rlds.wire_format import NotAnExampleError, features_behind, iterate_features
 from vjepa2_ac.errors import InputError
 
 RECORDS = [b"", b"one", bytes(1000), b"trailing zeros\0\0\0"]
@@ -99,7 +99,7 @@ features = st.dictionaries(
 @given(features=features)
 def test_features_are_found_without_reading_the_others(features: dict) -> None:
     data = b"before" + encode_example(features) + b"after"
-    located = locate_features(reader_of(data), 6, len(data) - 11)
+    located = dict(iterate_features(reader_of(data), 6, len(data) - 11))
     assert located.keys() == features.keys()
     for name, (kind, values) in features.items():
         offset, length = located[name]
@@ -114,7 +114,7 @@ def test_features_are_found_without_reading_the_others(features: dict) -> None:
 @given(features=features, share=st.floats(0, 1))
 def test_what_is_found_from_the_end_lies_where_it_does(features: dict, share: float) -> None:
     data = encode_example(features)
-    located = locate_features(reader_of(data), 0, len(data))
+    located = dict(iterate_features(reader_of(data), 0, len(data)))
     cut = int(share * len(data))
     for place, name in enumerate(located):
         behind = dict(list(located.items())[place:])
@@ -128,6 +128,6 @@ def test_bytes_that_are_no_example_are_refused() -> None:
     example = encode_example({"name": ("bytes_list", [b"value" * 10])})
     for length in range(1, len(example)):
         with pytest.raises(NotAnExampleError):
-            locate_features(reader_of(example), 0, length)
+            dict(iterate_features(reader_of(example), 0, length))
     with pytest.raises(InputError, match=r"here.*not a tf\.train\.Feature"):
         decode_feature(b"\xff\xff", where="here")

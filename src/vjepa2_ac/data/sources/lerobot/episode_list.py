@@ -12,13 +12,14 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_bytes
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo
 from vjepa2_ac.data.sources.lerobot.parquet import Opener, read_table
-from vjepa2_ac.data.sources.lerobot.path_templates import filled, list_by_template
+from vjepa2_ac.data.sources.lerobot.path_templates import filled
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import json_object
 
-EPISODES_V21 = "meta/episodes.jsonl"
-EPISODES_V30 = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES = {  # templates of the files that list the episodes
+    "v2.1": "meta/episodes.jsonl",
+    "v3.0": "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+}
 
 _T = TypeVar("_T")
 
@@ -52,8 +53,8 @@ class EpisodeRow:
 
     @property
     def id(self) -> str:
-        """Its identity."""
-        return identity(self.index)
+        """Its identity: its number, the only name in LeRobot."""
+        return f"episode_{self.index:06d}"
 
 
 @dataclass(frozen=True)
@@ -62,21 +63,6 @@ class StatisticsColumns:
 
     states: tuple[str, ...]  # to find episodes with the same states; none: their rows are read
     success: str | None  # the episode's success
-
-
-def identity(index: int) -> str:
-    """Return the identity of an episode: its number, the only name in LeRobot."""
-    return f"episode_{index:06d}"
-
-
-def tables_of_episodes(info: DatasetInfo, connections: int) -> dict[str, FileInfo]:
-    """Return the files that list the episodes.
-
-    Raises:
-        OSError: They cannot be listed.
-    """
-    template = EPISODES_V30 if info.version == "v3.0" else EPISODES_V21
-    return list_by_template(info.root, template, connections=connections)
 
 
 def read_episodes(
@@ -125,7 +111,7 @@ def video_file(info: DatasetInfo, place: VideoPlace, key: str) -> str:
 
 
 def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[EpisodeRow]:
-    where = storage.join(info.root, EPISODES_V21)
+    where = storage.join(info.root, EPISODES["v2.1"])
     try:
         lines = storage.read_bounded(where, _MOST_BYTES).decode().splitlines()
     except FileNotFoundError:

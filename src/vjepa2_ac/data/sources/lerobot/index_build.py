@@ -37,13 +37,8 @@ def find_problems(
         files: The existing files, within the data set.
         keys: Features of the cameras that are used.
     """
-    found: dict[int, InputError] = {}
-    for row in rows:
-        try:
-            _require_usable(info, row, files, keys)
-        except InputError as error:
-            found[row.index] = error
-    return found
+    found = {row.index: _problem_of(info, row, files, keys) for row in rows}
+    return {index: problem for index, problem in found.items() if problem is not None}
 
 
 def check_rows(
@@ -135,21 +130,22 @@ def _checked(row: EpisodeRow, check: Check) -> tuple[EpisodeRow, InputError | No
     return replace(row, success=success, state_hash=hash_of_states(content.states)), None
 
 
-def _require_usable(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> None:
+def _problem_of(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> InputError | None:
     if row.length == 0:
-        raise zero_steps(f"{info.root}: {row.id}")
+        return zero_steps(f"{info.root}: {row.id}")
     rows_in = data_file(info, row)
     if rows_in not in files:
         where, needed = f"{storage.join(info.root, rows_in)}: {row.id}", f"the {row.length} rows of the episode"
-        raise InputError(where=where, found="no such file", needed=needed, fix=_FIX)
+        return InputError(where=where, found="no such file", needed=needed, fix=_FIX)
     for key, place in row.videos.items():
         if key not in keys:
             continue
         shown_in = video_file(info, place, key)
         where, of_rows = f"{storage.join(info.root, shown_in)}: {row.id}", f"for {row.length} rows in {rows_in}"
         if shown_in not in files:
-            raise InputError(where=where, found=f"no such video, {of_rows}", needed=f"the frames of {key}", fix=_FIX)
+            return InputError(where=where, found=f"no such video, {of_rows}", needed=f"the frames of {key}", fix=_FIX)
         if place.length_s is not None and not place.length_s > (row.length - 0.5) / info.fps:
             found = f"{place.length_s:.3f} s of video, says the data set, {of_rows}"
             needed = f"{row.length / info.fps:.3f} s"
-            raise InputError(where=where, found=found, needed=needed, fix="Leave the episode out")
+            return InputError(where=where, found=found, needed=needed, fix="Leave the episode out")
+    return None

@@ -93,10 +93,6 @@ class DatasetInfo:
             raise InputError(where=self.where, found=f"no video_path, and {key} is a video", needed="one", fix=_FIX)
         return key
 
-    def known_keys(self, fields: LeRobotFields) -> list[str]:
-        """Return the cameras that both the config and the data set have."""
-        return [key for key in dict.fromkeys(fields.cameras.values()) if key in self.features]
-
 
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
     """Return the error of a missing name, with the existing ones, and a suggestion."""

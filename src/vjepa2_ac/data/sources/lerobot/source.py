@@ -16,11 +16,11 @@ from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened
 from vjepa2_ac.data.sources.lerobot.episode_list import (
+    EPISODES,
     EpisodeRow,
     StatisticsColumns,
     data_file,
     read_episodes,
-    tables_of_episodes,
     video_file,
 )
 from vjepa2_ac.data.sources.lerobot.episode_rows import EpisodeContent, content_of, wanted_columns
@@ -107,7 +107,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
             require_decoder(info.where)
-        tables = tables_of_episodes(info, self._connections)
+        tables = list_by_template(info.root, EPISODES[info.version], connections=self._connections)
         files = list_by_template(info.root, info.data_path, connections=self._connections)
         for key in keys:
             if info.features[key].dtype == "video":
@@ -131,7 +131,8 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, fields = self._info, self._config.lerobot
         statistics = StatisticsColumns(tuple(fields.state) if self._is_far else (), fields.success)
-        rows = read_episodes(info, tables, info.known_keys(fields), statistics, self._open_file)
+        known = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
+        rows = read_episodes(info, tables, known, statistics, self._open_file)
         problems = find_problems(info, rows, files, keys)
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
         if not self._is_far or (self._config.outcome != "all" and outcome_unknown):

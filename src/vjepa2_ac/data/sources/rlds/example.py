@@ -18,7 +18,7 @@ from vjepa2_ac.data.sources.rlds.wire_format import (
     Located,
     NotAnExampleError,
     Read,
-    locate_features,
+    iterate_features,
     locate_items,
     packed_numbers,
 )
@@ -43,7 +43,7 @@ class ExampleRecord:
     def located(self) -> dict[str, Located]:
         """The position of each feature."""
         try:
-            return locate_features(self._read, self._span.data_offset, self._span.length)
+            return dict(iterate_features(self._read, self._span.data_offset, self._span.length))
         except NotAnExampleError as error:
             raise not_an_example(self._span, error) from None
 
