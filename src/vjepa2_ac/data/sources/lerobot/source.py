@@ -15,14 +15,8 @@ from vjepa2_ac.data.cache.disk_cache import fetched_data
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened
-from vjepa2_ac.data.sources.lerobot.episode_list import (
-    EPISODES,
-    EpisodeRow,
-    StatisticsColumns,
-    data_file,
-    read_episodes,
-    video_file,
-)
+from vjepa2_ac.data.sources.lerobot import episode_list
+from vjepa2_ac.data.sources.lerobot.episode_list import EpisodeRow
 from vjepa2_ac.data.sources.lerobot.episode_rows import EpisodeContent, content_of, wanted_columns
 from vjepa2_ac.data.sources.lerobot.images import stored_images, video_frames
 from vjepa2_ac.data.sources.lerobot.index_build import check_rows, find_problems, row_of, table_of
@@ -107,7 +101,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
             require_decoder(info.where)
-        tables = list_by_template(info.root, EPISODES[info.version], connections=self._connections)
+        tables = list_by_template(info.root, episode_list.EPISODES[info.version], connections=self._connections)
         files = list_by_template(info.root, info.data_path, connections=self._connections)
         for key in keys:
             if info.features[key].dtype == "video":
@@ -130,9 +124,9 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
 
     def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, fields = self._info, self._config.lerobot
-        statistics = StatisticsColumns(tuple(fields.state) if self._is_far else (), fields.success)
+        statistics = episode_list.StatisticsColumns(tuple(fields.state) if self._is_far else (), fields.success)
         known = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
-        rows = read_episodes(info, tables, known, statistics, self._open_file)
+        rows = episode_list.read_episodes(info, tables, known, statistics, self._open_file)
         problems = find_problems(info, rows, files, keys)
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
         if not self._is_far or (self._config.outcome != "all" and outcome_unknown):
@@ -145,20 +139,20 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         return table
 
     def _content(self, row: EpisodeRow) -> EpisodeContent:
-        rows = self._parquet.rows(storage.join(self._info.root, data_file(self._info, row)), row.index)
+        rows = self._parquet.rows(storage.join(self._info.root, episode_list.data_file(self._info, row)), row.index)
         return content_of(rows, row.length, self._info, self._config, self._where(row))
 
     def _frames(self, row: EpisodeRow, key: str) -> FramesByStep:
         info = self._info
         if info.features[key].dtype == "image":
-            path = storage.join(info.root, data_file(info, row))
+            path = storage.join(info.root, episode_list.data_file(info, row))
             return stored_images(
                 lambda: self._parquet.images(path, key, row.index), row.length, f"{self._where(row)}: {key}"
             )
         place = row.videos[key]
-        path = storage.join(info.root, video_file(info, place, key))
+        path = storage.join(info.root, episode_list.video_file(info, place, key))
         clock = Clock(start_s=place.start_s, rate_hz=info.fps)
         return video_frames(self._open_file, path, clock, row.length, f"{path}: {row.id}")
 
     def _where(self, row: EpisodeRow) -> str:
-        return f"{storage.join(self._info.root, data_file(self._info, row))}: {row.id}"
+        return f"{storage.join(self._info.root, episode_list.data_file(self._info, row))}: {row.id}"

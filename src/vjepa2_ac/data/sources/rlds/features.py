@@ -36,7 +36,7 @@ def info_of(identity: str, num_steps: int) -> EpisodeInfo:
     return EpisodeInfo(id=identity, num_steps=num_steps, success=success)
 
 
-def features_of_steps(config: RldsData) -> tuple[str, ...]:
+def step_features(config: RldsData) -> tuple[str, ...]:
     """Return the features of states and recorded actions."""
     return config.fields.state + (config.fields.action if config.actions == "recorded" else ())
 
@@ -68,7 +68,7 @@ def check_record(
     Raises:
         InputError: A feature is missing, has no uniform shape over all steps, or has implausible numbers.
     """
-    record.require([*config.fields.identity, *features_of_steps(config), *cameras])
+    record.require([*config.fields.identity, *step_features(config), *cameras])
     steps = num_steps_of(record, config)
     states = states_of(record, config, steps, where)
     commands_of(record, config, steps, where)

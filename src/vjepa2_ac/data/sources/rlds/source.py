@@ -11,20 +11,10 @@ from vjepa2_ac.config import RldsData
 from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.index.index_cache import IndexKeys, cache_folder, get_or_build
 from vjepa2_ac.data.sources.indexed_source import IndexedSource, Opened
+from vjepa2_ac.data.sources.rlds import features
 from vjepa2_ac.data.sources.rlds.crc_marks import CrcMarks
 from vjepa2_ac.data.sources.rlds.dataset_info import find_shards
 from vjepa2_ac.data.sources.rlds.example import ExampleRecord
-from vjepa2_ac.data.sources.rlds.features import (
-    STEP_FLAG,
-    commands_of,
-    features_of_steps,
-    identity_of,
-    info_of,
-    joint_velocities_of,
-    language_of,
-    num_steps_of,
-    states_of,
-)
 from vjepa2_ac.data.sources.rlds.images import images_in_file, images_in_memory, wrong_count
 from vjepa2_ac.data.sources.rlds.images_remote import RemoteCache, RemoteEpisode, whole_record
 from vjepa2_ac.data.sources.rlds.index_local import index_local, position_of
@@ -74,7 +64,7 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
             with open_shard(shard) as read:
                 record = ExampleRecord(read, span)
                 if self._config.check_crc != "once" or index not in opened.verified:
-                    self._check(record, read, span, info, {feature, *self._features()})
+                    self._check(record, read, span, info, {feature, *self._image_features()})
                     if self._config.check_crc == "once":
                         opened.verified.add(index)
                 record.require([feature])
@@ -87,8 +77,9 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
             images = images_in_memory(read, record.located[feature], info.num_steps, f"{where}: {feature}")
         else:
             remote = RemoteEpisode(shard, span, opened.cache)
-            numbers = [*fields.identity, *features_of_steps(self._config), STEP_FLAG, fields.joint_velocity]
-            record = remote.record([name for name in numbers if name], [fields.language] if fields.language else [])
+            numbers = [*fields.identity, *features.step_features(self._config), features.STEP_FLAG]
+            numbers += [fields.joint_velocity] if fields.joint_velocity else []
+            record = remote.record(numbers, [fields.language] if fields.language else [])
             record.require([feature])
             place = record.located[feature]
             images = remote.images(feature, place, info.num_steps, needed, f"{where}: {feature}")
@@ -99,26 +90,26 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
         _require_as_indexed(record, info, config, where)
         return Episode(
             info=info,
-            states=states_of(record, config, info.num_steps, where),
+            states=features.states_of(record, config, info.num_steps, where),
             read_frames=images,
             control_rate_hz=fields.control_rate_hz,
-            joint_velocities=joint_velocities_of(record, fields, info.num_steps, where),
-            metadata=language_of(record, fields),
-            commands=commands_of(record, config, info.num_steps, where),
+            joint_velocities=features.joint_velocities_of(record, fields, info.num_steps, where),
+            metadata=features.language_of(record, fields),
+            commands=features.commands_of(record, config, info.num_steps, where),
         )
 
     def _check(
-        self, record: ExampleRecord, read: Read, span: RecordSpan, info: EpisodeInfo, features: Iterable[str]
+        self, record: ExampleRecord, read: Read, span: RecordSpan, info: EpisodeInfo, cameras: Iterable[str]
     ) -> None:
         """Check a complete record: its CRC, unless disabled, and the number of its images."""
         if self._config.check_crc != "never":
             require_intact(read, span)
-        for feature in features:
+        for feature in cameras:
             found = len(record.items(feature)[0])
             if found != info.num_steps:
                 raise wrong_count(found, info.num_steps, f"{span} ({info.id}): {feature}")
 
-    def _features(self) -> list[str]:
+    def _image_features(self) -> list[str]:
         """Return the features with the images of the config's cameras."""
         return [self._config.fields.cameras[camera] for camera in self._config.cameras]
 
@@ -126,16 +117,16 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
         config, fields = self._config, self._config.fields
         shards = tuple(find_shards(config.path))
         parts = {
-            **({"vector": features_of_steps(config)} if config.states == "vector" else {}),
+            **({"vector": features.step_features(config)} if config.states == "vector" else {}),
             "source": "rlds",
             **knobs_that_affect(Affects.INDEX, fields),
-            "cameras": self._features(),
+            "cameras": self._image_features(),
             "shards": [(shard.name, shard.episodes, shard.size, shard.version) for shard in shards],
         }
         parts.pop("action")  # where it matters, it is among the features
         keys = IndexKeys.of(parts, config.path)
         make = index_remote if storage.is_url(config.path) else index_local
-        build = partial(make, shards, config, self._features(), threads=config.connections, progress=progress)
+        build = partial(make, shards, config, self._image_features(), threads=config.connections, progress=progress)
         table = get_or_build(config.disk_cache, keys, config.path, build)
         return _Opened(
             replace(table, texts={**table.texts, "control_rate_hz": str(fields.control_rate_hz)}),
@@ -147,11 +138,8 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
 
 def _require_as_indexed(record: ExampleRecord, info: EpisodeInfo, config: RldsData, where: str) -> None:
     """Refuse a record that does not match the index."""
-    found = info_of(identity_of(record, config.fields), num_steps_of(record, config))
+    found = features.info_of(features.identity_of(record, config.fields), features.num_steps_of(record, config))
     if found != info:
-        raise InputError(
-            where=where,
-            found=f"the episode {found.id} of {found.num_steps} steps",
-            needed=f"{info.num_steps} steps of {info.id}, says the index",
-            fix="Start again",
-        )
+        text = f"the episode {found.id} of {found.num_steps} steps"
+        needed = f"{info.num_steps} steps of {info.id}, says the index"
+        raise InputError(where=where, found=text, needed=needed, fix="Start again")
