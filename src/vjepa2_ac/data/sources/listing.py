@@ -47,8 +47,9 @@ def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
     """
     place = storage.join(root, folder) if folder else root
     files, names = storage.list_files(place), storage.list_names(place)
-    for name in names:
-        _require_text(name, place)
+    for name in names:  # the identity of an episode must be text that can be encoded
+        if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
+            raise InputError(where=place, found=f"the name {name!r}", needed="names in UTF-8", fix="Rename it")
     known = {file.name for file in files}
     return files, [name for name in names if name not in known and not name.startswith(".")]
 
@@ -68,9 +69,3 @@ def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], conne
         yield from pool.map(function, items)
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _require_text(name: str, place: str) -> None:
-    """Refuse a name that cannot be encoded, as the identity of an episode must be."""
-    if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
-        raise InputError(where=place, found=f"the name {name!r}", needed="names in UTF-8", fix="Rename it")

@@ -26,7 +26,7 @@ from vjepa2_ac.data.sources.latents.manifest import (
     size_column,
     size_of,
 )
-from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges, StoredLatents
+from vjepa2_ac.episode import Episode, Progress, StepRanges, StoredLatents
 from vjepa2_ac.errors import InputError
 
 _ENCODE = "Run `vjepa2-ac encode` again, as the cache was made: it encodes what is lacking; or copy the file again"
@@ -73,12 +73,12 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
             InputError: No complete cache, or one of other clips than the config's.
         """
         kept = self._open().kept
-        if kept is None:  # `_require_fit` has compared the rules
+        if kept is None:  # `_look` has compared the rules
             where, found = str(self._folder / MANIFEST), f"damaged: no checksum of {KEPT}"
             raise InputError(where=where, found=found, needed="one", fix=_ENCODE)
         return kept
 
-    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
         """Return one episode; only requested latents are read.
 
         Raises:
@@ -93,7 +93,11 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
             found = f"no latents: it could not be read when they were encoded ({reason.rstrip('.')})"
             raise InputError(where=f"{self._folder}: episode {info.id}", found=found)
         record = EpisodeFile(path_of(self._folder, index, camera), opened.manifest.layout)
-        _require_as_indexed(record, info, camera)
+        found = record.id, record.camera, len(record["states"])
+        if found != (info.id, camera, info.num_steps):
+            text = f"episode {found[0]} of {found[2]} steps, camera {found[1]}"
+            needed = f"{info.id} of {info.num_steps} steps, camera {camera}"
+            raise InputError(where=record.path, found=text, needed=needed, fix=_DELETE)
         checked = self._checked.setdefault((index, camera), bytearray(len(record.frame_steps)))
         return Episode(
             info=info,
@@ -160,19 +164,15 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
 
     def _look(self, progress: Progress) -> _Opened:  # noqa: ARG002 - at once
         manifest = read_manifest(self._folder)
-        self._require_fit(manifest)
-        table, kept = read_episodes(self._folder, manifest)
-        return _Opened(table, manifest, kept)
-
-    def _require_fit(self, manifest: Manifest) -> None:
-        """Refuse a cache of other clips than the config's; name the differences."""
         parts = clip_parts(self._config)
         differing = manifest.cache_key.differences(parts, parts)
         for camera in () if self._config.camera is None else self._config.cameras:
             if camera not in manifest.cameras:
                 differing.append(f"data.camera: {', '.join(manifest.cameras)}, not {camera}")
-        if differing:
+        if differing:  # of other clips than the config's
             raise another_cache(self._folder, differing)
+        table, kept = read_episodes(self._folder, manifest)
+        return _Opened(table, manifest, kept)
 
 
 def another_cache(folder: Path, differing: Sequence[str]) -> InputError:
@@ -183,11 +183,3 @@ def another_cache(folder: Path, differing: Sequence[str]) -> InputError:
         needed="one that was made with this model and these settings",
         fix="Change the settings to those, or encode the data set again",
     )
-
-
-def _require_as_indexed(record: EpisodeFile, info: EpisodeInfo, camera: str) -> None:
-    found = record.id, record.camera, len(record["states"])
-    if found != (info.id, camera, info.num_steps):
-        text = f"episode {found[0]} of {found[2]} steps, camera {found[1]}"
-        needed = f"{info.id} of {info.num_steps} steps, camera {camera}"
-        raise InputError(where=record.path, found=text, needed=needed, fix=_DELETE)

@@ -66,11 +66,7 @@ class StatisticsColumns:
 
 
 def read_episodes(
-    info: DatasetInfo,
-    tables: Sequence[str],
-    keys: Sequence[str],
-    wanted: StatisticsColumns,
-    open_file: Opener,
+    info: DatasetInfo, tables: Sequence[str], keys: Sequence[str], wanted: StatisticsColumns, open_file: Opener
 ) -> list[EpisodeRow]:
     """Return every episode, sorted by number.
 

@@ -59,18 +59,24 @@ def check_rows(
     for row in rows:
         if row.index not in problems:
             by_file.setdefault(data_file(info, row), []).append(row)
-    checked = [row for row in rows if row.index in problems]
-    done = 0
 
-    def check_file(file: str) -> list[tuple[EpisodeRow, InputError | None]]:
-        return [_checked(row, check) for row in by_file[file]]
-
-    for results in in_parallel(check_file, list(by_file), connections):
-        for row, error in results:
-            checked.append(row)
-            if error is not None:
+    def check_file(file: str) -> list[EpisodeRow]:
+        checked = []
+        for row in by_file[file]:
+            try:
+                content = check(row)
+            except InputError as error:
                 problems[row.index] = error
-        done += len(results)
+                checked.append(row)
+            else:
+                success = row.success if content.success is None else content.success
+                checked.append(replace(row, success=success, state_hash=hash_of_states(content.states)))
+        return checked
+
+    checked, done = [row for row in rows if row.index in problems], 0
+    for of_file in in_parallel(check_file, list(by_file), connections):
+        checked += of_file
+        done += len(of_file)
         progress(done, len(rows))
     return sorted(checked, key=lambda row: row.index)
 
@@ -84,15 +90,14 @@ def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], tex
     usable = [row for row in rows if row.index not in problems]
     if not usable and problems:
         raise problems[min(problems)]
-    labels = Labels.of(["; ".join(row.tasks) for row in usable])
-    hashes = [row.state_hash for row in usable]
-    tasks = sorted({"; ".join(row.tasks) for row in usable})
+    task_of = ["; ".join(row.tasks) for row in usable]
+    labels, hashes, tasks = Labels.of(task_of), [row.state_hash for row in usable], sorted(set(task_of))
     number = {task: place for place, task in enumerate(tasks)}
     locators: dict[str, np.ndarray] = {
         "index": np.array([row.index for row in usable], np.int64),
         "chunk": np.array([row.chunk for row in usable], np.int32),
         "file": np.array([row.file for row in usable], np.int32),
-        "task": np.array([number["; ".join(row.tasks)] for row in usable], np.int32),
+        "task": np.array([number[task] for task in task_of], np.int32),
     }
     for key in usable[0].videos if usable else ():
         places = [row.videos[key] for row in usable]
@@ -119,15 +124,6 @@ def row_of(table: EpisodeTable, place: int) -> EpisodeRow:
     }
     length = int(table.num_steps[place])
     return EpisodeRow(int(at["index"]), length, (), int(at["chunk"]), int(at["file"]), videos)
-
-
-def _checked(row: EpisodeRow, check: Check) -> tuple[EpisodeRow, InputError | None]:
-    try:
-        content = check(row)
-    except InputError as error:
-        return row, error
-    success = row.success if content.success is None else content.success
-    return replace(row, success=success, state_hash=hash_of_states(content.states)), None
 
 
 def _problem_of(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> InputError | None:

@@ -137,7 +137,9 @@ class ParquetRows:
             raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=FIX)
         with self._lock:
             self._groups[path, number] = group
-            while len(self._groups) > 1 and sum(map(_size_of, self._groups.values())) > _CACHED_BYTES:
+            sizes = [sum(column.nbytes for column in columns.values()) for columns in self._groups.values()]
+            while len(sizes) > 1 and sum(sizes) > _CACHED_BYTES:
+                sizes.pop(0)
                 self._groups.popitem(last=False)
         return group
 
@@ -263,10 +265,6 @@ def _images_in(rows: list[Any], episodes: list[Any], episode: int, where: str) -
 def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
     found = f"{gaps} rows without a value" if gaps else f"values of type {kind}"
     return InputError(where=where, found=found, needed="numbers, as many in each row", fix=FIX)
-
-
-def _size_of(columns: Columns) -> int:
-    return sum(column.nbytes for column in columns.values())
 
 
 def _library(where: str) -> tuple[Any, Any]:

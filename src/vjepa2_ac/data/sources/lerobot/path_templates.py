@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.listing import in_parallel
@@ -61,11 +60,6 @@ def list_by_template(root: str, template: str, key: str = "", *, connections: in
     listings = in_parallel(lambda folder: storage.list_files(storage.join(root, folder)), found, connections)
     files = [(folder, file) for folder, inside in zip(found, listings, strict=True) for file in inside]
     return dict(sorted((f"{folder}{file.name}", file) for folder, file in files if _fits(file.name, name)))
-
-
-def fingerprint(*listings: Mapping[str, FileInfo]) -> Sequence[tuple[str, int, str]]:
-    """Return a version that changes with any of the files."""
-    return [(path, info.size, info.version) for files in listings for path, info in files.items()]
 
 
 def _fits(name: str, part: str) -> bool:

@@ -22,7 +22,7 @@ from vjepa2_ac.data.sources.lerobot.images import stored_images, video_frames
 from vjepa2_ac.data.sources.lerobot.index_build import check_rows, find_problems, row_of, table_of
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
-from vjepa2_ac.data.sources.lerobot.path_templates import fingerprint, list_by_template
+from vjepa2_ac.data.sources.lerobot.path_templates import list_by_template
 from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import Clock, require_decoder
@@ -115,7 +115,7 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
             "keys": keys,
             "outcome": self._is_far and config.outcome != "all",
             "info": repr(replace(info, root="")),
-            "files": fingerprint(tables, files),
+            "files": [(path, file.size, file.version) for path, file in [*tables.items(), *files.items()]],
         }
         index = IndexKeys.of(parts, config.path)
         self._version = index.now
@@ -146,9 +146,8 @@ class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
         info = self._info
         if info.features[key].dtype == "image":
             path = storage.join(info.root, episode_list.data_file(info, row))
-            return stored_images(
-                lambda: self._parquet.images(path, key, row.index), row.length, f"{self._where(row)}: {key}"
-            )
+            read = partial(self._parquet.images, path, key, row.index)
+            return stored_images(read, row.length, f"{self._where(row)}: {key}")
         place = row.videos[key]
         path = storage.join(info.root, episode_list.video_file(info, place, key))
         clock = Clock(start_s=place.start_s, rate_hz=info.fps)

@@ -44,9 +44,9 @@ class ExampleRecord:
         Raises:
             InputError: It does; names the features that it has.
         """
-        known = sorted(self.located)
         for name in names:
             if name not in self.located:
+                known = sorted(self.located)
                 close = difflib.get_close_matches(name, known, n=1)
                 raise InputError(
                     where=str(self._span),

@@ -22,8 +22,7 @@ from vjepa2_ac.data.sources.rlds.index_remote import index_remote
 from vjepa2_ac.data.sources.rlds.shard_reader import Shard, open_shard
 from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan, require_intact
 from vjepa2_ac.data.sources.rlds.wire_format import Read
-from vjepa2_ac.episode import Episode, EpisodeInfo, FrameReader, Progress, StepRanges
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
                         opened.verified.add(index)
                 record.require([feature])
                 images = images_in_file(shard, record.located[feature], info.num_steps, f"{where}: {feature}")
-                return self._episode(record, info, images, where)
+                return features.episode_of(record, self._config, info, images, where)
         if self._config.check_crc == "always":
             read = whole_record(shard, span)
             record = ExampleRecord(read, span)
@@ -83,20 +82,7 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
             record.require([feature])
             place = record.located[feature]
             images = remote.images(feature, place, info.num_steps, needed, f"{where}: {feature}")
-        return self._episode(record, info, images, where)
-
-    def _episode(self, record: ExampleRecord, info: EpisodeInfo, images: FrameReader, where: str) -> Episode:
-        config, fields = self._config, self._config.fields
-        _require_as_indexed(record, info, config, where)
-        return Episode(
-            info=info,
-            states=features.states_of(record, config, info.num_steps, where),
-            read_frames=images,
-            control_rate_hz=fields.control_rate_hz,
-            joint_velocities=features.joint_velocities_of(record, fields, info.num_steps, where),
-            metadata=features.language_of(record, fields),
-            commands=features.commands_of(record, config, info.num_steps, where),
-        )
+        return features.episode_of(record, self._config, info, images, where)
 
     def _check(
         self, record: ExampleRecord, read: Read, span: RecordSpan, info: EpisodeInfo, cameras: Iterable[str]
@@ -134,12 +120,3 @@ class RldsSource(IndexedSource[RldsData, _Opened]):
             CrcMarks(cache_folder(config.disk_cache) / "index" / f"{keys.now}.checked"),
             RemoteCache.of(config.disk_cache, keys.now),
         )
-
-
-def _require_as_indexed(record: ExampleRecord, info: EpisodeInfo, config: RldsData, where: str) -> None:
-    """Refuse a record that does not match the index."""
-    found = features.info_of(features.identity_of(record, config.fields), features.num_steps_of(record, config))
-    if found != info:
-        text = f"the episode {found.id} of {found.num_steps} steps"
-        needed = f"{info.num_steps} steps of {info.id}, says the index"
-        raise InputError(where=where, found=text, needed=needed, fix="Start again")
