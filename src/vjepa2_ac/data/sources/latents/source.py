@@ -93,11 +93,11 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
             found = f"no latents: it could not be read when they were encoded ({reason.rstrip('.')})"
             raise InputError(where=f"{self._folder}: episode {info.id}", found=found)
         record = EpisodeFile(path_of(self._folder, index, camera), opened.manifest.layout)
-        found = record.id, record.camera, len(record["states"])
-        if found != (info.id, camera, info.num_steps):
-            text = f"episode {found[0]} of {found[2]} steps, camera {found[1]}"
-            needed = f"{info.id} of {info.num_steps} steps, camera {camera}"
-            raise InputError(where=record.path, found=text, needed=needed, fix=_DELETE)
+        name, its_camera, steps = record.id, record.camera, len(record["states"])
+        if (name, its_camera, steps) != (info.id, camera, info.num_steps):
+            text = f"episode {name} of {steps} steps, camera {its_camera}"
+            wanted = f"{info.id} of {info.num_steps} steps, camera {camera}"
+            raise InputError(where=record.path, found=text, needed=wanted, fix=_DELETE)
         checked = self._checked.setdefault((index, camera), bytearray(len(record.frame_steps)))
         return Episode(
             info=info,
