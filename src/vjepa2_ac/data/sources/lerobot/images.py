@@ -50,11 +50,11 @@ def stored_images(read: Callable[[], list[bytes]], num_steps: int, where: str) -
         for step in steps:
             at = f"{where}: step {step}"
             frame = decode_image(images()[step], at)
-            (height, width, _), (first_height, first_width, _) = frame.shape, (frames or [frame])[0].shape
+            height, width, _ = frame.shape
             if not frames:
                 require_bounded(height, width, at, count=len(steps))
-            elif (height, width) != (first_height, first_width):
-                needed = f"{first_height}x{first_width} as at step {steps[0]}"
+            elif frame.shape != frames[0].shape:
+                needed = f"{frames[0].shape[0]}x{frames[0].shape[1]} as at step {steps[0]}"
                 raise InputError(where=at, found=f"an image of {height}x{width}", needed=needed)
             frames.append(frame)
         return np.stack(frames)
