@@ -78,7 +78,7 @@ class LatentSource(IndexedSource[DataConfig, _Opened]):
             raise InputError(where=where, found=found, needed="one", fix=_ENCODE)
         return kept
 
-    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:
+    def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - nothing is fetched
         """Return one episode; only requested latents are read.
 
         Raises:
