@@ -15,8 +15,8 @@ from pathlib import Path
 
 from vjepa2_ac.errors import RefusedError, UnreachableError
 from vjepa2_ac.places import is_url
-from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.reading import join
+from vjepa2_ac.storage.remote import ranged_reads, uploads
 from vjepa2_ac.storage.writing import atomic_writer, try_writing_at
 
 _AWAY = frozenset({
@@ -40,7 +40,7 @@ def upload(source: Path, target: str) -> None:
         UnreachableError: It cannot be written; a RefusedError if that is permanent.
     """
     if is_url(target):
-        return remote.upload_file(source, target)
+        return uploads.upload_file(source, target)
     with source.open("rb") as file, _explained(target), atomic_writer(target) as copy:
         shutil.copyfileobj(file, copy)
     return None
@@ -58,10 +58,10 @@ def download(source: str, target: Path) -> None:
         with Path(source).open("rb") as file, atomic_writer(target) as copy:
             shutil.copyfileobj(file, copy)
         return
-    size = remote.file_size(source)
+    size = ranged_reads.file_size(source)
     with atomic_writer(target) as copy:
         for start in range(0, size, _PIECE_BYTES):
-            copy.write(remote.read_range(source, start, min(_PIECE_BYTES, size - start)))
+            copy.write(ranged_reads.read_range(source, start, min(_PIECE_BYTES, size - start)))
 
 
 def remove(path: str) -> None:
@@ -71,7 +71,7 @@ def remove(path: str) -> None:
         UnreachableError: It cannot be removed; a RefusedError if that is permanent.
     """
     if is_url(path):
-        return remote.remove_file(path)
+        return uploads.remove_file(path)
     with _explained(path):
         Path(path).unlink(missing_ok=True)
     return None
@@ -98,7 +98,7 @@ def file_sizes(folder: str) -> dict[str, int]:
         UnreachableError: It cannot be listed; a RefusedError if that is permanent.
     """
     if is_url(folder):
-        return remote.file_sizes(folder)
+        return uploads.file_sizes(folder)
     with _explained(folder):
         files = [path for path in Path(folder).rglob("*") if path.is_file()]
         return {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}

@@ -21,7 +21,7 @@ from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable, Not
 from vjepa2_ac.data.index.index_cache import fingerprints_of, get_or_make, key_of
 from vjepa2_ac.episode import EpisodeSource, Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.arrays import read_arrays
+from vjepa2_ac.storage.npz_reader import read_arrays
 from vjepa2_ac.storage.structured import json_object, record_of, shown
 
 logger = logging.getLogger(__name__)

@@ -37,12 +37,8 @@ class RangedFile(io.RawIOBase):
         """Return that it can seek."""
         return True
 
-    def tell(self) -> int:
-        """Return the offset of the next byte."""
-        return self._position
-
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Go to an offset from the start, the current position or the end; return it from the start."""
+        """Go to an offset from the start, the current position or the end; return it from the start, as `tell` does."""
         base = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
         if base + offset < 0:
             raise ValueError(f"negative position {base + offset}")

@@ -25,13 +25,13 @@ _PIECE_BYTES = 16 << 20  # longer reads are split: each piece has the full time-
 _VERSION_KEYS = ("generation", "etag", "ETag", "blob_id", "mtime", "last_modified", "LastModified", "created")
 
 
-class Entry(NamedTuple):
-    """A file or folder in a listing."""
+class FileInfo(NamedTuple):
+    """A file or folder in a listing, on this machine or at a server."""
 
     name: str
-    is_file: bool
     size: int
-    version: str  # as the server gives it
+    version: str  # changes with the content, as far as is known without reading it
+    is_file: bool = True
 
 
 def exists(url: str) -> bool:
@@ -67,23 +67,25 @@ def file_version(url: str) -> str:
     return _version_of(_call(url, "info"))
 
 
-def list_folder(url: str) -> list[Entry]:
-    """Return the entries of a folder, sorted by name: one listing, one call per page.
+def list_folder(url: str) -> list[FileInfo]:
+    """Return the entries of a folder, sorted by name: one listing, one call per page; none if there is no such folder.
 
     Raises:
-        FileNotFoundError: There is no such folder.
         UnreachableError: It cannot be reached.
     """
-    entries = [
-        Entry(
+    try:
+        listed = _call(url, "ls", detail=True, refresh=True)
+    except FileNotFoundError:
+        return []
+    return sorted(
+        FileInfo(
             name=str(found["name"]).rstrip("/").rsplit("/", 1)[-1],
-            is_file=found["type"] == "file",
             size=int(found.get("size") or 0),
             version=_version_of(found),
+            is_file=found["type"] == "file",
         )
-        for found in _call(url, "ls", detail=True, refresh=True)
-    ]
-    return sorted(entries)
+        for found in listed
+    )
 
 
 def read_range(url: str, start: int, length: int) -> bytes:
@@ -161,7 +163,7 @@ def _version_of(found: Mapping[str, Any]) -> str:
 
 def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
     """Read a range; accept a short answer only at the end of the file."""
-    bare = {} if is_asynchronous(url) else {"cache_type": "none"}  # else megabytes are prefetched
+    bare: dict[str, Any] = {} if is_asynchronous(url) else {"cache_type": "none"}  # else megabytes are prefetched
     try:
         data: bytes = ask(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
     except Exception as error:

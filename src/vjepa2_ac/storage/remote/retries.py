@@ -146,8 +146,8 @@ def status_of(error: BaseException) -> int | None:
 
 def _comes_from_outside(error: Exception) -> bool:
     """Distinguish external failures from bugs."""
-    is_of_a_library = _is_of_network(error) or _is_of_google_login(error)
-    return isinstance(error, OSError | ValueError | EOFError) or status_of(error) is not None or is_of_a_library
+    of_the_system = isinstance(error, OSError | ValueError | EOFError)
+    return of_the_system or status_of(error) is not None or _is_of_network(error) or _is_of_google_login(error)
 
 
 def _is_of_network(error: Exception) -> bool:

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from vjepa2_ac.errors import RefusedError
 from vjepa2_ac.storage.remote import retries
-from vjepa2_ac.storage.remote.filesystems import discard, login_hint, send, sizes_below
+from vjepa2_ac.storage.remote.filesystems import ask, login_hint, send, sizes_below
 from vjepa2_ac.storage.remote.retries import RetryPolicy
 
 _T = TypeVar("_T")
@@ -48,7 +48,7 @@ def remove_file(url: str) -> None:
         UnreachableError: It cannot be reached.
     """
     try:
-        _persist(url, lambda timeout_s: discard(url, timeout_s), retries.DEFAULT)
+        _persist(url, lambda timeout_s: ask(url, "rm_file", timeout_s, writing=True), retries.DEFAULT)
     except FileNotFoundError:
         return
 

@@ -61,14 +61,6 @@ def read_json_object(
     return json_object(data, where=str(path), needed=needed, fix=fix, allow_nan=allow_nan)
 
 
-def read_json_list(
-    path: str | Path, *, most_bytes: int = MOST_BYTES, needed: str = "", fix: str = "", allow_nan: bool = False
-) -> list[Any]:
-    """Return the values of a JSON list in a file; arguments and errors as of `read_json_object`."""
-    data = read_bounded(path, most_bytes)
-    return json_list(data, where=str(path), needed=needed, fix=fix, allow_nan=allow_nan)
-
-
 def _parsed(data: bytes | str, kind: type, where: str, needed: str, fix: str, *, allow_nan: bool) -> Any:
     needed = needed or f"a JSON {_NAMES[kind]}"
     try:

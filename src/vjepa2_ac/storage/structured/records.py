@@ -36,7 +36,7 @@ def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: s
     try:
         record: T = _adapter(cast("Any", kind)).validate_json(json.dumps(dict(values)), strict=True)
     except ValidationError as error:
-        problems += [f"{_place(detail)}: {_problem_of(detail)}" for detail in error.errors()]
+        problems += [f"{'.'.join(map(str, detail['loc']))}: {_problem_of(detail)}" for detail in error.errors()]
     if problems:
         more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
         raise InputError(where=where, found="; ".join(problems[:_MOST_PROBLEMS]) + more, needed=needed, fix=fix)
@@ -46,10 +46,6 @@ def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: s
 @cache
 def _adapter(kind: Any) -> Any:
     return TypeAdapter(kind)
-
-
-def _place(detail: Any) -> str:
-    return ".".join(str(part) for part in detail["loc"])
 
 
 def _problem_of(detail: Any) -> str:

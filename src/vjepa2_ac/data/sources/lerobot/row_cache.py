@@ -11,7 +11,7 @@ from jaxtyping import Shaped
 
 from vjepa2_ac.data.cache.disk_cache import DiskCache
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.arrays import read_arrays
+from vjepa2_ac.storage.npz_reader import read_arrays
 
 Columns = Mapping[str, Shaped[np.ndarray, "rows _"]]
 
