@@ -23,24 +23,16 @@ class CacheSize:
     hours: float  # of robot data that clips come from
 
     @property
-    def bytes(self) -> int:
-        """Of the whole cache."""
-        return self.frames * self.bytes_per_frame
-
-    @property
     def bytes_left(self) -> int:
         """Of the part that is not written yet."""
         return self.frames_left * self.bytes_per_frame
 
-    @property
-    def gigabytes_per_hour(self) -> float:
-        """Of robot data."""
-        return self.bytes / GIGABYTE / self.hours if self.hours else 0.0
-
     def __str__(self) -> str:
+        gigabytes = self.frames * self.bytes_per_frame / GIGABYTE
+        per_hour = gigabytes / self.hours if self.hours else 0.0
         return (
-            f"{self.frames:,} frames, {self.bytes / GIGABYTE:.3g} GB"
-            f" ({self.gigabytes_per_hour:.3g} GB per hour of robot data, of which there are {self.hours:.3g})"
+            f"{self.frames:,} frames, {gigabytes:.3g} GB"
+            f" ({per_hour:.3g} GB per hour of robot data, of which there are {self.hours:.3g})"
         )
 
 

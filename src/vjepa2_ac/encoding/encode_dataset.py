@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from datetime import timedelta
 from functools import partial
 from pathlib import Path
 
@@ -40,12 +39,7 @@ class EncodedSet:
     manifest: Manifest | None  # None: other processes are still at work
 
 
-def encode_config(
-    config: Config,
-    reporter: Reporter = SILENT,
-    *,
-    out: Path | None = None,
-) -> EncodedSet:
+def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | None = None) -> EncodedSet:
     """Write the latents of every frame that the clips of a config need, or this process's share of them.
 
     Args:
@@ -132,14 +126,8 @@ def encode_share(
         reporter.note(f"{work.frames - work.left_in_total:,} frames are there already; {work.left_in_total:,} are left")
     require_space(work.room, writer.folder, smaller=size_reducing_knobs(config))
     claim_folder(writer)
-    return build(
-        work, encoder, threads=max(1, config.data.workers), progress=reporter.task("encoding frames", "frames")
-    )
-
-
-def duration(frames: int, per_second: float) -> str:
-    """Return as text how long encoding takes."""
-    return str(timedelta(seconds=round(frames / per_second)))
+    progress = reporter.task("encoding frames", "frames")
+    return build(work, encoder, threads=max(1, config.data.workers), progress=progress)
 
 
 def size_reducing_knobs(config: Config) -> tuple[str, ...]:

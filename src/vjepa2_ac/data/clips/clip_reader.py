@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from vjepa2_ac.data.clips.actions import actions_of, require_widths
 from vjepa2_ac.data.clips.dataset import Dataset
@@ -72,7 +73,7 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
         starts=tuple(clip.start for clip in clips),
         augmentations=augmentations,
         bytes_fetched=bytes_fetched,
-        latents=_stacked(latents) if latents else None,
+        latents=joined_latents(latents, torch.stack) if latents else None,
         cameras=tuple(clip.camera for clip in clips),
     )
 
@@ -107,9 +108,10 @@ def _require_one_size(clips: Sequence[Clip]) -> None:
             raise with_way_out(error, [clip.episode_id], skippable=False)
 
 
-def _stacked(latents: Sequence[StoredLatents]) -> StoredLatents:
+def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:
+    """Return latents joined by `torch.stack` or `torch.cat`, and their scales likewise."""
     scales = [one.scales for one in latents if one.scales is not None]
-    return StoredLatents(torch.stack([one.values for one in latents]), torch.stack(scales) if scales else None)
+    return StoredLatents(join([one.values for one in latents]), join(scales) if scales else None)
 
 
 def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
