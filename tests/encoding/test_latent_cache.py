@@ -18,13 +18,14 @@ from pydantic import ValidationError
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from clips import clip_at
 from latent_sets import NUMBERS, as_numbers, write_cache
 from memory_source import MemorySource
 from synthetic import synthetic_episode, synthetic_states
 from vector_sets import write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
-from vjepa2_ac.data.clips.clip_reader import clip_at, frames_of
+from vjepa2_ac.data.clips.clip_reader import frames_of
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, training_loader, validation_batches
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes

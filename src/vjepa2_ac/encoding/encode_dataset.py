@@ -16,6 +16,7 @@ import torch
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import ProcessShare
+from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.data.sources.latents.manifest import Manifest, is_whole, read_manifest
 from vjepa2_ac.distributed.device import autocast, computing_device
 from vjepa2_ac.encoding.batch import encoding_of
@@ -76,13 +77,8 @@ def require_encodable(config: Config) -> None:
     data = config.data
     if data.is_cache:
         raise InputError(where="data.source", found="latents: they are encoded already", needed="a data set of frames")
-    if data.stride == "auto":
-        raise InputError(
-            where="data.stride",
-            found="auto: which frames are needed is not known yet",
-            needed="a number of control steps",
-            fix="`vjepa2-ac data calibrate` finds one; or let the run encode by itself, with data.cache: auto",
-        )
+    fix = "`vjepa2-ac data calibrate CONFIG` finds one; or let the run encode by itself, with data.cache: auto"
+    require_stride(data, to="know which frames are needed", fix=fix)
     if data.augment.is_on:
         raise InputError(
             where="data.augment",

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clips import split_of
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.windows import split_of
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.step_ranges import StepSelection
 from vjepa2_ac.data.inspection.statistics import (
