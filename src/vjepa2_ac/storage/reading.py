@@ -57,7 +57,13 @@ def absolute(path: str | Path) -> str:
 
 def exists(path: str | Path) -> bool:
     """Return whether there is a file or folder."""
-    return ranged_reads.exists(str(path)) if is_url(path) else Path(path).exists()
+    if not is_url(path):
+        return Path(path).exists()
+    try:
+        ranged_reads.file_version(str(path))
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def file_size(path: str | Path) -> int:

@@ -130,7 +130,7 @@ def _some_of(batches: Iterator[Batch], dataset: Dataset) -> Iterator[Batch]:
     if empty:
         raise InputError(
             where=f"data.path: {dataset.config.path}",
-            found=f"none of the clips can be read; broken episodes: {named(dataset.broken.names)}",
+            found=f"none of the clips can be read; broken episodes: {named(tuple(dataset.broken.reasons))}",
             needed="at least one",
             fix="Repair or fetch these episodes again, or add them to data.exclude",
         )

@@ -44,16 +44,14 @@ class Windows:
         if not 0 <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
         run = int(np.searchsorted(self.ends, index, side="right"))
-        episode, first, span, count = (int(column[run]) for column in self.starts.columns)
-        place = index - (int(self.ends[run]) - count)
-        if count == span:
-            return episode, first + self.starts.every * place
-        return episode, int(self.starts.steps_of(run, self.id_hash, self.keep_share)[place])
+        place = index - (int(self.ends[run]) - int(self.starts.count[run]))
+        steps = self.starts.steps_of(run, self.id_hash, self.keep_share)
+        return int(self.starts.episode[run]), int(steps[place])
 
     @property
     def episodes(self) -> Int32[np.ndarray, " episodes"]:
         """The episodes that clips come from; an index into the source."""
-        return np.unique(self.starts.episode)
+        return self.starts.episodes
 
 
 @dataclass(frozen=True)

@@ -32,11 +32,6 @@ class Labels:
         place = {name: number for number, name in enumerate(names)}
         return cls(tuple(names), np.array([place.get(value or "", _MISSING) for value in values], np.int32))
 
-    @property
-    def is_present(self) -> bool:
-        """Whether there is a name for any episode."""
-        return bool(self.names)
-
     def of_episode(self, index: int) -> str | None:
         """Return the name of one episode, or None if unknown."""
         number = int(self.number[index])
@@ -47,4 +42,4 @@ def labels_of(values: Sequence[Mapping[str, str | None]]) -> dict[str, Labels]:
     """Return the labels of episodes, each given as {label: name}; unused labels are dropped."""
     every = {label for of_one in values for label in of_one}
     found = {label: Labels.of([of_one.get(label) for of_one in values]) for label in sorted(every)}
-    return {label: labels for label, labels in found.items() if labels.is_present}
+    return {label: labels for label, labels in found.items() if labels.names}

@@ -1,1 +1,1 @@
-"""Remote storage: `ranged_reads` and `uploads` over networks that fail, with the policy of `retries`."""
+"""Remote storage: reading, and the calls behind writing, over networks that fail, with the policy of `retries`."""

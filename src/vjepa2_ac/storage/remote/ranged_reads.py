@@ -34,19 +34,6 @@ class FileInfo(NamedTuple):
     is_file: bool = True
 
 
-def exists(url: str) -> bool:
-    """Return whether there is a file or folder.
-
-    Raises:
-        UnreachableError: The server cannot be reached.
-    """
-    try:
-        _call(url, "info")
-    except FileNotFoundError:
-        return False
-    return True
-
-
 def file_size(url: str) -> int:
     """Return the size of a file in bytes.
 
@@ -58,10 +45,10 @@ def file_size(url: str) -> int:
 
 
 def file_version(url: str) -> str:
-    """Return the server's version of a file's content, which changes with the content; empty if it has none.
+    """Return the server's version of a file's content, which changes with the content; empty where there is none.
 
     Raises:
-        FileNotFoundError: There is no such file.
+        FileNotFoundError: There is no such file or folder.
         UnreachableError: It cannot be reached.
     """
     return _version_of(_call(url, "info"))
@@ -195,7 +182,7 @@ def _require_bucket(url: str) -> None:
     """
     protocol, _, path = url.partition("://")
     bucket = path.split("/", 1)[0]
-    if protocol not in GOOGLE or (os.getpid(), bucket) in _known_buckets:
+    if protocol not in GOOGLE or bucket in _known_buckets:
         return
     root = f"{protocol}://{bucket}"
 
@@ -209,7 +196,7 @@ def _require_bucket(url: str) -> None:
     except UnreachableError as error:
         if "no permission" not in error.found:
             raise
-    _known_buckets.add((os.getpid(), bucket))
+    _known_buckets.add(bucket)
 
 
-_known_buckets: set[tuple[int, str]] = set()
+_known_buckets: set[str] = set()

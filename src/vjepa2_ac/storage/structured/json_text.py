@@ -42,9 +42,9 @@ def json_object(
     return value
 
 
-def json_list(data: bytes | str, *, where: str, needed: str = "", fix: str = "", allow_nan: bool = False) -> list[Any]:
+def json_list(data: bytes | str, *, where: str) -> list[Any]:
     """Return the values of a JSON list; arguments and errors as of `json_object`."""
-    value: list[Any] = _parsed(data, list, where, needed, fix, allow_nan=allow_nan)
+    value: list[Any] = _parsed(data, list, where, "", "", allow_nan=False)
     return value
 
 
