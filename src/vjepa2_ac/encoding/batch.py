@@ -37,7 +37,8 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
     Raises:
         InputError: The model needs camera poses and a clip has none; or cached latents are of another width.
     """
-    batch = _arrived(batch).mapped(lambda tensor: tensor.to(device, non_blocking=True))
+    arrived = batch.on_device() if batch.on_device else None  # None, too, if it was used before
+    batch = (arrived or batch).mapped(lambda tensor: tensor.to(device, non_blocking=True))
     return LatentBatch(
         latents=_latents_of(world_model, batch, chunk),
         states=batch.states,
@@ -72,12 +73,6 @@ def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Conf
     """
     if dataset.config.is_cache:  # else the weights need not be hashed
         require_encoding(dataset, encoding_of(world_model, config))
-
-
-def _arrived(batch: Batch) -> Batch:
-    """Return the copy of a batch on the device; the batch itself if there is none, or it was used before."""
-    there = None if batch.on_device is None else batch.on_device()
-    return batch if there is None else there
 
 
 def _latents_of(world_model: WorldModel, batch: Batch, chunk: int) -> Float[Tensor, "batch time tokens dim"]:

@@ -31,8 +31,6 @@ from vjepa2_ac.model.network.world_model import WorldModel
 
 _WRITES_UNDER_WAY = 2  # files: limits the memory
 
-Autocast = Callable[[], contextlib.AbstractContextManager[object]]
-
 
 @dataclass(frozen=True, eq=False)
 class EncoderOnDevice:
@@ -40,7 +38,7 @@ class EncoderOnDevice:
 
     world_model: WorldModel
     device: torch.device
-    autocast: Autocast
+    autocast: Callable[[], contextlib.AbstractContextManager[object]]
     chunk: int  # frames at once
 
     @torch.no_grad()

@@ -57,9 +57,7 @@ class Dataset:
     table: EpisodeTable
     kept: StepSelection
     broken: BrokenEpisodes  # grows in the process that opened the set
-    groups: UInt64[np.ndarray, " episodes"] | None = (
-        None  # hash of each episode's group; None: `data.split_by` names none
-    )
+    groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each one's group; None: `data.split_by` names none
 
     @property
     def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
@@ -209,10 +207,9 @@ def open_dataset(config: DataConfig, *, progress: Progress | None = None) -> Dat
     if config.idle.rule == "none":
         kept = StepSelection.whole(table, taking_part)
     else:
-        if isinstance(source, LatentSource):
-            ranges = source.kept_ranges()
-        else:
-            ranges = find_ranges(source, table, config, progress)
+        ranges = (
+            source.kept_ranges() if isinstance(source, LatentSource) else find_ranges(source, table, config, progress)
+        )
         kept = _select_steps(ranges, table, taking_part, broken)
         _log_listed_episodes(ranges, table, config)
     dataset = Dataset(config, source, table, kept, broken, split_hash(table, kept.taking_part, config))

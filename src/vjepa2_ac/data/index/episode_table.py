@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, overload
 
@@ -115,9 +115,6 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             num_steps=int(self.num_steps[index]),
             success=None if success == _UNKNOWN else bool(success),
         )
-
-    def __iter__(self) -> Iterator[EpisodeInfo]:
-        return (self[number] for number in range(len(self)))
 
     def identity(self, index: int) -> str:
         """Return the identity of one episode."""

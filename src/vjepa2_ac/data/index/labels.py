@@ -20,8 +20,6 @@ class Labels:
 
     def __post_init__(self) -> None:
         """Refuse numbers without a name, which a damaged file may contain."""
-        if not all(isinstance(name, str) for name in self.names):
-            raise ValueError("labels that are no text")
         if len(self.number) and not _MISSING <= self.number.min() <= self.number.max() < len(self.names):
             raise ValueError(f"labels of {len(self.names)} names with numbers up to {self.number.max()}")
 

@@ -47,10 +47,6 @@ class RetryPolicy:
     timeout_s: float = 30.0
     total_s: float = 300.0
 
-    def __post_init__(self) -> None:
-        if self.attempts < 1 or self.timeout_s <= 0:
-            raise ValueError(f"{self} never tries")
-
     def wait_s(self, failures: int) -> float:
         """Return how long to wait after so many failures."""
         longest: float = min(self.first_wait_s * 2 ** (failures - 1), self.longest_wait_s)
