@@ -6,6 +6,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.errors import InputError
 
 GIGABYTE = 10**9
@@ -51,13 +52,13 @@ def free_bytes(folder: Path) -> int:
     return shutil.disk_usage(next(there for there in [folder, *folder.parents] if there.exists())).free
 
 
-def require_space(room: CacheSize, folder: Path, *, smaller: tuple[str, ...]) -> None:
+def require_space(room: CacheSize, folder: Path, config: DataConfig) -> None:
     """Refuse to start if the disk has too little space.
 
     Args:
         room: What is to be written.
         folder: The folder to write to.
-        smaller: Knobs that would reduce the size.
+        config: The data, some knobs of which would reduce the size.
 
     Raises:
         InputError: Says how much is free, how much is needed, and what to do.
@@ -65,6 +66,9 @@ def require_space(room: CacheSize, folder: Path, *, smaller: tuple[str, ...]) ->
     free = free_bytes(folder)
     if room.bytes_left <= free:
         return
+    smaller = [] if config.cache_dtype == "int8" else ["data.cache_dtype: int8"]
+    if config.start_every % config.model_stride:
+        smaller.append(f"data.start_every: {config.model_stride}")
     fix = f"Set {', '.join(smaller)}; " if smaller else ""
     raise InputError(
         where=str(folder),

@@ -65,7 +65,7 @@ def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | No
         restart(writer, missing)
     share = ProcessShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
     at_work = encoder_on_device(config, model, device)
-    return EncodedSet(writer.folder, encode_share(config, dataset, writer, at_work, share, reporter))
+    return EncodedSet(writer.folder, encode_share(dataset, writer, at_work, share, reporter))
 
 
 def require_encodable(config: Config) -> None:
@@ -102,34 +102,20 @@ def encoder_on_device(config: Config, model: WorldModel, device: torch.device) -
 
 
 def encode_share(
-    config: Config,
-    dataset: Dataset,
-    writer: CacheWriter,
-    encoder: EncoderOnDevice,
-    share: ProcessShare,
-    reporter: Reporter = SILENT,
+    dataset: Dataset, writer: CacheWriter, encoder: EncoderOnDevice, share: ProcessShare, reporter: Reporter
 ) -> Manifest | None:
     """Report the work, check the disk space, and encode the share of one process.
 
     Raises:
         InputError: As `encode_config`.
     """
-    work = Workload.of(dataset, writer, share)
+    work, config = Workload.of(dataset, writer, share), dataset.config
     free = free_bytes(writer.folder) / GIGABYTE
-    reporter.note(f"Encoding {config.data.path}: {work.room} as {config.data.cache_dtype}")
+    reporter.note(f"Encoding {config.path}: {work.room} as {config.cache_dtype}")
     reporter.note(f"The latents go into {writer.folder}, with {free:.4g} GB free on its disk")
     if work.left_in_total < work.frames:
         reporter.note(f"{work.frames - work.left_in_total:,} frames are there already; {work.left_in_total:,} are left")
-    require_space(work.room, writer.folder, smaller=size_reducing_knobs(config))
+    require_space(work.room, writer.folder, config)
     claim_folder(writer)
     progress = reporter.task("encoding frames", "frames")
-    return build(work, encoder, threads=max(1, config.data.workers), progress=progress)
-
-
-def size_reducing_knobs(config: Config) -> tuple[str, ...]:
-    """Return the knobs that would reduce the size of a cache."""
-    data = config.data
-    knobs = [] if data.cache_dtype == "int8" else ["data.cache_dtype: int8"]
-    if data.start_every % data.model_stride:
-        knobs.append(f"data.start_every: {data.model_stride}")
-    return tuple(knobs)
+    return build(work, encoder, threads=max(1, config.workers), progress=progress)

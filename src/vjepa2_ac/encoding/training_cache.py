@@ -16,7 +16,7 @@ from vjepa2_ac.encoding.batch import require_same_encoder
 from vjepa2_ac.encoding.cache_lookup import through_cache
 from vjepa2_ac.encoding.cache_writer import CacheWriter
 from vjepa2_ac.encoding.disk_space import require_space
-from vjepa2_ac.encoding.encode_dataset import encode_share, encoder_on_device, size_reducing_knobs, writer_for
+from vjepa2_ac.encoding.encode_dataset import encode_share, encoder_on_device, writer_for
 from vjepa2_ac.encoding.pipeline import EncoderOnDevice, frames_per_second
 from vjepa2_ac.encoding.repair import MissingFiles, describe, missing_files, restart
 from vjepa2_ac.encoding.workload import Workload
@@ -52,9 +52,8 @@ def with_latents(
         return dataset
     writer = writer_for(config, dataset, model)
     if missing := _missing(config, dataset, accelerator, writer):
-        reporter.note(
-            f"{describe(missing)}. " + ("A run would encode it again." if check_only else "It is encoded again.")
-        )
+        again = "A run would encode it again" if check_only else "It is encoded again"
+        reporter.note(f"{describe(missing)}. {again}.")
         if check_only:
             return dataset
         if accelerator.is_main_process:
@@ -64,10 +63,10 @@ def with_latents(
             return through_cache(dataset, writer.encoding)  # which reports what was found instead
         encoder = encoder_on_device(config, model, accelerator.device)
         if check_only:
-            reporter.note(_forecast(config, Workload.of(dataset, writer, WHOLE), encoder, accelerator.num_processes))
+            reporter.note(_forecast(Workload.of(dataset, writer, WHOLE), encoder, accelerator.num_processes))
             return dataset
         share = ProcessShare(accelerator.process_index, accelerator.num_processes)
-        encode_share(config, dataset, writer, encoder, share, reporter)
+        encode_share(dataset, writer, encoder, share, reporter)
         accelerator.wait_for_everyone()
         _require_whole(writer.folder, share)
     reporter.note(f"Latents come from {writer.folder}: the encoder is not needed")
@@ -104,12 +103,13 @@ def _require_whole(folder: Path, share: ProcessShare) -> None:
         )
 
 
-def _forecast(config: Config, work: Workload, encoder: EncoderOnDevice, processes: int) -> str:
+def _forecast(work: Workload, encoder: EncoderOnDevice, processes: int) -> str:
     """Return as text what a run would encode first, after a check that there is space for it."""
-    require_space(work.room, work.writer.folder, smaller=size_reducing_knobs(config))
+    config = work.dataset.config
+    require_space(work.room, work.writer.folder, config)
     speed = frames_per_second(encoder) * processes
     return (
-        f"A run would first encode {work.left_in_total:,} of {work.room} as {config.data.cache_dtype}, into"
+        f"A run would first encode {work.left_in_total:,} of {work.room} as {config.cache_dtype}, into"
         f" {work.writer.folder}. At the {speed:.3g} frames/s of one chunk just timed that takes"
         f" {timedelta(seconds=round(work.left_in_total / speed))}"
     )
