@@ -33,7 +33,7 @@ _HELD = frozenset({errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES})
 
 
 @contextlib.contextmanager
-def partial(parent: Path, name: str, *, is_folder: bool = False) -> Iterator[Path]:
+def new_partial(parent: Path, name: str, *, is_folder: bool = False) -> Iterator[Path]:
     """Yield a new empty file or folder in `parent`, to be renamed to `name`, and locked meanwhile; it is not removed.
 
     Raises:

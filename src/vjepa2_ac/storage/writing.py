@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.partial import is_partial, partial
+from vjepa2_ac.storage.partial import is_partial, new_partial
 
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 _UNWRITABLE = _FULL | {
@@ -28,7 +28,7 @@ def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
     Missing folders are created. The bytes are on the disk (fsync) before the file gets its name.
     """
     target = Path(path)
-    with partial(target.parent, target.name) as temporary:
+    with new_partial(target.parent, target.name) as temporary:
         try:
             with temporary.open("wb") as file:  # opened by name: some libraries determine the format by it
                 yield file
@@ -72,7 +72,7 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
             if target.exists() and not there:
                 raise NotADirectoryError(errno.ENOTDIR, "it is a file")
             parent = target if there else target.parent
-            filling = while_writing.enter_context(partial(parent, target.name, is_folder=True))
+            filling = while_writing.enter_context(new_partial(parent, target.name, is_folder=True))
         try:
             with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's
                 yield filling

@@ -67,14 +67,11 @@ def view(
 
 
 def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time side side 3"]:
-    time, height, width, channels = frames.shape
+    height, width = frames.shape[1:3]
     if height == width:
         return frames
-    side = max(height, width)
-    top, left = (side - height) // 2, (side - width) // 2
-    square = np.zeros((time, side, side, channels), np.uint8)
-    square[:, top : top + height, left : left + width] = frames
-    return square
+    rows, columns = max(0, width - height), max(0, height - width)  # missing ones, in all
+    return np.pad(frames, ((0, 0), (rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0)))
 
 
 def pixels_to_input(
