@@ -29,8 +29,9 @@ import video
 from synthetic_droid import draw_episodes
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.clips.clip_reader import ClipRequest, read_clip
 from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import clip_at, training_loader
+from vjepa2_ac.data.clips.loader import training_loader
 from vjepa2_ac.data.clips.windows import ClipOrder, windows_of
 from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
 from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
@@ -112,7 +113,7 @@ def measure_clips(config: DataConfig, clips: int, tfds_python: str | None) -> No
     print(f"{config.frames} frames at stride {config.stride}, {clips} random clips, medians (TFDS: mean):\n")
 
     def later_reads(position: int) -> None:
-        clip_at(dataset, *order.window(position))
+        read_clip(dataset, ClipRequest(*order.window(position)))
 
     def everything(position: int) -> None:
         episode, first = order.window(position)
@@ -123,9 +124,9 @@ def measure_clips(config: DataConfig, clips: int, tfds_python: str | None) -> No
 
     always = open_dataset(config.model_copy(update={"check_crc": "always"}))  # every read is as a first one
     for episode in range(len(spans)):
-        clip_at(dataset, episode, 0)
+        read_clip(dataset, ClipRequest(episode, 0))
     names = ("every frame of every camera", "ours, first read of a record", "ours")
-    ways = (everything, lambda position: clip_at(always, *order.window(position)), later_reads)
+    ways = (everything, lambda position: read_clip(always, ClipRequest(*order.window(position))), later_reads)
     seconds = dict(zip(names, alternate(clips, *ways), strict=True))
     if tfds_python:
         steps = int(dataset.table.num_steps.min())

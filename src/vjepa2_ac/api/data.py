@@ -18,6 +18,7 @@ from vjepa2_ac.data.clips import dataset as datasets
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import validation_batches
 from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
+from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
@@ -83,13 +84,7 @@ def read_clips(dataset: Dataset, split: Split = "train", *, clips: int = 16, bat
     """
     if split not in get_args(Split):
         raise InputError(where="read_clips", found=f"split {split!r}", needed=", ".join(get_args(Split)))
-    if dataset.config.stride == "auto":
-        raise InputError(
-            where="data.stride",
-            found="auto",
-            needed="a number, to read clips",
-            fix="Give one: open_dataset(config, stride=4)",
-        )
+    require_stride(dataset.config, to="read clips", fix="Give one: open_dataset(config, stride=4)")
     return validation_batches(dataset, split, clips=clips, batch_size=batch_size)
 
 

@@ -35,7 +35,7 @@ from vjepa2_ac.runs.checkpoint import remove_leavings
 from vjepa2_ac.runs.lock import LOCK
 from vjepa2_ac.runs.own_files import refuse_links_out
 from vjepa2_ac.storage import read_bounded, try_writing_at, write_atomically
-from vjepa2_ac.storage.structured import read_json_list, shown, utc_now
+from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown, utc_now
 
 CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
@@ -196,7 +196,7 @@ def _is_without_config(path: Path) -> bool:
 
 def _earlier_starts(path: Path) -> list[object]:
     try:
-        return read_json_list(path)
+        return json_list(read_bounded(path, MOST_BYTES), where=str(path))
     except (OSError, InputError):
         return []
 

@@ -110,7 +110,7 @@ def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], tex
         locators=locators,
         texts={"tasks": json.dumps(tasks), **texts},
         state_hashes=hashes if any(hashes) else None,
-        labels={"task": labels} if labels.is_present else {},
+        labels={"task": labels} if labels.names else {},
     )
 
 
