@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+from jinja2 import TemplateError
 from safetensors import safe_open
 
 from vjepa2_ac.config import Config
@@ -133,7 +134,7 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dic
     adapter = run.checkpoint / ADAPTER
     try:
         card = model_card(run.config, _facts(run, folder, evaluation, plot))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, TemplateError) as error:
         raise _damaged(folder, f"metrics that cannot be used ({error!r})") from None
     _merge(run)  # the merged model is not written, but an adapter that makes it not finite is of no use
     with folder_writer(destination, ADAPTER_FILE) as fresh:
