@@ -77,7 +77,7 @@ HOMES = {
     "google_crc32c": ["data/sources/rlds/tfrecord.py"],
     "h5py": ["data/sources/droid_raw/trajectory.py"],
     "huggingface_hub": ["export/"],
-    "jinja2": ["export/"],
+    "jinja2": ["export/", "reports/"],
     "matplotlib": ["reports/"],
     "mujoco": ["simulation/world/"],
     "peft": ["model/adapter/"],

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from markupsafe import Markup
 
 from vjepa2_ac.evaluation.result import EpisodeScore, Ranking
-from vjepa2_ac.reports.html.charts import Line, axis_at, legend, line_chart, nice_axis
-from vjepa2_ac.reports.html.markup import Markup, joined
+from vjepa2_ac.reports.html.charts import Line, axis_at, line_chart, nice_axis
 from vjepa2_ac.reports.html.series import Series
 
 _POINTS = 51
@@ -23,8 +23,7 @@ def rank_chart(rankings: Sequence[tuple[Series, Ranking]]) -> Markup:
     description = "Share of clips by rank of the true action: " + "; ".join(
         f"{line.name} {line.y[_POINTS // 10]:.0f} % among the best tenth" for line in lines[1:]
     )
-    chart = line_chart(f"{description}.", lines, x_axis, nice_axis("share of clips (%)", [0.0, 100.0]))
-    return joined(chart, legend(lines))
+    return line_chart(f"{description}.", lines, x_axis, nice_axis("share of clips (%)", [0.0, 100.0]), key=lines)
 
 
 def episode_chart(scores: Sequence[EpisodeScore]) -> Markup:
