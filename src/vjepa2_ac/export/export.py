@@ -135,7 +135,7 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dic
     try:
         card = model_card(run.config, _facts(run, folder, evaluation, plot))
     except (KeyError, TypeError, ValueError, AttributeError, TemplateError) as error:
-        raise _damaged(folder, f"metrics that cannot be used ({error!r})") from None
+        raise _damaged(folder, error) from None
     _merge(run)  # the merged model is not written, but an adapter that makes it not finite is of no use
     with folder_writer(destination, ADAPTER_FILE) as fresh:
         for path in (*sorted(adapter.iterdir()), *([plot] if plot else [])):
@@ -175,13 +175,13 @@ def _read_evaluation(folder: Path) -> dict[str, Any] | None:
         about = {**metrics["about"], "subject": folder.resolve().name}
         return {**metrics, "about": {**about, "checkpoint_path": Path(about["checkpoint_path"]).name}}
     except (TypeError, KeyError) as error:
-        raise _damaged(folder, f"metrics that cannot be used ({error!r})") from None
+        raise _damaged(folder, error) from None
 
 
-def _damaged(folder: Path, found: str) -> InputError:
+def _damaged(folder: Path, error: Exception) -> InputError:
     return InputError(
         where=str(folder / METRICS_FILE),
-        found=found,
+        found=f"metrics that cannot be used ({error!r})",
         needed="what `vjepa2-ac evaluate` writes",
         fix=f"Write it again with `vjepa2-ac evaluate {folder}`, or delete it",
     )

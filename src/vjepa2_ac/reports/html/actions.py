@@ -11,12 +11,13 @@ from markupsafe import Markup
 
 from vjepa2_ac.evaluation.estimates import cost_of_actions, one_step_over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscape, Landscapes, Ranking
-from vjepa2_ac.reports.html.distributions import rank_chart
+from vjepa2_ac.reports.html.charts import Line, line_chart, nice_axis
 from vjepa2_ac.reports.html.formatting import NOT_MEASURED, decimal, percent, share, value
 from vjepa2_ac.reports.html.heatmaps import MapAxis, heat_map
-from vjepa2_ac.reports.html.series import models_of
+from vjepa2_ac.reports.html.series import Series, models_of
 from vjepa2_ac.reports.html.templates import render
 
+_POINTS = 51  # of a curve
 _MOST_LANDSCAPES = 3  # clips whose maps are shown
 
 Table = tuple[list[str], list[list[str]]]  # head, rows
@@ -31,7 +32,7 @@ def actions_section(evaluation: Evaluation) -> Markup:
             (one, found.rankings[place]) for one, found in sensitivities if found and place < len(found.rankings)
         ]
         if rankings:
-            drawings.append((f"{rankings[0][1].samples} {rankings[0][1].words}", rank_chart(rankings)))
+            drawings.append((f"{rankings[0][1].samples} {rankings[0][1].words}", _rank_chart(rankings)))
     return render(
         "actions", evaluation=evaluation, costs=_costs(evaluation), ranks=_ranks(evaluation), drawings=drawings
     )
@@ -81,6 +82,23 @@ def _ranks(evaluation: Evaluation) -> Table | None:
     ]
     head = ["model", "change of the prediction", "among", "mean rank of the true action"]
     return [*head, *(f"true action among the best {k}" for k in tops)], rows
+
+
+def _rank_chart(rankings: Sequence[tuple[Series, Ranking]]) -> Markup:
+    """Return the cumulative distribution of the true action's rank over clips, for each model and by chance."""
+    reached = np.linspace(0, 1, _POINTS).tolist()
+    by_chance = Line("chance", [0.0, 1.0], [0.0, 100.0], "s-persistence")
+    lines = [by_chance, *(Line(one.label, reached, _shares(ranking, reached), one.style) for one, ranking in rankings)]
+    x_axis = nice_axis("rank of the true action (0: best)", [0.0, 1.0], most=5)
+    description = "Share of clips by rank of the true action: " + "; ".join(
+        f"{line.name} {line.y[_POINTS // 10]:.0f} % among the best tenth" for line in lines[1:]
+    )
+    return line_chart(f"{description}.", lines, x_axis, nice_axis("share of clips (%)", [0.0, 100.0]), key=lines)
+
+
+def _shares(ranking: Ranking, reached: Sequence[float]) -> list[float]:
+    ranks = np.sort(ranking.rank)
+    return [float(100 * np.searchsorted(ranks, each, side="right") / max(len(ranks), 1)) for each in reached]
 
 
 def _top(ranking: Ranking, k: int) -> str:

@@ -10,8 +10,7 @@ from typing import Any
 from markupsafe import Markup
 
 from vjepa2_ac.evaluation.result import EpisodeScore, Evaluation, TrainingCurve
-from vjepa2_ac.reports.html.charts import Line, line_chart, nice_axis
-from vjepa2_ac.reports.html.distributions import episode_chart
+from vjepa2_ac.reports.html.charts import Line, axis_at, line_chart, nice_axis
 from vjepa2_ac.reports.html.formatting import NOT_MEASURED, decimal, percent
 from vjepa2_ac.reports.html.templates import render, visible
 
@@ -33,7 +32,7 @@ def episode_section(evaluation: Evaluation) -> Markup:
             f"The {_AT_EACH_END} worst of {len(scores)} episodes, worst last": scores[-_AT_EACH_END:],
         }
     tables = [(caption, *_episodes(part)) for caption, part in parts.items()]
-    return render("episodes", evaluation=evaluation, tables=tables, chart=episode_chart(scores))
+    return render("episodes", evaluation=evaluation, tables=tables, chart=_episode_chart(scores))
 
 
 def training_section(evaluation: Evaluation) -> Markup:
@@ -54,6 +53,17 @@ def calibration_section(evaluation: Evaluation) -> Markup:
     head = ["stride (control steps)", "seconds per model step", "one-step L1 error / persistence", "clips", "episodes"]
     rows = [_stride(one) for one in found.get("strides", ())]
     return render("strides", evaluation=evaluation, head=head, rows=rows)
+
+
+def _episode_chart(scores: Sequence[EpisodeScore]) -> Markup:
+    """Return the error over persistence of every episode, best first."""
+    places = [float(place + 1) for place in range(len(scores))]
+    line = Line("episode", places, [score.over_persistence for score in scores], "s-trained")
+    y_axis = nice_axis("L1 error / persistence", [*line.y, 1.0], from_zero=True)
+    x_axis = axis_at("episodes, best first", places, [f"{place:.0f}" for place in places])
+    better = sum(score.over_persistence < 1 for score in scores)
+    description = f"Error over persistence of {len(scores)} episodes, best first: {better} of them are below 1."
+    return line_chart(description, [line], x_axis, y_axis, level=1.0)
 
 
 def _episodes(scores: Sequence[EpisodeScore]) -> tuple[list[str], list[list[str]]]:
