@@ -181,11 +181,7 @@ def _sensitivity(sensitivity: Sensitivity) -> dict[str, Any]:
         "change_by_clip": sensitivity.change_by_clip,
         "rankings": [
             {
-                "drawn_from": ranking.drawn_from,
-                "words": ranking.words,
-                "samples": ranking.samples,
-                "clips": ranking.clips,
-                "mean_rank": ranking.mean_rank,
+                **{name: getattr(ranking, name) for name in ("drawn_from", "words", "samples", "clips", "mean_rank")},
                 "chance_rank": 0.5,
                 "top": {
                     str(k): {**share.as_dict(), "chance": ranking.chance_of_top(k)} for k, share in ranking.top.items()

@@ -61,7 +61,7 @@ def _pictures(part: Any, answer: PlanResult) -> None:
 def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     elites, heights, energies, path = part.subplots(1, 4, width_ratios=[3, 3, 3, 3])
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
-    factor = _factor(answer)
+    factor = answer.state_space.shown_factor
     first, upper = answer.actions[0] * factor, answer.space.upper[0].double().numpy() * factor
     across, up, third = _three(answer)
     for number, (one, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
@@ -88,11 +88,7 @@ def _three(answer: PlanResult) -> tuple[int, int, int]:
 
 def _label(answer: PlanResult, axis: int) -> str:
     name = answer.state_space.change_names[axis]
-    return f"{name} (cm)" if answer.state_space.is_pose else name
-
-
-def _factor(answer: PlanResult) -> float:
-    return answer.state_space.shown_factor if answer.state_space.is_pose else 1.0
+    return f"{name} ({unit})" if (unit := answer.state_space.shown_unit) else name
 
 
 def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
@@ -119,7 +115,7 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
 
 def _path(axes: Any, answer: PlanResult) -> None:
     space = answer.state_space
-    way = (answer.states - answer.states[0]) * _factor(answer)
+    way = (answer.states - answer.states[0]) * answer.state_space.shown_factor
     if not space.is_pose:
         for number in answer.space.free[:_MOST_NUMBERS].tolist():
             axes.plot(way[:, number], "o-", markersize=4, label=space.names[number])
@@ -145,7 +141,7 @@ def _slices(part: Any, answer: PlanResult) -> None:
 
 def _slice(axes: Any, one: EnergySlice, answer: PlanResult, lowest: float, highest: float) -> Any:
     first, second = one.axes
-    factor = _factor(answer)
+    factor = answer.state_space.shown_factor
     across, up = one.across * factor, one.up * factor
     image = axes.pcolormesh(across, up, one.energy, shading="nearest", cmap="viridis", vmin=lowest, vmax=highest)
     upper = answer.space.upper[0].double().numpy() * factor
