@@ -2,42 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any
 
 from huggingface_hub import EvalResult, ModelCardData
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+from safetensors import safe_open
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_yaml
-from vjepa2_ac.episode import Widths
+from vjepa2_ac.model.adapter.adapter_folder import LORA_WEIGHTS
+from vjepa2_ac.model.adapter.lora import trainable_report
+from vjepa2_ac.model.network.input_heads import widths_of_model
+from vjepa2_ac.runs.checkpoint import ADAPTER, read_state
+from vjepa2_ac.runs.loading import TrainedRun
 
 
-@dataclass(frozen=True)
-class AdapterFacts:
-    """The content of a card besides the settings of its run."""
-
-    name: str
-    steps: int  # optimizer steps done
-    checkpoint: str  # name of the checkpoint that is exported
-    chosen: str  # the same, and whether it is the newest or the best
-    trained: str  # number of trained parameters, as text
-    base_predictor: str  # fingerprints
-    base_encoder: str
-    evaluation: Mapping[str, Any] | None  # what `vjepa2-ac evaluate` wrote
-    plot: str | None  # name of the file beside the card
-    fresh_heads: Widths | None = None  # of states and actions, if the base's input heads were replaced
-
-
-def model_card(config: Config, facts: AdapterFacts) -> str:
+def model_card(run: TrainedRun, name: str, evaluation: Mapping[str, Any] | None, plot: str | None) -> str:
     """Return the README.md of an adapter, in Markdown, with the Hub's front matter.
+
+    Args:
+        run: Whose adapter it is.
+        name: Of the run.
+        evaluation: What `vjepa2-ac evaluate` wrote.
+        plot: Name of the figure beside the card.
 
     Raises:
         KeyError: The evaluation lacks a metric; likewise TemplateError, and TypeError if one is of another type.
     """
+    config, model = run.config, run.world_model
     card = Environment(  # Markdown is not escaped
         loader=PackageLoader("vjepa2_ac", "assets"),
         undefined=StrictUndefined,
@@ -48,34 +44,46 @@ def model_card(config: Config, facts: AdapterFacts) -> str:
     card.filters |= {"code": lambda name: f"`{name}`", "count": _count, "ratio": _ratio}
     return card.get_template("model_card.md.jinja").render(
         **dict(config),
-        facts=facts,
-        heads=facts.fresh_heads,
+        run=run,
+        name=name,
+        evaluation=evaluation,
+        plot=plot,
+        base=model.adaptation,
+        heads=None if model.fresh_heads is None else widths_of_model(model.sizes),
+        steps=read_state(run.checkpoint).step,
+        trained=_trained(run),
         version=__version__,
-        front=_front(config, facts),
+        front=_front(run, name, evaluation),
         loss=_loss(config),
         adapter_words=_adapter(config),
-        curves=[] if facts.evaluation is None else _curves(facts.evaluation),
+        curves=[] if evaluation is None else _curves(evaluation),
         base_arguments=_base_arguments(config),
-        every_setting=config_as_yaml(config.model_copy(update={"run_dir": facts.name})),
+        every_setting=config_as_yaml(config.model_copy(update={"run_dir": name})),
     )
 
 
-def _front(config: Config, facts: AdapterFacts) -> str:
+def _trained(run: TrainedRun) -> str:
+    """Return the number of trained parameters as text."""
+    with safe_open(run.checkpoint / ADAPTER / LORA_WEIGHTS, framework="pt") as file:
+        shapes = [file.get_slice(name).get_shape() for name in file.keys()]  # noqa: SIM118  # no iterator
+    return str(trainable_report(run.world_model)._replace(trained=sum(map(math.prod, shapes))))
+
+
+def _front(run: TrainedRun, name: str, evaluation: Mapping[str, Any] | None) -> str:
     """Return what the Hub reads of a card: tags, and the errors of the adapter as results of an evaluation."""
     card = ModelCardData(
         library_name="peft",
         pipeline_tag="robotics",
         tags=["v-jepa-2-ac", "world-model", "lora"],
-        model_name=facts.name,
-        eval_results=_eval_results(config, facts),
+        model_name=name,
+        eval_results=None if evaluation is None else _eval_results(run, evaluation),
     )
     return str(card.to_yaml())
 
 
-def _eval_results(config: Config, facts: AdapterFacts) -> list[EvalResult] | None:
+def _eval_results(run: TrainedRun, measured: Mapping[str, Any]) -> list[EvalResult] | None:
     """Return the rollout errors of this very checkpoint; None where it was not measured."""
-    measured = facts.evaluation
-    if measured is None or measured["about"]["checkpoint_path"] != facts.checkpoint:
+    if measured["about"]["checkpoint_path"] != run.checkpoint.name:
         return None
     about, models = measured["about"], measured["models"]
     ratios = models[list(models)[-1]]["rollout"]["l1"]["over_persistence"]  # what was measured comes last
@@ -83,8 +91,8 @@ def _eval_results(config: Config, facts: AdapterFacts) -> list[EvalResult] | Non
         EvalResult(
             task_type="robotics",
             task_name="prediction of latents",
-            dataset_type=config.data.source,
-            dataset_name=PurePath(config.data.path).name,
+            dataset_type=run.config.data.source,
+            dataset_name=PurePath(run.config.data.path).name,
             dataset_split=about["split"],
             metric_type="l1_over_persistence",
             metric_name=f"L1 error over persistence, {step * about['seconds_per_step']:.2f} s ahead",
