@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import UInt8
 
 from vjepa2_ac.evaluation.estimates import Curve, one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Example
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.reports.comparison import Comparison
@@ -82,7 +81,8 @@ def _use_of_actions(axes: Any, evaluation: Evaluation) -> None:
     for i, (name, colour) in enumerate(_colours(evaluation).items()):
         ratios = [one_step_over_persistence(evaluation.models[name].errors, actions) for actions in ACTIONS]
         places = np.arange(len(ratios)) + (i - (len(evaluation.models) - 1) / 2) * width
-        spread = np.array([_reach(r) for r in ratios]).T
+        spread = np.array([(r.value - r.low, r.high - r.value) for r in ratios]).T
+        spread = np.nan_to_num(spread.clip(min=0))  # rounding could make it negative; NaN: there is no interval
         axes.bar(places, [r.value for r in ratios], width, color=colour, yerr=spread, error_kw={"elinewidth": 1})
     axes.axhline(1.0, color=GREY, linestyle="--")
     axes.set_xticks(range(len(ACTIONS)), ACTIONS)
@@ -93,13 +93,6 @@ def _colours(evaluation: Evaluation) -> dict[str, str]:
     """Return a colour for each model."""
     others = iter(_OTHERS * len(evaluation.models))
     return {name: _COLOURS.get(name) or next(others) for name in evaluation.models}
-
-
-def _reach(value: Estimate) -> tuple[float, float]:
-    """Return the length of an error bar downwards and upwards; never negative, which rounding could make it."""
-    if not value.has_interval:
-        return 0.0, 0.0
-    return max(0.0, value.value - value.low), max(0.0, value.high - value.value)
 
 
 def _filmstrip(figure: Any, example: Example, seconds_per_step: float) -> None:

@@ -28,14 +28,9 @@ class _Track:
     """What is shown of a clip at each time: a row of the strip, and perhaps a panel of the animation."""
 
     kind: Literal["frames", "error", "latents"]
-    of: str  # the model; of frames and true latents: true
+    of: str  # the model; of frames and true latents, which the first frame has as well: true
     name: str
     panel: str = ""  # name in the animation; empty: it is not part of it
-
-    @property
-    def from_start(self) -> bool:
-        """Whether the first frame has it as well; every prediction begins there."""
-        return self.of == "true"
 
 
 @dataclass(frozen=True, eq=False)
