@@ -78,6 +78,7 @@ HOMES = {
     "h5py": ["data/sources/droid_raw/trajectory.py"],
     "huggingface_hub": ["export/"],
     "jinja2": ["export/", "reports/"],
+    "markupsafe": ["reports/html/"],
     "matplotlib": ["reports/"],
     "mujoco": ["simulation/world/"],
     "peft": ["model/adapter/"],
