@@ -77,6 +77,8 @@ HOMES = {
     "google_crc32c": ["data/sources/rlds/tfrecord.py"],
     "h5py": ["data/sources/droid_raw/trajectory.py"],
     "huggingface_hub": ["export/"],
+    "jinja2": ["export/", "reports/"],
+    "markupsafe": ["reports/html/"],
     "matplotlib": ["reports/"],
     "mujoco": ["simulation/world/"],
     "peft": ["model/adapter/"],
