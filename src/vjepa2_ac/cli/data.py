@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli.options import (
     Commands,
-    Handler,
-    as_local,
+    add_config,
+    argument,
     as_model,
     as_path,
     command,
@@ -26,42 +26,29 @@ if TYPE_CHECKING:
     from vjepa2_ac.config import Config
 
 
-def add_data(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands) -> None:
     """Add `data` with its commands to a parser."""
     text = "Look at a data set before training on it."
-    parser = commands.add_parser("data", help=text, description=text)
-    inner = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    _add_check(inner)
-    _add_index(inner)
-    _add_inspect(inner)
-    _add_calibrate(inner)
+    inner = commands.add_parser("data", help=text, description=text).add_subparsers(
+        title="commands", required=True, metavar="COMMAND"
+    )
+    for add in (_add_check, _add_index, _add_inspect, _add_calibrate):
+        add_config(add(inner), such_as="data.camera=wrist_left")
 
 
-def _command(
-    commands: Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
-) -> argparse.ArgumentParser:
-    parser = command(commands, name, handler, text)
-    parser.add_argument("config", metavar="CONFIG", type=as_local, help="a YAML config")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as data.camera=wrist_left")
-    return parser
-
-
-def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
-        commands, "check", _check,
+def _add_check(commands: Commands) -> argparse.ArgumentParser:
+    text = (
         "Open the data, load some clips as training would, and look at every number. Exit status 0: all is well or"
-        " only warnings, 1: training would learn nothing or not begin, 2: something cannot be used.",
-    )  # fmt: skip
-    parser.add_argument(
-        "--limit", metavar="N", type=count, default=32, help="clips to load (32); to probe, twice as many"
+        " only warnings, 1: training would learn nothing or not begin, 2: something cannot be used."
     )
-    parser.add_argument(
-        "--model",
-        metavar="RUN_OR_MODEL",
-        type=as_model,
-        help="probe the data with a model that knows robots (a run, or what model.base takes): does it predict better"
-        " where frames are shifted, mirrored, reversed, BGR, or the gripper is inverted?",
+    parser = command(commands, "check", _check, text)
+    argument(parser, "--limit N", "clips to load (32); to probe, twice as many", count, default=32)
+    text = (
+        "probe the data with a model that knows robots (a run, or what model.base takes): does it predict better where"
+        " frames are shifted, mirrored, reversed, BGR, or the gripper is inverted?"
     )
+    argument(parser, "--model RUN_OR_MODEL", text, as_model)
+    return parser
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -106,11 +93,11 @@ def _probe(config: Config, model: str, *, clips: int) -> None:
     print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
 
 
-def _add_index(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
-        commands, "index", _index, "Build the index of a data set, or show the one that is kept on this machine."
-    )
-    parser.add_argument("--rebuild", action="store_true", help="build it again, also where one is kept")
+def _add_index(commands: Commands) -> argparse.ArgumentParser:
+    text = "Build the index of a data set, or show the one that is kept on this machine."
+    parser = command(commands, "index", _index, text)
+    argument(parser, "--rebuild", "build it again, also where one is kept", action="store_true")
+    return parser
 
 
 def _index(options: argparse.Namespace) -> None:
@@ -129,15 +116,13 @@ def _index(options: argparse.Namespace) -> None:
         console.print(line)
 
 
-def _add_inspect(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
-        commands, "inspect", _inspect, "Say what is in a data set, and draw it: text, inspect.json, a contact sheet."
-    )
-    parser.add_argument("--out", metavar="DIR", type=as_path, default=Path("inspection"), help="where to (inspection)")
-    parser.add_argument(
-        "--episodes", "--limit", metavar="N", type=count, default=100, help="episodes whose motion is looked at (100)"
-    )
-    parser.add_argument("--rows", metavar="N", type=count, default=8, help="episodes on the contact sheet (8)")
+def _add_inspect(commands: Commands) -> argparse.ArgumentParser:
+    text = "Say what is in a data set, and draw it: text, inspect.json, a contact sheet."
+    parser = command(commands, "inspect", _inspect, text)
+    argument(parser, "--out DIR", "where to (inspection)", as_path, default=Path("inspection"))
+    argument(parser, "--episodes --limit N", "episodes whose motion is looked at (100)", count, default=100)
+    argument(parser, "--rows N", "episodes on the contact sheet (8)", count, default=8)
+    return parser
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -171,18 +156,16 @@ def _inspect(options: argparse.Namespace) -> None:
     console.print(f"  {image}\n  {options.out / 'inspect.json'}")
 
 
-def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
-        commands, "calibrate", _calibrate,
-        "Let a model say how many control steps its model step is: its error over persistence at each stride.",
-    )  # fmt: skip
-    parser.add_argument(
-        "--model", metavar="MODEL", type=as_model, help="another than model.base: a .pt, a folder, or a run"
-    )
-    parser.add_argument("--split", choices=["train", "validation", "test"], default="validation", help="(validation)")
-    parser.add_argument("--limit", metavar="N", type=count, default=64, help="clips at each stride (64)")
-    parser.add_argument("--frames", metavar="N", type=whole_number(2, 256), help="of a clip (the config's, 8 at most)")
-    parser.add_argument("--out", metavar="DIR", type=as_path, default=Path("inspection"), help="where to (inspection)")
+def _add_calibrate(commands: Commands) -> argparse.ArgumentParser:
+    text = "Let a model say how many control steps its model step is: its error over persistence at each stride."
+    parser = command(commands, "calibrate", _calibrate, text)
+    argument(parser, "--model MODEL", "another than model.base: a .pt, a folder, or a run", as_model)
+    splits = ["train", "validation", "test"]
+    argument(parser, "--split", "(validation)", choices=splits, default="validation")
+    argument(parser, "--limit N", "clips at each stride (64)", count, default=64)
+    argument(parser, "--frames N", "of a clip (the config's, 8 at most)", whole_number(2, 256))
+    argument(parser, "--out DIR", "where to (inspection)", as_path, default=Path("inspection"))
+    return parser
 
 
 def _calibrate(options: argparse.Namespace) -> None:

@@ -7,13 +7,15 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from vjepa2_ac.cli.evaluate import add_checkpoint
 from vjepa2_ac.cli.options import (
     Commands,
+    add_checkpoint,
+    argument,
     as_local,
     as_model,
     as_path,
     command,
+    load_planning_session,
     require_overrides,
     require_to_plan,
     say_places_elsewhere,
@@ -27,71 +29,41 @@ if TYPE_CHECKING:
     from vjepa2_ac.config import Config
 
 
-def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands) -> None:
     """Add `plan` to a parser."""
-    parser = command(
-        commands,
-        "plan",
-        _plan,
+    text = (
         "Plan from an image and a state to a goal image: plan.json, and an image of how the planner came to it."
-        " Status 1 where the model gives no finite energy.",
+        " Status 1 where the model gives no finite energy."
     )
+    parser = command(commands, "plan", _plan, text)
     parser._negative_number_matcher = re.compile(r"^-[\d.]")  # "-0.3,0.1,..." is a value, not an option
-    parser.add_argument(
-        "subject", metavar="RUN_OR_MODEL", type=as_model, help="folder of a run, or what model.base takes"
-    )
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as planning.horizon=2")
+    argument(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
+    argument(parser, "overrides key=value", "such as planning.horizon=2", nargs="*")
     _add_request(parser)
-    parser.add_argument(
-        "--config", metavar="CONFIG", type=as_local, help="for a model: the config whose planning, crop and dtype count"
-    )
+    text = "for a model: the config whose planning, crop and dtype count"
+    argument(parser, "--config CONFIG", text, as_local)
     add_checkpoint(parser)
-    parser.add_argument("--seed", metavar="N", type=whole_number(0, 2**31 - 1), help="default: the config's")
-    parser.add_argument(
-        "--nodes",
-        metavar="N",
-        type=whole_number(0, 101),
-        default=13,
-        help="of an energy slice along each axis (13); below 3: no slices",
-    )
-    parser.add_argument("--out", metavar="FOLDER", type=as_path, default=Path("plan"), help="for both files (plan)")
+    argument(parser, "--seed N", "default: the config's", whole_number(0, 2**31 - 1))
+    text = "of an energy slice along each axis (13); below 3: no slices"
+    argument(parser, "--nodes N", text, whole_number(0, 101), default=13)
+    argument(parser, "--out FOLDER", "for both files (plan)", as_path, default=Path("plan"))
 
 
 def _add_request(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--start", metavar="IMAGE", type=as_local, required=True, help="what the camera sees: PNG or JPEG"
+    argument(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", as_local, required=True)
+    text = (
+        "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers of a"
+        " vector, as the data had them"
     )
-    parser.add_argument(
-        "--state",
-        metavar="NUMBERS",
-        required=True,
-        help="measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers"
-        " of a vector, as the data had them",
-    )
-    parser.add_argument(
-        "--goal",
-        metavar="IMAGE",
-        type=as_local,
-        required=True,
-        action="append",
-        help="what it shall see; again for goals that follow one another",
-    )
-    parser.add_argument(
-        "--durations",
-        metavar="STEPS",
-        help="model steps of each goal but the last, as 2,1; default: equal shares of planning.horizon",
-    )
-    parser.add_argument(
-        "--mask",
-        metavar="IMAGE",
-        type=as_local,
-        help="what of the image counts: of the goal's size, black where it does not",
-    )
-    parser.add_argument(
-        "--extrinsics",
-        metavar="NUMBERS",
-        help="the camera in the robot base frame: x,y,z,roll,pitch,yaw; where the model uses it",
-    )
+    argument(parser, "--state NUMBERS", text, required=True)
+    text = "what it shall see; again for goals that follow one another"
+    argument(parser, "--goal IMAGE", text, as_local, required=True, action="append")
+    text = "model steps of each goal but the last, as 2,1; default: equal shares of planning.horizon"
+    argument(parser, "--durations STEPS", text)
+    text = "what of the image counts: of the goal's size, black where it does not"
+    argument(parser, "--mask IMAGE", text, as_local)
+    text = "the camera in the robot base frame: x,y,z,roll,pitch,yaw; where the model uses it"
+    argument(parser, "--extrinsics NUMBERS", text)
 
 
 def _plan(options: argparse.Namespace) -> int:
@@ -110,21 +82,18 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.planning.decision import PlanRequest, decide
     from vjepa2_ac.planning.plan_json import PLAN_FILE, write_plan
-    from vjepa2_ac.planning.session import load_to_plan
     from vjepa2_ac.planning.summary import summarize
     from vjepa2_ac.reports.figures.plan import PLAN_IMAGE, plot_plan
 
-    question = PlanRequest(images.start, state, images.goals, durations, images.mask)
+    request = PlanRequest(images.start, state, images.goals, durations, images.mask)
     say_places_elsewhere(options.subject)
-    session = load_to_plan(
-        options.subject, checkpoint=options.checkpoint, config=options.config, overrides=options.overrides
-    )
+    session = load_planning_session(options)
     if not options.durations:
-        question = question.with_equal_durations(session.config.planning.horizon)
+        request = request.with_equal_durations(session.config.planning.horizon)
     with ConsoleReporter() as reporter:
         progress = reporter.task("planning, iterations")
         controller = session.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
-        found = decide(controller, question, nodes=options.nodes)
+        found = decide(controller, request, nodes=options.nodes)
     images_given = {"start": options.start, "goals": options.goal, "mask": options.mask}
     with user_can_write(options.out):
         written = [
@@ -182,13 +151,11 @@ def _extrinsics(options: argparse.Namespace) -> np.ndarray | None:
 def _numbers(text: str, where: str) -> np.ndarray:
     import numpy as np
 
-    words = text.replace(",", " ").split()
     try:
-        return np.array([float(word) for word in words])
+        return np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError as error:
-        raise InputError(
-            where=where, found=f"{text!r} ({error})", needed="numbers with commas between them, in one word"
-        ) from None
+        found, needed = f"{text!r} ({error})", "numbers with commas between them, in one word"
+        raise InputError(where=where, found=found, needed=needed) from None
 
 
 def _durations(text: str, goals: int) -> tuple[int, ...]:
