@@ -6,15 +6,15 @@ For commands without handling of their own: a training run finishes its step fir
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
 import threading
 import time
 from collections.abc import Iterator
 from types import FrameType
 
+from vjepa2_ac.distributed import preemption
+
 SIGNALS = (signal.SIGTERM, signal.SIGHUP)
-_SAME_WITHIN_S = 0.5  # `timeout`, some launchers and terminals signal twice
 
 
 class EndedError(BaseException):
@@ -44,8 +44,8 @@ def tidy_end() -> Iterator[None]:
         if not came_at:
             came_at.append(time.monotonic())
             raise EndedError(number)
-        if time.monotonic() - came_at[0] >= _SAME_WITHIN_S:
-            _die(number)
+        if time.monotonic() - came_at[0] >= preemption.SAME_WITHIN_S:
+            preemption.end_by(number)
 
     taken = [number for number in SIGNALS if signal.getsignal(number) is signal.SIG_DFL]
     for number in taken:
@@ -53,12 +53,7 @@ def tidy_end() -> Iterator[None]:
     try:
         yield
     except EndedError as ended:
-        _die(ended.number)
+        preemption.end_by(ended.number)
     finally:
         for number in taken:
             signal.signal(number, signal.SIG_DFL)
-
-
-def _die(number: int) -> None:
-    signal.signal(number, signal.SIG_DFL)
-    os.kill(os.getpid(), number)

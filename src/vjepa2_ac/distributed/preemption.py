@@ -21,6 +21,7 @@ from types import FrameType
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 HANG_UP = signal.SIGHUP
+SAME_WITHIN_S = 0.5  # another signal is the same request: `timeout` and launchers signal a process and its group
 EXIT_STATUS = 75  # sysexits.h, EX_TEMPFAIL: the same command resumes
 
 
@@ -39,16 +40,10 @@ class StoppedError(Exception):
 
 
 class StopRequest:
-    """Records whether a signal has requested a stop, and which.
+    """Records whether a signal has requested a stop, and which."""
 
-    Args:
-        same_within_s: Another signal within this time is the same request: `timeout` and some launchers signal both the
-            process and its group, so the process gets two.
-    """
-
-    def __init__(self, same_within_s: float) -> None:
+    def __init__(self) -> None:
         self.reason: str | None = None
-        self._same_within_s = same_within_s
         self._came_at = 0.0
 
     @property
@@ -60,19 +55,24 @@ class StopRequest:
         """Record a first signal; give a second one its default effect."""
         if self.reason is None:
             self.reason, self._came_at = signal.Signals(number).name, time.monotonic()
-        elif number != HANG_UP and time.monotonic() - self._came_at >= self._same_within_s:
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
+        elif number != HANG_UP and time.monotonic() - self._came_at >= SAME_WITHIN_S:
+            end_by(number)
+
+
+def end_by(number: int) -> None:
+    """Give a signal its default effect, and this process the signal."""
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
 
 
 @contextlib.contextmanager
-def stop_on_signals(*, same_within_s: float = 0.5) -> Iterator[StopRequest]:
+def stop_on_signals() -> Iterator[StopRequest]:
     """Record signals instead of being killed by them, within the context; afterwards the old handlers are restored.
 
     Nothing changes outside the main thread, where Python handles no signals, and for signals that the process was
     started to ignore (`nohup`, a shell's `&`).
     """
-    request = StopRequest(same_within_s)
+    request = StopRequest()
     if threading.current_thread() is not threading.main_thread():
         yield request
         return

@@ -60,6 +60,11 @@ class RunState:
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
     data: str | None = None  # the fingerprint of the episodes
 
+    @property
+    def best_name(self) -> str | None:
+        """The name of the best checkpoint; None if there is none."""
+        return None if self.best_step is None else checkpoint_name(self.best_step)
+
     def measured(self, error: float) -> RunState:
         """Return the state after a validation at its step: changed only if it was better than all before."""
         if not math.isfinite(error) or (self.best_error is not None and error >= self.best_error):
@@ -141,7 +146,9 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
                 _remove(stale)
         temporary.rename(final)
         sync(folder)
-        _prune(folder, keep, state.best_step)
+        for old in listed(folder)[:-keep]:
+            if step_of(old.name) != state.best_step:
+                _remove(old)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise InputError(
@@ -220,12 +227,6 @@ def _another_step(checkpoint: Path, name: str) -> str | None:
     if type(step) is not int:
         return f"no readable {STATE} (step: {shown(step)})"
     return None if step_of(name) in {None, step} else f"a copy of another one, of step {step}"
-
-
-def _prune(folder: Path, keep: int, best_step: int | None) -> None:
-    for path in listed(folder)[:-keep]:
-        if step_of(path.name) != best_step:
-            _remove(path)
 
 
 def _remove(checkpoint: Path) -> None:

@@ -28,7 +28,7 @@ from pathlib import Path
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.effects import Affects, mark_of
-from vjepa2_ac.config.loading import changed_keys, config_as_dict, config_as_flat_dict, config_as_yaml, load_config
+from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import is_url, literal
 from vjepa2_ac.runs.checkpoint import remove_leavings
@@ -105,8 +105,7 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
         # First of all files: it makes the folder a run's.
         write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     path = folder / ENVIRONMENT
-    starts = _earlier_starts(path)
-    write_atomically(path, json.dumps([*starts, start], indent=1).encode())
+    write_atomically(path, json.dumps([*_earlier_starts(path), start], indent=1).encode())
     write_atomically(folder / RUN_ID, run_name)
     (folder / CHECKPOINTS).mkdir(exist_ok=True)
     remove_leavings(folder / CHECKPOINTS)
@@ -135,8 +134,9 @@ def config_changes(config: Config) -> list[str]:
     if not (folder / CONFIG).is_file():
         return []
     old = read_run_config(folder)
+    before, now = config_as_flat_dict(old), config_as_flat_dict(config)
     keys = [key for key in changed_keys(old, config) if key != "run_dir"]
-    return [f"{key}: {_setting(old, key)} -> {_setting(config, key)}" for key in keys]
+    return [f"{key}: {json.dumps(before.get(key))} -> {json.dumps(now.get(key))}" for key in keys]
 
 
 def is_run(subject: str) -> bool:
@@ -199,13 +199,6 @@ def _earlier_starts(path: Path) -> list[object]:
         return read_json_list(path)
     except (OSError, InputError):
         return []
-
-
-def _setting(config: Config, dotted_key: str) -> str:
-    value: object = config_as_dict(config)
-    for part in dotted_key.split("."):
-        value = value.get(part) if isinstance(value, dict) else None
-    return json.dumps(value)
 
 
 def _refuse_another_config(folder: Path, config: Config) -> None:

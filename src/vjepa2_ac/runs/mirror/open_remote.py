@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -94,7 +95,12 @@ def open_remote(
         _warn(f"{reason_of(error)}. Training goes on after step {step}, though {further[0]} is there")
         return remote
     if further and damaged == further:
-        _refuse_all_damaged(remote.place, damaged, step)
+        if step is None:
+            raise InputError(
+                where="checkpoint.remote",
+                found=f"{remote.place}: none of {len(damaged)} checkpoints is whole",
+                fix="To start the run anew, remove them, or set another checkpoint.remote",
+            )
         return replace(remote, damaged=tuple(damaged))
     return replace(remote, config=target, damaged=tuple(damaged))
 
@@ -146,25 +152,13 @@ def _refuse_own_folder(remote: str, run_dir: Path) -> None:
         )
 
 
-def _refuse_all_damaged(remote: str, damaged: list[str], step: int | None) -> None:
-    if step is None:
-        raise InputError(
-            where="checkpoint.remote",
-            found=f"{remote}: none of {len(damaged)} checkpoints is whole",
-            fix="To start the run anew, remove them, or set another checkpoint.remote",
-        )
-
-
 def _where_this_machine_stands(run_dir: Path) -> tuple[int | None, str | None]:
     """Return step and run of the newest complete local checkpoint."""
-    try:
-        checkpoint = newest_checkpoint(run_dir / CHECKPOINTS)
-    except InputError:  # none is complete: a remote one may be
-        return None, None
-    if checkpoint is None:
-        return None, None
-    state = written_state(checkpoint)
-    return state.step, state.run_id
+    with suppress(InputError):  # none is complete: a remote one may be
+        if (checkpoint := newest_checkpoint(run_dir / CHECKPOINTS)) is not None:
+            state = written_state(checkpoint)
+            return state.step, state.run_id
+    return None, None
 
 
 def _warn(text: str) -> None:
