@@ -271,8 +271,8 @@ class DataConfig(Section):
 
     @property
     def first_camera(self) -> str:
-        """The camera that the model sees unless `camera` names others."""
-        raise NotImplementedError
+        """The camera that the model sees unless `camera` names others; of the form of data, where none are known."""
+        return self.offered_cameras[0]
 
     @property
     def own_knobs_of_poses(self) -> list[str]:
