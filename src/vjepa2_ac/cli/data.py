@@ -20,7 +20,6 @@ from vjepa2_ac.cli.options import (
     require_subject,
     whole_number,
 )
-from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
@@ -192,9 +191,7 @@ def _calibrate(options: argparse.Namespace) -> None:
 
 def _make_folder(folder: Path) -> None:
     """Create the folder for results before any long work."""
-    try:
+    from vjepa2_ac.storage import user_can_write
+
+    with user_can_write(f"--out {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            where=f"--out {folder}", found=f"cannot be made ({error.strerror})", needed="a folder of yours"
-        ) from None

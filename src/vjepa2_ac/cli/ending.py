@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from types import FrameType
@@ -35,9 +34,6 @@ def tidy_end() -> Iterator[None]:
 
     Outside the main thread, and for signals that already have a handler, nothing is changed.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     came_at: list[float] = []
 
     def end(number: int, _frame: FrameType | None) -> None:
@@ -48,12 +44,8 @@ def tidy_end() -> Iterator[None]:
             preemption.end_by(number)
 
     taken = [number for number in SIGNALS if signal.getsignal(number) is signal.SIG_DFL]
-    for number in taken:
-        signal.signal(number, end)
     try:
-        yield
+        with preemption.handle_signals(taken, end):
+            yield
     except EndedError as ended:
         preemption.end_by(ended.number)
-    finally:
-        for number in taken:
-            signal.signal(number, signal.SIG_DFL)

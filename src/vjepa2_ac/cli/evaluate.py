@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli.options import (
     Commands,
-    SubjectsAndOverrides,
     add_checkpoint,
     argument,
     as_local,
@@ -37,7 +36,7 @@ def add_to(commands: Commands) -> None:
     text = "Measure a run or a model on held-out episodes, beside its base, doing nothing and wrong actions."
     parser = command(commands, "evaluate", _evaluate, text)
     text = "folder of a run, or (with --data) what model.base takes; several: their spread, too"
-    argument(parser, "subjects RUN_OR_MODEL", text, as_subject, nargs="+", action=SubjectsAndOverrides)
+    argument(parser, "subjects RUN_OR_MODEL", text, as_subject, nargs="+")
     text = "measure on the data of this config (and with its model.dtype, device, seed)"
     argument(parser, "--data CONFIG", text, as_local)
     text = "what to compare with, on the same latents; default: the base of a run, nothing for a model"

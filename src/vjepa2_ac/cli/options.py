@@ -166,34 +166,25 @@ def load_planning_session(options: argparse.Namespace) -> PlanningSession:
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse a command line; `key=value` may be anywhere after a command that takes it.
 
-    argparse does not accept such words after an option, and treats them as unknown arguments.
+    argparse does not accept such words after an option, and treats them as unknown arguments; and it takes those among
+    the names of several runs or models for names.
     """
     options, rest = parser.parse_known_args(arguments)
     unknown = [word for word in rest if _OPTION.match(word)]
     if rest and (unknown or not hasattr(options, "overrides")):
         parser.error(f"unrecognized arguments: {' '.join(word for word in rest if not _OVERRIDE.match(word))}")
+    if "subjects" in options:
+        rest = [*filter(_is_override, options.subjects), *rest]
+        options.subjects = [word for word in options.subjects if not _is_override(word)]
+        if not options.subjects:
+            parser.error("the following arguments are required: RUN_OR_MODEL")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
 
 
-class SubjectsAndOverrides(argparse.Action):
-    """Takes names of runs or models, one or more, and among them `key=value` words that are no folders."""
-
-    def __call__(
-        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, _option: str | None = None
-    ) -> None:
-        """Sort the words into both kinds."""
-        overrides = [word for word in values if _is_override(word)]
-        subjects = [word for word in values if word not in overrides]
-        if not subjects:
-            parser.error(f"the following arguments are required: {self.metavar}")
-        setattr(namespace, self.dest, subjects)
-        namespace.overrides = [*namespace.overrides, *overrides]
-
-
 def as_subject(text: str) -> str:
-    """Parse the name of a run or a model, and leave a `key=value` unchanged for `SubjectsAndOverrides`."""
+    """Parse the name of a run or a model, and leave a `key=value` among several of them unchanged, for `parsed`."""
     return text if _is_override(text) else as_model(text)
 
 

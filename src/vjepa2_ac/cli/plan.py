@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli.options import (
     Commands,
@@ -76,7 +76,7 @@ def _plan(options: argparse.Namespace) -> int:
     _require_state(state, require_to_plan(options))
     with user_can_write(options.out):
         options.out.mkdir(parents=True, exist_ok=True)
-    images = _images(options)
+    start, goals, mask = _images(options)
 
     from vjepa2_ac.console.plan import plan_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
@@ -85,7 +85,7 @@ def _plan(options: argparse.Namespace) -> int:
     from vjepa2_ac.planning.summary import summarize
     from vjepa2_ac.reports.figures.plan import PLAN_IMAGE, plot_plan
 
-    request = PlanRequest(images.start, state, images.goals, durations, images.mask)
+    request = PlanRequest(start, state, goals, durations, mask)
     say_places_elsewhere(options.subject)
     session = load_planning_session(options)
     if not options.durations:
@@ -115,14 +115,8 @@ def _require_state(state: np.ndarray, config: Config) -> None:
     require_numbers(state, measured_space(config.data, len(state)), where="--state")
 
 
-class _Images(NamedTuple):
-    start: np.ndarray
-    goals: tuple[np.ndarray, ...]
-    mask: np.ndarray | None
-
-
-def _images(options: argparse.Namespace) -> _Images:
-    """Read what was given and refuse what cannot be planned with, before a model is loaded."""
+def _images(options: argparse.Namespace) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray | None]:
+    """Return start, goals and mask; refuse what cannot be planned with, before a model is loaded."""
     from vjepa2_ac.media.image_file import read_image
     from vjepa2_ac.planning.input_checks import require_image, require_mask
 
@@ -134,7 +128,7 @@ def _images(options: argparse.Namespace) -> _Images:
     mask = None if options.mask is None else read_image(options.mask).max(axis=-1)
     if mask is not None:
         require_mask(mask, where=f"--mask {options.mask}", like=goals[0])
-    return _Images(start, goals, mask)
+    return start, goals, mask
 
 
 def _extrinsics(options: argparse.Namespace) -> np.ndarray | None:

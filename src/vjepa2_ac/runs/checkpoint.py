@@ -193,10 +193,7 @@ def find_damage(checkpoint: Path, name: str | None = None) -> str | None:
 def read_state(checkpoint: Path) -> RunState:
     """Return the progress of the run at a checkpoint, without a best checkpoint that is missing or damaged."""
     state = written_state(checkpoint)
-    if (
-        state.best_step in {None, state.step}
-        or find_damage(checkpoint.parent / checkpoint_name(state.best_step)) is None
-    ):
+    if state.best_step in {None, state.step} or find_damage(checkpoint.parent / str(state.best_name)) is None:
         return state
     return replace(state, best_step=None, best_error=None)
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
+from operator import getitem
 from pathlib import Path
-from typing import Any
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, config_as_flat_dict, parse_config
@@ -40,7 +41,13 @@ def with_paths_from_start(config: Config, run: Path, *, needed: Sequence[str]) -
                 fix=("Go to the folder in which it does" if starts else "Go to the folder in which the run was started")
                 + (", or name the data with --data CONFIG and a folder with --out" if key == DATA else ""),
             )
-    return parse_config(_replaced(config_as_dict(config), elsewhere), where=str(run)) if elsewhere else config
+    if not elsewhere:
+        return config
+    values = config_as_dict(config)
+    for key, path in elsewhere.items():
+        *sections, name = key.split(".")
+        reduce(getitem, sections, values)[name] = path
+    return parse_config(values, where=str(run))
 
 
 def require_start_folder(config: Config, run: Path) -> None:
@@ -79,13 +86,3 @@ def _leads_nowhere(path: str | None) -> bool:
         return False
     here = Path(path)
     return not here.is_absolute() and not here.exists()
-
-
-def _replaced(values: dict[str, Any], changes: dict[str, str]) -> dict[str, Any]:
-    for key, value in changes.items():
-        *sections, name = key.split(".")
-        inside = values
-        for section in sections:
-            inside = inside[section]
-        inside[name] = value
-    return values
