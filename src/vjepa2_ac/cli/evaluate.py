@@ -131,12 +131,9 @@ def _require_planning(options: argparse.Namespace) -> None:
     """Refuse planning settings if no plans are requested: they would have no effect."""
     require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
     if options.overrides and options.plan_settings is None:
-        raise InputError(
-            where="command line",
-            found=f"{' '.join(options.overrides)}, and no plans are asked for",
-            needed="--planning beside settings of planning; what else a config says is not changed by evaluate",
-            fix="Add --planning",
-        )
+        found = f"{' '.join(options.overrides)}, and no plans are asked for"
+        needed = "--planning beside settings of planning; what else a config says is not changed by evaluate"
+        raise InputError(where="command line", found=found, needed=needed, fix="Add --planning")
 
 
 def _compare(options: argparse.Namespace) -> None:

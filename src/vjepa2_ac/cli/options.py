@@ -109,12 +109,9 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
     config = load_config(path, overrides)
     data = config.data.path
     if not places.is_url(data) and not Path(data).exists():
-        raise InputError(
-            where=f"data.path: {data}",
-            found=f"no such file or folder, seen from {Path.cwd()}",
-            needed="a data set",
-            fix="Set data.path to the data set; docs/QUICKSTART.md says how to get DROID",
-        )
+        found = f"no such file or folder, seen from {Path.cwd()}"
+        fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
+        raise InputError(where=f"data.path: {data}", found=found, needed="a data set", fix=fix)
     if base and config.model.base is not None:
         find_base(config.model.base)
     return config
@@ -200,12 +197,8 @@ def require_overrides(words: Sequence[str], *, fix: str = "") -> None:
     """
     others = [word for word in words if "=" not in word]
     if others:
-        raise InputError(
-            where="command line",
-            found=f"{' '.join(others)!r}",
-            needed="key=value, such as training.steps=100",
-            fix=fix,
-        )
+        found, needed = f"{' '.join(others)!r}", "key=value, such as training.steps=100"
+        raise InputError(where="command line", found=found, needed=needed, fix=fix)
 
 
 def as_path(text: str) -> Path:

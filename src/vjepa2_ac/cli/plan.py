@@ -155,9 +155,7 @@ def _numbers(text: str, where: str) -> np.ndarray:
 def _durations(text: str, goals: int) -> tuple[int, ...]:
     words = text.replace(",", " ").split()
     if len(words) != goals - 1 or not all(word.isdecimal() and int(word) for word in words):
-        raise InputError(
-            where="--durations",
-            found=f"{text!r} for {goals} goal{'s' * (goals > 1)}",
-            needed=f"{goals - 1} whole numbers from 1, with commas between them: of each goal but the last",
-        )
+        found = f"{text!r} for {goals} goal{'s' * (goals > 1)}"
+        needed = f"{goals - 1} whole numbers from 1, with commas between them: of each goal but the last"
+        raise InputError(where="--durations", found=found, needed=needed)
     return tuple(int(word) for word in words)

@@ -61,11 +61,8 @@ def _require_working_directory() -> None:
     try:
         Path.cwd()
     except OSError:
-        raise InputError(
-            where="working directory",
-            found="it is gone: it was deleted, or its disk went away",
-            fix="Change to a folder that is there, with `cd`",
-        ) from None
+        found, fix = "it is gone: it was deleted, or its disk went away", "Change to a folder that is there, with `cd`"
+        raise InputError(where="working directory", found=found, fix=fix) from None
 
 
 def _complain(error: str) -> None:

@@ -36,13 +36,11 @@ def _train(options: argparse.Namespace) -> int:
 
     path = Path(options.config)
     if options.resume and options.overrides:
-        raise InputError(
-            where="command line", found="--resume with overrides", needed="the run's own config, unchanged"
-        )
+        needed = "the run's own config, unchanged"
+        raise InputError(where="command line", found="--resume with overrides", needed=needed)
     if path.is_dir() and not options.resume:
-        raise InputError(
-            where=options.config, found="a folder", needed="a config file", fix="To go on with a run, add --resume"
-        )
+        fix = "To go on with a run, add --resume"
+        raise InputError(where=options.config, found="a folder", needed="a config file", fix=fix)
     if options.resume:
         say_places_elsewhere(options.config)
     config = read_run_config(path) if options.resume else read_config(path, options.overrides, base=True)

@@ -151,11 +151,9 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
                 _remove(old)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
-        raise InputError(
-            where=str(final),
-            found=f"the checkpoint cannot be written ({error.strerror or error})",
-            fix="Older checkpoints are untouched: make room or pass another run_dir, then resume",
-        ) from error
+        found = f"the checkpoint cannot be written ({error.strerror or error})"
+        fix = "Older checkpoints are untouched: make room or pass another run_dir, then resume"
+        raise InputError(where=str(final), found=found, fix=fix) from error
     return final
 
 
@@ -172,11 +170,8 @@ def newest_checkpoint(folder: Path) -> Path | None:
             return path
         logger.warning("%s: %s; passed over", path, problem)
     if found:
-        raise InputError(
-            where=str(folder),
-            found=f"none of {len(found)} checkpoints is whole",
-            fix="To start the run anew, delete this folder",
-        )
+        damaged, fix = f"none of {len(found)} checkpoints is whole", "To start the run anew, delete this folder"
+        raise InputError(where=str(folder), found=damaged, fix=fix)
     return None
 
 

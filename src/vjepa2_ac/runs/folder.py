@@ -75,12 +75,9 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
         if not allow_config_change:
             _refuse_another_config(folder, config)
     elif folder.exists() and not all(_is_without_config(path) for path in folder.iterdir()):
-        raise InputError(
-            where=str(folder),
-            found="a folder with other things in it, and no config.yaml",
-            needed="an empty or new folder, or one of a run",
-            fix="Set another run_dir",
-        )
+        found = "a folder with other things in it, and no config.yaml"
+        needed = "an empty or new folder, or one of a run"
+        raise InputError(where=str(folder), found=found, needed=needed, fix="Set another run_dir")
     _check_writable(folder)
 
 
@@ -151,11 +148,9 @@ def read_run_config(folder: Path) -> Config:
         InputError: Not the folder of a run.
     """
     if not (folder / CONFIG).is_file():
-        raise InputError(
-            where=str(folder),
-            found="no config.yaml" if folder.is_dir() else "no such folder",
-            needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
-        )
+        found = "no config.yaml" if folder.is_dir() else "no such folder"
+        needed = "the folder of a run, which `vjepa2-ac train CONFIG` makes"
+        raise InputError(where=str(folder), found=found, needed=needed)
     return load_config(folder / CONFIG, [f"run_dir={json.dumps(literal(folder))}"])
 
 
@@ -205,22 +200,20 @@ def _refuse_another_config(folder: Path, config: Config) -> None:
     changed = changed_keys(read_run_config(folder), config)
     differing = [key for key in changed if Affects.RUN in mark_of(key, Config)]
     if differing:
-        raise InputError(
-            where=str(folder),
-            found=f"a run of another config; it differs in {', '.join(differing)}",
-            needed="the same config, to go on with it",
-            fix=f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`; where"
-            " the change is meant, add --allow-config-change",
+        found = f"a run of another config; it differs in {', '.join(differing)}"
+        fix = (
+            f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`; where the change is"
+            " meant, add --allow-config-change"
         )
+        raise InputError(where=str(folder), found=found, needed="the same config, to go on with it", fix=fix)
 
 
 def _check_writable(folder: Path) -> None:
     try:
         try_writing_at(folder)
     except OSError as error:
-        raise InputError(
-            where=str(folder), found=f"cannot be written ({error.strerror})", fix="Set run_dir to a folder of yours"
-        ) from None
+        found = f"cannot be written ({error.strerror})"
+        raise InputError(where=str(folder), found=found, fix="Set run_dir to a folder of yours") from None
 
 
 def with_settled_stride(config: Config) -> Config:

@@ -58,12 +58,10 @@ class RunLock:
             if error.errno in _TAKEN:
                 holder = _holder(self._file)
                 self.release()
-                raise InputError(
-                    where=str(self.path.parent),
-                    found=f"a run that is being trained right now, by {holder}",
-                    needed="a folder that no other process writes to",
-                    fix="Wait until it ends, stop it, or set another run_dir",
-                ) from None
+                found = f"a run that is being trained right now, by {holder}"
+                needed = "a folder that no other process writes to"
+                fix = "Wait until it ends, stop it, or set another run_dir"
+                raise InputError(where=str(self.path.parent), found=found, needed=needed, fix=fix) from None
             logger.warning(
                 "%s: this file system has no locks (%s): see that no other process trains in this folder",
                 self.path, error.strerror,

@@ -129,11 +129,9 @@ def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _unwritable(path: Path, error: OSError, checkpoint: str) -> InputError:
-    return InputError(
-        where=str(path),
-        found=f"the latest metrics cannot be written ({error.strerror or error}), and are lost",
-        fix=f"{checkpoint}. Make room on the disk of the run, then resume: the same command goes on",
-    )
+    found = f"the latest metrics cannot be written ({error.strerror or error}), and are lost"
+    fix = f"{checkpoint}. Make room on the disk of the run, then resume: the same command goes on"
+    return InputError(where=str(path), found=found, fix=fix)
 
 
 def warnings_of(path: Path) -> list[str]:

@@ -58,12 +58,10 @@ def require_start_folder(config: Config, run: Path) -> None:
     """
     for key, path in _seen_from_start(config, run).items():
         if key in {DATA, BASE}:
-            raise InputError(
-                where=f"{run}: {key}",
-                found=f"{config_as_flat_dict(config)[key]}: a relative path that leads nowhere from {Path.cwd()}",
-                needed=f"the folder in which the run was started: there it is {path}",
-                fix=f"Go to that folder: vjepa2-ac train {run.absolute()} --resume",
-            )
+            found = f"{config_as_flat_dict(config)[key]}: a relative path that leads nowhere from {Path.cwd()}"
+            needed = f"the folder in which the run was started: there it is {path}"
+            fix = f"Go to that folder: vjepa2-ac train {run.absolute()} --resume"
+            raise InputError(where=f"{run}: {key}", found=found, needed=needed, fix=fix)
 
 
 def _seen_from_start(config: Config, run: Path) -> dict[str, str]:

@@ -81,12 +81,9 @@ def _require_this_config(config: Config, fetched: Path, place: str, *, allow_con
         there = with_settled_stride(config.model_copy(update={"run_dir": str(fetched)}))
         check_run_folder(there, allow_config_change=allow_config_change)
     except InputError as error:
-        raise InputError(
-            where=f"checkpoint.remote {place}",
-            found=error.found,
-            needed=error.needed,
-            fix="Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change",
-        ) from None
+        fix = "Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change"
+        where = f"checkpoint.remote {place}"
+        raise InputError(where=where, found=error.found, needed=error.needed, fix=fix) from None
 
 
 def _fetch(remote: RemoteCheckpoints, name: str, folder: Path, described: str) -> Path | None:

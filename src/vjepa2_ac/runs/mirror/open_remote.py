@@ -25,6 +25,8 @@ from vjepa2_ac.storage.remote import quietly
 
 logger = logging.getLogger(__name__)
 
+_KNOB = "checkpoint.remote"
+
 
 @dataclass(frozen=True)
 class Remote:
@@ -96,11 +98,9 @@ def open_remote(
         return remote
     if further and damaged == further:
         if step is None:
-            raise InputError(
-                where="checkpoint.remote",
-                found=f"{remote.place}: none of {len(damaged)} checkpoints is whole",
-                fix="To start the run anew, remove them, or set another checkpoint.remote",
-            )
+            found = f"{remote.place}: none of {len(damaged)} checkpoints is whole"
+            fix = "To start the run anew, remove them, or set another checkpoint.remote"
+            raise InputError(where=_KNOB, found=found, fix=fix)
         return replace(remote, damaged=tuple(damaged))
     return replace(remote, config=target, damaged=tuple(damaged))
 
@@ -117,12 +117,9 @@ def _look(checkpoints: RemoteCheckpoints, run_id: str | None) -> tuple[Listing, 
         listing = checkpoints.listing()
         owner = _refuse_foreign(checkpoints, listing, run_id)
     except RefusedError as error:
-        raise InputError(
-            where="checkpoint.remote",
-            found=f"{checkpoints.place}: {error.found}",
-            needed="a place where files can be written and removed",
-            fix=f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out",
-        ) from error
+        found, needed = f"{checkpoints.place}: {error.found}", "a place where files can be written and removed"
+        fix = f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out"
+        raise InputError(where=_KNOB, found=found, needed=needed, fix=fix) from error
     return listing, owner
 
 
@@ -132,24 +129,18 @@ def _refuse_foreign(checkpoints: RemoteCheckpoints, listing: Listing, run_id: st
         owner = checkpoints.run_id(name)
         run_id = owner if run_id is None else run_id
         if owner is not None and owner != run_id:
-            raise InputError(
-                where="checkpoint.remote",
-                found=f"{checkpoints.place} holds a checkpoint of another run, {name}",
-                needed="an empty place, or the one of this run",
-                fix="Set another checkpoint.remote; nothing was written there",
-            )
+            found = f"{checkpoints.place} holds a checkpoint of another run, {name}"
+            fix = "Set another checkpoint.remote; nothing was written there"
+            raise InputError(where=_KNOB, found=found, needed="an empty place, or the one of this run", fix=fix)
     return run_id
 
 
 def _refuse_own_folder(remote: str, run_dir: Path) -> None:
     own = run_dir.resolve()
     if not is_url(remote) and (Path(remote) == own or own in Path(remote).parents):
-        raise InputError(
-            where="checkpoint.remote",
-            found=f"{remote}, and run_dir is {own}",
-            needed="a place outside the run's folder",
-            fix="Set checkpoint.remote to a folder on another disk, or a URL such as gs://bucket/run",
-        )
+        found, needed = f"{remote}, and run_dir is {own}", "a place outside the run's folder"
+        fix = "Set checkpoint.remote to a folder on another disk, or a URL such as gs://bucket/run"
+        raise InputError(where=_KNOB, found=found, needed=needed, fix=fix)
 
 
 def _where_this_machine_stands(run_dir: Path) -> tuple[int | None, str | None]:
@@ -162,4 +153,4 @@ def _where_this_machine_stands(run_dir: Path) -> tuple[int | None, str | None]:
 
 
 def _warn(text: str) -> None:
-    logger.warning("checkpoint.remote: %s", text)
+    logger.warning("%s: %s", _KNOB, text)
