@@ -93,11 +93,9 @@ def pip_install(extra: str) -> str:
 def too_few_files(where: str = "") -> InputError:
     """Return the error of a process that has reached its limit of open files."""
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    return InputError(
-        where=where or "ulimit -n",
-        found=f"too many open files: this process may have {limit} of them at once (ulimit -n)",
-        fix="Raise that where it is started, as with `ulimit -n 4096`, or lower data.workers and data.connections",
-    )
+    found = f"too many open files: this process may have {limit} of them at once (ulimit -n)"
+    fix = "Raise that where it is started, as with `ulimit -n 4096`, or lower data.workers and data.connections"
+    return InputError(where=where or "ulimit -n", found=found, fix=fix)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

@@ -38,8 +38,7 @@ def warn_if_shared_memory_is_small(
     clip = batch_of_frames
     if batch_of_frames.latents is None and dataset.config.is_cache:
         clip = next(validation_batches(dataset, "train", clips=_MOST_CLIPS_READ, batch_size=1))
-    text = small_shared_memory(config, clip.nbytes, processes)
-    if text is not None:
+    if text := small_shared_memory(config, clip.nbytes, processes):
         reporter.note(text)
 
 

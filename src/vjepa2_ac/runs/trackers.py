@@ -70,11 +70,8 @@ def require_installed(tracking: TrackingConfig) -> None:
     }
     for library, (is_asked, install, off) in asked.items():
         if is_asked and importlib.util.find_spec(library) is None:
-            raise InputError(
-                where=f"tracking.{library}",
-                found=f"asked for, but {library} is not installed",
-                fix=f"Run {install}, or set tracking.{library}={off}",
-            )
+            found, fix = f"asked for, but {library} is not installed", f"Run {install}, or set tracking.{library}={off}"
+            raise InputError(where=f"tracking.{library}", found=found, fix=fix)
 
 
 def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int) -> Trackers:
