@@ -52,7 +52,12 @@ def load_model(
         (96, 36, 128)
     """
     place = _device(device)
-    config = _config(_name(name), dtype, sizes or ModelSizes(), place)
+    try:
+        base = places.of_a_model(str(name))
+    except ValueError as error:
+        needed = "a model: a .pt, a folder or builtin:sim-tiny"
+        raise InputError(where="load_model", found=f"{str(name)!r} {error}", needed=needed) from None
+    config = _config(base, dtype, sizes or ModelSizes(), place)
     model = load_base(config, seed=0)
     if adapter is not None:
         load_trained(model, adapter, trainable=False)
@@ -84,14 +89,6 @@ def load_run(folder: str | Path, checkpoint: str | int = "newest", *, device: De
     run = loading.load_run(folder, str(checkpoint))
     run.world_model.to(place).eval()
     return run
-
-
-def _name(name: str | Path) -> str:
-    try:
-        return places.of_a_model(str(name))
-    except ValueError as error:
-        needed = "a model: a .pt, a folder or builtin:sim-tiny"
-        raise InputError(where="load_model", found=f"{str(name)!r} {error}", needed=needed) from None
 
 
 def _config(name: str, dtype: str, sizes: ModelSizes, device: torch.device) -> ModelConfig:

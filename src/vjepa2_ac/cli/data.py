@@ -28,26 +28,44 @@ if TYPE_CHECKING:
 def add_to(commands: Commands) -> None:
     """Add `data` with its commands to a parser."""
     text = "Look at a data set before training on it."
-    inner = commands.add_parser("data", help=text, description=text).add_subparsers(
-        title="commands", required=True, metavar="COMMAND"
-    )
-    for add in (_add_check, _add_index, _add_inspect, _add_calibrate):
-        add_config(add(inner), such_as="data.camera=wrist_left")
+    parser = commands.add_parser("data", help=text, description=text)
+    inner = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
+    such_as, out = "data.camera=wrist_left", Path("inspection")
 
-
-def _add_check(commands: Commands) -> argparse.ArgumentParser:
     text = (
         "Open the data, load some clips as training would, and look at every number. Exit status 0: all is well or"
         " only warnings, 1: training would learn nothing or not begin, 2: something cannot be used."
     )
-    parser = command(commands, "check", _check, text)
+    parser = command(inner, "check", _check, text)
+    add_config(parser, such_as=such_as)
     argument(parser, "--limit N", "clips to load (32); to probe, twice as many", count, default=32)
     text = (
         "probe the data with a model that knows robots (a run, or what model.base takes): does it predict better where"
         " frames are shifted, mirrored, reversed, BGR, or the gripper is inverted?"
     )
     argument(parser, "--model RUN_OR_MODEL", text, as_model)
-    return parser
+
+    text = "Build the index of a data set, or show the one that is kept on this machine."
+    parser = command(inner, "index", _index, text)
+    add_config(parser, such_as=such_as)
+    argument(parser, "--rebuild", "build it again, also where one is kept", action="store_true")
+
+    text = "Say what is in a data set, and draw it: text, inspect.json, a contact sheet."
+    parser = command(inner, "inspect", _inspect, text)
+    add_config(parser, such_as=such_as)
+    argument(parser, "--out DIR", "where to (inspection)", as_path, default=out)
+    argument(parser, "--episodes --limit N", "episodes whose motion is looked at (100)", count, default=100)
+    argument(parser, "--rows N", "episodes on the contact sheet (8)", count, default=8)
+
+    text = "Let a model say how many control steps its model step is: its error over persistence at each stride."
+    parser = command(inner, "calibrate", _calibrate, text)
+    add_config(parser, such_as=such_as)
+    argument(parser, "--model MODEL", "another than model.base: a .pt, a folder, or a run", as_model)
+    splits = ["train", "validation", "test"]
+    argument(parser, "--split", "(validation)", choices=splits, default="validation")
+    argument(parser, "--limit N", "clips at each stride (64)", count, default=64)
+    argument(parser, "--frames N", "of a clip (the config's, 8 at most)", whole_number(2, 256))
+    argument(parser, "--out DIR", "where to (inspection)", as_path, default=out)
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -92,13 +110,6 @@ def _probe(config: Config, model: str, *, clips: int) -> None:
     print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
 
 
-def _add_index(commands: Commands) -> argparse.ArgumentParser:
-    text = "Build the index of a data set, or show the one that is kept on this machine."
-    parser = command(commands, "index", _index, text)
-    argument(parser, "--rebuild", "build it again, also where one is kept", action="store_true")
-    return parser
-
-
 def _index(options: argparse.Namespace) -> None:
     config = read_config(options.config, options.overrides).data
 
@@ -113,15 +124,6 @@ def _index(options: argparse.Namespace) -> None:
         dataset = open_dataset(config, progress=reporter.task(INDEXING))
     for line in index_lines(dataset.table, watch, time.perf_counter() - started):
         console.print(line)
-
-
-def _add_inspect(commands: Commands) -> argparse.ArgumentParser:
-    text = "Say what is in a data set, and draw it: text, inspect.json, a contact sheet."
-    parser = command(commands, "inspect", _inspect, text)
-    argument(parser, "--out DIR", "where to (inspection)", as_path, default=Path("inspection"))
-    argument(parser, "--episodes --limit N", "episodes whose motion is looked at (100)", count, default=100)
-    argument(parser, "--rows N", "episodes on the contact sheet (8)", count, default=8)
-    return parser
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -153,18 +155,6 @@ def _inspect(options: argparse.Namespace) -> None:
     with ConsoleReporter() as reporter:
         image = plot_dataset(dataset, inspection, path, rows=options.rows, progress=reporter.task("reading frames"))
     console.print(f"  {image}\n  {options.out / 'inspect.json'}")
-
-
-def _add_calibrate(commands: Commands) -> argparse.ArgumentParser:
-    text = "Let a model say how many control steps its model step is: its error over persistence at each stride."
-    parser = command(commands, "calibrate", _calibrate, text)
-    argument(parser, "--model MODEL", "another than model.base: a .pt, a folder, or a run", as_model)
-    splits = ["train", "validation", "test"]
-    argument(parser, "--split", "(validation)", choices=splits, default="validation")
-    argument(parser, "--limit N", "clips at each stride (64)", count, default=64)
-    argument(parser, "--frames N", "of a clip (the config's, 8 at most)", whole_number(2, 256))
-    argument(parser, "--out DIR", "where to (inspection)", as_path, default=Path("inspection"))
-    return parser
 
 
 def _calibrate(options: argparse.Namespace) -> None:

@@ -107,10 +107,14 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
-    """Return what is asked of each subject."""
+    """Return what is asked of each subject; refuse planning settings that would have no effect: without plans."""
     from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 
-    _require_planning(options)
+    require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
+    if options.overrides and options.plan_settings is None:
+        found = f"{' '.join(options.overrides)}, and no plans are asked for"
+        needed = "--planning beside settings of planning; what else a config says is not changed by evaluate"
+        raise InputError(where="command line", found=found, needed=needed, fix="Add --planning")
     several, plan_settings = len(options.subjects) > 1, options.plan_settings
     clips = 0 if plan_settings is None else options.planning_clips
     every = record_of_options(
@@ -125,15 +129,6 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
         (subject, replace(every, out=options.out / Path(subject).name if options.out and several else options.out))
         for subject in options.subjects
     ]
-
-
-def _require_planning(options: argparse.Namespace) -> None:
-    """Refuse planning settings if no plans are requested: they would have no effect."""
-    require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
-    if options.overrides and options.plan_settings is None:
-        found = f"{' '.join(options.overrides)}, and no plans are asked for"
-        needed = "--planning beside settings of planning; what else a config says is not changed by evaluate"
-        raise InputError(where="command line", found=found, needed=needed, fix="Add --planning")
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -39,17 +39,6 @@ def add_to(commands: Commands) -> None:
     parser._negative_number_matcher = re.compile(r"^-[\d.]")  # "-0.3,0.1,..." is a value, not an option
     argument(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
     argument(parser, "overrides key=value", "such as planning.horizon=2", nargs="*")
-    _add_request(parser)
-    text = "for a model: the config whose planning, crop and dtype count"
-    argument(parser, "--config CONFIG", text, as_local)
-    add_checkpoint(parser)
-    argument(parser, "--seed N", "default: the config's", whole_number(0, 2**31 - 1))
-    text = "of an energy slice along each axis (13); below 3: no slices"
-    argument(parser, "--nodes N", text, whole_number(0, 101), default=13)
-    argument(parser, "--out FOLDER", "for both files (plan)", as_path, default=Path("plan"))
-
-
-def _add_request(parser: argparse.ArgumentParser) -> None:
     argument(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", as_local, required=True)
     text = (
         "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers of a"
@@ -64,6 +53,13 @@ def _add_request(parser: argparse.ArgumentParser) -> None:
     argument(parser, "--mask IMAGE", text, as_local)
     text = "the camera in the robot base frame: x,y,z,roll,pitch,yaw; where the model uses it"
     argument(parser, "--extrinsics NUMBERS", text)
+    text = "for a model: the config whose planning, crop and dtype count"
+    argument(parser, "--config CONFIG", text, as_local)
+    add_checkpoint(parser)
+    argument(parser, "--seed N", "default: the config's", whole_number(0, 2**31 - 1))
+    text = "of an energy slice along each axis (13); below 3: no slices"
+    argument(parser, "--nodes N", text, whole_number(0, 101), default=13)
+    argument(parser, "--out FOLDER", "for both files (plan)", as_path, default=Path("plan"))
 
 
 def _plan(options: argparse.Namespace) -> int:

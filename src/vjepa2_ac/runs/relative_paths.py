@@ -34,13 +34,11 @@ def with_paths_from_start(config: Config, run: Path, *, needed: Sequence[str]) -
     for key in needed:
         if _leads_nowhere(flat[key]) and key not in elsewhere:
             starts = " or ".join(dict.fromkeys(map(str, start_folders(run))))
-            raise InputError(
-                where=f"{run}: {key}",
-                found=f"{flat[key]}: a relative path that leads nowhere from {Path.cwd()}"
-                + (f", nor from {starts}, where the run was started" if starts else ""),
-                fix=("Go to the folder in which it does" if starts else "Go to the folder in which the run was started")
-                + (", or name the data with --data CONFIG and a folder with --out" if key == DATA else ""),
-            )
+            found = f"{flat[key]}: a relative path that leads nowhere from {Path.cwd()}"
+            found += f", nor from {starts}, where the run was started" if starts else ""
+            fix = f"Go to the folder in which {'it does' if starts else 'the run was started'}"
+            fix += ", or name the data with --data CONFIG and a folder with --out" if key == DATA else ""
+            raise InputError(where=f"{run}: {key}", found=found, fix=fix)
     if not elsewhere:
         return config
     values = config_as_dict(config)

@@ -11,7 +11,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import RefusedError, UnreachableError, UserError
@@ -92,9 +91,7 @@ class Mirror:
         """Return the mirror."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: object, _traceback: object) -> None:
         """Stop uploading; if the run ends with an error, upload what exists first."""
         if isinstance(error, Exception) and not self._stop.is_set():
             self.finish(lambda: True)
