@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from vjepa2_ac.config.data import DataConfig
 from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import Section
+from vjepa2_ac.config.section import Count, Section
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 
@@ -67,7 +67,7 @@ class LeRobotFields(Section):
     vector` any numbers."""
     action: Annotated[_Names, Affects.INDEX | Affects.CLIPS] = ("action",)
     """For `actions: recorded`: columns that form, concatenated, the *commanded* action of each control step."""
-    select: Annotated[tuple[Annotated[int, Field(ge=0)], ...] | None, Affects.EPISODES] = None
+    select: Annotated[tuple[Count, ...] | None, Affects.EPISODES] = None
     """Which of the concatenated numbers, in this order, are x, y, z, the rotation's 3 or 4, the gripper; for `states:
     vector` which are the state; null: all."""
     rotation: Annotated[Literal["euler_xyz", "quaternion_wxyz", "quaternion_xyzw"], Affects.EPISODES] = "euler_xyz"
