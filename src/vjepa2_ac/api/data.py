@@ -25,7 +25,6 @@ from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 
 _REST = {"run_dir": "none", "model": {"base": "builtin:sim-tiny"}, "training": {"rollout_steps": 1}}  # of a config
-_FRAMES = "RGB frames: uint8, ... x height x width x 3"
 
 
 def open_dataset(data: str | Path | Config, **knobs: Any) -> Dataset:
@@ -51,12 +50,8 @@ def open_dataset(data: str | Path | Config, **knobs: Any) -> Dataset:
         config = config_from(values | {"data": values["data"] | knobs}, where="open_dataset") if knobs else data
         return datasets.open_dataset(config.data)
     if str(data).endswith((".yaml", ".yml")):
-        raise InputError(
-            where=str(data),
-            found="a config",
-            needed="the folder of a data set",
-            fix="Read it first: open_dataset(load_config(PATH))",
-        )
+        fix = "Read it first: open_dataset(load_config(PATH))"
+        raise InputError(where=str(data), found="a config", needed="the folder of a data set", fix=fix)
     return datasets.open_dataset(config_from(_REST | {"data": {"path": str(data)} | knobs}, where="open_dataset").data)
 
 
@@ -126,8 +121,8 @@ def encode(
         return encode_batch(model, seen, device=model.device, chunk=chunk)
     frames = np.asarray(seen)
     if frames.dtype != np.uint8 or frames.ndim < 3 or frames.shape[-1] != 3 or 0 in frames.shape:
-        shape = " x ".join(map(str, frames.shape))
-        raise InputError(where="encode", found=f"{frames.dtype} of the shape {shape}", needed=_FRAMES)
+        found = f"{frames.dtype} of the shape {' x '.join(map(str, frames.shape))}"
+        raise InputError(where="encode", found=found, needed="RGB frames: uint8, ... x height x width x 3")
     cropped = np.ascontiguousarray(view(frames.reshape(-1, *frames.shape[-3:]), crop))
     pixels = torch.from_numpy(cropped).to(model.device)[None]
     latents = model.encode(pixels_to_input(pixels, model.image_size), chunk=chunk)

@@ -25,8 +25,8 @@ from vjepa2_ac.data.sources.lerobot.bounds import (
     require_sane,
 )
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.arrays import read_arrays
 from vjepa2_ac.storage.libraries import require_library
+from vjepa2_ac.storage.npz_reader import read_arrays
 
 if TYPE_CHECKING:
     import pyarrow as pa
