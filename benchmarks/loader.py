@@ -16,6 +16,7 @@ import argparse
 import multiprocessing
 import statistics
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -28,14 +29,13 @@ import video
 from synthetic_droid import draw_episodes
 
 from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.clips.clip_reader import ClipRequest, read_clip
 from vjepa2_ac.data.clips.dataset import open_dataset
-from vjepa2_ac.data.clips.loader import clip_at, training_loader
+from vjepa2_ac.data.clips.loader import training_loader
 from vjepa2_ac.data.clips.windows import ClipOrder, windows_of
 from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts
 from vjepa2_ac.data.index.episode_table import FORMAT, EpisodeTable
 from vjepa2_ac.data.index.index_cache import get_or_build
-from vjepa2_ac.data.sources.rlds.dataset_info import find_shards, index_shards
-from vjepa2_ac.data.sources.rlds.tfrecord import decode_example, read_record
 from vjepa2_ac.data.sources.rlds.writing.droid_writer import write_droid_rlds
 from vjepa2_ac.episode import EpisodeInfo
 
@@ -101,7 +101,10 @@ def main() -> None:
 
 def measure_clips(config: DataConfig, clips: int, tfds_python: str | None) -> None:
     """Time every way of reading the same number of clips, and print clips per second and ratios."""
-    spans = index_shards(find_shards(config.path))
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
+    from tfrecords import decode_example, index_set, read_record
+
+    spans = index_set(config.path)
     start = time.perf_counter()
     dataset = open_dataset(config)
     order = ClipOrder(dataset.windows("train"), seed=0)
@@ -110,20 +113,20 @@ def measure_clips(config: DataConfig, clips: int, tfds_python: str | None) -> No
     print(f"{config.frames} frames at stride {config.stride}, {clips} random clips, medians (TFDS: mean):\n")
 
     def later_reads(position: int) -> None:
-        clip_at(dataset, *order.window(position))
+        read_clip(dataset, ClipRequest(*order.window(position)))
 
     def everything(position: int) -> None:
         episode, first = order.window(position)
-        features = decode_example(read_record(spans[episode]), where="")
+        features = decode_example(read_record(spans[episode]))
         for name in config.fields.cameras.values():
             frames = np.stack([simplejpeg.decode_jpeg(picture, fastdct=True) for picture in features[name][1]])
             frames[first : first + config.clip_steps : config.model_stride].copy()
 
     always = open_dataset(config.model_copy(update={"check_crc": "always"}))  # every read is as a first one
     for episode in range(len(spans)):
-        clip_at(dataset, episode, 0)
+        read_clip(dataset, ClipRequest(episode, 0))
     names = ("every frame of every camera", "ours, first read of a record", "ours")
-    ways = (everything, lambda position: clip_at(always, *order.window(position)), later_reads)
+    ways = (everything, lambda position: read_clip(always, ClipRequest(*order.window(position))), later_reads)
     seconds = dict(zip(names, alternate(clips, *ways), strict=True))
     if tfds_python:
         steps = int(dataset.table.num_steps.min())

@@ -11,8 +11,8 @@ from vjepa2_ac.data.sources.rlds.writing.droid_writer import (
     DroidCommands,
     DroidEpisode,
     DroidMeasurements,
-    encode_jpeg,
 )
+from vjepa2_ac.media.jpeg import encode_jpeg
 
 
 def draw_episodes(count: int = 12, steps: int = 290) -> Iterator[DroidEpisode]:

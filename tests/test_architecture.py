@@ -34,7 +34,7 @@ ORDERS: dict[str, list[str]] = {
         "cli",
     ],
     "data": ["picture_file", "index", "cache filters", "sources", "clips", "inspection"],
-    "data.sources": ["listing configured_spaces", "rlds droid_raw lerobot npz latents", "registry"],
+    "data.sources": ["listing configured_spaces indexed_source", "rlds droid_raw lerobot npz latents", "registry"],
     "model": [
         "finite sizes quiet_imports",
         "base_model",
@@ -77,6 +77,8 @@ HOMES = {
     "google_crc32c": ["data/sources/rlds/tfrecord.py"],
     "h5py": ["data/sources/droid_raw/trajectory.py"],
     "huggingface_hub": ["export/"],
+    "jinja2": ["export/", "reports/"],
+    "markupsafe": ["reports/html/"],
     "matplotlib": ["reports/"],
     "mujoco": ["simulation/world/"],
     "peft": ["model/adapter/"],

@@ -18,18 +18,9 @@ if TYPE_CHECKING:
     from vjepa2_ac.planning.controller import Controller
 
 __all__ = [
-    "Controller",
-    "UserError",
-    "WorldModel",
-    "encode",
-    "evaluate",
-    "load_config",
-    "load_model",
-    "load_run",
-    "open_dataset",
-    "read_clips",
-    "train",
-]
+    "Controller", "UserError", "WorldModel", "encode", "evaluate", "load_config", "load_model", "load_run",
+    "open_dataset", "read_clips", "train",
+]  # fmt: skip
 
 __version__ = version("vjepa2-ac")
 

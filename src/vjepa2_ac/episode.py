@@ -55,13 +55,8 @@ class Widths(NamedTuple):
 POSE_WIDTHS = Widths(STATE_DIM, ACTION_DIM)
 
 
-@runtime_checkable
-class FrameReader(Protocol):
-    """Reads the requested frames of one camera of one episode."""
-
-    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB frames at these control steps, in this order."""
-        ...
+FrameReader = Callable[[Sequence[int]], UInt8[np.ndarray, "time height width 3"]]
+"""Reads RGB frames of one camera of one episode: those at the given control steps, in this order."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +71,8 @@ class StoredLatents:
         return StoredLatents(change(self.values), None if self.scales is None else change(self.scales))
 
 
-@runtime_checkable
-class LatentReader(Protocol):
-    """Reads the requested latents of one camera of one episode from a cache."""
-
-    def __call__(self, steps: Sequence[int]) -> StoredLatents:
-        """Return the latents at these control steps, in this order."""
-        ...
+LatentReader = Callable[[Sequence[int]], StoredLatents]
+"""Reads latents of one camera of one episode from a cache: those at the given control steps, in this order."""
 
 
 @dataclass(frozen=True, slots=True)

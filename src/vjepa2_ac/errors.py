@@ -3,6 +3,7 @@
 import errno
 import resource
 import unicodedata
+from functools import partial
 
 _MOST_CHARACTERS = 8_000  # of a part of a message: quoted input may have any length
 _CONTROL = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})  # some control terminals; lone surrogates cannot be encoded
@@ -30,7 +31,7 @@ class UserError(Exception):
 
     def __reduce__(self) -> tuple[object, tuple[object, ...]]:
         """Pickle the error, for the way from a loader worker to the main process."""
-        return (_rebuild, (type(self), self.where, self.found, self.needed, self.fix))
+        return partial(type(self), where=self.where, found=self.found, needed=self.needed, fix=self.fix), ()
 
 
 class InputError(UserError):
@@ -43,10 +44,6 @@ class UnreachableError(UserError):
 
 class RefusedError(UnreachableError):
     """A server or a disk refuses permanently: no permission, no such bucket."""
-
-
-def _rebuild(kind: type[UserError], where: str, found: str, needed: str, fix: str) -> UserError:
-    return kind(where=where, found=found, needed=needed, fix=fix)
 
 
 def _sentence(text: str) -> str:
@@ -96,11 +93,9 @@ def pip_install(extra: str) -> str:
 def too_few_files(where: str = "") -> InputError:
     """Return the error of a process that has reached its limit of open files."""
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    return InputError(
-        where=where or "ulimit -n",
-        found=f"too many open files: this process may have {limit} of them at once (ulimit -n)",
-        fix="Raise that where it is started, as with `ulimit -n 4096`, or lower data.workers and data.connections",
-    )
+    found = f"too many open files: this process may have {limit} of them at once (ulimit -n)"
+    fix = "Raise that where it is started, as with `ulimit -n 4096`, or lower data.workers and data.connections"
+    return InputError(where=where or "ulimit -n", found=found, fix=fix)
 
 
 def is_out_of_memory(error: BaseException) -> bool:

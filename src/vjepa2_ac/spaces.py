@@ -102,12 +102,9 @@ class StateSpace(Space):
         for wrong, needed, looks in self._checks(states):
             if wrong.any():
                 step = int(wrong.argmax())
-                raise InputError(
-                    where=f"{where}: step {step}" if len(states) > 1 else where,
-                    found=f"the numbers {np.array2string(states[step], precision=4, max_line_width=200)}",
-                    needed=needed,
-                    fix=fix or looks,
-                )
+                place = f"{where}: step {step}" if len(states) > 1 else where
+                found = f"the numbers {np.array2string(states[step], precision=4, max_line_width=200)}"
+                raise InputError(where=place, found=found, needed=needed, fix=fix or looks)
 
     def _checks(self, states: Float[np.ndarray, "steps dim"]) -> list[tuple[np.ndarray, str, str]]:
         """Return, for each rule: where it is broken, what is needed, and what the numbers look like."""

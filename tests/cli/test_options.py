@@ -4,6 +4,7 @@ import argparse
 import errno
 import re
 from collections.abc import Callable
+from dataclasses import MISSING, fields
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,9 @@ import pytest
 from vjepa2_ac.cli import config as config_command
 from vjepa2_ac.cli import main, program
 from vjepa2_ac.cli.options import parsed
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+from vjepa2_ac.simulation.closed_loop.benchmark import BenchmarkOptions
+from vjepa2_ac.simulation.recording.record import RecordingSpec
 
 EVALUATE, SIMULATE = ["evaluate", "run"], ["simulate", "record", "folder"]
 CALIBRATE = ["data", "calibrate", "config.yaml"]
@@ -21,12 +25,12 @@ CALIBRATE = ["data", "calibrate", "config.yaml"]
     [
         (EVALUATE, "--nodes", ["x", "2", "52", "3.5", ""], "a whole number from 3 to 51"),
         (EVALUATE, "--reach", ["x", "0", "1000", "nan", "-1"], "a number of cm above 0 and below 1000"),
-        (EVALUATE, "--sensitivity-clips", ["-1", "many"], "a whole number from 0"),
-        (EVALUATE, "--landscapes", ["-1"], "a whole number from 0"),
-        (EVALUATE, "--examples", ["1e3"], "a whole number from 0"),
-        (EVALUATE, "--clips", ["0", "x"], "a whole number from 1"),
+        (EVALUATE, "--sensitivity-clips", ["-1", "many"], "a whole number from 0 to 1000000000"),
+        (EVALUATE, "--landscapes", ["-1"], "a whole number from 0 to 1000000000"),
+        (EVALUATE, "--examples", ["1e3"], "a whole number from 0 to 1000000000"),
+        (EVALUATE, "--clips", ["0", "x"], "a whole number from 1 to 1000000000"),
         (CALIBRATE, "--frames", ["1", "257", "x"], "a whole number from 2 to 256"),
-        (CALIBRATE, "--limit", ["x"], "a whole number from 1"),
+        (CALIBRATE, "--limit", ["x"], "a whole number from 1 to 1000000000"),
         (SIMULATE, "--seed", ["x", "-1", "2147483648"], "a whole number from 0 to 2147483647"),
         (SIMULATE, "--cameras", ["x"], "a whole number from 1 to 3"),
     ],
@@ -84,6 +88,25 @@ BEHIND = {  # what each must be given, and an option with a value
 
 def test_every_command_is_known_to_take_settings_or_not() -> None:
     assert set(COMMANDS) == set(BEHIND) | WITHOUT_SETTINGS, "say of a new command which it is"
+
+
+@pytest.mark.parametrize(
+    ("command", "kind"),
+    [
+        ("evaluate", EvaluationOptions),
+        ("evaluate", ProbeOptions),
+        ("simulate", BenchmarkOptions),
+        ("simulate", RecordingSpec),
+    ],
+)
+def test_the_help_says_the_defaults_of_the_records_that_options_fill(command: str, kind: type) -> None:
+    """An option that is not given is None: the record says what then counts."""
+    helps = {action.dest: str(action.help) for action in COMMANDS[command,]._actions if action.default is None}
+    defaults = {field.name: field.default for field in fields(kind) if field.name in helps}
+    told = {name: default for name, default in defaults.items() if default not in {None, MISSING}}
+    assert len(told) > 1
+    for name, default in told.items():
+        assert re.search(rf"\({default}[;)]", helps[name]), name
 
 
 @pytest.mark.parametrize("words", BEHIND, ids=" ".join)

@@ -17,7 +17,7 @@ from vjepa2_ac.config.loading import changed_keys, config_as_yaml, parse_config
 from vjepa2_ac.config.section import Section
 from vjepa2_ac.data.filters import idle_ranges
 from vjepa2_ac.data.index.episode_table import EpisodeInfo, EpisodeTable
-from vjepa2_ac.data.index.index_cache import IndexKeys, key_of
+from vjepa2_ac.data.index.index_cache import IndexKeys
 from vjepa2_ac.data.sources.latents.cache_key import Encoding, key_of_cache
 from vjepa2_ac.data.sources.registry import open_source
 from vjepa2_ac.encoding.batch import encoding_of
@@ -120,12 +120,12 @@ def world_model() -> WorldModel:
 def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str | None]]:
     """Return the keys by which index, idle ranges and latents of a config are looked for; None: the data refuse it."""
 
-    def stop(_: Any, keys: Any, *__: Any) -> None:
+    def stop(_: Any, keys: Any, *__: Any, **___: Any) -> None:
         raise Found(keys)
 
     for source in WRITERS:
         monkeypatch.setattr(f"vjepa2_ac.data.sources.{source}.source.get_or_build", stop)
-    monkeypatch.setattr(idle_ranges, "_cached", stop)
+    monkeypatch.setattr(idle_ranges, "get_or_make", stop)
 
     def found(action: Callable[[], Any]) -> Any:
         with pytest.raises(Found) as caught:
@@ -140,7 +140,7 @@ def keys_of(monkeypatch: pytest.MonkeyPatch) -> Callable[[Config], dict[str, str
         table = EpisodeTable.of([EpisodeInfo("one", 9, None)], texts={"index": index.now})
         ranges = found(lambda: idle_ranges.find_ranges(open_source(config.data), table, config.data, None))
         latents = key_of_cache(config.data, index.now, encoding_of(world_model(), config))
-        return {"index": index.now, "idle": key_of(ranges), "latents": latents.digest}
+        return {"index": index.now, "idle": ranges, "latents": latents.digest}
 
     return keys
 
@@ -228,7 +228,7 @@ def test_keys_are_those_of_the_versions_before_knobs_were_marked(
     data = config_of(source, "gs://b/set", tmp_path, idle={"rule": "motion"}).data
     encoding = Encoding("e", 256, 16, 256, 1408, "bfloat16", "bf16")
     assert key_of_cache(data, "f", encoding).digest == latents
-    monkeypatch.setattr(idle_ranges, "_cached", lambda _, parts, __: key_of(parts))
+    monkeypatch.setattr(idle_ranges, "get_or_make", lambda _, key, *__, **___: key)
     table = EpisodeTable.of([EpisodeInfo("one", 9)], texts={"index": "f"})
     assert idle_ranges.find_ranges(None, table, data, None) == idle
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from rich.table import Table
 
-from vjepa2_ac.console.closed_loop import contest_table
+from vjepa2_ac.console.closed_loop import benchmark_table
 from vjepa2_ac.console.data import calibration_table, motion_table, probe_table
 from vjepa2_ac.console.evaluation import comparison_table, evaluation_tables
 from vjepa2_ac.console.plan import plan_table
@@ -85,7 +85,7 @@ def contests() -> list[Table]:
         seconds_per_decision=Estimate(16.2, 15.0, 17.0),
     )  # fmt: skip
     asked = Mock(task="reach", domain="B", episodes=100, seed=5)
-    return [contest_table(Mock(spec=ClosedLoopBenchmark, asked=asked, results=(result,), seconds_per_step=0.27))]
+    return [benchmark_table(Mock(spec=ClosedLoopBenchmark, asked=asked, results=(result,), seconds_per_step=0.27))]
 
 
 @pytest.mark.parametrize("width", [80, 120])

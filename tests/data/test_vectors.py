@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from clips import clip_at
 from gcs import Gcs
 from lerobot_sets import Recorded, recorded, write_v21, write_v30
 from memory_source import MemorySource
@@ -16,7 +17,6 @@ from vector_sets import vectors, write_vectors
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.loading import parse_config
 from vjepa2_ac.data.clips.actions import actions_of, joined
-from vjepa2_ac.data.clips.clip_reader import clip_at
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.inspection.check import check_data, findings_in
 from vjepa2_ac.data.inspection.statistics import inspect_dataset

@@ -1,6 +1,7 @@
 """Shared memory: a run whose workers may fill /dev/shm warns with sizes and fixes."""
 
-import os
+import shutil
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,14 +15,22 @@ from vjepa2_ac.training.loop import train
 MB = 10**6
 
 
-def disk(free: int) -> Any:
-    """Return what tells that so many bytes are free."""
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> Callable[[int | OSError], None]:
+    """A function that sets how much shared memory is free on this machine."""
+    real = shutil.disk_usage
 
-    def statvfs(path: str) -> Any:
-        assert path == SHARED_MEMORY
-        return SimpleNamespace(f_bavail=free // 1000, f_frsize=1000)
+    def set_to(free: int | OSError) -> None:
+        def usage(path: Any) -> Any:
+            if path != SHARED_MEMORY:
+                return real(path)
+            if isinstance(free, OSError):
+                raise free
+            return SimpleNamespace(free=free)
 
-    return statvfs
+        monkeypatch.setattr(shutil, "disk_usage", usage)
+
+    return set_to
 
 
 def config_of(make_config: Any, **changes: Any) -> Config:
@@ -40,15 +49,18 @@ def config_of(make_config: Any, **changes: Any) -> Config:
         ({}, 2, 2 * 4 * 3 * 8 * 11.5),
     ],
 )
-def test_what_the_workers_may_hold_is_counted(make_config, changes: Any, processes: int, needed: float) -> None:
+def test_what_the_workers_may_hold_is_counted(make_config, disk, changes: Any, processes: int, needed: float) -> None:
     config, clip = config_of(make_config, **changes), round(11.5 * MB)
     enough = round(needed * MB)
-    assert small_shared_memory(config, clip, processes, statvfs=disk(enough)) is None
-    assert small_shared_memory(config, clip, processes, statvfs=disk(enough - 1000)) is not None
+    disk(enough)
+    assert small_shared_memory(config, clip, processes) is None
+    disk(enough - 1000)
+    assert small_shared_memory(config, clip, processes) is not None
 
 
-def test_the_number_and_the_ways_out_are_told(make_config) -> None:
-    said = small_shared_memory(config_of(make_config), round(11.5 * MB), 2, statvfs=disk(64 * MB))
+def test_the_number_and_the_ways_out_are_told(make_config, disk) -> None:
+    disk(64 * MB)
+    said = small_shared_memory(config_of(make_config), round(11.5 * MB), 2)
     assert said == (
         f"{SHARED_MEMORY} has 0.064 GB free, and batches on their way from the loader's workers may take 2.21 GB:"
         " 2 processes x 4 workers x (2 prefetched + 1) x 8 clips of 11.5 MB. Where it is full, workers die of a bus"
@@ -56,18 +68,15 @@ def test_the_number_and_the_ways_out_are_told(make_config) -> None:
     )
 
 
-def test_a_system_without_shared_memory_is_not_asked_for_any(make_config) -> None:
-    def statvfs(path: str) -> Any:
-        raise FileNotFoundError(path)
-
-    assert small_shared_memory(config_of(make_config), 10**15, statvfs=statvfs) is None
+def test_a_system_without_shared_memory_is_not_asked_for_any(make_config, disk) -> None:
+    disk(FileNotFoundError(SHARED_MEMORY))
+    assert small_shared_memory(config_of(make_config), 10**15) is None
 
 
 @pytest.fixture
-def little(monkeypatch: pytest.MonkeyPatch) -> None:
+def little(disk) -> None:
     """A machine with hardly any shared memory."""
-    real = os.statvfs
-    monkeypatch.setattr(os, "statvfs", lambda path: disk(1000)(path) if path == SHARED_MEMORY else real(path))
+    disk(1000)
 
 
 def notes_of(reporter: Any) -> list[str]:

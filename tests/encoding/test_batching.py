@@ -29,7 +29,7 @@ def part(wanted: FramesToEncode, first: int, last: int) -> Part:
     """Return frames whose pixels are ten times the episode and the step."""
     values = 10 * wanted.episode + wanted.steps[first:last]
     frames = np.tile(values[:, None, None, None].astype(np.uint8), (1, 2, 2, 3))
-    return Part(wanted, recording(wanted.episode), frames, frames, last == len(wanted.steps))
+    return Part(wanted, recording(wanted.episode), frames, frames)
 
 
 class Brightness:
@@ -170,7 +170,7 @@ def test_frames_come_in_the_order_in_which_they_are_wanted_and_are_read_once(ahe
     source = MemorySource(lengths)
     parts = list(ahead(source, threads))
     seen = [(int(frame[2, 2, 0]), int(frame[2, 2, 1])) for one in parts for frame in one.frames]
-    assert [one.is_last for one in parts] == [False, True, True, False, True]
+    assert [len(one.frames) for one in parts] == [FRAMES_AT_ONCE, 1, 3, FRAMES_AT_ONCE, FRAMES_AT_ONCE]
     expected = [(number, step) for number, frames in enumerate(lengths) for step in range(frames)]
     assert seen == sorted(source.decoded) == expected
     assert sorted(index for index, _, _ in source.reads) == [0, 1, 2]

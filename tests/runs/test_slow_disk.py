@@ -58,15 +58,17 @@ def test_a_run_on_a_disk_that_stalls_says_so_and_goes_on(
 def test_a_disk_that_answers_is_not_spoken_of(said, tmp_path: Path) -> None:
     before = threading.active_count()
     for _ in range(3):
-        with warn_if_stalled(tmp_path, after_s=60.0):
+        with warn_if_stalled(tmp_path):
             pass
     wait_until(lambda: threading.active_count() <= before)
     assert said() == []
 
 
-def test_what_stalls_and_then_fails_is_said_and_fails(said, tmp_path: Path) -> None:
+def test_what_stalls_and_then_fails_is_said_and_fails(said, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(slow_disk, "STALLED_S", 0.01)
+
     def stall_and_fail() -> None:
-        with warn_if_stalled(tmp_path, after_s=0.01):
+        with warn_if_stalled(tmp_path):
             wait_until(said)
             raise OSError(5, "Input/output error")
 

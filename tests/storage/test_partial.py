@@ -34,9 +34,9 @@ with tidy_end():
 
 
 @pytest.fixture(autouse=True)
-def _looks_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def _looks_again() -> None:
     """A process looks at a folder once: here each test is a new one."""
-    monkeypatch.setattr(partial, "_looked_at", set())
+    partial._remove_abandoned_once.cache_clear()
 
 
 def writing(target: Path, kind: str) -> subprocess.Popen:
@@ -71,7 +71,7 @@ def test_what_a_killed_writer_left_goes_with_the_next_one_and_not_before_it_is_d
     process.wait(timeout=60)
     storage.write_atomically(tmp_path / "other", "of this process, which has looked here before")
     assert names(tmp_path) == [left, "other"]
-    partial._looked_at.clear()  # a new process
+    partial._remove_abandoned_once.cache_clear()  # a new process
     with storage.folder_writer(tmp_path / "target", "manifest") as fresh:
         (fresh / "manifest").touch()
         assert names(tmp_path) == [fresh.name, "other"]

@@ -8,13 +8,8 @@ from typing import Any
 import pytest
 
 from synthetic import write_synthetic_droid
-from vjepa2_ac.data.sources.rlds.tfrecord import (
-    decode_example,
-    encode_example,
-    index_records,
-    read_record,
-    write_record,
-)
+from tfrecords import decode_example, index_records, read_record
+from vjepa2_ac.data.sources.rlds.tfrecord import encode_example, write_record
 
 Features = dict[str, tuple[Any, Any]]
 
@@ -36,9 +31,7 @@ def spoiled(droid: Path, tmp_path: Path) -> Callable[[Callable[[Features], None]
         shutil.copytree(droid, folder)
         shard = sorted(folder.glob("*.tfrecord-*"))[0]
         records = [read_record(span) for span in index_records(shard)]
-        features: Features = {
-            name: (kind, list(values)) for name, (kind, values) in decode_example(records[0], where="").items()
-        }
+        features: Features = {name: (kind, list(values)) for name, (kind, values) in decode_example(records[0]).items()}
         change(features)
         with shard.open("wb") as file:
             for record in [encode_example(features), *records[1:]]:

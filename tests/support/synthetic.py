@@ -13,9 +13,9 @@ from vjepa2_ac.data.sources.rlds.writing.droid_writer import (
     DroidCommands,
     DroidEpisode,
     DroidMeasurements,
-    encode_jpeg,
     write_droid_rlds,
 )
+from vjepa2_ac.media.jpeg import encode_jpeg
 
 
 def synthetic_states(steps: int, *, seed: int = 0) -> Float[np.ndarray, "steps 7"]:

@@ -18,13 +18,13 @@ from vjepa2_ac.data.clips import dataset as datasets
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.loader import validation_batches
 from vjepa2_ac.data.clips.transforms import Crop, pixels_to_input, view
+from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.world_model import WorldModel
 
 _REST = {"run_dir": "none", "model": {"base": "builtin:sim-tiny"}, "training": {"rollout_steps": 1}}  # of a config
-_FRAMES = "RGB frames: uint8, ... x height x width x 3"
 
 
 def open_dataset(data: str | Path | Config, **knobs: Any) -> Dataset:
@@ -50,12 +50,8 @@ def open_dataset(data: str | Path | Config, **knobs: Any) -> Dataset:
         config = config_from(values | {"data": values["data"] | knobs}, where="open_dataset") if knobs else data
         return datasets.open_dataset(config.data)
     if str(data).endswith((".yaml", ".yml")):
-        raise InputError(
-            where=str(data),
-            found="a config",
-            needed="the folder of a data set",
-            fix="Read it first: open_dataset(load_config(PATH))",
-        )
+        fix = "Read it first: open_dataset(load_config(PATH))"
+        raise InputError(where=str(data), found="a config", needed="the folder of a data set", fix=fix)
     return datasets.open_dataset(config_from(_REST | {"data": {"path": str(data)} | knobs}, where="open_dataset").data)
 
 
@@ -83,13 +79,7 @@ def read_clips(dataset: Dataset, split: Split = "train", *, clips: int = 16, bat
     """
     if split not in get_args(Split):
         raise InputError(where="read_clips", found=f"split {split!r}", needed=", ".join(get_args(Split)))
-    if dataset.config.stride == "auto":
-        raise InputError(
-            where="data.stride",
-            found="auto",
-            needed="a number, to read clips",
-            fix="Give one: open_dataset(config, stride=4)",
-        )
+    require_stride(dataset.config, to="read clips", fix="Give one: open_dataset(config, stride=4)")
     return validation_batches(dataset, split, clips=clips, batch_size=batch_size)
 
 
@@ -131,8 +121,8 @@ def encode(
         return encode_batch(model, seen, device=model.device, chunk=chunk)
     frames = np.asarray(seen)
     if frames.dtype != np.uint8 or frames.ndim < 3 or frames.shape[-1] != 3 or 0 in frames.shape:
-        shape = " x ".join(map(str, frames.shape))
-        raise InputError(where="encode", found=f"{frames.dtype} of the shape {shape}", needed=_FRAMES)
+        found = f"{frames.dtype} of the shape {' x '.join(map(str, frames.shape))}"
+        raise InputError(where="encode", found=found, needed="RGB frames: uint8, ... x height x width x 3")
     cropped = np.ascontiguousarray(view(frames.reshape(-1, *frames.shape[-3:]), crop))
     pixels = torch.from_numpy(cropped).to(model.device)[None]
     latents = model.encode(pixels_to_input(pixels, model.image_size), chunk=chunk)

@@ -9,7 +9,7 @@ import torch
 
 from vjepa2_ac import places
 from vjepa2_ac.config import ModelConfig, ModelSizes
-from vjepa2_ac.distributed.device import has_bf16, require_type_of_weights
+from vjepa2_ac.distributed.device import has_bf16, no_cuda, require_type_of_weights
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE
 from vjepa2_ac.model.adapter.lora import load_trained
@@ -52,7 +52,12 @@ def load_model(
         (96, 36, 128)
     """
     place = _device(device)
-    config = _config(_name(name), dtype, sizes or ModelSizes(), place)
+    try:
+        base = places.of_a_model(str(name))
+    except ValueError as error:
+        needed = "a model: a .pt, a folder or builtin:sim-tiny"
+        raise InputError(where="load_model", found=f"{str(name)!r} {error}", needed=needed) from None
+    config = _config(base, dtype, sizes or ModelSizes(), place)
     model = load_base(config, seed=0)
     if adapter is not None:
         load_trained(model, adapter, trainable=False)
@@ -79,24 +84,11 @@ def load_run(folder: str | Path, checkpoint: str | int = "selected", *, device: 
     """
     place, folder = _device(device), Path(folder)
     if not is_run(str(folder)) and (folder / ADAPTER_FILE).is_file():
-        raise InputError(
-            where=str(folder),
-            found="an adapter without its run",
-            needed="the folder of a run",
-            fix="Name its base, too: load_model(BASE, adapter=FOLDER)",
-        )
+        found, fix = "an adapter without its run", "Name its base, too: load_model(BASE, adapter=FOLDER)"
+        raise InputError(where=str(folder), found=found, needed="the folder of a run", fix=fix)
     run = loading.load_run(folder, str(checkpoint))
     run.world_model.to(place).eval()
     return run
-
-
-def _name(name: str | Path) -> str:
-    try:
-        return places.of_a_model(str(name))
-    except ValueError as error:
-        raise InputError(
-            where="load_model", found=f"{str(name)!r} {error}", needed="a model: a .pt, a folder or builtin:sim-tiny"
-        ) from None
 
 
 def _config(name: str, dtype: str, sizes: ModelSizes, device: torch.device) -> ModelConfig:
@@ -118,9 +110,5 @@ def _device(device: Device) -> torch.device:
     except (RuntimeError, TypeError):
         raise InputError(where="device", found=repr(device), needed="auto, cpu, cuda, or one such as cuda:1") from None
     if found.type == "cuda" and not has_cuda:
-        raise InputError(
-            where="device",
-            found=f"{device}, but this PyTorch sees no CUDA device",
-            fix="Take device='cpu', or install a CUDA build of PyTorch and a driver",
-        )
+        raise no_cuda(where="device", asked=str(device), instead="Take device='cpu'")
     return found

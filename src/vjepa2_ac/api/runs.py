@@ -87,12 +87,8 @@ def evaluate(
         Estimate(value=0.732, low=0.702, high=0.764)
     """
     if data is not None and out is None:
-        raise InputError(
-            where="evaluate",
-            found="data without out",
-            needed="a folder for the results: those in a run's own folder are of its own data",
-            fix="Name one: out=FOLDER",
-        )
+        needed = "a folder for the results: those in a run's own folder are of its own data"
+        raise InputError(where="evaluate", found="data without out", needed=needed, fix="Name one: out=FOLDER")
     asked = EvaluationOptions(
         clips=clips,
         checkpoint=str(checkpoint),
@@ -106,9 +102,7 @@ def evaluate(
 class _Told(NullReporter):
     """Calls functions of the user."""
 
-    def __init__(
-        self, note: Callable[[str], None], on_step: Callable[[int, dict[str, float]], None] | None = None
-    ) -> None:
+    def __init__(self, note: Callable[[str], None], on_step: Callable[[int, dict[str, float]], None] | None) -> None:
         self._note, self._on_step = note, on_step
 
     def note(self, text: str) -> None:

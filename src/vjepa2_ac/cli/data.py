@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli.options import (
     Commands,
-    Handler,
-    as_local,
+    add_config,
+    argument,
     as_model,
     as_path,
     command,
@@ -20,48 +20,52 @@ from vjepa2_ac.cli.options import (
     require_subject,
     whole_number,
 )
-from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
 
 
-def add_data(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands) -> None:
     """Add `data` with its commands to a parser."""
     text = "Look at a data set before training on it."
     parser = commands.add_parser("data", help=text, description=text)
     inner = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    _add_check(inner)
-    _add_index(inner)
-    _add_inspect(inner)
-    _add_calibrate(inner)
+    such_as, out = "data.camera=wrist_left", Path("inspection")
 
-
-def _command(
-    commands: Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
-) -> argparse.ArgumentParser:
-    parser = command(commands, name, handler, text)
-    parser.add_argument("config", metavar="CONFIG", type=as_local, help="a YAML config")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as data.camera=wrist_left")
-    return parser
-
-
-def _add_check(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
-        commands, "check", _check,
+    text = (
         "Open the data, load some clips as training would, and look at every number. Exit status 0: all is well or"
-        " only warnings, 1: training would learn nothing or not begin, 2: something cannot be used.",
-    )  # fmt: skip
-    parser.add_argument(
-        "--limit", metavar="N", type=count, default=32, help="clips to load (32); to probe, twice as many"
+        " only warnings, 1: training would learn nothing or not begin, 2: something cannot be used."
     )
-    parser.add_argument(
-        "--model",
-        metavar="RUN_OR_MODEL",
-        type=as_model,
-        help="probe the data with a model that knows robots (a run, or what model.base takes): does it predict better"
-        " where frames are shifted, mirrored, reversed, BGR, or the gripper is inverted?",
+    parser = command(inner, "check", _check, text)
+    add_config(parser, such_as=such_as)
+    argument(parser, "--limit N", "clips to load (32); to probe, twice as many", count, default=32)
+    text = (
+        "probe the data with a model that knows robots (a run, or what model.base takes): does it predict better where"
+        " frames are shifted, mirrored, reversed, BGR, or the gripper is inverted?"
     )
+    argument(parser, "--model RUN_OR_MODEL", text, as_model)
+
+    text = "Build the index of a data set, or show the one that is kept on this machine."
+    parser = command(inner, "index", _index, text)
+    add_config(parser, such_as=such_as)
+    argument(parser, "--rebuild", "build it again, also where one is kept", action="store_true")
+
+    text = "Say what is in a data set, and draw it: text, inspect.json, a contact sheet."
+    parser = command(inner, "inspect", _inspect, text)
+    add_config(parser, such_as=such_as)
+    argument(parser, "--out DIR", "where to (inspection)", as_path, default=out)
+    argument(parser, "--episodes --limit N", "episodes whose motion is looked at (100)", count, default=100)
+    argument(parser, "--rows N", "episodes on the contact sheet (8)", count, default=8)
+
+    text = "Let a model say how many control steps its model step is: its error over persistence at each stride."
+    parser = command(inner, "calibrate", _calibrate, text)
+    add_config(parser, such_as=such_as)
+    argument(parser, "--model MODEL", "another than model.base: a .pt, a folder, or a run", as_model)
+    splits = ["train", "validation", "test"]
+    argument(parser, "--split", "(validation)", choices=splits, default="validation")
+    argument(parser, "--limit N", "clips at each stride (64)", count, default=64)
+    argument(parser, "--frames N", "of a clip (the config's, 8 at most)", whole_number(2, 256))
+    argument(parser, "--out DIR", "where to (inspection)", as_path, default=out)
 
 
 def _check(options: argparse.Namespace) -> int:
@@ -106,13 +110,6 @@ def _probe(config: Config, model: str, *, clips: int) -> None:
     print_finding(Finding("warning" if probe.better else "ok", "probe", probe.verdict()))
 
 
-def _add_index(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
-        commands, "index", _index, "Build the index of a data set, or show the one that is kept on this machine."
-    )
-    parser.add_argument("--rebuild", action="store_true", help="build it again, also where one is kept")
-
-
 def _index(options: argparse.Namespace) -> None:
     config = read_config(options.config, options.overrides).data
 
@@ -127,17 +124,6 @@ def _index(options: argparse.Namespace) -> None:
         dataset = open_dataset(config, progress=reporter.task(INDEXING))
     for line in index_lines(dataset.table, watch, time.perf_counter() - started):
         console.print(line)
-
-
-def _add_inspect(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
-        commands, "inspect", _inspect, "Say what is in a data set, and draw it: text, inspect.json, a contact sheet."
-    )
-    parser.add_argument("--out", metavar="DIR", type=as_path, default=Path("inspection"), help="where to (inspection)")
-    parser.add_argument(
-        "--episodes", "--limit", metavar="N", type=count, default=100, help="episodes whose motion is looked at (100)"
-    )
-    parser.add_argument("--rows", metavar="N", type=count, default=8, help="episodes on the contact sheet (8)")
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -171,20 +157,6 @@ def _inspect(options: argparse.Namespace) -> None:
     console.print(f"  {image}\n  {options.out / 'inspect.json'}")
 
 
-def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = _command(
-        commands, "calibrate", _calibrate,
-        "Let a model say how many control steps its model step is: its error over persistence at each stride.",
-    )  # fmt: skip
-    parser.add_argument(
-        "--model", metavar="MODEL", type=as_model, help="another than model.base: a .pt, a folder, or a run"
-    )
-    parser.add_argument("--split", choices=["train", "validation", "test"], default="validation", help="(validation)")
-    parser.add_argument("--limit", metavar="N", type=count, default=64, help="clips at each stride (64)")
-    parser.add_argument("--frames", metavar="N", type=whole_number(2, 256), help="of a clip (the config's, 8 at most)")
-    parser.add_argument("--out", metavar="DIR", type=as_path, default=Path("inspection"), help="where to (inspection)")
-
-
 def _calibrate(options: argparse.Namespace) -> None:
     config = read_config(options.config, options.overrides)
     if options.model is not None:
@@ -209,9 +181,7 @@ def _calibrate(options: argparse.Namespace) -> None:
 
 def _make_folder(folder: Path) -> None:
     """Create the folder for results before any long work."""
-    try:
+    from vjepa2_ac.storage import user_can_write
+
+    with user_can_write(f"--out {folder}"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            where=f"--out {folder}", found=f"cannot be made ({error.strerror})", needed="a folder of yours"
-        ) from None

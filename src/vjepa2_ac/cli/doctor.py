@@ -8,21 +8,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from vjepa2_ac.cli.options import Commands, as_local, command
+from vjepa2_ac.cli.options import Commands, add_config, command
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
 
 
-def add_doctor(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands) -> None:
     """Add `doctor` to a parser."""
     text = (
         "Estimate the GPU memory of a run, part by part, by a step on tensors without numbers: nothing is loaded."
         " Exit status 0: it fits, 1: it does not, 2: something cannot be used."
     )
-    parser = command(commands, "doctor", _doctor, text)
-    parser.add_argument("config", metavar="CONFIG", type=as_local, help="a YAML config")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as training.batch_size=4")
+    add_config(command(commands, "doctor", _doctor, text), such_as="training.batch_size=4")
 
 
 def _doctor(options: argparse.Namespace) -> int:

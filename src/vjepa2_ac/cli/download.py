@@ -5,16 +5,16 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from vjepa2_ac.cli.options import Commands, as_path, command
+from vjepa2_ac.cli.options import Commands, argument, as_path, command
 
 
-def add_download(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands) -> None:
     """Add `download` to a parser."""
-    parser = command(
-        commands, "download", _download, "Fetch the official checkpoint (11.7 GB); goes on where it stopped."
-    )
-    parser.add_argument("path", metavar="PATH", type=as_path, nargs="?", default=Path("checkpoints/vjepa2-ac-vitg.pt"))
-    parser.add_argument("--url", default=None, help="another address than Meta's")
+    text = "Fetch the official checkpoint (11.7 GB); goes on where it stopped."
+    parser = command(commands, "download", _download, text)
+    place = Path("checkpoints/vjepa2-ac-vitg.pt")
+    argument(parser, "path PATH", f"where to ({place})", as_path, nargs="?", default=place)
+    argument(parser, "--url", "another address than Meta's")
 
 
 def _download(options: argparse.Namespace) -> None:

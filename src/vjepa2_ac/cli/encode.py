@@ -6,26 +6,20 @@ import argparse
 import os
 
 from vjepa2_ac import output
-from vjepa2_ac.cli.options import Commands, as_local, as_path, read_config
+from vjepa2_ac.cli.options import Commands, add_config, argument, as_path, command, read_config
 
 
-def add_encode(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands) -> None:
     """Add `encode` to a parser."""
     text = (
         "Run the frozen encoder once over all frames that the clips of a config need, and cache the latents."
         " Stopping it costs the few episodes in progress at most: the same command goes on. Several processes"
         " (torchrun) share the work."
     )
-    parser = commands.add_parser("encode", help=text.split(".", maxsplit=1)[0] + ".", description=text)
-    parser.set_defaults(handler=_encode)
-    parser.add_argument("config", metavar="CONFIG", type=as_local, help="a YAML config")
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as data.cache_dtype=int8")
-    parser.add_argument(
-        "--out",
-        metavar="FOLDER",
-        type=as_path,
-        help="folder of the cache, for data.source: latents (default: where data.cache finds it)",
-    )
+    parser = command(commands, "encode", _encode, text)
+    add_config(parser, such_as="data.cache_dtype=int8")
+    text = "folder of the cache, for data.source: latents (default: where data.cache finds it)"
+    argument(parser, "--out FOLDER", text, as_path)
 
 
 def _encode(options: argparse.Namespace) -> None:
@@ -45,12 +39,7 @@ def _encode(options: argparse.Namespace) -> None:
         return
     for name, reason in manifest.broken.items():
         console.print(f"left out: {name}: {reason}")
-    console.print(
-        f"{manifest.encoded:,} of {manifest.episodes:,} episodes, {manifest.frames:,} frames,"
-        f" {manifest.bytes / 1e9:.3g} GB are in {encoded.folder}",
-    )
-    console.print(
-        f"Train on them with data.source=latents data.path={encoded.folder}"
-        if options.out
-        else "Train on them with data.cache=auto",
-    )
+    episodes = f"{manifest.encoded:,} of {manifest.episodes:,} episodes"
+    console.print(f"{episodes}, {manifest.frames:,} frames, {manifest.bytes / 1e9:.3g} GB are in {encoded.folder}")
+    knobs = f"data.source=latents data.path={encoded.folder}" if options.out else "data.cache=auto"
+    console.print(f"Train on them with {knobs}")

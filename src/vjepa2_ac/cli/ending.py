@@ -6,15 +6,14 @@ For commands without handling of their own: a training run finishes its step fir
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from types import FrameType
 
+from vjepa2_ac.distributed import preemption
+
 SIGNALS = (signal.SIGTERM, signal.SIGHUP)
-_SAME_WITHIN_S = 0.5  # `timeout`, some launchers and terminals signal twice
 
 
 class EndedError(BaseException):
@@ -35,30 +34,18 @@ def tidy_end() -> Iterator[None]:
 
     Outside the main thread, and for signals that already have a handler, nothing is changed.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
     came_at: list[float] = []
 
     def end(number: int, _frame: FrameType | None) -> None:
         if not came_at:
             came_at.append(time.monotonic())
             raise EndedError(number)
-        if time.monotonic() - came_at[0] >= _SAME_WITHIN_S:
-            _die(number)
+        if time.monotonic() - came_at[0] >= preemption.SAME_WITHIN_S:
+            preemption.end_by(number)
 
     taken = [number for number in SIGNALS if signal.getsignal(number) is signal.SIG_DFL]
-    for number in taken:
-        signal.signal(number, end)
     try:
-        yield
+        with preemption.handle_signals(taken, end):
+            yield
     except EndedError as ended:
-        _die(ended.number)
-    finally:
-        for number in taken:
-            signal.signal(number, signal.SIG_DFL)
-
-
-def _die(number: int) -> None:
-    signal.signal(number, signal.SIG_DFL)
-    os.kill(os.getpid(), number)
+        preemption.end_by(ended.number)

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli.options import (
     Commands,
-    SubjectsAndOverrides,
+    add_checkpoint,
+    argument,
     as_local,
     as_model,
     as_path,
@@ -18,6 +19,7 @@ from vjepa2_ac.cli.options import (
     count,
     number_between,
     read_config,
+    record_of_options,
     require_overrides,
     require_subject,
     say_places_elsewhere,
@@ -29,101 +31,50 @@ if TYPE_CHECKING:
     from vjepa2_ac.evaluation.request import EvaluationOptions
 
 
-def add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands) -> None:
     """Add `evaluate` and `compare` to a parser."""
-    _add_evaluate(commands)
-    _add_compare(commands)
-
-
-def add_checkpoint(parser: argparse._ActionsContainer) -> None:
-    """Add the option that selects a checkpoint of a run."""
-    parser.add_argument(
-        "--checkpoint",
-        default="selected",
-        metavar="selected|newest|best|STEP",
-        help="which one: the selected (default: the best by validation, else the newest), or that of a step",
-    )
-
-
-def _add_evaluate(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = command(
-        commands,
-        "evaluate",
-        _evaluate,
-        "Measure a run or a model on held-out episodes, beside its base, doing nothing and wrong actions.",
-    )
-    parser.add_argument(
-        "subjects",
-        metavar="RUN_OR_MODEL",
-        type=as_subject,
-        nargs="+",
-        action=SubjectsAndOverrides,
-        help="folder of a run, or (with --data) what model.base takes; several: their spread, too",
-    )
-    parser.add_argument(
-        "--data",
-        metavar="CONFIG",
-        type=as_local,
-        help="measure on the data of this config (and with its model.dtype, device, seed)",
-    )
-    parser.add_argument(
-        "--against",
-        metavar="base|RUN|MODEL",
-        type=as_model,
-        nargs="+",
-        help="what to compare with, on the same latents; default: the base of a run, nothing for a model",
-    )
-    parser.add_argument("--out", metavar="FOLDER", type=as_path, help="where figures go; default: the run's folder")
-    parser.add_argument("--split", choices=["test", "validation"], default="test", help="which held-out episodes")
-    parser.add_argument("--clips", type=count, default=256, help="at most this many clips, spread over the episodes")
+    text = "Measure a run or a model on held-out episodes, beside its base, doing nothing and wrong actions."
+    parser = command(commands, "evaluate", _evaluate, text)
+    text = "folder of a run, or (with --data) what model.base takes; several: their spread, too"
+    argument(parser, "subjects RUN_OR_MODEL", text, as_subject, nargs="+")
+    text = "measure on the data of this config (and with its model.dtype, device, seed)"
+    argument(parser, "--data CONFIG", text, as_local)
+    text = "what to compare with, on the same latents; default: the base of a run, nothing for a model"
+    argument(parser, "--against base|RUN|MODEL", text, as_model, nargs="+")
+    argument(parser, "--out FOLDER", "where figures go; default: the run's folder", as_path)
+    argument(parser, "--split", "which held-out episodes (test)", choices=["test", "validation"])
+    argument(parser, "--clips N", "at most this many clips, spread over the episodes (256)", count)
     add_checkpoint(parser)
-    parser.add_argument("--calibrate", action="store_true", help="measure the one-step error at other strides, too")
+    argument(parser, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
+    _add_probes(parser.add_argument_group("use of the actions"))
+    _add_planning(parser.add_argument_group("plans (they take long: see docs/evaluation.md)"))
     parser.set_defaults(overrides=[])
-    _add_probes(parser)
-    _add_planning(parser)
+
+    text = "Put runs side by side that `evaluate` has measured on the same clips: one table, one image."
+    parser = command(commands, "compare", _compare, text)
+    argument(parser, "runs RUN", "folders with a metrics.json, two or more", as_path, nargs="+")
+    argument(parser, "--out PNG", "the image (comparison.png)", as_path, default=Path("comparison.png"))
 
 
-def _add_probes(parser: argparse.ArgumentParser) -> None:
-    probes = parser.add_argument_group("use of the actions")
-    probes.add_argument(
-        "--sensitivity-clips", metavar="N", type=whole_number(0), default=32, help="clips to try other actions on (32)"
-    )
-    probes.add_argument("--samples", metavar="N", type=count, default=64, help="other actions for each of them (64)")
-    probes.add_argument(
-        "--landscapes",
-        metavar="N",
-        type=whole_number(0),
-        default=8,
-        help="clips of those with an energy landscape (8)",
-    )
-    probes.add_argument(
-        "--nodes", metavar="N", type=whole_number(3, 51), default=9, help="of a landscape along each axis (9)"
-    )
-    probes.add_argument(
-        "--reach",
-        metavar="CM",
-        type=number_between(0.0, 1000.0, "cm"),
-        default=7.5,
-        help="half the width of landscape and box, in cm (7.5)",
-    )
-    probes.add_argument("--examples", metavar="N", type=whole_number(0), default=4, help="clips to show (4)")
-    probes.add_argument(
-        "--at-once", metavar="N", type=count, default=64, help="actions computed together (64): lower it to save memory"
-    )
+def _add_probes(group: argparse._ArgumentGroup) -> None:
+    argument(group, "--sensitivity-clips N", "clips to try other actions on (32)", whole_number(0))
+    argument(group, "--samples N", "other actions for each of them (64)", count)
+    text = "clips of those with an energy landscape (8)"
+    argument(group, "--landscapes N", text, whole_number(0), dest="landscape_clips")
+    argument(group, "--nodes N", "of a landscape along each axis (9)", whole_number(3, 51))
+    text = "half the width of landscape and box, in cm (7.5)"
+    argument(group, "--reach CM", text, number_between(0.0, 1000.0, "cm"), dest="reach_cm")
+    argument(group, "--examples N", "clips to show (4)", whole_number(0))
+    argument(group, "--at-once N", "actions computed together (64): lower it to save memory", count)
 
 
-def _add_planning(parser: argparse.ArgumentParser) -> None:
-    planning = parser.add_argument_group("plans (they take long: see docs/evaluation.md)")
-    planning.add_argument(
-        "--planning",
-        metavar="planning.key=value",
-        nargs="*",
-        help="plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score;"
-        " settings of the plan of one step, such as planning.samples=200, in place of the config's, here or anywhere",
+def _add_planning(group: argparse._ArgumentGroup) -> None:
+    text = (
+        "plan from held-out frames, and hold the plans against the demonstrations: action error, Action Score; settings"
+        " of the plan of one step, such as planning.samples=200, in place of the config's, here or anywhere"
     )
-    planning.add_argument(
-        "--planning-clips", metavar="N", type=count, default=32, help="clips to plan from, one frame of each (32)"
-    )
+    argument(group, "--planning planning.key=value", text, nargs="*", dest="plan_settings")
+    argument(group, "--planning-clips N", "clips to plan from, one frame of each (32)", count, default=32)
 
 
 def _evaluate(options: argparse.Namespace) -> None:
@@ -156,58 +107,28 @@ def _evaluate(options: argparse.Namespace) -> None:
 
 
 def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
-    """Return what is asked of each subject."""
+    """Return what is asked of each subject; refuse planning settings that would have no effect: without plans."""
     from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
 
-    _require_planning(options)
-    probes = ProbeOptions(
-        sensitivity_clips=options.sensitivity_clips,
-        samples=options.samples,
-        landscape_clips=options.landscapes,
-        nodes=options.nodes,
-        reach_cm=options.reach,
-        examples=options.examples,
-        at_once=options.at_once,
-        planning_clips=0 if options.planning is None else options.planning_clips,
-    )
-    several = len(options.subjects) > 1
-    every = EvaluationOptions(
-        split=options.split,
-        clips=options.clips,
-        checkpoint=options.checkpoint,
+    require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
+    if options.overrides and options.plan_settings is None:
+        found = f"{' '.join(options.overrides)}, and no plans are asked for"
+        needed = "--planning beside settings of planning; what else a config says is not changed by evaluate"
+        raise InputError(where="command line", found=found, needed=needed, fix="Add --planning")
+    several, plan_settings = len(options.subjects) > 1, options.plan_settings
+    clips = 0 if plan_settings is None else options.planning_clips
+    every = record_of_options(
+        EvaluationOptions,
+        options,
         data=read_config(options.data) if options.data else None,
         against=tuple(options.against) if options.against else None,
-        probes=probes,
-        calibrate=options.calibrate,
-        planning=(*(options.planning or ()), *options.overrides),
+        probes=record_of_options(ProbeOptions, options, planning_clips=clips),
+        planning=(*(plan_settings or ()), *options.overrides),
     )
     return [
         (subject, replace(every, out=options.out / Path(subject).name if options.out and several else options.out))
         for subject in options.subjects
     ]
-
-
-def _require_planning(options: argparse.Namespace) -> None:
-    """Refuse planning settings if no plans are requested: they would have no effect."""
-    require_overrides(options.overrides, fix="Name all runs and models one behind the other, before the options")
-    if options.overrides and options.planning is None:
-        raise InputError(
-            where="command line",
-            found=f"{' '.join(options.overrides)}, and no plans are asked for",
-            needed="--planning beside settings of planning; what else a config says is not changed by evaluate",
-            fix="Add --planning",
-        )
-
-
-def _add_compare(commands: Commands[argparse.ArgumentParser]) -> None:
-    parser = command(
-        commands,
-        "compare",
-        _compare,
-        "Put runs side by side that `evaluate` has measured on the same clips: one table, one image.",
-    )
-    parser.add_argument("runs", metavar="RUN", type=as_path, nargs="+", help="folders with a metrics.json, two or more")
-    parser.add_argument("--out", metavar="PNG", type=as_path, default=Path("comparison.png"), help="the image")
 
 
 def _compare(options: argparse.Namespace) -> None:

@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import argparse
 
-from vjepa2_ac.cli.evaluate import add_checkpoint
-from vjepa2_ac.cli.options import Commands, as_path, command
+from vjepa2_ac.cli.options import Commands, add_checkpoint, argument, as_path, command
 
 
-def add_export(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands) -> None:
     """Add `export` to a parser."""
-    parser = command(
-        commands, "export", _export, "Write a run's model, adapter merged in, or its adapter, for others to use."
+    text = "Write a run's model, adapter merged in, or its adapter, for others to use."
+    parser = command(commands, "export", _export, text)
+    argument(parser, "run RUN", "the folder of a run", as_path)
+    argument(parser, "folder FOLDER", "where to, new or empty; official: or a .pt file", as_path)
+    text = (
+        "merged: a folder that `model.base` takes. official: one .pt by Meta's names, for the official code. hub: the"
+        " adapter in PEFT's format with a model card, ready to upload"
     )
-    parser.add_argument("run", metavar="RUN", type=as_path, help="the folder of a run")
-    parser.add_argument(
-        "folder", metavar="FOLDER", type=as_path, help="where to, new or empty; official: or a .pt file"
-    )
-    parser.add_argument(
-        "--to",
-        choices=["merged", "official", "hub"],
-        default="merged",
-        help="merged: a folder that `model.base` takes. official: one .pt by Meta's names, for the official code."
-        " hub: the adapter in PEFT's format with a model card, ready to upload",
-    )
+    argument(parser, "--to", text, choices=["merged", "official", "hub"], default="merged")
     add_checkpoint(parser)
 
 

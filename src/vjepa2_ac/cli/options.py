@@ -1,27 +1,31 @@
-"""Shared parts of the commands: adding a subcommand, and parsing numbers."""
+"""Shared parts of the commands: adding a subcommand and its arguments, and what each of them may be."""
 
 from __future__ import annotations
 
 import argparse
-import math
+import contextlib
 import os
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, TypeAlias, TypeVar
 
 from vjepa2_ac import places
 from vjepa2_ac.errors import InputError, printable
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
+    from vjepa2_ac.planning.session import PlanningSession
 
-Commands = argparse._SubParsersAction
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Handler = Callable[[argparse.Namespace], int | None]
 
 _MOST = 10**9
 _OPTION = re.compile(r"-(?![\d.])")  # but a negative number is a value
 _OVERRIDE = re.compile(r"[a-z_]+(\.\w+)+=")
+_Record = TypeVar("_Record")
+_Number = TypeVar("_Number", int, float)
 
 
 class Parser(argparse.ArgumentParser):
@@ -32,13 +36,48 @@ class Parser(argparse.ArgumentParser):
         super().error(printable(message))
 
 
-def command(
-    commands: Commands[argparse.ArgumentParser], name: str, handler: Handler, text: str
-) -> argparse.ArgumentParser:
+def command(commands: Commands, name: str, handler: Handler, text: str) -> argparse.ArgumentParser:
     """Add a command with its handler, and return its parser."""
     parser = commands.add_parser(name, help=text, description=text)
     parser.set_defaults(handler=handler)
     return parser
+
+
+def argument(
+    parser: argparse._ActionsContainer, words: str, text: str, read: Callable[[str], Any] | None = None, **how: Any
+) -> None:
+    """Add an argument to a parser.
+
+    Args:
+        parser: A parser, or a group of one.
+        words: Its name, or its names if it is an option, and what its value is called: "config CONFIG", "--clips N".
+        text: Its help. It says the default, also of an option that fills a record, which has None here.
+        read: Reads a value.
+        how: As `argparse.ArgumentParser.add_argument`.
+    """
+    first, *others = words.split()
+    names = [first, *(word for word in others if word.startswith("--"))]
+    value = next((word for word in others if word not in names), None)
+    how |= {name: one for name, one in (("type", read), ("metavar", value)) if one is not None}
+    parser.add_argument(*names, help=text, **how)
+
+
+def add_config(parser: argparse.ArgumentParser, *, such_as: str, what: str = "a YAML config") -> None:
+    """Add the config that a command reads, and `key=value` words behind it."""
+    argument(parser, "config CONFIG", what, as_local)
+    argument(parser, "overrides key=value", f"such as {such_as}", nargs="*")
+
+
+def add_checkpoint(parser: argparse._ActionsContainer, default: str | None = "selected") -> None:
+    """Add the option that selects a checkpoint of a run."""
+    text = "which one: the selected (default: the best by validation, else the newest), or that of a step"
+    argument(parser, "--checkpoint selected|newest|best|STEP", text, default=default)
+
+
+def record_of_options(kind: Callable[..., _Record], options: argparse.Namespace, **others: Any) -> _Record:
+    """Return a record whose fields are the options of their names that were given, and others."""
+    given = {field.name: getattr(options, field.name, None) for field in fields(kind)}  # type: ignore[arg-type]
+    return kind(**{name: value for name, value in given.items() if value is not None} | others)
 
 
 def say_places_elsewhere(subject: str) -> None:
@@ -70,12 +109,9 @@ def read_config(path: str | Path, overrides: Sequence[str] = (), *, base: bool =
     config = load_config(path, overrides)
     data = config.data.path
     if not places.is_url(data) and not Path(data).exists():
-        raise InputError(
-            where=f"data.path: {data}",
-            found=f"no such file or folder, seen from {Path.cwd()}",
-            needed="a data set",
-            fix="Set data.path to the data set; docs/QUICKSTART.md says how to get DROID",
-        )
+        found = f"no such file or folder, seen from {Path.cwd()}"
+        fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
+        raise InputError(where=f"data.path: {data}", found=found, needed="a data set", fix=fix)
     if base and config.model.base is not None:
         find_base(config.model.base)
     return config
@@ -86,7 +122,7 @@ def require_subject(subject: str, checkpoint: str | None = None) -> None:
 
     Args:
         subject: The folder of a run; or a model: what `model.base` takes.
-        checkpoint: Of a run: newest, best, or a number of optimizer steps; None: it is not looked for.
+        checkpoint: Of a run: selected, newest, best, or a number of optimizer steps; None: it is not looked for.
 
     Raises:
         InputError: There is no such run, checkpoint or model.
@@ -116,37 +152,36 @@ def require_to_plan(options: argparse.Namespace) -> Config:
     return config
 
 
+def load_planning_session(options: argparse.Namespace) -> PlanningSession:
+    """Load the run or the model that plans, with the settings that `require_to_plan` has checked."""
+    from vjepa2_ac.planning.session import load_to_plan
+
+    how = {"checkpoint": options.checkpoint, "config": options.config, "overrides": options.overrides}
+    return load_to_plan(options.subject, **how)
+
+
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse a command line; `key=value` may be anywhere after a command that takes it.
 
-    argparse does not accept such words after an option, and treats them as unknown arguments.
+    argparse does not accept such words after an option, and treats them as unknown arguments; and it takes those among
+    the names of several runs or models for names.
     """
     options, rest = parser.parse_known_args(arguments)
     unknown = [word for word in rest if _OPTION.match(word)]
     if rest and (unknown or not hasattr(options, "overrides")):
         parser.error(f"unrecognized arguments: {' '.join(word for word in rest if not _OVERRIDE.match(word))}")
+    if "subjects" in options:
+        rest = [*filter(_is_override, options.subjects), *rest]
+        options.subjects = [word for word in options.subjects if not _is_override(word)]
+        if not options.subjects:
+            parser.error("the following arguments are required: RUN_OR_MODEL")
     if rest:
         options.overrides = [*options.overrides, *rest]
     return options
 
 
-class SubjectsAndOverrides(argparse.Action):
-    """Takes names of runs or models, one or more, and among them `key=value` words that are no folders."""
-
-    def __call__(
-        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, _option: str | None = None
-    ) -> None:
-        """Sort the words into both kinds."""
-        overrides = [word for word in values if _is_override(word)]
-        subjects = [word for word in values if word not in overrides]
-        if not subjects:
-            parser.error(f"the following arguments are required: {self.metavar}")
-        setattr(namespace, self.dest, subjects)
-        namespace.overrides = [*namespace.overrides, *overrides]
-
-
 def as_subject(text: str) -> str:
-    """Parse the name of a run or a model, and leave a `key=value` unchanged for `SubjectsAndOverrides`."""
+    """Parse the name of a run or a model, and leave a `key=value` among several of them unchanged, for `parsed`."""
     return text if _is_override(text) else as_model(text)
 
 
@@ -162,12 +197,8 @@ def require_overrides(words: Sequence[str], *, fix: str = "") -> None:
     """
     others = [word for word in words if "=" not in word]
     if others:
-        raise InputError(
-            where="command line",
-            found=f"{' '.join(others)!r}",
-            needed="key=value, such as training.steps=100",
-            fix=fix,
-        )
+        found, needed = f"{' '.join(others)!r}", "key=value, such as training.steps=100"
+        raise InputError(where="command line", found=found, needed=needed, fix=fix)
 
 
 def as_path(text: str) -> Path:
@@ -185,35 +216,23 @@ def as_model(text: str) -> str:
     return _meant(places.of_a_model, text)
 
 
-def whole_number(least: int, most: int | None = None) -> Callable[[str], int]:
-    """Return a parser of whole numbers from `least` to `most`; None: a limit that no use reaches."""
-    meant = f"a whole number from {least}" + ("" if most is None else f" to {most}")
-
-    def read(text: str) -> int:
-        try:
-            number = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is not {meant}") from None
-        if most is None and number > _MOST:
-            raise argparse.ArgumentTypeError(f"{text!r} is not {meant} to {_MOST}")
-        if number < least or (most is not None and number > most):
-            raise argparse.ArgumentTypeError(f"{text!r} is not {meant}")
-        return number
-
-    return read
+def whole_number(least: int, most: int = _MOST) -> Callable[[str], int]:
+    """Return a parser of whole numbers from `least` to `most`; by default a limit that no use reaches."""
+    return _numbers(int, lambda number: least <= number <= most, f"a whole number from {least} to {most}")
 
 
 def number_between(least: float, most: float, unit: str) -> Callable[[str], float]:
     """Return a parser of numbers with a unit, strictly between the bounds."""
+    meant = f"a number of {unit} above {least:g} and below {most:g}"
+    return _numbers(float, lambda number: least < number < most, meant)
 
-    def read(text: str) -> float:
-        try:
-            number = float(text)
-        except ValueError:
-            number = math.nan
-        if not least < number < most:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a number of {unit} above {least:g} and below {most:g}")
-        return number
+
+def _numbers(kind: Callable[[str], _Number], fits: Callable[[_Number], bool], meant: str) -> Callable[[str], _Number]:
+    def read(text: str) -> _Number:
+        with contextlib.suppress(ValueError):
+            if fits(number := kind(text)):
+                return number
+        raise argparse.ArgumentTypeError(f"{text!r} is not {meant}")
 
     return read
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-from vjepa2_ac.cli.evaluate import add_checkpoint
 from vjepa2_ac.cli.options import (
     Commands,
+    add_checkpoint,
+    argument,
     as_local,
     as_model,
     as_path,
     command,
+    load_planning_session,
     require_overrides,
     require_to_plan,
     say_places_elsewhere,
@@ -27,71 +29,37 @@ if TYPE_CHECKING:
     from vjepa2_ac.config import Config
 
 
-def add_plan(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands) -> None:
     """Add `plan` to a parser."""
-    parser = command(
-        commands,
-        "plan",
-        _plan,
+    text = (
         "Plan from an image and a state to a goal image: plan.json, and an image of how the planner came to it."
-        " Status 1 where the model gives no finite energy.",
+        " Status 1 where the model gives no finite energy."
     )
+    parser = command(commands, "plan", _plan, text)
     parser._negative_number_matcher = re.compile(r"^-[\d.]")  # "-0.3,0.1,..." is a value, not an option
-    parser.add_argument(
-        "subject", metavar="RUN_OR_MODEL", type=as_model, help="folder of a run, or what model.base takes"
+    argument(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
+    argument(parser, "overrides key=value", "such as planning.horizon=2", nargs="*")
+    argument(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", as_local, required=True)
+    text = (
+        "measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers of a"
+        " vector, as the data had them"
     )
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as planning.horizon=2")
-    _add_request(parser)
-    parser.add_argument(
-        "--config", metavar="CONFIG", type=as_local, help="for a model: the config whose planning, crop and dtype count"
-    )
+    argument(parser, "--state NUMBERS", text, required=True)
+    text = "what it shall see; again for goals that follow one another"
+    argument(parser, "--goal IMAGE", text, as_local, required=True, action="append")
+    text = "model steps of each goal but the last, as 2,1; default: equal shares of planning.horizon"
+    argument(parser, "--durations STEPS", text)
+    text = "what of the image counts: of the goal's size, black where it does not"
+    argument(parser, "--mask IMAGE", text, as_local)
+    text = "the camera in the robot base frame: x,y,z,roll,pitch,yaw; where the model uses it"
+    argument(parser, "--extrinsics NUMBERS", text)
+    text = "for a model: the config whose planning, crop and dtype count"
+    argument(parser, "--config CONFIG", text, as_local)
     add_checkpoint(parser)
-    parser.add_argument("--seed", metavar="N", type=whole_number(0, 2**31 - 1), help="default: the config's")
-    parser.add_argument(
-        "--nodes",
-        metavar="N",
-        type=whole_number(0, 101),
-        default=13,
-        help="of an energy slice along each axis (13); below 3: no slices",
-    )
-    parser.add_argument("--out", metavar="FOLDER", type=as_path, default=Path("plan"), help="for both files (plan)")
-
-
-def _add_request(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--start", metavar="IMAGE", type=as_local, required=True, help="what the camera sees: PNG or JPEG"
-    )
-    parser.add_argument(
-        "--state",
-        metavar="NUMBERS",
-        required=True,
-        help="measured x,y,z (m), roll,pitch,yaw (radians, extrinsic xyz), gripper (0 open .. 1 closed); or the numbers"
-        " of a vector, as the data had them",
-    )
-    parser.add_argument(
-        "--goal",
-        metavar="IMAGE",
-        type=as_local,
-        required=True,
-        action="append",
-        help="what it shall see; again for goals that follow one another",
-    )
-    parser.add_argument(
-        "--durations",
-        metavar="STEPS",
-        help="model steps of each goal but the last, as 2,1; default: equal shares of planning.horizon",
-    )
-    parser.add_argument(
-        "--mask",
-        metavar="IMAGE",
-        type=as_local,
-        help="what of the image counts: of the goal's size, black where it does not",
-    )
-    parser.add_argument(
-        "--extrinsics",
-        metavar="NUMBERS",
-        help="the camera in the robot base frame: x,y,z,roll,pitch,yaw; where the model uses it",
-    )
+    argument(parser, "--seed N", "default: the config's", whole_number(0, 2**31 - 1))
+    text = "of an energy slice along each axis (13); below 3: no slices"
+    argument(parser, "--nodes N", text, whole_number(0, 101), default=13)
+    argument(parser, "--out FOLDER", "for both files (plan)", as_path, default=Path("plan"))
 
 
 def _plan(options: argparse.Namespace) -> int:
@@ -104,27 +72,24 @@ def _plan(options: argparse.Namespace) -> int:
     _require_state(state, require_to_plan(options))
     with user_can_write(options.out):
         options.out.mkdir(parents=True, exist_ok=True)
-    images = _images(options)
+    start, goals, mask = _images(options)
 
     from vjepa2_ac.console.plan import plan_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.planning.decision import PlanRequest, decide
     from vjepa2_ac.planning.plan_json import PLAN_FILE, write_plan
-    from vjepa2_ac.planning.session import load_to_plan
     from vjepa2_ac.planning.summary import summarize
     from vjepa2_ac.reports.figures.plan import PLAN_IMAGE, plot_plan
 
-    question = PlanRequest(images.start, state, images.goals, durations, images.mask)
+    request = PlanRequest(start, state, goals, durations, mask)
     say_places_elsewhere(options.subject)
-    session = load_to_plan(
-        options.subject, checkpoint=options.checkpoint, config=options.config, overrides=options.overrides
-    )
+    session = load_planning_session(options)
     if not options.durations:
-        question = question.with_equal_durations(session.config.planning.horizon)
+        request = request.with_equal_durations(session.config.planning.horizon)
     with ConsoleReporter() as reporter:
         progress = reporter.task("planning, iterations")
         controller = session.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
-        found = decide(controller, question, nodes=options.nodes)
+        found = decide(controller, request, nodes=options.nodes)
     images_given = {"start": options.start, "goals": options.goal, "mask": options.mask}
     with user_can_write(options.out):
         written = [
@@ -146,14 +111,8 @@ def _require_state(state: np.ndarray, config: Config) -> None:
     require_numbers(state, measured_space(config.data, len(state)), where="--state")
 
 
-class _Images(NamedTuple):
-    start: np.ndarray
-    goals: tuple[np.ndarray, ...]
-    mask: np.ndarray | None
-
-
-def _images(options: argparse.Namespace) -> _Images:
-    """Read what was given and refuse what cannot be planned with, before a model is loaded."""
+def _images(options: argparse.Namespace) -> tuple[np.ndarray, tuple[np.ndarray, ...], np.ndarray | None]:
+    """Return start, goals and mask; refuse what cannot be planned with, before a model is loaded."""
     from vjepa2_ac.media.image_file import read_image
     from vjepa2_ac.planning.input_checks import require_image, require_mask
 
@@ -165,7 +124,7 @@ def _images(options: argparse.Namespace) -> _Images:
     mask = None if options.mask is None else read_image(options.mask).max(axis=-1)
     if mask is not None:
         require_mask(mask, where=f"--mask {options.mask}", like=goals[0])
-    return _Images(start, goals, mask)
+    return start, goals, mask
 
 
 def _extrinsics(options: argparse.Namespace) -> np.ndarray | None:
@@ -182,21 +141,17 @@ def _extrinsics(options: argparse.Namespace) -> np.ndarray | None:
 def _numbers(text: str, where: str) -> np.ndarray:
     import numpy as np
 
-    words = text.replace(",", " ").split()
     try:
-        return np.array([float(word) for word in words])
+        return np.array([float(word) for word in text.replace(",", " ").split()])
     except ValueError as error:
-        raise InputError(
-            where=where, found=f"{text!r} ({error})", needed="numbers with commas between them, in one word"
-        ) from None
+        found, needed = f"{text!r} ({error})", "numbers with commas between them, in one word"
+        raise InputError(where=where, found=found, needed=needed) from None
 
 
 def _durations(text: str, goals: int) -> tuple[int, ...]:
     words = text.replace(",", " ").split()
     if len(words) != goals - 1 or not all(word.isdecimal() and int(word) for word in words):
-        raise InputError(
-            where="--durations",
-            found=f"{text!r} for {goals} goal{'s' * (goals > 1)}",
-            needed=f"{goals - 1} whole numbers from 1, with commas between them: of each goal but the last",
-        )
+        found = f"{text!r} for {goals} goal{'s' * (goals > 1)}"
+        needed = f"{goals - 1} whole numbers from 1, with commas between them: of each goal but the last"
+        raise InputError(where="--durations", found=found, needed=needed)
     return tuple(int(word) for word in words)

@@ -10,18 +10,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from vjepa2_ac import __version__, output
-from vjepa2_ac.cli.config import add_config
-from vjepa2_ac.cli.data import add_data
-from vjepa2_ac.cli.doctor import add_doctor
-from vjepa2_ac.cli.download import add_download
-from vjepa2_ac.cli.encode import add_encode
+from vjepa2_ac.cli import config, data, doctor, download, encode, evaluate, export, plan, simulate, train
 from vjepa2_ac.cli.ending import tidy_end
-from vjepa2_ac.cli.evaluate import add_evaluate
-from vjepa2_ac.cli.export import add_export
 from vjepa2_ac.cli.options import Handler, Parser, parsed
-from vjepa2_ac.cli.plan import add_plan
-from vjepa2_ac.cli.simulate import add_simulate
-from vjepa2_ac.cli.train import add_train
 from vjepa2_ac.errors import InputError, UserError, in_words, is_out_of_memory, printable
 
 
@@ -70,11 +61,8 @@ def _require_working_directory() -> None:
     try:
         Path.cwd()
     except OSError:
-        raise InputError(
-            where="working directory",
-            found="it is gone: it was deleted, or its disk went away",
-            fix="Change to a folder that is there, with `cd`",
-        ) from None
+        found, fix = "it is gone: it was deleted, or its disk went away", "Change to a folder that is there, with `cd`"
+        raise InputError(where="working directory", found=found, fix=fix) from None
 
 
 def _complain(error: str) -> None:
@@ -104,14 +92,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    add_train(commands)
-    add_evaluate(commands)
-    add_data(commands)
-    add_encode(commands)
-    add_doctor(commands)
-    add_plan(commands)
-    add_export(commands)
-    add_config(commands)
-    add_download(commands)
-    add_simulate(commands)
+    for one in (train, evaluate, data, encode, doctor, plan, export, config, download, simulate):
+        one.add_to(commands)
     return parser

@@ -8,11 +8,11 @@ import sys
 from pathlib import Path
 
 from vjepa2_ac import output
-from vjepa2_ac.cli.options import Commands, as_local, command, read_config, say_places_elsewhere
+from vjepa2_ac.cli.options import Commands, add_config, argument, command, read_config, say_places_elsewhere
 from vjepa2_ac.errors import InputError, printable
 
 
-def add_train(commands: Commands[argparse.ArgumentParser]) -> None:
+def add_to(commands: Commands) -> None:
     """Add `train` to a parser."""
     parser = command(
         commands,
@@ -21,17 +21,14 @@ def add_train(commands: Commands[argparse.ArgumentParser]) -> None:
         "Train an adapter (or the whole predictor) as a config says. SIGTERM, SIGINT, SIGUSR1, SIGHUP: finish the step,"
         " write a checkpoint, end with status 75; the same command goes on from there. A second signal: end at once.",
     )
-    parser.add_argument(
-        "config", metavar="CONFIG", type=as_local, help="a YAML config, or with --resume the folder of a run"
-    )
-    parser.add_argument("overrides", nargs="*", metavar="key=value", help="such as training.learning_rate=3e-4")
-    parser.add_argument("--resume", action="store_true", help="go on with the run in the folder CONFIG")
-    parser.add_argument(
-        "--check", action="store_true", help="do everything that can fail and stop before the first step"
-    )
-    parser.add_argument(
-        "--allow-config-change", action="store_true", help="go on with the run in run_dir though its config is another"
-    )
+    what = "a YAML config, or with --resume the folder of a run"
+    add_config(parser, such_as="training.learning_rate=3e-4", what=what)
+    for words, text in (
+        ("--resume", "go on with the run in the folder CONFIG"),
+        ("--check", "do everything that can fail and stop before the first step"),
+        ("--allow-config-change", "go on with the run in run_dir though its config is another"),
+    ):
+        argument(parser, words, text, action="store_true")
 
 
 def _train(options: argparse.Namespace) -> int:
@@ -39,13 +36,11 @@ def _train(options: argparse.Namespace) -> int:
 
     path = Path(options.config)
     if options.resume and options.overrides:
-        raise InputError(
-            where="command line", found="--resume with overrides", needed="the run's own config, unchanged"
-        )
+        needed = "the run's own config, unchanged"
+        raise InputError(where="command line", found="--resume with overrides", needed=needed)
     if path.is_dir() and not options.resume:
-        raise InputError(
-            where=options.config, found="a folder", needed="a config file", fix="To go on with a run, add --resume"
-        )
+        fix = "To go on with a run, add --resume"
+        raise InputError(where=options.config, found="a folder", needed="a config file", fix=fix)
     if options.resume:
         say_places_elsewhere(options.config)
     config = read_run_config(path) if options.resume else read_config(path, options.overrides, base=True)

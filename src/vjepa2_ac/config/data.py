@@ -9,12 +9,13 @@ from pydantic import AfterValidator, BeforeValidator, Field, GetCoreSchemaHandle
 from pydantic_core import CoreSchema, core_schema
 
 from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import OFF, Local, Place, PositiveInt, Section, Share
+from vjepa2_ac.config.section import OFF, Count, Local, NonNegative, Place, Positive, PositiveInt, Section, Share
 from vjepa2_ac.places import is_url
 
 # A serial number is a name, also where YAML takes it for a number.
 _CameraName = Annotated[str, BeforeValidator(lambda name: str(name) if type(name) is int else name)]
 
+_PartOfAFrame = Annotated[float, Field(gt=0.0, le=1.0)]
 Split = Literal["train", "validation", "test"]
 _STRIDES_AT_15_HZ = (4, 8, 15)
 
@@ -46,19 +47,19 @@ class IdleConfig(Section):
     that it does not name count as idle."""
     keep_share: Annotated[float, Field(ge=0.0, le=1.0), Affects.LATENTS | Affects.RUN] = 0.0
     """Share of the idle windows that are kept: a world model should see stillness too."""
-    velocity_change_rad_s: Annotated[float, Field(gt=0.0)] = 1e-3
+    velocity_change_rad_s: Positive = 1e-3
     """For commands: a step is idle if no commanded joint velocity changes by this much."""
-    translation_m: Annotated[float, Field(gt=0.0)] = 1e-3
+    translation_m: Positive = 1e-3
     """For motion: a step is idle if translation, rotation and gripper change less than these three."""
-    rotation_rad: Annotated[float, Field(gt=0.0)] = 5e-3
+    rotation_rad: Positive = 5e-3
     """See translation_m."""
-    gripper: Annotated[float, Field(gt=0.0)] = 1e-2
+    gripper: Positive = 1e-2
     """See translation_m."""
     shortest_idle_steps: PositiveInt = 7
     """Shorter idle runs stay."""
     shortest_kept_steps: PositiveInt = 16
     """Ranges between idle runs are removed, too, if they are shorter."""
-    cut_last_steps: Annotated[int, Field(ge=0)] = 10
+    cut_last_steps: Count = 10
     """Steps cut from the end of each remaining range."""
 
     @model_validator(mode="after")
@@ -71,9 +72,9 @@ class IdleConfig(Section):
 class AugmentConfig(Section):
     """Random changes of training clips, the same for all frames of a clip. The released recipe has none."""
 
-    crop_scale: tuple[Annotated[float, Field(gt=0.0, le=1.0)], Annotated[float, Field(gt=0.0, le=1.0)]] | None = None
+    crop_scale: tuple[_PartOfAFrame, _PartOfAFrame] | None = None
     """Random resized crop: least and greatest share of the frame's area; null: no random crop."""
-    crop_aspect: tuple[Annotated[float, Field(gt=0.0)], Annotated[float, Field(gt=0.0)]] = (0.75, 1.35)
+    crop_aspect: tuple[Positive, Positive] = (0.75, 1.35)
     """Random resized crop: narrowest and widest width over height."""
     brightness: Share = 0.0
     """Colour jitter: brightness is multiplied by 1 - this .. 1 + this."""
@@ -100,7 +101,7 @@ class DiskCacheConfig(Section):
 
     dir: Local | None = None
     """Folder; null: $VJEPA2_AC_CACHE, or vjepa2-ac in the user's cache folder."""
-    limit_gb: Annotated[float, Field(ge=0.0)] = 50.0
+    limit_gb: NonNegative = 50.0
     """Frames beyond this size are removed, least recently used first; 0: none are cached. Indexes do not count."""
 
 
@@ -271,8 +272,8 @@ class DataConfig(Section):
 
     @property
     def first_camera(self) -> str:
-        """The camera that the model sees unless `camera` names others."""
-        raise NotImplementedError
+        """The camera that the model sees unless `camera` names others; of the form of data, where none are known."""
+        return self.offered_cameras[0]
 
     @property
     def own_knobs_of_poses(self) -> list[str]:

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from vjepa2_ac.config import Config, DataConfig
 from vjepa2_ac.config.data import source_of
+from vjepa2_ac.config.effects import marks_of, sections_in
 from vjepa2_ac.storage.structured import message_of
 
 _ROUNDS = 20  # more than the number of rules about several values
@@ -79,15 +80,10 @@ def wrong_values(values: Mapping[str, Any], error: ValidationError) -> list[str]
     return lines
 
 
-def all_keys(section: type[BaseModel] = Config, prefix: str = "") -> list[str]:
-    """Return the dotted keys of a section and those in it."""
-    keys = []
-    for kind in _kinds_of(section).values() or (section,):
-        for name, info in kind.model_fields.items():
-            keys.append(prefix + name)
-            if inner := _section_of(info.annotation):
-                keys += all_keys(inner, f"{prefix}{name}.")
-    return list(dict.fromkeys(keys))
+def all_keys() -> list[str]:
+    """Return the dotted keys of all sections and knobs."""
+    paths = [key.split(".") for key in marks_of(Config)]
+    return list(dict.fromkeys(".".join(path[:depth]) for path in paths for depth in range(1, len(path) + 1)))
 
 
 def _messages_of(details: Sequence[Any]) -> list[str]:
@@ -231,10 +227,7 @@ def _kinds_of(section: type[BaseModel] | None) -> Mapping[str, type[BaseModel]]:
 
 
 def _section_of(annotation: Any) -> type[BaseModel] | None:
-    for candidate in (annotation, *getattr(annotation, "__args__", ())):
-        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
-            return candidate
-    return None
+    return next(iter(sections_in(annotation)), None)
 
 
 def _keys_at(location: Iterable[Any]) -> list[str]:

@@ -93,7 +93,7 @@ def _marks(section: type[BaseModel], outer: Affects | None, prefix: str) -> Iter
     for name, field in section.model_fields.items():
         mark = _mark_of(field)
         mark = outer if mark is None else mark
-        inner = _sections_in(field.annotation)
+        inner = sections_in(field.annotation)
         inner = [kind for one in inner for kind in [*getattr(one, "kinds", {}).values()] or [one]]
         for one in inner:
             yield from _marks(one, mark, f"{prefix}{name}.")
@@ -107,7 +107,8 @@ def _mark_of(field: FieldInfo) -> Affects | None:
     return next((one for one in field.metadata if isinstance(one, Affects)), None)
 
 
-def _sections_in(annotation: Any) -> list[type[BaseModel]]:
+def sections_in(annotation: Any) -> list[type[BaseModel]]:
+    """Return the sections that a knob of this type may hold."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [section for one in get_args(annotation) for section in _sections_in(one)]
+    return [section for one in get_args(annotation) for section in sections_in(one)]

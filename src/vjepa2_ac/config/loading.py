@@ -42,7 +42,7 @@ def config_from(values: Mapping[str, Any], overrides: Iterable[str] = (), *, whe
     Raises:
         InputError: Names every key that is wrong.
     """
-    return parse_config(_overridden(_plain(values, where), overrides), where=where)
+    return parse_config(_overridden(json.loads(_as_json(values, where)), overrides), where=where)
 
 
 def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
@@ -51,22 +51,16 @@ def parse_config(values: Mapping[str, Any], *, where: str) -> Config:
     Raises:
         InputError: Names every key that is wrong, all at once.
     """
-    require_shallow(dict(values), where=where)
-    if "data" in values:
-        values = {**values, "data": without_sections_of_others(values["data"])}
+    plain = json.loads(_as_json(values, where))
+    if "data" in plain:
+        plain["data"] = without_sections_of_others(plain["data"])
     try:
-        return Config.model_validate_json(json.dumps(values))
+        return Config.model_validate_json(json.dumps(plain))
     except ValidationError as error:
-        lines = wrong_values(values, error)
-        raise InputError(
-            where=where,
-            found=f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n"
-            + "\n".join(f"  {line}" for line in lines)
-            + "\n",
-            fix="`vjepa2-ac config schema` lists every key with its range",
-        ) from None
-    except (TypeError, ValueError) as error:  # of values that are not from a file
-        raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
+        lines = wrong_values(plain, error)
+        found = f"{len(lines)} value{'s are' if len(lines) > 1 else ' is'} wrong\n  " + "\n  ".join(lines) + "\n"
+        fix = "`vjepa2-ac config schema` lists every key with its range"
+        raise InputError(where=where, found=found, fix=fix) from None
 
 
 def config_as_dict(config: Config) -> dict[str, Any]:
@@ -116,9 +110,8 @@ def _read_yaml(path: Path) -> dict[str, Any]:
             data = file.read(_MOST_BYTES + 1)
         text = data.decode()
     except FileNotFoundError:
-        raise InputError(
-            where=str(path), found="no such file", needed="a config", fix="See configs/ for examples"
-        ) from None
+        fix = "See configs/ for examples"
+        raise InputError(where=str(path), found="no such file", needed="a config", fix=fix) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed="a YAML file") from None
     if len(data) > _MOST_BYTES:
@@ -130,11 +123,11 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return values
 
 
-def _plain(values: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Return a copy as a file would hold it: a Path is text."""
+def _as_json(values: Mapping[str, Any], where: str) -> str:
+    """Return values as a file would hold them: a Path is text."""
     require_shallow(dict(values), where=where)
     try:
-        return dict(json.loads(json.dumps(dict(values), default=os.fspath)))
+        return json.dumps(dict(values), default=os.fspath)
     except (TypeError, ValueError) as error:
         raise InputError(where=where, found=f"a value that a config cannot hold ({error})") from None
 
@@ -150,12 +143,11 @@ def _overridden(values: dict[str, Any], overrides: Iterable[str]) -> dict[str, A
 
 def _set(values: dict[str, Any], keys: list[str], value: Any, override: str) -> None:
     for depth, key in enumerate(keys[:-1]):
-        inner = values.setdefault(key, {})
-        if inner is None:
-            inner = values[key] = {}
+        if values.get(key) is None:
+            values[key] = {}
+        inner = values[key]
         if not isinstance(inner, dict):
-            raise InputError(
-                where=f"override {override}", found=f"{'.'.join(keys[: depth + 1])} is a value", needed="a section"
-            )
+            found = f"{'.'.join(keys[: depth + 1])} is a value"
+            raise InputError(where=f"override {override}", found=found, needed="a section")
         values = inner
     values[keys[-1]] = value

@@ -7,10 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from vjepa2_ac.config.section import OFF, PositiveInt, Section, Share
+from vjepa2_ac.config.section import OFF, Count, NonNegative, Positive, PositiveInt, Section, Share, ZeroToOne
 
-Positive = Annotated[float, Field(gt=0.0)]
-Metre = Annotated[float, Field(ge=0.0, le=1.0)]  # no arm moves farther in a model step: more would be millimetres
+Metre = ZeroToOne  # no arm moves farther in a model step: more would be millimetres
 
 
 class LimitsConfig(Section):
@@ -24,17 +23,17 @@ class LimitsConfig(Section):
     """Of the ball, in metres."""
     rotation: Annotated[float, Field(ge=0.0, le=math.pi)] = 0.0
     """Largest turn about each axis, in radians; 0: the rotation is held, as upstream does."""
-    axes: Literal["data"] | Annotated[tuple[Annotated[float, Field(ge=0.0)], ...], Field(min_length=1)] = "data"
+    axes: Literal["data"] | Annotated[tuple[NonNegative, ...], Field(min_length=1)] = "data"
     """Of vectors only: the largest change of each number, in its own unit; one number stands for all. data: what the
     run was taught, the 99th percentile of each number's change."""
-    gripper: Annotated[float, Field(ge=0.0, le=1.0)] = 0.75
+    gripper: ZeroToOne = 0.75
     """Largest change of the gripper's closedness."""
     gripper_mode: Literal["rounded", "free", "held", "open", "close"] = "rounded"
     """rounded: small changes of a finished plan become zero, as upstream. free: left as they are. held: no change.
     open, close: a change of -1 or 1, whatever `gripper` says, from model step `gripper_from` on; rounded before."""
-    gripper_rounding: Annotated[float, Field(ge=0.0, le=1.0)] = 0.25
+    gripper_rounding: ZeroToOne = 0.25
     """Changes below this become zero."""
-    gripper_from: Annotated[int, Field(ge=0)] = 0
+    gripper_from: Count = 0
     """Model step of the plan at which open or close begins; a multiple of action_repeat."""
 
     @model_validator(mode="after")
@@ -86,7 +85,7 @@ class IcemConfig(Section):
     """Power spectrum 1 / frequency^exponent along the plan: 0 is white, more is smoother."""
     shrink: Annotated[float, Field(ge=1.0)] = 1.25
     """Each iteration has as many samples as the last divided by this, and at least twice the elites."""
-    kept: Annotated[float, Field(ge=0.0, le=1.0)] = 0.3
+    kept: ZeroToOne = 0.3
     """Share of the elites that are reused, in the next iteration and, with warm_start, in the next decision."""
 
 

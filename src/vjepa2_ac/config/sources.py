@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from vjepa2_ac.config.data import DataConfig
 from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import Section
+from vjepa2_ac.config.section import Count, Section
 
 RAW_CAMERAS = ("left", "right", "wrist", "ext1", "ext2")
 
@@ -67,7 +67,7 @@ class LeRobotFields(Section):
     vector` any numbers."""
     action: Annotated[_Names, Affects.INDEX | Affects.CLIPS] = ("action",)
     """For `actions: recorded`: columns that form, concatenated, the *commanded* action of each control step."""
-    select: Annotated[tuple[Annotated[int, Field(ge=0)], ...] | None, Affects.EPISODES] = None
+    select: Annotated[tuple[Count, ...] | None, Affects.EPISODES] = None
     """Which of the concatenated numbers, in this order, are x, y, z, the rotation's 3 or 4, the gripper; for `states:
     vector` which are the state; null: all."""
     rotation: Annotated[Literal["euler_xyz", "quaternion_wxyz", "quaternion_xyzw"], Affects.EPISODES] = "euler_xyz"
@@ -111,13 +111,8 @@ class RldsData(DataConfig):
 
     @property
     def known_cameras(self) -> tuple[str, ...]:
-        """Those that have a feature."""
+        """Those that have a feature. DROID's first is the left exterior one, which the released weights saw."""
         return tuple(self.fields.cameras)
-
-    @property
-    def first_camera(self) -> str:
-        """DROID's is the left exterior one, which the released weights saw."""
-        return self.known_cameras[0]
 
     @property
     def own_knobs_of_poses(self) -> list[str]:
@@ -138,13 +133,8 @@ class RawDroidData(DataConfig):
 
     @property
     def offered_cameras(self) -> tuple[str, ...]:
-        """By their place on the robot; or by a serial number."""
+        """By their place on the robot, the left exterior one first; or by a serial number."""
         return RAW_CAMERAS
-
-    @property
-    def first_camera(self) -> str:
-        """The left exterior one."""
-        return RAW_CAMERAS[0]
 
 
 class LeRobotData(DataConfig):
@@ -163,11 +153,6 @@ class LeRobotData(DataConfig):
     def known_cameras(self) -> tuple[str, ...]:
         """Those that have a video."""
         return tuple(self.lerobot.cameras)
-
-    @property
-    def first_camera(self) -> str:
-        """The first that has a video."""
-        return self.known_cameras[0]
 
     @property
     def own_knobs_of_poses(self) -> list[str]:

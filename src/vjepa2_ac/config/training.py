@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import OFF, Place, PositiveInt, Section
+from vjepa2_ac.config.section import OFF, Count, NonNegative, Place, Positive, PositiveInt, Section, ZeroToOne
 
 
 def _earlier_keep_best(value: object) -> object:
@@ -29,32 +29,32 @@ class TrainingConfig(Section):
     """Predictions of the rollout loss; the first is teacher-forced, each further one uses the previous prediction."""
     loss: Literal["l1", "l2", "smooth_l1"] = "l1"
     """Distance of predicted and true latents: absolute (released), squared, or squared only below smooth_l1_beta."""
-    smooth_l1_beta: Annotated[float, Field(gt=0.0)] = 1.0
+    smooth_l1_beta: Positive = 1.0
     """Below this difference smooth_l1 is squared, above it is absolute; smooth_l1 only."""
-    teacher_forcing_weight: Annotated[float, Field(ge=0.0)] = 1.0
+    teacher_forcing_weight: NonNegative = 1.0
     """Factor of the teacher-forced loss, in the sum and in metrics.jsonl."""
-    rollout_weight: Annotated[float, Field(ge=0.0)] = 1.0
+    rollout_weight: NonNegative = 1.0
     """Factor of the rollout loss, in the sum and in metrics.jsonl; 0 saves its computation."""
     learning_rate: Annotated[float, Field(gt=0.0, le=1.0)] = 1e-4
     """Peak learning rate."""
     schedule: Literal["cosine", "warmup_stable_decay", "linear", "constant"] = "cosine"
     """All begin with a linear warm-up. Then cosine: half a cosine to the end. linear: a straight line to the end.
     warmup_stable_decay: constant, and a linear decay at the end. constant: the peak throughout."""
-    warmup_steps: Annotated[int, Field(ge=0)] = 1_000
+    warmup_steps: Count = 1_000
     """Optimizer steps of the linear warm-up."""
-    decay_steps: Annotated[int, Field(ge=0)] = 0
+    decay_steps: Count = 0
     """Optimizer steps of the final decay; warmup_stable_decay only."""
-    start_learning_rate: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    start_learning_rate: ZeroToOne = 0.0
     """Learning rate at the start of the warm-up."""
-    final_learning_rate: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    final_learning_rate: ZeroToOne = 0.0
     """Learning rate at the end of the schedule; not used by constant."""
     optimizer: Literal["adamw", "adamw_8bit"] = "adamw"
     """adamw_8bit stores the moments of matrices of 4,096 elements and more in 8 bits: bitsandbytes, extra 8bit."""
-    weight_decay: Annotated[float, Field(ge=0.0, le=1.0)] = 0.04
+    weight_decay: ZeroToOne = 0.04
     """AdamW's decay; biases and norms are exempt."""
     betas: tuple[Annotated[float, Field(ge=0.0, lt=1.0)], Annotated[float, Field(ge=0.0, lt=1.0)]] = (0.9, 0.999)
     """AdamW's decay rates of the running moments."""
-    max_grad_norm: Annotated[float, Field(gt=0.0)] | None = 1.0
+    max_grad_norm: Positive | None = 1.0
     """Gradients are clipped to this norm; null: never (the released recipe)."""
     precision: Annotated[Literal["bf16", "fp16", "fp32"], Affects.LATENTS | Affects.RUN] = "bf16"
     """Arithmetic of the networks (autocast). bf16 needs compute capability 8.0 on CUDA (Ampere). fp16 scales the loss,
@@ -123,7 +123,7 @@ class CheckpointConfig(Section):
 
     every: PositiveInt = 1_000
     """Optimizer steps between checkpoints."""
-    every_minutes: Annotated[float, Field(gt=0.0)] | None = 15.0
+    every_minutes: Positive | None = 15.0
     """Minutes after which a checkpoint is written in any case; null: by steps only."""
     keep: PositiveInt = 5
     """Number of newest checkpoints that are kept."""
@@ -138,9 +138,9 @@ class CheckpointConfig(Section):
     """Where the run is copied to during training: gs://bucket/folder, another URL of fsspec that can be written, or a
     folder (a mounted disk). A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as
     here."""
-    remote_every_minutes: Annotated[float, Field(ge=0.0)] = 30.0
+    remote_every_minutes: NonNegative = 30.0
     """Minutes between uploads to remote; there is also one at the end and on preemption."""
-    remote_wait_seconds: Annotated[float, Field(ge=0.0)] = 120.0
+    remote_wait_seconds: NonNegative = 120.0
     """How long a preempted run waits for that; shorter than the notice period of the machine."""
 
 

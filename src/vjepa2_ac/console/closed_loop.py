@@ -4,35 +4,37 @@ from __future__ import annotations
 
 from rich.table import Table
 
-from vjepa2_ac.console.progress import MetricsTable
-from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.console.progress import MetricsTable, with_interval
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark
-from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult
 from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M
 
 _USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that are not mentioned
 
 
-def contest_table(contest: ClosedLoopBenchmark) -> Table:
+def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
     """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
-    asked, threshold = contest.asked, f"{100 * SUCCESS_M[contest.asked.task]:g} cm"
+    asked, threshold = benchmark.asked, f"{100 * SUCCESS_M[benchmark.asked.task]:g} cm"
     table = MetricsTable(
         f"{asked.task} in domain {asked.domain}: {asked.episodes} problems of seed {asked.seed},"
-        f" {contest.results[0].steps} steps of {contest.seconds_per_step:.2f} s (95 % interval over episodes)",
+        f" {benchmark.results[0].steps} steps of {benchmark.seconds_per_step:.2f} s (95 % interval over episodes)",
+        ["", f"within {threshold} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
     )
-    table.add_column("")
-    columns = (f"within {threshold} at the end", "once on the way", "left at the end, cm", "steps", "s per decision")
-    for column in columns:
-        table.add_column(column, justify="right")
-    for result in contest.results:
-        table.add_row(result.policy, *_cells(result))
+    for result in benchmark.results:
+        table.add_row(
+            result.policy,
+            with_interval(result.success_rate, ".0%"),
+            with_interval(result.success_ever_rate, ".0%"),
+            with_interval(result.final_distance_cm, ".1f"),
+            "" if result.steps_needed is None else f"{result.steps_needed.value:.1f}",
+            f"{result.seconds_per_decision.value:.2f}",
+        )
     return table
 
 
-def contest_notes(contest: ClosedLoopBenchmark) -> tuple[str, ...]:
+def benchmark_notes(benchmark: ClosedLoopBenchmark) -> tuple[str, ...]:
     """Return notes on unusual decisions and commands: a line each, none if all was as usual."""
     notes = []
-    for result in contest.results:
+    for result in benchmark.results:
         unusual = {why: number for why, number in result.why_counts.items() if why not in _USUAL}
         if unusual:
             counts = ", ".join(f"{why} {number}" for why, number in unusual.items())
@@ -40,18 +42,3 @@ def contest_notes(contest: ClosedLoopBenchmark) -> tuple[str, ...]:
         if result.unreachable.any():
             notes.append(f"{result.policy}: {result.unreachable.sum()} commands led out of the arm's reach")
     return tuple(notes)
-
-
-def _cells(result: ClosedLoopResult) -> tuple[str, ...]:
-    distance, seconds = result.final_distance_cm, result.seconds_per_decision
-    return (
-        _share(result.success_rate),
-        _share(result.success_ever_rate),
-        f"{distance.value:.1f}" + (f" [{distance.low:.1f}, {distance.high:.1f}]" if distance.has_interval else ""),
-        "" if result.steps_needed is None else f"{result.steps_needed.value:.1f}",
-        f"{seconds.value:.2f}",
-    )
-
-
-def _share(share: Estimate) -> str:
-    return f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}]"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from rich.table import Table
 from rich.text import Text
 
@@ -38,6 +40,8 @@ def inspection_lines(inspection: Inspection) -> list[str]:
     success = inspection.success_share
     known = int((inspection.success >= 0).sum())
     shortest, low, median, high, longest = inspection.length_percentiles
+    hours = inspection.hours
+    lasting = f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
     config = inspection.config
     splits = ", ".join(
         f"{name} {windows:,} clips in {inspection.episodes_of[name]:,} episodes"
@@ -47,22 +51,18 @@ def inspection_lines(inspection: Inspection) -> list[str]:
     rows = {
         "data set": f"{config.path} ({config.source})",
         "episodes": f"{len(inspection.lengths):,} ({inspection.broken:,} broken)",
-        "steps": f"{int(inspection.lengths.sum()):,} at {inspection.control_rate_hz:g} per second:"
-        f" {_lasting(inspection.hours)}",
+        "steps": f"{int(inspection.lengths.sum()):,} at {inspection.control_rate_hz:g} per second: {lasting}",
         "length": f"{shortest} / {low} / {median} / {high} / {longest} steps (least, 10 %, median, 90 %, most)",
         "cameras": f"{', '.join(inspection.cameras)}; used: {', '.join(config.cameras)}",
         "success": "not known" if success is None else f"{success:.1%} of {known:,} episodes of which it is known",
         "left out": removed or "nothing",
         "splits": f"{splits}; clips of {config.frames} frames at stride {config.model_stride}",
-        "duplicates": str(inspection.duplicates) + _copies_are_listed(inspection),
+        "duplicates": str(inspection.duplicates)
+        + ("; inspect.json lists the copies" if inspection.duplicates.copies else ""),
         "sample": f"{len(inspection.sample):,} episodes, for what follows",
         **(_pose_rows(inspection) if inspection.has_poses else _vector_rows(inspection)),
     }
     return [f"{name:<16}{text}" for name, text in rows.items()]
-
-
-def _copies_are_listed(inspection: Inspection) -> str:
-    return "; inspect.json lists the copies" if inspection.duplicates.copies else ""
 
 
 def _pose_rows(inspection: Inspection) -> dict[str, str]:
@@ -83,39 +83,26 @@ def _vector_rows(inspection: Inspection) -> dict[str, str]:
     return {"states": f"{widths.state} numbers: {ranges}", "actions": f"{widths.action} numbers, {config.actions}{how}"}
 
 
-def _lasting(hours: float) -> str:
-    return f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
-
-
 def motion_table(inspection: Inspection) -> Table:
     """Return the percentiles of the motion, or of the change of vectors, per model step at several strides."""
-    if not inspection.has_poses:
-        return _change_table(inspection)
-    table = MetricsTable("Motion per model step: 10 / 50 / 90 / 99 %")
-    for name in ("stride", "seconds", "moves by (cm)", "turns by (degrees)"):
-        table.add_column(name, justify="right")
-    for one in inspection.motions:
-        metrics = (one.percentiles("moved_cm"), one.percentiles("turned_deg"))
+    rows: list[tuple[Any, ...]]
+    if inspection.has_poses:
+        what, columns = "Motion", ["moves by (cm)", "turns by (degrees)"]
+        rows = [(one, one.percentiles("moved_cm"), one.percentiles("turned_deg")) for one in inspection.motions]
+    else:
+        what, columns = "Change", ["the number that changes most (% of its range)"]
+        rows = [(one, one.percentiles(PERCENTILES)) for one in inspection.changes]
+    table = MetricsTable(f"{what} per model step: 10 / 50 / 90 / 99 %", ["stride", "seconds", *columns], labelled=False)
+    for one, *metrics in rows:
         cells = (" / ".join(f"{value:.1f}" for value in values) or "no step fits" for values in metrics)
         table.add_row(str(one.stride), f"{one.seconds:.2f}", *cells)
     return table
 
 
-def _change_table(inspection: Inspection) -> Table:
-    table = MetricsTable("Change per model step: 10 / 50 / 90 / 99 %")
-    for name in ("stride", "seconds", "the number that changes most (% of its range)"):
-        table.add_column(name, justify="right")
-    for one in inspection.changes:
-        cell = " / ".join(f"{value:.1f}" for value in one.percentiles(PERCENTILES)) or "no step fits"
-        table.add_row(str(one.stride), f"{one.seconds:.2f}", cell)
-    return table
-
-
 def probe_table(probe: VariantProbe) -> Table:
     """Return the table of `data check --model`."""
-    table = MetricsTable("One-step error / persistence of the data, read otherwise")
-    for name in ("variant", "error / persistence", "difference"):
-        table.add_column(name, justify="left" if name == "variant" else "right")
+    columns = ["variant", "error / persistence", "difference"]
+    table = MetricsTable("One-step error / persistence of the data, read otherwise", columns)
     for row in rows_of(probe):
         table.add_row(*row)
     return table
@@ -125,10 +112,10 @@ def calibration_table(calibration: Calibration) -> Table:
     """Return the table of `data calibrate`."""
     table = MetricsTable(
         f"One-step error / persistence on {calibration.split} episodes, {calibration.frames} frames a clip"
-        " (95 % interval over episodes)"
+        " (95 % interval over episodes)",
+        ["stride", "seconds", "error / persistence", "error", "persistence", "moves by", "clips (episodes)"],
+        labelled=False,
     )
-    for name in ("stride", "seconds", "error / persistence", "error", "persistence", "moves by", "clips (episodes)"):
-        table.add_column(name, justify="right")
     for one in calibration.results:
         mark = " <" if one is calibration.best else ""
         moved = "" if one.moved_cm is None else f"{one.moved_cm:.1f} cm"
@@ -136,8 +123,6 @@ def calibration_table(calibration: Calibration) -> Table:
             f"{one.stride}{mark}", f"{one.seconds_per_step:.2f}", str(one.ratio), f"{one.error:.4f}",
             f"{one.persistence:.4f}", moved, f"{one.clips} ({one.episodes})",
         )  # fmt: skip
-    if calibration.impossible:
-        table.caption = "\n".join(
-            f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()
-        )
+    reasons = [f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()]
+    table.caption = "\n".join(reasons) or None
     return table

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import Literal
-
 from rich.table import Table
 
-from vjepa2_ac.console.progress import MetricsTable
-from vjepa2_ac.evaluation.action_score.metrics import AXES, PlanMetrics, metrics_of, signed_along, ways_of
+from vjepa2_ac.console.progress import MetricsTable, with_interval
+from vjepa2_ac.evaluation.action_score.metrics import AXES, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
 from vjepa2_ac.evaluation.intervals import Estimate
@@ -33,52 +29,42 @@ def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 def comparison_table(comparison: Comparison) -> Table:
     """Return the table of `compare`, a row per run."""
-    table = MetricsTable(comparison.title)
-    table.add_column("run")
-    for column in comparison.columns:
-        table.add_column(column, justify="right")
+    table = MetricsTable(comparison.title, ["run", *comparison.columns])
+    forms = [".1%" if column.startswith("gain") else ".3f" for column in comparison.columns]
     for name, cells in comparison.rows.items():
-        shown = zip(comparison.columns, cells, strict=True)
-        table.add_row(name, *(_share(cell) if title.startswith("gain") else str(cell) for title, cell in shown))
+        shown = zip(cells, forms, strict=True)
+        table.add_row(name, *(cell if isinstance(cell, str) else with_interval(cell, form) for cell, form in shown))
     return table
-
-
-def _share(cell: Estimate | str) -> str:
-    """Return a gain in percent."""
-    if isinstance(cell, str) or not cell.has_interval:
-        return cell if isinstance(cell, str) else f"{cell.value:.1%}"
-    return f"{cell.value:.1%} [{cell.low:.1%}, {cell.high:.1%}]"
 
 
 def _errors(evaluation: Evaluation) -> Table:
     sure = "95 % interval over episodes" if evaluation.clips.episodes > 1 else "one episode: no interval"
-    table = _table(f"Latent error / persistence on held-out episodes ({sure})", "open loop, L1")
-    table.add_column("persistence", justify="right")
-    for name in evaluation.models:
-        table.add_column(name, justify="right")
+    title = f"Latent error / persistence on held-out episodes ({sure})"
+    table = MetricsTable(title, ["open loop, L1", "persistence", *evaluation.models])
     seconds, last = evaluation.about.seconds_per_step, evaluation.horizon
     models = [model.errors for model in evaluation.models.values()]
     curves = [over_persistence(errors, "rollout") for errors in models]
+
+    def row(label: str, ratios: list[Estimate]) -> None:
+        table.add_row(label, "1.000", *map(str, ratios))
+
     for h in range(1, last + 1):
         if h == last or h % -(-last // _MOST_HORIZONS) == 0 or h == 1:
-            _row(table, f"{h * seconds:.2f} s ahead", [curve[h - 1] for curve in curves])
+            row(f"{h * seconds:.2f} s ahead", [curve[h - 1] for curve in curves])
     for metric in evaluation.metrics[1:]:
         ratios = [over_persistence(errors, "rollout", metric)[-1] for errors in models]
-        _row(table, f"{last * seconds:.2f} s, {metric.heading}", ratios)
+        row(f"{last * seconds:.2f} s, {metric.heading}", ratios)
     table.add_section()
     for actions in ACTIONS:
-        _row(table, f"one step, {actions} actions", [one_step_over_persistence(errors, actions) for errors in models])
+        row(f"one step, {actions} actions", [one_step_over_persistence(errors, actions) for errors in models])
     table.add_section()
     for part in evaluation.strata:
-        _row(table, f"one step, {part.name}", [stratum_over_persistence(errors, part) for errors in models])
+        row(f"one step, {part.name}", [stratum_over_persistence(errors, part) for errors in models])
     return table
 
 
 def _use_of_actions(evaluation: Evaluation) -> Table:
-    table = _table("Use of the actions: one step from one frame", "")
-    table.add_column("ignoring them", justify="right")
-    for name in evaluation.models:
-        table.add_column(name, justify="right")
+    table = MetricsTable("Use of the actions: one step from one frame", ["", "ignoring them", *evaluation.models])
     sensitivities = [model.sensitivity for model in evaluation.models.values()]
     if all(sensitivities):
         _sensitivity_rows(table, [one for one in sensitivities if one is not None])
@@ -114,54 +100,32 @@ def _landscape_rows(table: Table, models: list[Landscapes]) -> None:
 
 
 def _plans(evaluation: Evaluation, study: PlanningStudy) -> Table:
-    table = _table(f"Plans beside demonstrations, from {_clips(len(study))} (95 % interval over episodes)", "")
-    found = {"doing nothing": study.zero, "random": study.random, "within limits": study.within_limits}
-    ways = {**found, **ways_of(evaluation)}
-    for name in ways:
-        table.add_column(name, justify="right")
+    model_free = {"doing nothing": study.zero, "random": study.random, "within limits": study.within_limits}
+    ways = model_free | ways_of(evaluation)
+    title = f"Plans beside demonstrations, from {_clips(len(study))} (95 % interval over episodes)"
+    table = MetricsTable(title, ["", *ways])
     metrics = [metrics_of(study, plans) for plans in ways.values()]
 
-    def row(label: str, of: Callable[[PlanMetrics], Estimate], digits: int = 1) -> None:
-        cells = [_short(of(one), digits, interval=name not in found) for name, one in zip(ways, metrics, strict=True)]
+    def row(label: str, estimates: list[Estimate], form: str = ".1f") -> None:
+        named = zip(ways, estimates, strict=True)
+        cells = (f"{one.value:{form}}" if name in model_free else with_interval(one, form) for name, one in named)
         table.add_row(label, *cells)
 
-    row(f"Action Score (best {BEST_SCORE:.0f})", lambda one: one.score)
-    row(f"end of {STEPS} steps off by, cm", lambda one: one.missed_cm)
+    row(f"Action Score (best {BEST_SCORE:.0f})", [one.score for one in metrics])
+    row(f"end of {STEPS} steps off by, cm", [one.missed_cm for one in metrics])
     table.add_section()
-    row("one step off by, cm", lambda one: one.step_cm)
+    row("one step off by, cm", [one.step_cm for one in metrics])
     for axis, name in enumerate(AXES):
-        row(f"  along {name}", partial(_on, "axes_cm", axis))
-    row("  angle, degrees", lambda one: one.angle_degrees, 0)
+        row(f"  along {name}", [one.axes_cm[axis] for one in metrics])
+    row("  angle, degrees", [one.angle_degrees for one in metrics], ".0f")
     for axis, name in enumerate(AXES):
-        count = int(signed_along(study, axis).sum())
-        if count:
-            row(f"  right sign of {name} ({_clips(count)})", partial(_on, "signs", axis), 2)
-    row("  gripper off by", lambda one: one.gripper, 2)
+        if count := int(signed_along(study, axis).sum()):
+            row(f"  right sign of {name} ({_clips(count)})", [one.signs[axis] for one in metrics], ".2f")
+    row("  gripper off by", [one.gripper for one in metrics], ".2f")
     table.add_section()
-    seconds = [plans.seconds / len(study) if plans.seconds else None for plans in ways.values()]
-    table.add_row("seconds a clip", *("" if one is None else f"{one:.1f}" for one in seconds))
+    table.add_row("seconds a clip", *(f"{one.seconds / len(study):.1f}" * bool(one.seconds) for one in ways.values()))
     return table
-
-
-def _on(name: Literal["axes_cm", "signs"], axis: int, metrics: PlanMetrics) -> Estimate:
-    estimates = {"axes_cm": metrics.axes_cm, "signs": metrics.signs}
-    return estimates[name][axis]
-
-
-def _short(one: Estimate, digits: int, *, interval: bool) -> str:
-    value = f"{one.value:.{digits}f}"
-    return f"{value} [{one.low:.{digits}f}, {one.high:.{digits}f}]" if interval and one.has_interval else value
 
 
 def _clips(number: int) -> str:
     return f"{number} clip{'s' * (number != 1)}"
-
-
-def _table(title: str, first: str) -> Table:
-    table = MetricsTable(title)
-    table.add_column(first)
-    return table
-
-
-def _row(table: Table, label: str, ratios: list[Estimate]) -> None:
-    table.add_row(label, "1.000", *(str(one) for one in ratios))

@@ -12,7 +12,6 @@ from vjepa2_ac.spaces import POSE
 
 def plan_table(answer: PlanResult) -> Table:
     """Return a row for each model step: its action, and the state after it."""
-    table = MetricsTable(f"Plan: {answer.decision.why}")
     space = answer.state_space
     rows = list(zip(answer.actions, answer.states[1:], strict=True))
     if not space.is_pose:
@@ -21,8 +20,7 @@ def plan_table(answer: PlanResult) -> Table:
         turns = ["turn (degrees)"] * bool(answer.actions[:, POSE.rotation].any())
         names = ["dx (cm)", "dy (cm)", "dz (cm)", *turns, "gripper", "then x, y, z (m)", "gripper"]
         cells = _of_poses
-    for name in ["step", *names]:
-        table.add_column(name, justify="right")
+    table = MetricsTable(f"Plan: {answer.decision.why}", ["step", *names], labelled=False)
     for step, (action, after) in enumerate(rows, start=1):
         for row in cells(answer, action, after):
             table.add_row(str(step), *row)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import timedelta
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions
@@ -14,6 +14,9 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from vjepa2_ac.errors import printable
+
+if TYPE_CHECKING:
+    from vjepa2_ac.evaluation.intervals import Estimate
 
 _LINE_EVERY_S = 10.0
 _WIDE = 120  # columns that leave room for a long bar
@@ -39,10 +42,17 @@ class MetricsTable(Table):
     """A table that does not cut numbers and words: if the terminal is narrow, cells are wrapped at their spaces.
 
     A cell may not squeeze the others, however long it is.
+
+    Args:
+        title: Above the table.
+        columns: Their names.
+        labelled: Whether the first column has labels, on the left; numbers are on the right.
     """
 
-    def __init__(self, title: str) -> None:
+    def __init__(self, title: str, columns: Sequence[str], *, labelled: bool = True) -> None:
         super().__init__(title=title, title_justify="left", caption_justify="left")
+        for place, name in enumerate(columns):
+            self.add_column(name, justify="left" if labelled and place == 0 else "right")
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Any]:
         """Yield what is shown."""
@@ -60,6 +70,12 @@ class MetricsTable(Table):
         while sum(widths) > room and (shrinking := [n for n, width in enumerate(widths) if width > least[n]]):
             widths[max(shrinking, key=lambda n: widths[n])] -= 1
         return widths
+
+
+def with_interval(estimate: Estimate, form: str = ".3f") -> str:
+    """Return an estimate in a number format, with its interval if it has one."""
+    value, low, high = (f"{number:{form}}" for number in (estimate.value, estimate.low, estimate.high))
+    return f"{value} [{low}, {high}]" if estimate.has_interval else value
 
 
 class _Words(TextColumn):

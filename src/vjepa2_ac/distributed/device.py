@@ -22,12 +22,14 @@ def is_on_cpu(training: TrainingConfig) -> bool:
     """
     has_cuda = torch.cuda.is_available()
     if training.device == "cuda" and not has_cuda:
-        raise InputError(
-            where="training.device",
-            found="cuda, but this PyTorch sees no CUDA device",
-            fix="Set training.device=cpu, or install a CUDA build of PyTorch and a driver",
-        )
+        raise no_cuda(where="training.device", asked="cuda", instead="Set training.device=cpu")
     return training.device == "cpu" or not has_cuda
+
+
+def no_cuda(*, where: str, asked: str, instead: str) -> InputError:
+    """Return the error of a CUDA device where there is none."""
+    fix = f"{instead}, or install a CUDA build of PyTorch and a driver"
+    return InputError(where=where, found=f"{asked}, but this PyTorch sees no CUDA device", fix=fix)
 
 
 def computing_device(training: TrainingConfig) -> torch.device:
@@ -39,16 +41,12 @@ def computing_device(training: TrainingConfig) -> torch.device:
     """
     on_cpu = is_on_cpu(training)
     if training.precision == "fp16" and on_cpu:
-        raise InputError(
-            where="training.precision",
-            found="fp16 on a CPU",
-            needed="a CUDA device: only there are losses scaled so that small gradients do not vanish",
-            fix="Set training.precision to bf16 or fp32",
-        )
+        needed = "a CUDA device: only there are losses scaled so that small gradients do not vanish"
+        fix = "Set training.precision to bf16 or fp32"
+        raise InputError(where="training.precision", found="fp16 on a CPU", needed=needed, fix=fix)
     if training.cuda_graph and on_cpu:
-        raise InputError(
-            where="training.cuda_graph", found="true, on a CPU", needed="a CUDA device", fix="Set it to false"
-        )
+        where, fix = "training.cuda_graph", "Set it to false"
+        raise InputError(where=where, found="true, on a CPU", needed="a CUDA device", fix=fix)
     device = torch.device("cpu") if on_cpu else torch.device("cuda", cuda_index())
     if training.precision == "bf16":  # fp32 is for float32 weights only, and fp16 casts any weights
         _require_bf16(device, where="training.precision", found="bf16", fix="Set training.precision=fp16")
@@ -87,9 +85,6 @@ def _require_bf16(device: torch.device, *, where: str, found: str, fix: str) -> 
     if device.type != "cuda" or has_bf16():
         return
     major, minor = torch.cuda.get_device_capability(cuda_index())
-    raise InputError(
-        where=where,
-        found=f"{found}, on {torch.cuda.get_device_name(cuda_index())} of compute capability {major}.{minor}",
-        needed="8.0 or more (Ampere or later): earlier GPUs only emulate bfloat16",
-        fix=fix,
-    )
+    found += f", on {torch.cuda.get_device_name(cuda_index())} of compute capability {major}.{minor}"
+    needed = "8.0 or more (Ampere or later): earlier GPUs only emulate bfloat16"
+    raise InputError(where=where, found=found, needed=needed, fix=fix)

@@ -21,10 +21,10 @@ _OTHER_WAYS = {
     "ACCELERATE_USE_PARALLELISM_CONFIG": "a parallelism config",
 }
 _OPTIONS = {  # that would have no effect, and have no recognisable default
-    "FSDP_OFFLOAD_PARAMS": ("--fsdp_offload_params true", "start without it"),
+    "FSDP_OFFLOAD_PARAMS": ("--fsdp_offload_params true", "Start without it"),
     "FSDP_ACTIVATION_CHECKPOINTING": (
         "--fsdp_activation_checkpointing true",
-        "start without it, and set training.gradient_checkpointing=true",
+        "Start without it, and set training.gradient_checkpointing=true",
     ),
 }
 
@@ -63,7 +63,7 @@ def check_launch(config: Config, environment: Mapping[str, str] = os.environ) ->
     _check_run(config)
     for name, (option, way_out) in _OPTIONS.items():
         if _is_set(environment, name):
-            raise _refusal(option, "FSDP2 without it", way_out[0].upper() + way_out[1:])
+            raise _refusal(option, "FSDP2 without it", way_out)
 
 
 def shares_weights(environment: Mapping[str, str] = os.environ) -> bool:
@@ -73,26 +73,18 @@ def shares_weights(environment: Mapping[str, str] = os.environ) -> bool:
 
 def _check_run(config: Config) -> None:
     """Refuse runs whose weights FSDP2 cannot shard."""
-    if config.adapter.kind == "lora":
-        raise _refusal(
-            "FSDP with adapter.kind lora",
-            "adapter.kind none: an adapter needs no shards",
-            "Start without --use_fsdp",
-        )
-    if config.training.optimizer == "adamw_8bit":
-        raise _refusal("FSDP with training.optimizer adamw_8bit", "adamw", "Set training.optimizer=adamw")
-    if config.training.compile != "off":
-        raise _refusal(
-            "FSDP with training.compile blocks", "off: together they are untried", "Set training.compile=off"
-        )
-    if config.training.cuda_graph:
-        raise _refusal("FSDP with training.cuda_graph", "false: together they are untried", "Set it to false")
-    if config.data.broken_episodes == "skip":
-        raise _refusal(
-            "FSDP with data.broken_episodes skip",
-            "clips for every process: one without would leave the others waiting",
-            "Set data.broken_episodes=error, or start without --use_fsdp",
-        )
+    training, untried, without = config.training, "together they are untried", "Start without --use_fsdp"
+    clips = "clips for every process: one without would leave the others waiting"
+    whole = "Set data.broken_episodes=error, or start without --use_fsdp"
+    for knob, is_set, needed, fix in (
+        ("adapter.kind lora", config.adapter.kind == "lora", "adapter.kind none: an adapter needs no shards", without),
+        ("training.optimizer adamw_8bit", training.optimizer == "adamw_8bit", "adamw", "Set training.optimizer=adamw"),
+        ("training.compile blocks", training.compile != "off", f"off: {untried}", "Set training.compile=off"),
+        ("training.cuda_graph", training.cuda_graph, f"false: {untried}", "Set it to false"),
+        ("data.broken_episodes skip", config.data.broken_episodes == "skip", clips, whole),
+    ):
+        if is_set:
+            raise _refusal(f"FSDP with {knob}", needed, fix)
 
 
 def _is_set(environment: Mapping[str, str], name: str) -> bool:

@@ -15,12 +15,13 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 HANG_UP = signal.SIGHUP
+SAME_WITHIN_S = 0.5  # another signal is the same request: `timeout` and launchers signal a process and its group
 EXIT_STATUS = 75  # sysexits.h, EX_TEMPFAIL: the same command resumes
 
 
@@ -39,16 +40,10 @@ class StoppedError(Exception):
 
 
 class StopRequest:
-    """Records whether a signal has requested a stop, and which.
+    """Records whether a signal has requested a stop, and which."""
 
-    Args:
-        same_within_s: Another signal within this time is the same request: `timeout` and some launchers signal both the
-            process and its group, so the process gets two.
-    """
-
-    def __init__(self, same_within_s: float) -> None:
+    def __init__(self) -> None:
         self.reason: str | None = None
-        self._same_within_s = same_within_s
         self._came_at = 0.0
 
     @property
@@ -60,26 +55,37 @@ class StopRequest:
         """Record a first signal; give a second one its default effect."""
         if self.reason is None:
             self.reason, self._came_at = signal.Signals(number).name, time.monotonic()
-        elif number != HANG_UP and time.monotonic() - self._came_at >= self._same_within_s:
-            signal.signal(number, signal.SIG_DFL)
-            os.kill(os.getpid(), number)
+        elif number != HANG_UP and time.monotonic() - self._came_at >= SAME_WITHIN_S:
+            end_by(number)
+
+
+def end_by(number: int) -> None:
+    """Give a signal its default effect, and this process the signal."""
+    signal.signal(number, signal.SIG_DFL)
+    os.kill(os.getpid(), number)
 
 
 @contextlib.contextmanager
-def stop_on_signals(*, same_within_s: float = 0.5) -> Iterator[StopRequest]:
+def stop_on_signals() -> Iterator[StopRequest]:
     """Record signals instead of being killed by them, within the context; afterwards the old handlers are restored.
 
     Nothing changes outside the main thread, where Python handles no signals, and for signals that the process was
     started to ignore (`nohup`, a shell's `&`).
     """
-    request = StopRequest(same_within_s)
-    if threading.current_thread() is not threading.main_thread():
-        yield request
-        return
+    request = StopRequest()
     taken = [number for number in (*SIGNALS, HANG_UP) if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, request.take) for number in taken}
-    try:
+    with handle_signals(taken, request.take):
         yield request
+
+
+@contextlib.contextmanager
+def handle_signals(numbers: Iterable[int], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Handle signals within the context, in the main thread; afterwards the old handlers are restored."""
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+        for number, old in before.items():
+            signal.signal(number, signal.SIG_DFL if old is None else old)

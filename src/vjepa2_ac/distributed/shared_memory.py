@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import platform
-from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+import shutil
 
 from accelerate import Accelerator
 
@@ -19,21 +17,6 @@ from vjepa2_ac.reporter import Reporter
 SHARED_MEMORY = "/dev/shm"  # noqa: S108  # where PyTorch puts them on Linux
 _MOST_CLIPS_READ = 8  # one is needed; the others replace clips that data.broken_episodes skips
 _GIGABYTE, _MEGABYTE = 10**9, 10**6
-
-
-@runtime_checkable
-class FileSystem(Protocol):
-    """The used part of `os.statvfs_result`."""
-
-    @property
-    def f_bavail(self) -> int:
-        """Free blocks."""
-        ...
-
-    @property
-    def f_frsize(self) -> int:
-        """Bytes of a block."""
-        ...
 
 
 def warn_if_shared_memory_is_small(
@@ -55,14 +38,11 @@ def warn_if_shared_memory_is_small(
     clip = batch_of_frames
     if batch_of_frames.latents is None and dataset.config.is_cache:
         clip = next(validation_batches(dataset, "train", clips=_MOST_CLIPS_READ, batch_size=1))
-    text = small_shared_memory(config, clip.nbytes, processes)
-    if text is not None:
+    if text := small_shared_memory(config, clip.nbytes, processes):
         reporter.note(text)
 
 
-def small_shared_memory(
-    config: Config, clip_bytes: int, processes: int = 1, *, statvfs: Callable[[str], FileSystem] | None = None
-) -> str | None:
+def small_shared_memory(config: Config, clip_bytes: int, processes: int = 1) -> str | None:
     """Return a warning if shared memory may not hold the prefetched batches; None if it does.
 
     Validation batches are loaded by workers, too, while those of training wait.
@@ -71,16 +51,14 @@ def small_shared_memory(
         config: The run.
         clip_bytes: Of one clip from the loader.
         processes: Of the run, on this machine.
-        statvfs: Returns the free space of a file system; None: the system's.
     """
     data, validation = config.data, config.validation
     clips = config.training.batch_size + validation.batch_size * (validation.clips >= CLIPS_WORTH_WORKERS)
     needed = processes * data.workers * (data.prefetch + 1) * clips * clip_bytes
     try:
-        found = (statvfs or os.statvfs)(SHARED_MEMORY)
+        free = shutil.disk_usage(SHARED_MEMORY).free
     except OSError:  # other systems have none
         return None
-    free = found.f_bavail * found.f_frsize
     if needed <= free:
         return None
     times = f"{processes} processes x " if processes > 1 else ""

@@ -15,7 +15,7 @@ from vjepa2_ac.data.clips.transforms import pixels_to_input
 from vjepa2_ac.data.sources.latents.cache_key import Encoding
 from vjepa2_ac.data.sources.latents.dtypes import unpack_latents
 from vjepa2_ac.encoding.cache_lookup import require_encoding
-from vjepa2_ac.episode import Batch, LatentBatch, StoredLatents, Widths
+from vjepa2_ac.episode import Batch, LatentBatch, Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -37,13 +37,13 @@ def encode_batch(world_model: WorldModel, batch: Batch, *, device: torch.device,
     Raises:
         InputError: The model needs camera poses and a clip has none; or cached latents are of another width.
     """
-    batch = _arrived(batch)
-    extrinsics = extrinsics_for(world_model, batch)
+    arrived = batch.on_device() if batch.on_device else None  # None, too, if it was used before
+    batch = (arrived or batch).mapped(lambda tensor: tensor.to(device, non_blocking=True))
     return LatentBatch(
-        latents=_latents_of(world_model, batch, device, chunk),
-        states=batch.states.to(device, non_blocking=True),
-        actions=batch.actions.to(device, non_blocking=True),
-        extrinsics=None if extrinsics is None else extrinsics.to(device, non_blocking=True),
+        latents=_latents_of(world_model, batch, chunk),
+        states=batch.states,
+        actions=batch.actions,
+        extrinsics=extrinsics_for(world_model, batch),
         episode_ids=batch.episode_ids,
         starts=batch.starts,
     )
@@ -75,21 +75,13 @@ def require_same_encoder(world_model: WorldModel, dataset: Dataset, config: Conf
         require_encoding(dataset, encoding_of(world_model, config))
 
 
-def _arrived(batch: Batch) -> Batch:
-    """Return the copy of a batch on the device; the batch itself if there is none, or it was used before."""
-    there = None if batch.on_device is None else batch.on_device()
-    return batch if there is None else there
-
-
-def _latents_of(
-    world_model: WorldModel, batch: Batch, device: torch.device, chunk: int
-) -> Float[Tensor, "batch time tokens dim"]:
+def _latents_of(world_model: WorldModel, batch: Batch, chunk: int) -> Float[Tensor, "batch time tokens dim"]:
     if batch.latents is None:
         if batch.frames is None:
             raise ValueError("a batch with neither frames nor latents")
-        frames = batch.frames.to(device, non_blocking=True)
-        return world_model.encode(pixels_to_input(frames, world_model.image_size, batch.augmentations), chunk=chunk)
-    values, scales = batch.latents.values, batch.latents.scales
+        inputs = pixels_to_input(batch.frames, world_model.image_size, batch.augmentations)
+        return world_model.encode(inputs, chunk=chunk)
+    values = batch.latents.values
     if values.shape[-2:] != (world_model.num_tokens, world_model.latent_dim):
         raise InputError(
             where="data.path",
@@ -97,8 +89,7 @@ def _latents_of(
             needed=f"{world_model.num_tokens} of {world_model.latent_dim}, as this model's encoder makes them",
             fix="Use a cache that was made with this model",
         )
-    moved = None if scales is None else scales.to(device, non_blocking=True)
-    return unpack_latents(StoredLatents(values.to(device, non_blocking=True), moved))
+    return unpack_latents(batch.latents)
 
 
 def require_widths(world_model: WorldModel, widths: Widths, *, where: str) -> None:

@@ -5,13 +5,15 @@ from __future__ import annotations
 import itertools
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from operator import itemgetter
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from vjepa2_ac.data.clips.clip_reader import joined_latents
 from vjepa2_ac.data.clips.streams import Copies
 from vjepa2_ac.data.clips.transforms import pixels_to_input
 from vjepa2_ac.encoding.prefetch import FramesToEncode, Part, Unreadable
@@ -32,6 +34,15 @@ class Encoded:
     small_frames: UInt8[np.ndarray, "frames side side 3"]
 
 
+@dataclass(eq=False)
+class _Unfinished:
+    """The frames of a request that have been decoded, and those of them that have been encoded."""
+
+    recording: Episode
+    small_frames: list[np.ndarray] = field(default_factory=list)
+    latents: list[StoredLatents] = field(default_factory=list)
+
+
 class Chunks:
     """Encodes frames in whole chunks, across episodes.
 
@@ -50,17 +61,14 @@ class Chunks:
         self._inputs: list[Tensor] = []  # prepared, not yet encoded
         self._owners: list[FramesToEncode] = []  # of each of these frames
         self._under_way: deque[tuple[Callable[[], StoredLatents], list[FramesToEncode]]] = deque()
-        self._done: dict[FramesToEncode, list[StoredLatents]] = {}
-        self._small_frames: dict[FramesToEncode, list[np.ndarray]] = {}
-        self._ends: deque[tuple[FramesToEncode, Episode]] = deque()  # all of whose frames have arrived, in order
+        self._unfinished: dict[FramesToEncode, _Unfinished] = {}  # in the order in which they were requested
         self.frames = 0  # encoded so far
 
     def encoded(self, parts: Iterable[Part | Unreadable]) -> Generator[Encoded | Unreadable, None, None]:
         """Yield finished episodes in order; for an unreadable one, its error."""
         for part in parts:
             if isinstance(part, Unreadable):
-                self._done.pop(part.wanted, None)
-                self._small_frames.pop(part.wanted, None)
+                self._unfinished.pop(part.wanted, None)
                 yield part
                 continue
             self._add(part)
@@ -76,10 +84,7 @@ class Chunks:
         arrived = self._copies.to_device.start(lambda copy: copy(frames))()
         self._inputs.append(pixels_to_input(arrived[None], self._image_size)[0])
         self._owners += [part.wanted] * len(frames)
-        self._done.setdefault(part.wanted, [])
-        self._small_frames.setdefault(part.wanted, []).append(part.small_frames)
-        if part.is_last:
-            self._ends.append((part.wanted, part.recording))
+        self._unfinished.setdefault(part.wanted, _Unfinished(part.recording)).small_frames.append(part.small_frames)
 
     def _start(self) -> None:
         """Encode one chunk, and start copying its latents."""
@@ -97,31 +102,23 @@ class Chunks:
         while len(self._under_way) > under_way:
             fetched, owners = self._under_way.popleft()
             self._distribute(fetched().mapped(_unpinned), owners)
-        while self._ends and self._is_whole(self._ends[0][0]):
-            wanted, recording = self._ends.popleft()
-            small_frames = np.concatenate(self._small_frames.pop(wanted))
-            yield Encoded(wanted, recording, _joined(self._done.pop(wanted)), small_frames)
+        for wanted, one in list(self._unfinished.items()):
+            if sum(len(piece.values) for piece in one.latents) < len(wanted.steps):
+                return
+            del self._unfinished[wanted]
+            latents = joined_latents(one.latents, torch.cat)
+            yield Encoded(wanted, one.recording, latents, np.concatenate(one.small_frames))
 
     def _distribute(self, latents: StoredLatents, owners: list[FramesToEncode]) -> None:
         """Distribute the frames of a chunk to their owners."""
-        values, scales = latents.values, latents.scales
         start = 0
         for owner, frames in itertools.groupby(owners):
             end = start + len(list(frames))
-            if owner in self._done:  # else it was found to be unreadable
-                own_scales = None if scales is None else scales[start:end]
-                self._done[owner].append(StoredLatents(values[start:end], own_scales))
+            if owner in self._unfinished:  # else it was found to be unreadable
+                self._unfinished[owner].latents.append(latents.mapped(itemgetter(slice(start, end))))
             start = end
-
-    def _is_whole(self, wanted: FramesToEncode) -> bool:
-        return sum(len(piece.values) for piece in self._done[wanted]) == len(wanted.steps)
 
 
 def _unpinned(tensor: Tensor) -> Tensor:
     """Return a tensor in pageable memory, as it may be held for a whole episode: pinned memory is never given back."""
     return tensor.clone() if tensor.is_pinned() else tensor
-
-
-def _joined(pieces: list[StoredLatents]) -> StoredLatents:
-    scales = [piece.scales for piece in pieces if piece.scales is not None]
-    return StoredLatents(torch.cat([piece.values for piece in pieces]), torch.cat(scales) if scales else None)

@@ -6,19 +6,16 @@ import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Int64
 
 from vjepa2_ac import storage
+from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.filters.idle_ranges import find_ranges
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey, Encoding
 from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode, EpisodeLayout, write_episode_file
-from vjepa2_ac.data.sources.latents.manifest import EPISODES, KEPT, MANIFEST, Manifest, path_of, size_column
-
-if TYPE_CHECKING:
-    from vjepa2_ac.data.clips.dataset import Dataset
+from vjepa2_ac.data.sources.latents.manifest import EPISODES, KEPT, MANIFEST, Manifest, path_of, size_column, size_of
 
 
 @dataclass(frozen=True)
@@ -49,16 +46,13 @@ class CacheWriter:
         layout = EpisodeLayout(self.key.digest, self.key.kind, self.encoding.tokens, self.encoding.dim)
         return write_episode_file(path_of(self.folder, number, encoded.camera), layout, encoded)
 
-    def finish(
-        self, dataset: Dataset, *, broken: Mapping[str, str], frames: int, about: Mapping[str, Any] | None = None
-    ) -> Manifest:
+    def finish(self, dataset: Dataset, *, broken: Mapping[str, str], frames: int) -> Manifest:
         """Finalize the cache, when every episode with clips is written: one process does this, once.
 
         Args:
             dataset: The encoded data set, opened without a cache.
             broken: Identities of the episodes that could not be read (`data.broken_episodes` is skip), and why.
             frames: Number of encoded frames, of all cameras; for information.
-            about: Further information, as JSON.
 
         Raises:
             InputError: The folder cannot be written.
@@ -82,7 +76,7 @@ class CacheWriter:
             bytes=sum(int(column.sum()) for column in sizes.values()),
             broken=dict(broken),
             checksums={name: zlib.crc32(data) for name, data in files.items()},
-            about=dict(about or {}),
+            about={},
         )
         with storage.user_can_write(self.folder):
             for name, data in files.items():
@@ -100,7 +94,8 @@ class CacheWriter:
         unread = np.array([place for place in found if place is not None], np.int64)
         sizes = {}
         for place, camera in enumerate(dataset.config.cameras):
-            column = self._sizes(len(dataset.table), camera)
+            paths = (path_of(self.folder, number, camera) for number in range(len(dataset.table)))
+            column = np.array([size_of(path) or 0 for path in paths], np.int64)
             column[unread] = 0
             needed = dataset.starts.episodes
             missing = np.setdiff1d(needed[column[needed] == 0], unread)
@@ -108,7 +103,3 @@ class CacheWriter:
                 raise ValueError(f"{len(missing)} episodes are not written: {missing[:10].tolist()}")
             sizes[size_column(place)] = column
         return sizes
-
-    def _sizes(self, episodes: int, camera: str) -> Int64[np.ndarray, " episodes"]:
-        paths = [path_of(self.folder, number, camera) for number in range(episodes)]
-        return np.array([path.stat().st_size if path.is_file() else 0 for path in paths], np.int64)

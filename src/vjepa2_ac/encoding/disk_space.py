@@ -6,6 +6,7 @@ import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
+from vjepa2_ac.config import DataConfig
 from vjepa2_ac.errors import InputError
 
 GIGABYTE = 10**9
@@ -23,24 +24,16 @@ class CacheSize:
     hours: float  # of robot data that clips come from
 
     @property
-    def bytes(self) -> int:
-        """Of the whole cache."""
-        return self.frames * self.bytes_per_frame
-
-    @property
     def bytes_left(self) -> int:
         """Of the part that is not written yet."""
         return self.frames_left * self.bytes_per_frame
 
-    @property
-    def gigabytes_per_hour(self) -> float:
-        """Of robot data."""
-        return self.bytes / GIGABYTE / self.hours if self.hours else 0.0
-
     def __str__(self) -> str:
+        gigabytes = self.frames * self.bytes_per_frame / GIGABYTE
+        per_hour = gigabytes / self.hours if self.hours else 0.0
         return (
-            f"{self.frames:,} frames, {self.bytes / GIGABYTE:.3g} GB"
-            f" ({self.gigabytes_per_hour:.3g} GB per hour of robot data, of which there are {self.hours:.3g})"
+            f"{self.frames:,} frames, {gigabytes:.3g} GB"
+            f" ({per_hour:.3g} GB per hour of robot data, of which there are {self.hours:.3g})"
         )
 
 
@@ -59,13 +52,13 @@ def free_bytes(folder: Path) -> int:
     return shutil.disk_usage(next(there for there in [folder, *folder.parents] if there.exists())).free
 
 
-def require_space(room: CacheSize, folder: Path, *, smaller: tuple[str, ...]) -> None:
+def require_space(room: CacheSize, folder: Path, config: DataConfig) -> None:
     """Refuse to start if the disk has too little space.
 
     Args:
         room: What is to be written.
         folder: The folder to write to.
-        smaller: Knobs that would reduce the size.
+        config: The data, some knobs of which would reduce the size.
 
     Raises:
         InputError: Says how much is free, how much is needed, and what to do.
@@ -73,6 +66,9 @@ def require_space(room: CacheSize, folder: Path, *, smaller: tuple[str, ...]) ->
     free = free_bytes(folder)
     if room.bytes_left <= free:
         return
+    smaller = [] if config.cache_dtype == "int8" else ["data.cache_dtype: int8"]
+    if config.start_every % config.model_stride:
+        smaller.append(f"data.start_every: {config.model_stride}")
     fix = f"Set {', '.join(smaller)}; " if smaller else ""
     raise InputError(
         where=str(folder),

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from datetime import timedelta
 from functools import partial
 from pathlib import Path
 
@@ -17,6 +16,7 @@ import torch
 from vjepa2_ac.config import Config
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import ProcessShare
+from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.data.sources.latents.manifest import Manifest, is_whole, read_manifest
 from vjepa2_ac.distributed.device import autocast, computing_device
 from vjepa2_ac.encoding.batch import encoding_of
@@ -40,12 +40,7 @@ class EncodedSet:
     manifest: Manifest | None  # None: other processes are still at work
 
 
-def encode_config(
-    config: Config,
-    reporter: Reporter = SILENT,
-    *,
-    out: Path | None = None,
-) -> EncodedSet:
+def encode_config(config: Config, reporter: Reporter = SILENT, *, out: Path | None = None) -> EncodedSet:
     """Write the latents of every frame that the clips of a config need, or this process's share of them.
 
     Args:
@@ -70,7 +65,7 @@ def encode_config(
         restart(writer, missing)
     share = ProcessShare(int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1")))
     at_work = encoder_on_device(config, model, device)
-    return EncodedSet(writer.folder, encode_share(config, dataset, writer, at_work, share, reporter))
+    return EncodedSet(writer.folder, encode_share(dataset, writer, at_work, share, reporter))
 
 
 def require_encodable(config: Config) -> None:
@@ -82,13 +77,8 @@ def require_encodable(config: Config) -> None:
     data = config.data
     if data.is_cache:
         raise InputError(where="data.source", found="latents: they are encoded already", needed="a data set of frames")
-    if data.stride == "auto":
-        raise InputError(
-            where="data.stride",
-            found="auto: which frames are needed is not known yet",
-            needed="a number of control steps",
-            fix="`vjepa2-ac data calibrate` finds one; or let the run encode by itself, with data.cache: auto",
-        )
+    fix = "`vjepa2-ac data calibrate CONFIG` finds one; or let the run encode by itself, with data.cache: auto"
+    require_stride(data, to="know which frames are needed", fix=fix)
     if data.augment.is_on:
         raise InputError(
             where="data.augment",
@@ -112,40 +102,20 @@ def encoder_on_device(config: Config, model: WorldModel, device: torch.device) -
 
 
 def encode_share(
-    config: Config,
-    dataset: Dataset,
-    writer: CacheWriter,
-    encoder: EncoderOnDevice,
-    share: ProcessShare,
-    reporter: Reporter = SILENT,
+    dataset: Dataset, writer: CacheWriter, encoder: EncoderOnDevice, share: ProcessShare, reporter: Reporter
 ) -> Manifest | None:
     """Report the work, check the disk space, and encode the share of one process.
 
     Raises:
         InputError: As `encode_config`.
     """
-    work = Workload.of(dataset, writer, share)
+    work, config = Workload.of(dataset, writer, share), dataset.config
     free = free_bytes(writer.folder) / GIGABYTE
-    reporter.note(f"Encoding {config.data.path}: {work.room} as {config.data.cache_dtype}")
+    reporter.note(f"Encoding {config.path}: {work.room} as {config.cache_dtype}")
     reporter.note(f"The latents go into {writer.folder}, with {free:.4g} GB free on its disk")
     if work.left_in_total < work.frames:
         reporter.note(f"{work.frames - work.left_in_total:,} frames are there already; {work.left_in_total:,} are left")
-    require_space(work.room, writer.folder, smaller=size_reducing_knobs(config))
+    require_space(work.room, writer.folder, config)
     claim_folder(writer)
-    return build(
-        work, encoder, threads=max(1, config.data.workers), progress=reporter.task("encoding frames", "frames")
-    )
-
-
-def duration(frames: int, per_second: float) -> str:
-    """Return as text how long encoding takes."""
-    return str(timedelta(seconds=round(frames / per_second)))
-
-
-def size_reducing_knobs(config: Config) -> tuple[str, ...]:
-    """Return the knobs that would reduce the size of a cache."""
-    data = config.data
-    knobs = [] if data.cache_dtype == "int8" else ["data.cache_dtype: int8"]
-    if data.start_every % data.model_stride:
-        knobs.append(f"data.start_every: {data.model_stride}")
-    return tuple(knobs)
+    progress = reporter.task("encoding frames", "frames")
+    return build(work, encoder, threads=max(1, config.workers), progress=progress)

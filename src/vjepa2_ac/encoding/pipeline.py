@@ -7,6 +7,7 @@ The process that finds nothing missing finalizes the cache.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -21,16 +22,14 @@ from vjepa2_ac.data.clips.streams import copies_for
 from vjepa2_ac.data.sources.latents.dtypes import pack_latents
 from vjepa2_ac.data.sources.latents.episode_file import EncodedEpisode
 from vjepa2_ac.data.sources.latents.manifest import Manifest
-from vjepa2_ac.encoding.batching import Chunks, Encode, Encoded
+from vjepa2_ac.encoding.batching import Chunks, Encoded
 from vjepa2_ac.encoding.disk_space import small_frame_side
 from vjepa2_ac.encoding.prefetch import Unreadable, prefetched
 from vjepa2_ac.encoding.workload import Workload, broken_in, forget_broken, note_broken
-from vjepa2_ac.episode import Progress, StoredLatents, no_progress
+from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.model.network.world_model import WorldModel
 
 _WRITES_UNDER_WAY = 2  # files: limits the memory
-
-Autocast = Callable[[], contextlib.AbstractContextManager[object]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +38,7 @@ class EncoderOnDevice:
 
     world_model: WorldModel
     device: torch.device
-    autocast: Autocast
+    autocast: Callable[[], contextlib.AbstractContextManager[object]]
     chunk: int  # frames at once
 
     @torch.no_grad()
@@ -70,8 +69,9 @@ def build(
     folder, dataset = work.writer.folder, work.dataset
     for episode in sorted({one.episode for one in work.left}):
         forget_broken(folder, episode)
-    for frames in _written(work, encoder, threads) if work.left else ():
-        progress(frames, work.frames_left)
+    if work.left:
+        for done in itertools.accumulate(_written(work, encoder, threads), initial=0):
+            progress(done, work.frames_left)
     if work.is_incomplete:
         return None
     broken = broken_in(folder)
@@ -81,51 +81,35 @@ def build(
 
 
 def _written(work: Workload, encoder: EncoderOnDevice, threads: int) -> Iterator[int]:
-    """Write episode after episode; yield the number of finished frames, first 0; those of unreadable ones count."""
-    yield 0
-    side = small_frame_side(encoder.world_model.image_size)
+    """Write episode after episode; yield the number of frames of each one, also of an unreadable one."""
+    image_size, kind = encoder.world_model.image_size, work.writer.key.kind
     chunks = Chunks(
-        _storing(work, encoder),
+        lambda inputs: pack_latents(encoder.latents(inputs), kind),
         chunk=encoder.chunk,
-        image_size=encoder.world_model.image_size,
+        image_size=image_size,
         copies=copies_for(encoder.device),
     )
-    done, under_way = 0, deque[tuple[Future[int], int]]()
-    decoded = prefetched(work.dataset, work.left, threads=threads, side=side)
+    under_way = deque[Future[int]]()
+    decoded = prefetched(work.dataset, work.left, threads=threads, side=small_frame_side(image_size))
     with contextlib.closing(decoded), ThreadPoolExecutor(1, thread_name_prefix="write") as pool:
         for one in chunks.encoded(decoded):
             if isinstance(one, Unreadable):
                 _leave_out(work, one)
-                done += len(one.wanted.steps)
-                yield done
+                yield len(one.wanted.steps)
             else:
-                under_way.append((pool.submit(_write, work, one), len(one.wanted.steps)))
-            while len(under_way) > _WRITES_UNDER_WAY or (under_way and under_way[0][0].done()):
-                done += _waited_for(under_way)
-                yield done
-        while under_way:
-            done += _waited_for(under_way)
-            yield done
-
-
-def _waited_for(under_way: deque[tuple[Future[int], int]]) -> int:
-    """Wait for the first file, and return its number of frames."""
-    written, frames = under_way.popleft()
-    written.result()
-    return frames
-
-
-def _storing(work: Workload, encoder: EncoderOnDevice) -> Encode:
-    def encode(inputs: Tensor) -> StoredLatents:
-        return pack_latents(encoder.latents(inputs), work.writer.key.kind)
-
-    return encode
+                under_way.append(pool.submit(_write, work, one))
+            while len(under_way) > _WRITES_UNDER_WAY or (under_way and under_way[0].done()):
+                yield under_way.popleft().result()
+        for written in under_way:
+            yield written.result()
 
 
 def _write(work: Workload, one: Encoded) -> int:
-    wanted = one.wanted
-    encoded = EncodedEpisode(one.recording, wanted.camera, wanted.steps.tolist(), one.latents, one.small_frames)
-    return work.writer.write_episode(wanted.episode, encoded)
+    """Write the file of an episode, and return its number of frames."""
+    wanted, steps = one.wanted, one.wanted.steps.tolist()
+    encoded = EncodedEpisode(one.recording, wanted.camera, steps, one.latents, one.small_frames)
+    work.writer.write_episode(wanted.episode, encoded)
+    return len(steps)
 
 
 def _leave_out(work: Workload, one: Unreadable) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import threading
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import torch
@@ -33,13 +33,12 @@ class FramesToEncode:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Some neighbouring requested frames, cropped; the last part ends the request."""
+    """Some neighbouring requested frames, cropped."""
 
     wanted: FramesToEncode
     recording: Episode
     frames: UInt8[np.ndarray, "frames height width 3"]
     small_frames: UInt8[np.ndarray, "frames side side 3"]  # the same, small, for display
-    is_last: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,16 +64,13 @@ def prefetched(
         UnreachableError: A failure of the connection, not of the episode.
     """
     pool = ThreadPoolExecutor(threads, thread_name_prefix="decode")
-    waiting: deque[Future[Part | Unreadable]] = deque()
-    tasks = _tasks(dataset, wanted, side)
+    parts = _started(pool, dataset, wanted, side)
+    waiting = deque(islice(parts, threads * _PREFETCHED_PARTS))
     failed: FramesToEncode | None = None
     try:
-        while True:
-            while len(waiting) < threads * _PREFETCHED_PARTS and (task := next(tasks, None)) is not None:
-                waiting.append(pool.submit(task))
-            if not waiting:
-                return
+        while waiting:
             done = waiting.popleft().result()
+            waiting.extend(islice(parts, 1))
             if done.wanted is failed:
                 continue  # one error is enough
             failed = done.wanted if isinstance(done, Unreadable) else None
@@ -83,55 +79,33 @@ def prefetched(
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """One part to read."""
-
-    source: _Recording
-    first: int
-
-    def __call__(self) -> Part | Unreadable:
-        wanted, upto = self.source.wanted, self.first + FRAMES_AT_ONCE
-        try:
-            recording = self.source.opened()
-            frames = recording.read_frames(wanted.steps[self.first : upto].tolist())
-            frames = view(frames, self.source.dataset.config.crop)
-            return Part(wanted, recording, frames, _small(frames, self.source.side), upto >= len(wanted.steps))
-        except InputError as error:
-            return Unreadable(wanted, error)
-
-
-def _tasks(dataset: Dataset, wanted: Iterable[FramesToEncode], side: int) -> Iterator[_Task]:
+def _started(
+    pool: ThreadPoolExecutor, dataset: Dataset, wanted: Iterable[FramesToEncode], side: int
+) -> Iterator[Future[Part | Unreadable]]:
+    """Start to read part after part; an episode is opened once, before the first of its parts."""
     for one in wanted:
-        source = _Recording(dataset, one, side)
-        yield from (_Task(source, first) for first in range(0, len(one.steps), FRAMES_AT_ONCE))
+        recording = pool.submit(_opened, dataset, one)
+        for first in range(0, len(one.steps), FRAMES_AT_ONCE):
+            yield pool.submit(_read, dataset, recording, one, first, side)
 
 
-class _Recording:
-    """An episode that is opened once, by the first of its parts."""
+def _opened(dataset: Dataset, wanted: FramesToEncode) -> Episode:
+    recording = dataset.source.read(wanted.episode, wanted.camera, dataset.needed_steps(wanted.episode))
+    require_widths(recording, dataset.widths)
+    return recording
 
-    def __init__(self, dataset: Dataset, wanted: FramesToEncode, side: int) -> None:
-        self.dataset, self.wanted, self.side = dataset, wanted, side
-        self._lock = threading.Lock()
-        self._episode: Episode | InputError | None = None
 
-    def opened(self) -> Episode:
-        """Return the episode; a failure to open it applies to all parts."""
-        with self._lock:
-            if self._episode is None:
-                try:
-                    self._episode = self._open()
-                except InputError as error:
-                    self._episode = error
-        if isinstance(self._episode, InputError):
-            raise self._episode
-        return self._episode
-
-    def _open(self) -> Episode:
-        dataset, episode = self.dataset, self.wanted.episode
-        recording = dataset.source.read(episode, self.wanted.camera, dataset.needed_steps(episode))
-        require_widths(recording, dataset.widths)
-        return recording
+def _read(
+    dataset: Dataset, opened: Future[Episode], wanted: FramesToEncode, first: int, side: int
+) -> Part | Unreadable:
+    """Read one part; a failure to open the episode is one of each part."""
+    try:
+        recording = opened.result()
+        steps = wanted.steps[first : first + FRAMES_AT_ONCE].tolist()
+        frames = view(recording.read_frames(steps), dataset.config.crop)
+        return Part(wanted, recording, frames, _small(frames, side))
+    except InputError as error:
+        return Unreadable(wanted, error)
 
 
 def _small(frames: UInt8[np.ndarray, "frames height width 3"], side: int) -> UInt8[np.ndarray, "frames side side 3"]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from datetime import timedelta
+from pathlib import Path
+
 from accelerate import Accelerator
 
 from vjepa2_ac.config import Config
@@ -13,8 +16,8 @@ from vjepa2_ac.encoding.batch import require_same_encoder
 from vjepa2_ac.encoding.cache_lookup import through_cache
 from vjepa2_ac.encoding.cache_writer import CacheWriter
 from vjepa2_ac.encoding.disk_space import require_space
-from vjepa2_ac.encoding.encode_dataset import duration, encode_share, encoder_on_device, size_reducing_knobs, writer_for
-from vjepa2_ac.encoding.pipeline import frames_per_second
+from vjepa2_ac.encoding.encode_dataset import encode_share, encoder_on_device, writer_for
+from vjepa2_ac.encoding.pipeline import EncoderOnDevice, frames_per_second
 from vjepa2_ac.encoding.repair import MissingFiles, describe, missing_files, restart
 from vjepa2_ac.encoding.workload import Workload
 from vjepa2_ac.errors import InputError
@@ -49,9 +52,8 @@ def with_latents(
         return dataset
     writer = writer_for(config, dataset, model)
     if missing := _missing(config, dataset, accelerator, writer):
-        reporter.note(
-            f"{describe(missing)}. " + ("A run would encode it again." if check_only else "It is encoded again.")
-        )
+        again = "A run would encode it again" if check_only else "It is encoded again"
+        reporter.note(f"{describe(missing)}. {again}.")
         if check_only:
             return dataset
         if accelerator.is_main_process:
@@ -59,10 +61,14 @@ def with_latents(
     if not broadcast_object(accelerator, is_whole(writer.folder)):
         if config.data.cache == "require":
             return through_cache(dataset, writer.encoding)  # which reports what was found instead
+        encoder = encoder_on_device(config, model, accelerator.device)
         if check_only:
-            _report_encoding(config, dataset, model, accelerator, writer, reporter)
+            reporter.note(_forecast(Workload.of(dataset, writer, WHOLE), encoder, accelerator.num_processes))
             return dataset
-        _encode(config, dataset, model, accelerator, writer, reporter)
+        share = ProcessShare(accelerator.process_index, accelerator.num_processes)
+        encode_share(dataset, writer, encoder, share, reporter)
+        accelerator.wait_for_everyone()
+        _require_whole(writer.folder, share)
     reporter.note(f"Latents come from {writer.folder}: the encoder is not needed")
     return through_cache(dataset, writer.encoding)
 
@@ -86,45 +92,24 @@ def _missing(config: Config, dataset: Dataset, accelerator: Accelerator, writer:
     return broadcast_object(accelerator, missing_files(dataset, writer) if looks else [])
 
 
-def _encode(
-    config: Config,
-    dataset: Dataset,
-    model: WorldModel,
-    accelerator: Accelerator,
-    writer: CacheWriter,
-    reporter: Reporter,
-) -> None:
-    """Let all processes encode their share.
-
-    Raises:
-        InputError: They do not see the same folder; or as `encode_share`.
-    """
-    share = ProcessShare(accelerator.process_index, accelerator.num_processes)
-    encoder = encoder_on_device(config, model, accelerator.device)
-    encode_share(config, dataset, writer, encoder, share, reporter)
-    accelerator.wait_for_everyone()
-    if not is_whole(writer.folder):
+def _require_whole(folder: Path, share: ProcessShare) -> None:
+    """Refuse a folder that the processes do not share: its cache is unfinished when all are done."""
+    if not is_whole(folder):
         raise InputError(
-            where=f"data.cache_dir: {writer.folder.parent}",
+            where=f"data.cache_dir: {folder.parent}",
             found=f"a folder in which process {share.rank} does not see what the others of {share.processes} wrote",
             needed="one that all machines of the run share",
             fix="Set data.cache_dir to a shared folder; or run `vjepa2-ac encode` once on every machine",
         )
 
 
-def _report_encoding(
-    config: Config,
-    dataset: Dataset,
-    model: WorldModel,
-    accelerator: Accelerator,
-    writer: CacheWriter,
-    reporter: Reporter,
-) -> None:
-    work = Workload.of(dataset, writer, WHOLE)
-    require_space(work.room, writer.folder, smaller=size_reducing_knobs(config))
-    speed = frames_per_second(encoder_on_device(config, model, accelerator.device)) * accelerator.num_processes
-    reporter.note(
-        f"A run would first encode {work.left_in_total:,} of {work.room} as {config.data.cache_dtype}, into"
-        f" {writer.folder}. At the {speed:.3g} frames/s of one chunk just timed that takes"
-        f" {duration(work.left_in_total, speed)}"
+def _forecast(work: Workload, encoder: EncoderOnDevice, processes: int) -> str:
+    """Return as text what a run would encode first, after a check that there is space for it."""
+    config = work.dataset.config
+    require_space(work.room, work.writer.folder, config)
+    speed = frames_per_second(encoder) * processes
+    return (
+        f"A run would first encode {work.left_in_total:,} of {work.room} as {config.cache_dtype}, into"
+        f" {work.writer.folder}. At the {speed:.3g} frames/s of one chunk just timed that takes"
+        f" {timedelta(seconds=round(work.left_in_total / speed))}"
     )

@@ -11,7 +11,7 @@ import numpy as np
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.clips.dataset import Dataset
-from vjepa2_ac.data.clips.loader import ProcessShare
+from vjepa2_ac.data.clips.loader import WHOLE, ProcessShare
 from vjepa2_ac.data.sources.latents.cache_key import CacheKey
 from vjepa2_ac.data.sources.latents.dtypes import bytes_per_frame
 from vjepa2_ac.data.sources.latents.manifest import is_whole, read_manifest
@@ -66,13 +66,8 @@ class Workload:
     @property
     def is_incomplete(self) -> bool:
         """Whether an episode is currently neither written nor recorded as broken, by any process."""
-        cameras, broken = self.dataset.config.cameras, broken_in(self.writer.folder)
-        return any(
-            not self.writer.has(needed.episode, camera)
-            for needed in needed_frames(self.dataset)
-            if self.dataset.table.identity(needed.episode) not in broken
-            for camera in cameras
-        )
+        left, broken = Workload.of(self.dataset, self.writer, WHOLE).left, broken_in(self.writer.folder)
+        return any(self.dataset.table.identity(one.episode) not in broken for one in left)
 
 
 def claim_folder(writer: CacheWriter) -> None:

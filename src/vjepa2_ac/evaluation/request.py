@@ -8,6 +8,7 @@ from pathlib import Path
 from vjepa2_ac.config import Config, PlanningConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import config_as_dict, config_from
+from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_score.protocol import FRAMES
 from vjepa2_ac.runs.checkpoint_selection import SELECTED
@@ -75,13 +76,7 @@ def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
             needed="a folder for what is found on these data",
             fix="Add --out FOLDER",
         )
-    if config.data.stride == "auto":
-        raise InputError(
-            where="data.stride",
-            found="auto",
-            needed="a number, to evaluate",
-            fix="`vjepa2-ac data calibrate CONFIG` finds one",
-        )
+    require_stride(config.data, to="evaluate")
     return config, asked.out
 
 

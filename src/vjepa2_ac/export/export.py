@@ -8,23 +8,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
-from safetensors import safe_open
+from jinja2 import TemplateError
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.episode import POSE_WIDTHS, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.export.model_card import AdapterFacts, model_card
+from vjepa2_ac.export.model_card import model_card
 from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE
-from vjepa2_ac.model.adapter.adapter_folder import LORA_WEIGHTS
-from vjepa2_ac.model.adapter.lora import trainable_report
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.official import to_official
 from vjepa2_ac.model.finite import require_finite
 from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 from vjepa2_ac.reports.write import PLOT
-from vjepa2_ac.runs.checkpoint import ADAPTER, read_state
+from vjepa2_ac.runs.checkpoint import ADAPTER
 from vjepa2_ac.runs.checkpoint_selection import SELECTED
 from vjepa2_ac.runs.folder import read_run_config
 from vjepa2_ac.runs.loading import TrainedRun, load_run
@@ -132,9 +129,9 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dic
     plot = folder / PLOT if evaluation is not None and (folder / PLOT).is_file() else None
     adapter = run.checkpoint / ADAPTER
     try:
-        card = model_card(run.config, _facts(run, folder, evaluation, plot))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise _damaged(folder, f"metrics that cannot be used ({error!r})") from None
+        card = model_card(run, folder.resolve().name, evaluation, plot.name if plot else None)
+    except (KeyError, TypeError, ValueError, AttributeError, TemplateError) as error:
+        raise _damaged(folder, error) from None
     _merge(run)  # the merged model is not written, but an adapter that makes it not finite is of no use
     with folder_writer(destination, ADAPTER_FILE) as fresh:
         for path in (*sorted(adapter.iterdir()), *([plot] if plot else [])):
@@ -142,27 +139,6 @@ def _write_hub(run: TrainedRun, folder: Path, destination: Path, evaluation: dic
         if evaluation is not None:
             write_atomically(fresh / METRICS_FILE, json.dumps(evaluation, indent=1))
         write_atomically(fresh / CARD, card)
-
-
-def _facts(run: TrainedRun, folder: Path, evaluation: dict[str, Any] | None, plot: Path | None) -> AdapterFacts:
-    adaptation = run.world_model.adaptation
-    if adaptation is None:
-        raise RuntimeError("a run that was loaded has been adapted")
-    with safe_open(run.checkpoint / ADAPTER / LORA_WEIGHTS, framework="pt") as file:
-        shapes = [file.get_slice(name).get_shape() for name in file.keys()]  # noqa: SIM118  # no iterator
-    trained = sum(torch.Size(shape).numel() for shape in shapes)
-    return AdapterFacts(
-        name=folder.resolve().name,
-        steps=read_state(run.checkpoint).step,
-        checkpoint=run.checkpoint.name,
-        chosen=run.chosen,
-        trained=str(trainable_report(run.world_model)._replace(trained=trained)),
-        base_predictor=adaptation.base,
-        base_encoder=adaptation.encoder,
-        evaluation=evaluation,
-        plot=plot.name if plot else None,
-        fresh_heads=None if run.world_model.fresh_heads is None else widths_of_model(run.world_model.sizes),
-    )
 
 
 def _read_evaluation(folder: Path) -> dict[str, Any] | None:
@@ -174,13 +150,13 @@ def _read_evaluation(folder: Path) -> dict[str, Any] | None:
         about = {**metrics["about"], "subject": folder.resolve().name}
         return {**metrics, "about": {**about, "checkpoint_path": Path(about["checkpoint_path"]).name}}
     except (TypeError, KeyError) as error:
-        raise _damaged(folder, f"metrics that cannot be used ({error!r})") from None
+        raise _damaged(folder, error) from None
 
 
-def _damaged(folder: Path, found: str) -> InputError:
+def _damaged(folder: Path, error: Exception) -> InputError:
     return InputError(
         where=str(folder / METRICS_FILE),
-        found=found,
+        found=f"metrics that cannot be used ({error!r})",
         needed="what `vjepa2-ac evaluate` writes",
         fix=f"Write it again with `vjepa2-ac evaluate {folder}`, or delete it",
     )

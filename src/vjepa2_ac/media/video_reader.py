@@ -71,7 +71,7 @@ def read_frames(
         frames = video.decode(sorted(set(targets)), clock)
         if len(sizes := {frame.shape for frame in frames.values()}) > 1:
             found = f"frames of {' and '.join(f'{height}x{width}' for height, width, _ in sorted(sizes))}"
-            raise InputError(where=where, found=found, needed="frames of one size", fix=_FIX)
+            raise _unusable(where, found, "frames of one size")
         return np.stack([frames[target] for target in targets])
 
 
@@ -106,7 +106,7 @@ def _opened(file: str | Path | ByteReader, where: str) -> Iterator[_Video]:
         if isinstance(error, InputError):
             raise
         found = f"cannot be read as a video: {error.strerror}"
-        raise InputError(where=where, found=found, needed="a whole, undamaged MP4", fix=_FIX) from None
+        raise _unusable(where, found, "a whole, undamaged MP4") from None
     if isinstance(source, QuietFile) and source.error is not None:
         raise source.error
 
@@ -122,7 +122,7 @@ def _require_readable(path: str | Path, where: str) -> None:
 def _video_of(container: InputContainer, converter: VideoReformatter, where: str) -> _Video:
     stream = container.streams.best("video")
     if stream is None:
-        raise InputError(where=where, found="no video in the file", needed="an MP4 with frames", fix=_FIX)
+        raise _unusable(where, "no video in the file", "an MP4 with frames")
     if stream.codec_context is None:
         raise InputError(
             where=where,
@@ -172,13 +172,9 @@ class _Video:
         in_header = self.is_indexed and not self.is_reordered()
         times = self.stored_times() if in_header else self.shown_times()
         if max(steps) >= len(times):
-            raise InputError(
-                where=self.where, found=f"{len(times)} frames", needed=f"at least {max(steps) + 1}", fix=_FIX
-            )
+            raise _unusable(self.where, f"{len(times)} frames", f"at least {max(steps) + 1}")
         if len(set(times)) < len(times):
-            raise InputError(
-                where=self.where, found="frames shown at the same time", needed="a time for each", fix=_FIX
-            )
+            raise _unusable(self.where, "frames shown at the same time", "a time for each")
         return [times[step] for step in steps]
 
     def targets_by(self, clock: Clock, steps: Sequence[int]) -> list[int]:
@@ -186,7 +182,7 @@ class _Video:
         times = {step: round((clock.start_s + step / clock.rate_hz) / self._unit_s) for step in steps}
         if len(set(times.values())) < len(times):
             found = f"times in units of {self._unit_s:g} s for {clock.rate_hz:g} frames a second"
-            raise InputError(where=self.where, found=found, needed="a time for each", fix=_FIX)
+            raise _unusable(self.where, found, "a time for each")
         return [times[step] for step in steps]
 
     def decode(self, targets: list[int], clock: Clock | None) -> dict[int, UInt8[np.ndarray, "height width 3"]]:
@@ -197,13 +193,8 @@ class _Video:
             before = len(wanted.frames)
             self._decode_run(target, wanted)
             if len(wanted.frames) == before:
-                seconds = target * self._unit_s
-                raise InputError(
-                    where=self.where,
-                    found=f"no frame at {seconds:.3f} s",
-                    needed=f"one for each of {len(targets)} times from {targets[0] * self._unit_s:.3f} s on",
-                    fix=_FIX,
-                )
+                needed = f"one for each of {len(targets)} times from {targets[0] * self._unit_s:.3f} s on"
+                raise _unusable(self.where, f"no frame at {target * self._unit_s:.3f} s", needed)
         return wanted.frames
 
     def _decode_run(self, target: int, wanted: FrameTargets) -> None:
@@ -246,8 +237,7 @@ class _Video:
             if target is None or target in wanted.frames:
                 continue
             if frame.is_corrupt:
-                time = f"{target * self._unit_s:.3f} s"
-                raise InputError(where=self.where, found=f"a damaged frame at {time}", needed="a whole MP4", fix=_FIX)
+                raise _unusable(self.where, f"a damaged frame at {target * self._unit_s:.3f} s", "a whole MP4")
             require_bounded(frame.height, frame.width, self.where, count=wanted.count)
             converted = self.converter.reformat(frame, format="rgb24", threads=1)
             wanted.frames[target] = np.asarray(converted.to_ndarray())
@@ -255,6 +245,10 @@ class _Video:
     @property
     def _unit_s(self) -> float:
         return float(self.stream.time_base or 1)
+
+
+def _unusable(where: str, found: str, needed: str) -> InputError:
+    return InputError(where=where, found=found, needed=needed, fix=_FIX)
 
 
 def require_decoder(where: str) -> None:

@@ -75,26 +75,35 @@ def _compared(
     about, clips = first["about"], first["clips"]
     ids = [clip["episode"] for clip in clips["named"]]
     ahead = f"{(about['frames'] - 1) * about['seconds_per_step']:.2f} s"
+    columns = [f"{ahead} ahead", f"gain over {names[0]}", "gain over its base", "one step", "shuffled", "rank"]
+    columns += [f"{ahead}, {metric.heading}" for metric in shown[1:]]
+    rows = {
+        name: [*_row(metrics, first, ids), *(_last_ratio(metrics, metric) for metric in shown[1:])]
+        for name, metrics in measured.items()
+    }
+    if any(_trained(metrics).get("planning") for metrics in measured.values()):
+        columns += ["Action Score", "plans end off, cm"]
+        for name, metrics in measured.items():
+            plans = _trained(metrics).get("planning")  # None: none were requested, or evaluate did not know them yet
+            rows[name] += ["", ""] if plans is None else [_estimate(plans["score"]), _estimate(plans["missed_cm"])]
     return Comparison(
         title=f"{L1.label} error over persistence on {clips['count']} {about['split']} clips of {clips['episodes']}"
         f" episode{'s' * (clips['episodes'] != 1)}",
-        columns=(
-            *(f"{ahead} ahead", f"gain over {names[0]}", "gain over its base", "one step", "shuffled", "rank"),
-            *(f"{ahead}, {metric.heading}" for metric in shown[1:]),
-            *(("Action Score", "plans end off, cm") if any(map(_plans, measured.values())) else ()),
-        ),
-        rows={
-            name: (
-                *_row(metrics, first, ids),
-                *(_last_ratio(metrics, metric) for metric in shown[1:]),
-                *(_planned(metrics) if any(map(_plans, measured.values())) else ()),
-            )
+        columns=tuple(columns),
+        rows={name: tuple(cells) for name, cells in rows.items()},
+        seconds=about["seconds_per_step"] * np.arange(1, about["frames"]),
+        curves={
+            name: tuple(map(_estimate, _trained(metrics)["rollout"][L1.name]["over_persistence"]))
             for name, metrics in measured.items()
         },
-        seconds=about["seconds_per_step"] * np.arange(1, about["frames"]),
-        curves={name: _curve(metrics) for name, metrics in measured.items()},
         notes=_notes(measured, names),
     )
+
+
+def _trained(metrics: dict[str, Any]) -> dict[str, Any]:
+    """Return the metrics of the evaluated model."""
+    model: dict[str, Any] = metrics["models"][metrics["trained"]]
+    return model
 
 
 def _check_same_clips(one: dict[str, Any], other: dict[str, Any], first: Path, second: Path) -> None:
@@ -118,7 +127,7 @@ def _check_same_clips(one: dict[str, Any], other: dict[str, Any], first: Path, s
 
 
 def _row(metrics: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> tuple[Cell, ...]:
-    model = metrics["models"][metrics["trained"]]
+    model = _trained(metrics)
     base_gain = model["rollout"][L1.name].get("gain_over_base")
     sensitivity = model["sensitivity"]
     return (
@@ -132,19 +141,8 @@ def _row(metrics: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> 
 
 
 def _last_ratio(metrics: dict[str, Any], metric: Metric) -> Cell:
-    found = metrics["models"][metrics["trained"]]["rollout"].get(metric.name)
+    found = _trained(metrics)["rollout"].get(metric.name)
     return "" if found is None else _estimate(found["over_persistence"][-1])
-
-
-def _plans(metrics: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the metrics of its plans; None if none were requested, or evaluate did not know them yet."""
-    plans: dict[str, Any] | None = metrics["models"][metrics["trained"]].get("planning")
-    return plans
-
-
-def _planned(metrics: dict[str, Any]) -> tuple[Cell, ...]:
-    plans = _plans(metrics)
-    return ("", "") if plans is None else (_estimate(plans["score"]), _estimate(plans["missed_cm"]))
 
 
 def _gain(metrics: dict[str, Any], first: dict[str, Any], ids: Sequence[str]) -> Estimate:
@@ -161,10 +159,6 @@ def _last(metrics: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     return trained[:, -1], np.array(by_clip["persistence"], dtype=np.float64)[:, -1]
 
 
-def _curve(metrics: dict[str, Any]) -> tuple[Estimate, ...]:
-    return tuple(map(_estimate, metrics["models"][metrics["trained"]]["rollout"][L1.name]["over_persistence"]))
-
-
 def _notes(measured: Mapping[str, dict[str, Any]], names: Sequence[str]) -> tuple[str, ...]:
     nothing = {
         name: np.array(metrics["by_clip"]["persistence"], dtype=np.float64).mean() for name, metrics in measured.items()
@@ -175,14 +169,10 @@ def _notes(measured: Mapping[str, dict[str, Any]], names: Sequence[str]) -> tupl
         notes.append(
             f"Other latents than those of {names[0]} (another encoder or crop): {', '.join(others)}; ratios compare."
         )
-    starts = {name: _starts(metrics) for name, metrics in measured.items() if _plans(metrics)}
-    if len(set(starts.values())) > 1:
+    planned = [metrics["planning"] for metrics in measured.values() if _trained(metrics).get("planning")]
+    if len({(*starts["clips"], *starts["places"]) for starts in planned}) > 1:
         notes.append("Plans began at other frames (another --planning-clips or seed): Action Scores do not compare.")
     return tuple(notes)
-
-
-def _starts(metrics: dict[str, Any]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    return tuple(metrics["planning"]["clips"]), tuple(metrics["planning"]["places"])
 
 
 def _estimate(metrics: Mapping[str, float | None]) -> Estimate:

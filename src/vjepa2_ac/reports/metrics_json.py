@@ -5,10 +5,10 @@ It holds no images: these are in the report.
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ import numpy as np
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.estimates import (
-    Curve,
     difference_to,
     gain_over,
     gap_of_actions,
@@ -27,13 +26,12 @@ from vjepa2_ac.evaluation.estimates import (
     stratum_gain,
     stratum_over_persistence,
 )
+from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
     MODES,
-    About,
     Clips,
-    EpisodeScore,
     Evaluation,
     Landscapes,
     Mode,
@@ -83,38 +81,46 @@ def read_metrics(folder: Path) -> dict[str, Any]:
 
 def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     """Return all metrics as plain values; see docs/evaluation.md for the meaning of each."""
-    return {
+    about = {field.name: getattr(evaluation.about, field.name) for field in fields(evaluation.about)}
+    del about["space"]
+    metrics = {
         "format": FORMAT,
         "verdict": verdict(evaluation),
         "uses_actions": uses_actions(evaluation),
         "trained": evaluation.trained,
         "base": evaluation.base,
-        "about": _about(evaluation.about),
+        "about": {**about, "is_pose": evaluation.about.space.position is not None},
         "clips": _clips(evaluation.clips),
         "persistence": _by_mode(
-            evaluation, lambda mode, metric: _curve(mean_error(evaluation.errors, mode, metric, "persistence"))
+            evaluation, lambda mode, metric: mean_error(evaluation.errors, mode, metric, "persistence")
         ),
         "models": {name: _model(evaluation, model) for name, model in evaluation.models.items()},
         "strata": {
             "moving_means": evaluation.clips.moving_means,
             "parts": [_stratum(evaluation, stratum) for stratum in evaluation.strata],
         },
-        "episodes": [_episode(score) for score in evaluation.episodes],
-        "by_clip": _by_clip(evaluation),
+        "episodes": [
+            {
+                "episode": score.episode_id,
+                "clips": score.clips,
+                "over_persistence": score.over_persistence,
+                "gain_over_base": score.gain_over_base,
+            }
+            for score in evaluation.episodes
+        ],
+        "by_clip": {  # the rollout's L1 errors of every clip, which `compare` pairs between runs
+            "persistence": evaluation.errors.of("rollout", L1, "persistence"),
+            "models": {name: model.errors.of("rollout") for name, model in evaluation.models.items()},
+        },
         "calibration": evaluation.calibration,
         "planning": None if evaluation.planning is None else study_as_dict(evaluation.planning),
-        "notes": list(evaluation.notes),
+        "notes": evaluation.notes,
     }
-
-
-def _about(about: About) -> dict[str, Any]:
-    values = {field.name: getattr(about, field.name) for field in dataclasses.fields(about)}
-    known = {"space": ("is_pose", about.space.position is not None)}
-    return dict(known.get(name, (name, value)) for name, value in values.items())
+    return {name: _plain(value) for name, value in metrics.items()}
 
 
 def _clips(clips: Clips) -> dict[str, Any]:
-    named = [list(name) for name in zip(clips.episode_ids, clips.starts, strict=True)]
+    named = list(zip(clips.episode_ids, clips.starts, strict=True))
     return {
         "count": len(clips),
         "episodes": clips.episodes,
@@ -127,11 +133,9 @@ def _model(evaluation: Evaluation, model: ModelResult) -> dict[str, Any]:
     return {
         "role": model.role,
         **_by_mode(evaluation, partial(_errors, evaluation, model)),
-        "one_step_by_actions": {
-            actions: one_step_over_persistence(model.errors, actions).as_dict() for actions in ACTIONS
-        },
-        "gap_of_zero_actions": gap_of_actions(model.errors, "zero").as_dict(),
-        "gap_of_shuffled_actions": gap_of_actions(model.errors, "shuffled").as_dict(),
+        "one_step_by_actions": {actions: one_step_over_persistence(model.errors, actions) for actions in ACTIONS},
+        "gap_of_zero_actions": gap_of_actions(model.errors, "zero"),
+        "gap_of_shuffled_actions": gap_of_actions(model.errors, "shuffled"),
         "sensitivity": None if model.sensitivity is None else _sensitivity(model.sensitivity),
         "landscapes": None if model.landscapes is None else _landscapes(model.landscapes),
         "planning": plans_as_dict(evaluation, model.name),
@@ -144,15 +148,15 @@ def _by_mode(evaluation: Evaluation, of: Callable[[Mode, Metric], Any]) -> dict[
 
 def _errors(evaluation: Evaluation, model: ModelResult, mode: Mode, metric: Metric) -> dict[str, Any]:
     metrics = {
-        "error": _curve(mean_error(model.errors, mode, metric)),
-        "over_persistence": _curve(over_persistence(model.errors, mode, metric)),
-        "over_persistence_zero_actions": _curve(over_persistence(model.errors, mode, metric, "zero")),
-        "over_persistence_shuffled_actions": _curve(over_persistence(model.errors, mode, metric, "shuffled")),
+        "error": mean_error(model.errors, mode, metric),
+        "over_persistence": over_persistence(model.errors, mode, metric),
+        "over_persistence_zero_actions": over_persistence(model.errors, mode, metric, "zero"),
+        "over_persistence_shuffled_actions": over_persistence(model.errors, mode, metric, "shuffled"),
     }
     base = evaluation.base_errors
     if base is not None and model.errors is not base:
-        metrics["gain_over_base"] = _curve(gain_over(model.errors, base, mode, metric))
-        metrics["difference_to_base"] = _curve(difference_to(model.errors, base, mode, metric))
+        metrics["gain_over_base"] = gain_over(model.errors, base, mode, metric)
+        metrics["difference_to_base"] = difference_to(model.errors, base, mode, metric)
     return metrics
 
 
@@ -162,41 +166,27 @@ def _stratum(evaluation: Evaluation, stratum: Stratum) -> dict[str, Any]:
         "name": stratum.name,
         "kind": stratum.kind,
         "steps": int(stratum.steps.sum()),
-        "over_persistence": {name: stratum_over_persistence(one, stratum).as_dict() for name, one in errors.items()},
+        "over_persistence": {name: stratum_over_persistence(one, stratum) for name, one in errors.items()},
         "gain_over_base": {
-            name: stratum_gain(one, base, stratum).as_dict()
+            name: stratum_gain(one, base, stratum)
             for name, one in errors.items()
             if base is not None and one is not base
         },
     }
 
 
-def _episode(score: EpisodeScore) -> dict[str, Any]:
-    gain = score.gain_over_base
-    return {
-        "episode": score.episode_id,
-        "clips": score.clips,
-        "over_persistence": finite_or_none(score.over_persistence),
-        "gain_over_base": None if gain is None else finite_or_none(gain),
-    }
-
-
 def _sensitivity(sensitivity: Sensitivity) -> dict[str, Any]:
     return {
-        "change_over_persistence": sensitivity.change.as_dict(),
-        "change_by_clip": _rounded(sensitivity.change_by_clip),
+        "change_over_persistence": sensitivity.change,
+        "change_by_clip": sensitivity.change_by_clip,
         "rankings": [
             {
-                "drawn_from": ranking.drawn_from,
-                "words": ranking.words,
-                "samples": ranking.samples,
-                "clips": list(ranking.clips),
-                "mean_rank": ranking.mean_rank.as_dict(),
+                **{name: getattr(ranking, name) for name in ("drawn_from", "words", "samples", "clips", "mean_rank")},
                 "chance_rank": 0.5,
                 "top": {
                     str(k): {**share.as_dict(), "chance": ranking.chance_of_top(k)} for k, share in ranking.top.items()
                 },
-                "rank_by_clip": _rounded(ranking.rank),
+                "rank_by_clip": ranking.rank,
             }
             for ranking in sensitivity.rankings
         ],
@@ -206,44 +196,37 @@ def _sensitivity(sensitivity: Sensitivity) -> dict[str, Any]:
 def _landscapes(landscapes: Landscapes) -> dict[str, Any]:
     signs = zip(landscapes.sign_agreement, landscapes.sign_chance, landscapes.sign_clips, strict=True)
     return {
-        "axes": list(landscapes.axis_names),
+        "axes": landscapes.axis_names,
         "unit": landscapes.unit,
-        "distance": landscapes.distance.as_dict(),
+        "distance": landscapes.distance,
         "chance_distance": landscapes.chance_distance,
         "sign_least": landscapes.sign_least,
         "sign_agreement": {
-            name: {**agreement.as_dict(), "chance": finite_or_none(chance), "clips": clips}
+            name: {**agreement.as_dict(), "chance": chance, "clips": clips}
             for name, (agreement, chance, clips) in zip(landscapes.axis_names, signs, strict=True)
         },
         "maps": [
             {
                 "episode": one.episode_id,
-                "start": one.start,
-                "true": _rounded(one.true),
-                "minimum": _rounded(one.minimum),
-                "distance": one.distance,
-                "axes": _rounded(one.axes),
-                "energy": _rounded(one.energy),
+                **{name: getattr(one, name) for name in ("start", "true", "minimum", "distance", "axes", "energy")},
             }
             for one in landscapes.maps
         ],
     }
 
 
-def _by_clip(evaluation: Evaluation) -> dict[str, Any]:
-    """Return the rollout's L1 errors of every clip, which `compare` pairs between runs."""
-    models = {name: _rounded(model.errors.of("rollout")) for name, model in evaluation.models.items()}
-    return {"persistence": _rounded(evaluation.errors.of("rollout", L1, "persistence")), "models": models}
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it; arrays with 7 significant digits: more than a prediction in bfloat16 has."""
+    if isinstance(value, np.ndarray):
+        return _rounded(value.tolist())
+    if isinstance(value, Estimate):
+        return value.as_dict()
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    return finite_or_none(value) if isinstance(value, float) else value
 
 
-def _curve(curve: Curve) -> list[Mapping[str, float | None]]:
-    return [estimate.as_dict() for estimate in curve]
-
-
-def _rounded(values: np.ndarray) -> Any:
-    """Return numbers with 7 significant digits: more than a prediction in bfloat16 has."""
-    return _each(values.tolist())
-
-
-def _each(value: Any) -> Any:
-    return [_each(one) for one in value] if isinstance(value, list) else finite_or_none(float(f"{value:.7g}"))
+def _rounded(value: Any) -> Any:
+    return [_rounded(one) for one in value] if isinstance(value, list) else finite_or_none(float(f"{value:.7g}"))

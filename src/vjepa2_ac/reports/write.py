@@ -44,12 +44,10 @@ def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, repor
         InputError: As `measure_subject`; or the folder cannot be written.
     """
     measured = measure_subject(subject, asked, reporter=reporter)
-    return Evaluated(measured.evaluation, measured.checkpoint, _written(measured.evaluation, measured.folder))
-
-
-def _written(evaluation: Evaluation, folder: Path) -> tuple[Path, ...]:
-    return (
+    evaluation, folder = measured.evaluation, measured.folder
+    files = (
         plot_evaluation(evaluation, folder / PLOT),
         write_metrics(evaluation, folder / METRICS_FILE),
         write_report(evaluation, verdict(evaluation), folder / REPORT),
     )
+    return Evaluated(evaluation, measured.checkpoint, files)

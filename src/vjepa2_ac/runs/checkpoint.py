@@ -62,6 +62,11 @@ class RunState:
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
     data: str | None = None  # the fingerprint of the episodes
 
+    @property
+    def best_name(self) -> str | None:
+        """The name of the best checkpoint; None if there is none."""
+        return None if self.best_step is None else checkpoint_name(self.best_step)
+
     def measured(self, error: float, rank: float | None = None) -> RunState:
         """Return the state after a validation at its step: changed only if it was better than all before.
 
@@ -152,14 +157,14 @@ def write_checkpoint(folder: Path, state: RunState, write_files: Callable[[Path]
                 _remove(stale)
         temporary.rename(final)
         sync(folder)
-        _prune(folder, keep, state.best_step)
+        for old in listed(folder)[:-keep]:
+            if step_of(old.name) != state.best_step:
+                _remove(old)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
-        raise InputError(
-            where=str(final),
-            found=f"the checkpoint cannot be written ({error.strerror or error})",
-            fix="Older checkpoints are untouched: make room or pass another run_dir, then resume",
-        ) from error
+        found = f"the checkpoint cannot be written ({error.strerror or error})"
+        fix = "Older checkpoints are untouched: make room or pass another run_dir, then resume"
+        raise InputError(where=str(final), found=found, fix=fix) from error
     return final
 
 
@@ -176,11 +181,8 @@ def newest_checkpoint(folder: Path) -> Path | None:
             return path
         logger.warning("%s: %s; passed over", path, problem)
     if found:
-        raise InputError(
-            where=str(folder),
-            found=f"none of {len(found)} checkpoints is whole",
-            fix="To start the run anew, delete this folder",
-        )
+        damaged, fix = f"none of {len(found)} checkpoints is whole", "To start the run anew, delete this folder"
+        raise InputError(where=str(folder), found=damaged, fix=fix)
     return None
 
 
@@ -197,10 +199,7 @@ def find_damage(checkpoint: Path, name: str | None = None) -> str | None:
 def read_state(checkpoint: Path) -> RunState:
     """Return the progress of the run at a checkpoint, without a best checkpoint that is missing or damaged."""
     state = written_state(checkpoint)
-    if (
-        state.best_step in {None, state.step}
-        or find_damage(checkpoint.parent / checkpoint_name(state.best_step)) is None
-    ):
+    if state.best_step in {None, state.step} or find_damage(checkpoint.parent / str(state.best_name)) is None:
         return state
     return replace(state, best_step=None, best_error=None, best_rank=None)
 
@@ -231,12 +230,6 @@ def _another_step(checkpoint: Path, name: str) -> str | None:
     if type(step) is not int:
         return f"no readable {STATE} (step: {shown(step)})"
     return None if step_of(name) in {None, step} else f"a copy of another one, of step {step}"
-
-
-def _prune(folder: Path, keep: int, best_step: int | None) -> None:
-    for path in listed(folder)[:-keep]:
-        if step_of(path.name) != best_step:
-            _remove(path)
 
 
 def _remove(checkpoint: Path) -> None:

@@ -28,14 +28,14 @@ from pathlib import Path
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.effects import Affects, mark_of
-from vjepa2_ac.config.loading import changed_keys, config_as_dict, config_as_flat_dict, config_as_yaml, load_config
+from vjepa2_ac.config.loading import changed_keys, config_as_flat_dict, config_as_yaml, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import is_url, literal
 from vjepa2_ac.runs.checkpoint import remove_leavings
 from vjepa2_ac.runs.lock import LOCK
 from vjepa2_ac.runs.own_files import refuse_links_out
 from vjepa2_ac.storage import read_bounded, try_writing_at, write_atomically
-from vjepa2_ac.storage.structured import read_json_list, shown, utc_now
+from vjepa2_ac.storage.structured import MOST_BYTES, json_list, shown, utc_now
 
 CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
@@ -75,12 +75,9 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
         if not allow_config_change:
             _refuse_another_config(folder, config)
     elif folder.exists() and not all(_is_without_config(path) for path in folder.iterdir()):
-        raise InputError(
-            where=str(folder),
-            found="a folder with other things in it, and no config.yaml",
-            needed="an empty or new folder, or one of a run",
-            fix="Set another run_dir",
-        )
+        found = "a folder with other things in it, and no config.yaml"
+        needed = "an empty or new folder, or one of a run"
+        raise InputError(where=str(folder), found=found, needed=needed, fix="Set another run_dir")
     _check_writable(folder)
 
 
@@ -105,8 +102,7 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
         # First of all files: it makes the folder a run's.
         write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     path = folder / ENVIRONMENT
-    starts = _earlier_starts(path)
-    write_atomically(path, json.dumps([*starts, start], indent=1).encode())
+    write_atomically(path, json.dumps([*_earlier_starts(path), start], indent=1).encode())
     write_atomically(folder / RUN_ID, run_name)
     (folder / CHECKPOINTS).mkdir(exist_ok=True)
     remove_leavings(folder / CHECKPOINTS)
@@ -135,8 +131,9 @@ def config_changes(config: Config) -> list[str]:
     if not (folder / CONFIG).is_file():
         return []
     old = read_run_config(folder)
+    before, now = config_as_flat_dict(old), config_as_flat_dict(config)
     keys = [key for key in changed_keys(old, config) if key != "run_dir"]
-    return [f"{key}: {_setting(old, key)} -> {_setting(config, key)}" for key in keys]
+    return [f"{key}: {json.dumps(before.get(key))} -> {json.dumps(now.get(key))}" for key in keys]
 
 
 def is_run(subject: str) -> bool:
@@ -151,11 +148,9 @@ def read_run_config(folder: Path) -> Config:
         InputError: Not the folder of a run.
     """
     if not (folder / CONFIG).is_file():
-        raise InputError(
-            where=str(folder),
-            found="no config.yaml" if folder.is_dir() else "no such folder",
-            needed="the folder of a run, which `vjepa2-ac train CONFIG` makes",
-        )
+        found = "no config.yaml" if folder.is_dir() else "no such folder"
+        needed = "the folder of a run, which `vjepa2-ac train CONFIG` makes"
+        raise InputError(where=str(folder), found=found, needed=needed)
     return load_config(folder / CONFIG, [f"run_dir={json.dumps(literal(folder))}"])
 
 
@@ -196,38 +191,29 @@ def _is_without_config(path: Path) -> bool:
 
 def _earlier_starts(path: Path) -> list[object]:
     try:
-        return read_json_list(path)
+        return json_list(read_bounded(path, MOST_BYTES), where=str(path))
     except (OSError, InputError):
         return []
-
-
-def _setting(config: Config, dotted_key: str) -> str:
-    value: object = config_as_dict(config)
-    for part in dotted_key.split("."):
-        value = value.get(part) if isinstance(value, dict) else None
-    return json.dumps(value)
 
 
 def _refuse_another_config(folder: Path, config: Config) -> None:
     changed = changed_keys(read_run_config(folder), config)
     differing = [key for key in changed if Affects.RUN in mark_of(key, Config)]
     if differing:
-        raise InputError(
-            where=str(folder),
-            found=f"a run of another config; it differs in {', '.join(differing)}",
-            needed="the same config, to go on with it",
-            fix=f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`; where"
-            " the change is meant, add --allow-config-change",
+        found = f"a run of another config; it differs in {', '.join(differing)}"
+        fix = (
+            f"Set another run_dir for a new run, or go on with `vjepa2-ac train {folder} --resume`; where the change is"
+            " meant, add --allow-config-change"
         )
+        raise InputError(where=str(folder), found=found, needed="the same config, to go on with it", fix=fix)
 
 
 def _check_writable(folder: Path) -> None:
     try:
         try_writing_at(folder)
     except OSError as error:
-        raise InputError(
-            where=str(folder), found=f"cannot be written ({error.strerror})", fix="Set run_dir to a folder of yours"
-        ) from None
+        found = f"cannot be written ({error.strerror})"
+        raise InputError(where=str(folder), found=found, fix="Set run_dir to a folder of yours") from None
 
 
 def with_settled_stride(config: Config) -> Config:

@@ -13,7 +13,6 @@ import logging
 import os
 import platform
 from pathlib import Path
-from types import TracebackType
 from typing import TextIO
 
 from vjepa2_ac.errors import InputError
@@ -59,13 +58,16 @@ class RunLock:
             if error.errno in _TAKEN:
                 holder = _holder(self._file)
                 self.release()
-                raise _occupied(self.path.parent, holder) from None
+                found = f"a run that is being trained right now, by {holder}"
+                needed = "a folder that no other process writes to"
+                fix = "Wait until it ends, stop it, or set another run_dir"
+                raise InputError(where=str(self.path.parent), found=found, needed=needed, fix=fix) from None
             logger.warning(
                 "%s: this file system has no locks (%s): see that no other process trains in this folder",
                 self.path, error.strerror,
             )  # fmt: skip
         with user_can_write(self.path):
-            self._sign()
+            _sign(self._file)
 
     def _opened(self) -> TextIO:
         if self.path.is_symlink():
@@ -83,19 +85,15 @@ class RunLock:
         """Return the lock, not yet taken."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Release the lock."""
         self.release()
 
-    def _sign(self) -> None:
-        if self._file is None:
-            raise ValueError("the lock is not held")
-        self._file.truncate(0)
-        now = utc_now()
-        self._file.write(json.dumps({"process": os.getpid(), "host": platform.node(), "since": now}))
-        self._file.flush()
+
+def _sign(file: TextIO) -> None:
+    file.truncate(0)
+    file.write(json.dumps({"process": os.getpid(), "host": platform.node(), "since": utc_now()}))
+    file.flush()
 
 
 def _holder(file: TextIO) -> str:
@@ -106,12 +104,3 @@ def _holder(file: TextIO) -> str:
         return f"process {who['process']} on {who['host']}, since {who['since']}"
     except (OSError, ValueError, KeyError, InputError):  # it is just writing its name
         return "another process"
-
-
-def _occupied(folder: Path, holder: str) -> InputError:
-    return InputError(
-        where=str(folder),
-        found=f"a run that is being trained right now, by {holder}",
-        needed="a folder that no other process writes to",
-        fix="Wait until it ends, stop it, or set another run_dir",
-    )

@@ -13,7 +13,6 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from vjepa2_ac.errors import InputError, UserError
@@ -52,7 +51,8 @@ class MetricsLog:
 
     def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Append one row: its kind (train, validation), its optimizer step, and metrics (numbers or lists of them)."""
-        row = {"kind": kind, "step": step, **{key: _plain(value) for key, value in metrics.items()}}
+        plain = {key: finite_or_none(one) if isinstance(one, float) else one for key, one in metrics.items()}
+        row = {"kind": kind, "step": step, **plain}
         self._waiting += (json.dumps(row) + "\n").encode()
         self._write()
         self._trackers.log(kind, step, metrics)
@@ -72,7 +72,7 @@ class MetricsLog:
         Raises:
             InputError: Rows can be written neither before nor after the block, or its own error.
         """
-        error = self._sync()
+        error = self._write(sync=True)
         try:
             yield
         except UserError as other:
@@ -80,27 +80,20 @@ class MetricsLog:
                 raise
             raise _unwritable(self.path, error, f"{other.where}: {other.found}") from other
         if error and self._waiting:
-            error = self._sync()
+            error = self._write(sync=True)
         if error:  # also of a flush, after which the system may have discarded the data
             raise _unwritable(self.path, error, "The checkpoint of this step is written")
 
-    def _write(self) -> OSError | None:
-        if not self._waiting:
+    def _write(self, *, sync: bool = False) -> OSError | None:
+        """Write the rows that wait, and with `sync` wait until the disk has them; return what prevents it."""
+        if not self._waiting and not sync:
             return None
         try:
             with warn_if_stalled(self.path):
                 while self._waiting:
                     self._waiting = self._waiting[os.write(self._handle, self._waiting) :]
-        except OSError as error:
-            return error
-        return None
-
-    def _sync(self) -> OSError | None:
-        if error := self._write():
-            return error
-        try:
-            with warn_if_stalled(self.path):
-                os.fsync(self._handle)
+                if sync:
+                    os.fsync(self._handle)
         except OSError as error:
             return error
         return None
@@ -109,9 +102,7 @@ class MetricsLog:
         """Return the metrics log, open."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the file, and the trackers."""
         self._write()
         os.close(self._handle)
@@ -138,15 +129,9 @@ def read_metrics_log(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def _unwritable(path: Path, error: OSError, checkpoint: str) -> InputError:
-    return InputError(
-        where=str(path),
-        found=f"the latest metrics cannot be written ({error.strerror or error}), and are lost",
-        fix=f"{checkpoint}. Make room on the disk of the run, then resume: the same command goes on",
-    )
-
-
-def _plain(value: Any) -> Any:
-    return finite_or_none(value) if isinstance(value, float) else value
+    found = f"the latest metrics cannot be written ({error.strerror or error}), and are lost"
+    fix = f"{checkpoint}. Make room on the disk of the run, then resume: the same command goes on"
+    return InputError(where=str(path), found=found, fix=fix)
 
 
 def warnings_of(path: Path) -> list[str]:

@@ -12,13 +12,7 @@ from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import Reporter
 from vjepa2_ac.runs.checkpoint import RunState, find_damage, listed, read_state, step_of
-from vjepa2_ac.runs.folder import (
-    CHECKPOINTS,
-    check_run_folder,
-    config_changes,
-    open_run_folder,
-    with_settled_stride,
-)
+from vjepa2_ac.runs.folder import CHECKPOINTS, check_run_folder, config_changes, open_run_folder, with_settled_stride
 from vjepa2_ac.runs.lock import RunLock
 from vjepa2_ac.runs.mirror.background_sync import Mirror, NoMirror
 from vjepa2_ac.runs.mirror.open_remote import Remote, open_remote
@@ -106,9 +100,6 @@ def _refuse_if_overtaken(folder: Path, state: RunState) -> None:
     further = [path for path in listed(folder / CHECKPOINTS) if (step_of(path.name) or 0) > state.step]
     newest = next((path for path in reversed(further) if find_damage(path) is None), None)
     if newest is not None:
-        raise InputError(
-            where=str(newest),
-            found=f"a checkpoint of step {read_state(newest).step}, which another start wrote while this one stood at"
-            f" {state.step}",
-            fix="Start again: the run continues from there",
-        )
+        there = f"a checkpoint of step {read_state(newest).step}"
+        found = f"{there}, which another start wrote while this one stood at {state.step}"
+        raise InputError(where=str(newest), found=found, fix="Start again: the run continues from there")

@@ -31,13 +31,9 @@ def refuse_links_out(run: Path, names: Iterable[str]) -> None:
 def refused_link(link: Path) -> InputError:
     """Return the error of a link in a run's folder that is not followed."""
     target = _target(link)
-    return InputError(
-        where=str(link),
-        found="a link that leads nowhere" if target is None else f"a link that leads out of the run, to {target}",
-        needed="a file or folder of the run's own",
-        fix="Remove it. To have a run on another disk, make the run's folder itself the link, or set run_dir to that"
-        " disk",
-    )
+    found = "a link that leads nowhere" if target is None else f"a link that leads out of the run, to {target}"
+    fix = "Remove it. To have a run on another disk, make the run's folder itself the link, or set run_dir to that disk"
+    return InputError(where=str(link), found=found, needed="a file or folder of the run's own", fix=fix)
 
 
 def _links(run: Path, name: str) -> Iterator[Path]:

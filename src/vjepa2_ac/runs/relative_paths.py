@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
+from operator import getitem
 from pathlib import Path
-from typing import Any
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict, config_as_flat_dict, parse_config
@@ -33,14 +34,18 @@ def with_paths_from_start(config: Config, run: Path, *, needed: Sequence[str]) -
     for key in needed:
         if _leads_nowhere(flat[key]) and key not in elsewhere:
             starts = " or ".join(dict.fromkeys(map(str, start_folders(run))))
-            raise InputError(
-                where=f"{run}: {key}",
-                found=f"{flat[key]}: a relative path that leads nowhere from {Path.cwd()}"
-                + (f", nor from {starts}, where the run was started" if starts else ""),
-                fix=("Go to the folder in which it does" if starts else "Go to the folder in which the run was started")
-                + (", or name the data with --data CONFIG and a folder with --out" if key == DATA else ""),
-            )
-    return parse_config(_replaced(config_as_dict(config), elsewhere), where=str(run)) if elsewhere else config
+            found = f"{flat[key]}: a relative path that leads nowhere from {Path.cwd()}"
+            found += f", nor from {starts}, where the run was started" if starts else ""
+            fix = f"Go to the folder in which {'it does' if starts else 'the run was started'}"
+            fix += ", or name the data with --data CONFIG and a folder with --out" if key == DATA else ""
+            raise InputError(where=f"{run}: {key}", found=found, fix=fix)
+    if not elsewhere:
+        return config
+    values = config_as_dict(config)
+    for key, path in elsewhere.items():
+        *sections, name = key.split(".")
+        reduce(getitem, sections, values)[name] = path
+    return parse_config(values, where=str(run))
 
 
 def require_start_folder(config: Config, run: Path) -> None:
@@ -51,12 +56,10 @@ def require_start_folder(config: Config, run: Path) -> None:
     """
     for key, path in _seen_from_start(config, run).items():
         if key in {DATA, BASE}:
-            raise InputError(
-                where=f"{run}: {key}",
-                found=f"{config_as_flat_dict(config)[key]}: a relative path that leads nowhere from {Path.cwd()}",
-                needed=f"the folder in which the run was started: there it is {path}",
-                fix=f"Go to that folder: vjepa2-ac train {run.absolute()} --resume",
-            )
+            found = f"{config_as_flat_dict(config)[key]}: a relative path that leads nowhere from {Path.cwd()}"
+            needed = f"the folder in which the run was started: there it is {path}"
+            fix = f"Go to that folder: vjepa2-ac train {run.absolute()} --resume"
+            raise InputError(where=f"{run}: {key}", found=found, needed=needed, fix=fix)
 
 
 def _seen_from_start(config: Config, run: Path) -> dict[str, str]:
@@ -79,13 +82,3 @@ def _leads_nowhere(path: str | None) -> bool:
         return False
     here = Path(path)
     return not here.is_absolute() and not here.exists()
-
-
-def _replaced(values: dict[str, Any], changes: dict[str, str]) -> dict[str, Any]:
-    for key, value in changes.items():
-        *sections, name = key.split(".")
-        inside = values
-        for section in sections:
-            inside = inside[section]
-        inside[name] = value
-    return values

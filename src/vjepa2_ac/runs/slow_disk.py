@@ -19,14 +19,9 @@ STALLED_S = 60.0
 
 
 @contextmanager
-def warn_if_stalled(path: Path, *, after_s: float | None = None) -> Iterator[None]:
-    """Warn if the block, which writes a file, lasts longer than `after_s`; and when it ends, how long it took.
-
-    Args:
-        path: The file.
-        after_s: Seconds; None: a minute.
-    """
-    patience_s, begun_s, is_over = STALLED_S if after_s is None else after_s, time.monotonic(), threading.Lock()
+def warn_if_stalled(path: Path) -> Iterator[None]:
+    """Warn if the block, which writes a file, lasts longer than a minute; and when it ends, how long it took."""
+    patience_s, begun_s, is_over = STALLED_S, time.monotonic(), threading.Lock()
 
     def warn() -> None:
         if is_over.acquire(blocking=False):

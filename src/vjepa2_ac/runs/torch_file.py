@@ -47,7 +47,8 @@ def read_torch(path: Path) -> Any:
         found = f"more than tensors and plain values{f' ({name[1]})' if name else ''}: such a file can run foreign code"
         raise InputError(where=str(path), found=found, needed=needed) from None
     except _DAMAGE as error:
-        raise InputError(where=str(path), found=f"cannot be read ({_first_line(error)})", needed=needed) from None
+        first_line = str(error).strip().partition("\n")[0]
+        raise InputError(where=str(path), found=f"cannot be read ({first_line})", needed=needed) from None
 
 
 def _require_as_written(path: Path) -> None:
@@ -60,7 +61,3 @@ def _require_as_written(path: Path) -> None:
     with zipfile.ZipFile(path) as archive:
         if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
             raise ValueError("its parts are compressed")
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).strip().split("\n", 1)[0]

@@ -18,18 +18,12 @@ from typing import Any
 
 from vjepa2_ac.config import Config, TrackingConfig
 from vjepa2_ac.config.loading import config_as_flat_dict
-from vjepa2_ac.errors import InputError
+from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.runs.folder import TENSORBOARD
 from vjepa2_ac.runs.tracker_thread import Opening, TrackerThread
 
 PATIENCE_S = 60.0  # after which a warning says that a tracker does not answer
 CLOSING_S = 30.0  # that the end of a run waits for all of them
-
-_INSTALL = {
-    "tensorboard": "Run pip install -c constraints.txt -e .",
-    "wandb": 'Run pip install -c constraints.txt -e ".[wandb]"',
-    "trackio": 'Run pip install -c constraints.txt -e ".[trackio]"',
-}
 
 
 class Trackers:
@@ -70,18 +64,14 @@ def require_installed(tracking: TrackingConfig) -> None:
         InputError: A requested one is not installed.
     """
     asked = {
-        "tensorboard": tracking.tensorboard,
-        "wandb": tracking.wandb != "disabled",
-        "trackio": tracking.trackio,
+        "tensorboard": (tracking.tensorboard, "pip install -c constraints.txt -e .", "false"),
+        "wandb": (tracking.wandb != "disabled", pip_install("wandb"), "disabled"),
+        "trackio": (tracking.trackio, pip_install("trackio"), "false"),
     }
-    for library, is_asked in asked.items():
+    for library, (is_asked, install, off) in asked.items():
         if is_asked and importlib.util.find_spec(library) is None:
-            off = "disabled" if library == "wandb" else "false"
-            raise InputError(
-                where=f"tracking.{library}",
-                found=f"asked for, but {library} is not installed",
-                fix=f"{_INSTALL[library]}, or set tracking.{library}={off}",
-            )
+            found, fix = f"asked for, but {library} is not installed", f"Run {install}, or set tracking.{library}={off}"
+            raise InputError(where=f"tracking.{library}", found=found, fix=fix)
 
 
 def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int) -> Trackers:
@@ -98,9 +88,9 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
     if tracking.tensorboard:
         openings["TensorBoard"] = lambda: _TensorBoard(folder / TENSORBOARD, first_step)
     if tracking.wandb != "disabled":
-        openings["Weights & Biases"] = lambda: _WeightsAndBiases(config, folder, run_id)
+        openings["Weights & Biases"] = lambda: _OnlineRun(_wandb_run(config, folder, run_id))
     if tracking.trackio:
-        openings["trackio"] = lambda: _Trackio(config, run_id)
+        openings["trackio"] = lambda: _OnlineRun(_trackio_run(config, run_id))
     return Trackers(openings)
 
 
@@ -118,26 +108,14 @@ class _TensorBoard:
         self._writer.close()
 
 
-class _WeightsAndBiases:
-    """W&B ignores rows of steps that it has already: a resumed run repeats the same metrics."""
+class _OnlineRun:
+    """A run of W&B or trackio, whose methods are alike.
 
-    def __init__(self, config: Config, folder: Path, run_id: str) -> None:
-        import wandb
+    W&B ignores rows of steps that it has already: a resumed run repeats the same metrics.
+    """
 
-        # Output is not captured: it would contain the console's progress bar. Times are bounded where W&B can.
-        bounds: dict[str, Any] = {"init_timeout": 20.0, "login_timeout": 30.0, "finish_timeout": 20.0, "console": "off"}
-        known = getattr(wandb.Settings, "model_fields", {})
-        self._run: Any = wandb.init(
-            project=config.tracking.project,
-            id=run_id,
-            name=folder.resolve().name,
-            resume="allow",
-            mode=config.tracking.wandb,
-            dir=os.environ.get("WANDB_DIR") or str(folder),
-            config=config_as_flat_dict(config),
-            allow_val_change=True,
-            settings=wandb.Settings(**{name: value for name, value in bounds.items() if name in known}),
-        )
+    def __init__(self, run: Any) -> None:
+        self._run = run
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
         self._run.log(dict(metrics), step=step)
@@ -146,25 +124,31 @@ class _WeightsAndBiases:
         self._run.finish()
 
 
-class _Trackio:
-    """trackio identifies a run by its name, which is therefore the run's id."""
+def _wandb_run(config: Config, folder: Path, run_id: str) -> Any:
+    import wandb
 
-    def __init__(self, config: Config, run_id: str) -> None:
-        import trackio
+    # Output is not captured: it would contain the console's progress bar. Times are bounded where W&B can.
+    bounds: dict[str, Any] = {"init_timeout": 20.0, "login_timeout": 30.0, "finish_timeout": 20.0, "console": "off"}
+    known = getattr(wandb.Settings, "model_fields", {})
+    return wandb.init(
+        project=config.tracking.project,
+        id=run_id,
+        name=folder.resolve().name,
+        resume="allow",
+        mode=config.tracking.wandb,
+        dir=os.environ.get("WANDB_DIR") or str(folder),
+        config=config_as_flat_dict(config),
+        allow_val_change=True,
+        settings=wandb.Settings(**{name: value for name, value in bounds.items() if name in known}),
+    )
 
-        self._run: Any = trackio.init(
-            project=config.tracking.project,
-            name=run_id,
-            resume="allow",
-            config=config_as_flat_dict(config),
-            embed=False,
-        )
 
-    def log(self, metrics: Mapping[str, float], step: int) -> None:
-        self._run.log(dict(metrics), step=step)
+def _trackio_run(config: Config, run_id: str) -> Any:
+    """Open trackio, which identifies a run by its name: that is therefore the run's id."""
+    import trackio
 
-    def close(self) -> None:
-        self._run.finish()
+    plain, project = config_as_flat_dict(config), config.tracking.project
+    return trackio.init(project=project, name=run_id, resume="allow", config=plain, embed=False)
 
 
 def _numbers(metrics: Mapping[str, Any]) -> dict[str, float]:

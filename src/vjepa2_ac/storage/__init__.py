@@ -3,10 +3,8 @@
 from vjepa2_ac.places import is_url
 from vjepa2_ac.storage.reading import (
     ByteReader,
-    FileInfo,
     ShortReadError,
     absolute,
-    bytes_fetched,
     exists,
     file_size,
     file_version,
@@ -21,6 +19,7 @@ from vjepa2_ac.storage.reading import (
     sha256_of_file,
     unreadable,
 )
+from vjepa2_ac.storage.remote.ranged_reads import FileInfo, bytes_fetched
 from vjepa2_ac.storage.transfer import download, file_sizes, place, remove, remove_folder, try_writing, upload
 from vjepa2_ac.storage.writing import (
     atomic_writer,
@@ -32,40 +31,3 @@ from vjepa2_ac.storage.writing import (
     user_can_write,
     write_atomically,
 )
-
-__all__ = [
-    "ByteReader",
-    "FileInfo",
-    "ShortReadError",
-    "absolute",
-    "atomic_writer",
-    "bytes_fetched",
-    "download",
-    "exists",
-    "file_size",
-    "file_sizes",
-    "file_version",
-    "folder_writer",
-    "is_empty",
-    "is_url",
-    "join",
-    "list_files",
-    "list_names",
-    "open_to_read",
-    "place",
-    "read_bounded",
-    "read_bytes",
-    "read_range",
-    "read_ranges",
-    "remove",
-    "remove_folder",
-    "require_new_folder",
-    "sha256_of_file",
-    "sync",
-    "try_writing",
-    "try_writing_at",
-    "unreadable",
-    "upload",
-    "user_can_write",
-    "write_atomically",
-]

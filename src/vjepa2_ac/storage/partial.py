@@ -22,7 +22,7 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 _OLD_S = 86_400.0
@@ -31,46 +31,21 @@ _NAME = re.compile(r"\..+\.(?:([0-9a-f]{8})-)?[0-9a-f]+\.partial")  # without KE
 _NAME_BYTES = 200  # of the 255 that a name may have
 _HELD = frozenset({errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES})
 
-_looked_at: set[Path] = set()
-
 
 @contextlib.contextmanager
-def partial_file(target: Path) -> Iterator[Path]:
-    """Yield a new empty file beside a target, locked within the block; it is not removed.
-
-    Raises:
-        OSError: It cannot be created.
-    """
-    with _held(
-        target.parent, target.name, lambda path: os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-    ) as path:
-        yield path
-
-
-@contextlib.contextmanager
-def partial_folder(parent: Path, name: str) -> Iterator[Path]:
-    """Yield a new empty folder in `parent`, to be renamed to `name`; it is not removed.
+def new_partial(parent: Path, name: str, *, is_folder: bool = False) -> Iterator[Path]:
+    """Yield a new empty file or folder in `parent`, to be renamed to `name`, and locked meanwhile; it is not removed.
 
     Raises:
         OSError: It cannot be created.
     """
     parent.mkdir(parents=True, exist_ok=True)
-    with _held(parent, name, _open_new_folder) as path:
-        yield path
-
-
-def _open_new_folder(path: Path) -> int:
-    path.mkdir()
-    return os.open(path, os.O_RDONLY)
-
-
-@contextlib.contextmanager
-def _held(parent: Path, name: str, make: Callable[[Path], int]) -> Iterator[Path]:
-    """Create a partial file or folder, and hold a lock on it within the block."""
-    _remove_abandoned_once(parent)
+    _remove_abandoned_once(parent.absolute())
     while True:
         path = _new_name(parent, name)
-        handle = make(path)
+        if is_folder:
+            path.mkdir()
+        handle = os.open(path, os.O_RDONLY if is_folder else os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
         if _locked(path, handle):
             break
     try:
@@ -92,12 +67,10 @@ def remove_abandoned(folder: Path) -> None:
                 _remove_if_abandoned(path)
 
 
+@functools.cache
 def _remove_abandoned_once(folder: Path) -> None:
     """Scan a folder only the first time that this process writes there: it may hold thousands of files."""
-    place = folder.absolute()
-    if place not in _looked_at:
-        _looked_at.add(place)
-        remove_abandoned(folder)
+    remove_abandoned(folder)
 
 
 def _remove_if_abandoned(path: Path) -> None:

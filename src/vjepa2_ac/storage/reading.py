@@ -12,13 +12,13 @@ import hashlib
 import stat
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 from vjepa2_ac.errors import InputError, UnreachableError, UserError
 from vjepa2_ac.places import is_url
-from vjepa2_ac.storage import remote
+from vjepa2_ac.storage.remote import ranged_reads
+from vjepa2_ac.storage.remote.ranged_reads import FileInfo
 
 _HASH_CHUNK_BYTES = 1 << 20
 _ABSENT = frozenset({errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG})
@@ -30,7 +30,7 @@ class ShortReadError(OSError):
 
 @runtime_checkable
 class ByteReader(Protocol):
-    """A file open for reading, local or remote."""
+    """A file open for reading, local or ranged_reads."""
 
     def read(self, size: int = -1, /) -> bytes:
         """Return the next bytes; all remaining ones with -1."""
@@ -57,7 +57,13 @@ def absolute(path: str | Path) -> str:
 
 def exists(path: str | Path) -> bool:
     """Return whether there is a file or folder."""
-    return remote.exists(str(path)) if is_url(path) else Path(path).exists()
+    if not is_url(path):
+        return Path(path).exists()
+    try:
+        ranged_reads.file_version(str(path))
+    except FileNotFoundError:
+        return False
+    return True
 
 
 def file_size(path: str | Path) -> int:
@@ -66,7 +72,7 @@ def file_size(path: str | Path) -> int:
     Raises:
         OSError: There is no such file, or it cannot be read.
     """
-    return remote.file_size(str(path)) if is_url(path) else Path(path).stat().st_size
+    return ranged_reads.file_size(str(path)) if is_url(path) else Path(path).stat().st_size
 
 
 def file_version(path: str | Path) -> str:
@@ -75,16 +81,7 @@ def file_version(path: str | Path) -> str:
     Raises:
         OSError: There is no such file, or it cannot be read.
     """
-    return remote.file_version(str(path)) if is_url(path) else str(Path(path).stat().st_mtime_ns)
-
-
-@dataclass(frozen=True)
-class FileInfo:
-    """A file in a listing."""
-
-    name: str
-    size: int
-    version: str  # changes with the content, as far as is known without reading it
+    return ranged_reads.file_version(str(path)) if is_url(path) else str(Path(path).stat().st_mtime_ns)
 
 
 def list_files(folder: str | Path) -> list[FileInfo]:
@@ -94,7 +91,7 @@ def list_files(folder: str | Path) -> list[FileInfo]:
         OSError: The folder cannot be listed.
     """
     if is_url(folder):
-        return [FileInfo(file.name, file.size, file.version) for file in _remote_entries(folder) if file.is_file]
+        return [file for file in ranged_reads.list_folder(str(folder)) if file.is_file]
     files = [path for path in Path(folder).iterdir() if path.is_file()] if Path(folder).is_dir() else []
     found = {path.name: path.stat() for path in files}
     return [FileInfo(name, one.st_size, str(one.st_mtime_ns)) for name, one in sorted(found.items())]
@@ -103,7 +100,7 @@ def list_files(folder: str | Path) -> list[FileInfo]:
 def list_names(folder: str | Path) -> list[str]:
     """Return the names of the files and folders in a folder, sorted; none where there is no such folder."""
     if is_url(folder):
-        return [entry.name for entry in _remote_entries(folder)]
+        return [entry.name for entry in ranged_reads.list_folder(str(folder))]
     return sorted(entry.name for entry in Path(folder).iterdir()) if Path(folder).is_dir() else []
 
 
@@ -115,7 +112,7 @@ def open_to_read(path: str | Path) -> ByteReader:
     Raises:
         OSError: There is no such file, or it cannot be read.
     """
-    return remote.open_to_read(str(path)) if is_url(path) else Path(path).open("rb")
+    return ranged_reads.open_to_read(str(path)) if is_url(path) else Path(path).open("rb")
 
 
 def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -> UserError:
@@ -130,9 +127,9 @@ def unreadable(where: str, error: OSError, *, needed: str = "", fix: str = "") -
         needed: What should be there.
         fix: How to fix it where the file is wrong.
     """
-    if isinstance(error, ShortReadError) or error.errno in _ABSENT:
-        return InputError(where=where, found=f"cannot be read: {error.strerror or error}", needed=needed, fix=fix)
     found = f"cannot be read: {error.strerror or error}"
+    if isinstance(error, ShortReadError) or error.errno in _ABSENT:
+        return InputError(where=where, found=found, needed=needed, fix=fix)
     return UnreachableError(where=where, found=found, needed=needed, fix="Check its permissions, and the disk")
 
 
@@ -143,7 +140,7 @@ def read_bytes(path: str | Path) -> bytes:
         OSError: There is no such file, or it cannot be read.
     """
     if is_url(path):
-        return remote.read_range(str(path), 0, remote.file_size(str(path)))
+        return ranged_reads.read_range(str(path), 0, ranged_reads.file_size(str(path)))
     return Path(path).read_bytes()
 
 
@@ -155,8 +152,8 @@ def read_bounded(path: str | Path, most_bytes: int) -> bytes:
         OSError: There is no such file, or it cannot be read.
     """
     if is_url(path):
-        size = remote.file_size(str(path))
-        data = remote.read_range(str(path), 0, min(size, most_bytes + 1))
+        size = ranged_reads.file_size(str(path))
+        data = ranged_reads.read_range(str(path), 0, min(size, most_bytes + 1))
     else:
         if not (stat.S_ISREG(mode := Path(path).stat().st_mode) or stat.S_ISDIR(mode)):
             raise InputError(where=str(path), found="a pipe or a device", needed="a file")
@@ -174,7 +171,7 @@ def read_range(path: str | Path, start: int, length: int) -> bytes:
         OSError: There is no such file, or it cannot be read.
     """
     if is_url(path):
-        return remote.read_range(str(path), start, length)
+        return ranged_reads.read_range(str(path), start, length)
     with Path(path).open("rb") as file:
         file.seek(start)
         return file.read(length)
@@ -186,7 +183,7 @@ def read_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> list[byt
     Raises:
         OSError: There is no such file, it cannot be read, or it ends within a piece.
     """
-    pieces = remote.read_ranges(str(path), ranges) if is_url(path) else list(_local_ranges(path, ranges))
+    pieces = ranged_reads.read_ranges(str(path), ranges) if is_url(path) else list(_local_ranges(path, ranges))
     for (start, length), piece in zip(ranges, pieces, strict=True):
         if len(piece) < length:
             raise ShortReadError(f"{path}: {len(piece)} of {length} bytes at {start}")
@@ -198,18 +195,6 @@ def _local_ranges(path: str | Path, ranges: Sequence[tuple[int, int]]) -> Iterat
         for start, length in ranges:
             file.seek(start)
             yield file.read(length)
-
-
-def _remote_entries(folder: str | Path) -> list[remote.Entry]:
-    try:
-        return remote.list_folder(str(folder))
-    except FileNotFoundError:
-        return []
-
-
-def bytes_fetched() -> int:
-    """Return how many bytes this process has read over the network so far."""
-    return remote.bytes_fetched()
 
 
 def sha256_of_file(path: str | Path) -> str:

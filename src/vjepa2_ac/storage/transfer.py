@@ -1,6 +1,7 @@
 """File transfer to and from another place: a local folder, or a URL that can be written.
 
-A permanent failure to write a file is a `RefusedError`, any other an `UnreachableError`.
+A permanent failure to write a file is a `RefusedError`, any other an `UnreachableError`. As when reading, temporary
+failures at a URL are retried. A file in an object store is either complete or absent.
 """
 
 from __future__ import annotations
@@ -9,21 +10,28 @@ import errno
 import secrets
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from vjepa2_ac.errors import RefusedError, UnreachableError
 from vjepa2_ac.places import is_url
-from vjepa2_ac.storage import remote
 from vjepa2_ac.storage.reading import join
+from vjepa2_ac.storage.remote import ranged_reads, retries
+from vjepa2_ac.storage.remote.filesystems import ask, login_hint, send, sizes_below
+from vjepa2_ac.storage.remote.retries import RetryPolicy
 from vjepa2_ac.storage.writing import atomic_writer, try_writing_at
+
+_T = TypeVar("_T")
 
 _AWAY = frozenset({
     errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENOSPC,
     errno.EDQUOT,
 })  # fmt: skip
 _PIECE_BYTES = 32 << 20
+_SLOWEST_BYTES_PER_S = 1 << 20  # to a URL: allowed in addition to the time-out of any request
 
 
 def place(path: str) -> str:
@@ -39,11 +47,18 @@ def upload(source: Path, target: str) -> None:
         FileNotFoundError: There is no such local file.
         UnreachableError: It cannot be written; a RefusedError if that is permanent.
     """
-    if is_url(target):
-        return remote.upload_file(source, target)
-    with source.open("rb") as file, _explained(target), atomic_writer(target) as copy:
-        shutil.copyfileobj(file, copy)
-    return None
+    if not is_url(target):
+        with source.open("rb") as file, _explained(target), atomic_writer(target) as copy:
+            shutil.copyfileobj(file, copy)
+        return
+    allowed_s = source.stat().st_size / _SLOWEST_BYTES_PER_S
+    policy = replace(retries.DEFAULT, timeout_s=retries.DEFAULT.timeout_s + allowed_s)
+    try:
+        _persist(target, lambda timeout_s: send(source, target, timeout_s), policy)
+    except FileNotFoundError:
+        if not source.is_file():
+            raise
+        raise _no_bucket(target) from None
 
 
 def download(source: str, target: Path) -> None:
@@ -58,10 +73,10 @@ def download(source: str, target: Path) -> None:
         with Path(source).open("rb") as file, atomic_writer(target) as copy:
             shutil.copyfileobj(file, copy)
         return
-    size = remote.file_size(source)
+    size = ranged_reads.file_size(source)
     with atomic_writer(target) as copy:
         for start in range(0, size, _PIECE_BYTES):
-            copy.write(remote.read_range(source, start, min(_PIECE_BYTES, size - start)))
+            copy.write(ranged_reads.read_range(source, start, min(_PIECE_BYTES, size - start)))
 
 
 def remove(path: str) -> None:
@@ -71,10 +86,11 @@ def remove(path: str) -> None:
         UnreachableError: It cannot be removed; a RefusedError if that is permanent.
     """
     if is_url(path):
-        return remote.remove_file(path)
+        with suppress(FileNotFoundError):
+            _persist(path, lambda timeout_s: ask(path, "rm_file", timeout_s, writing=True), retries.DEFAULT)
+        return
     with _explained(path):
         Path(path).unlink(missing_ok=True)
-    return None
 
 
 def remove_folder(folder: str, *, first: str) -> None:
@@ -97,11 +113,16 @@ def file_sizes(folder: str) -> dict[str, int]:
     Raises:
         UnreachableError: It cannot be listed; a RefusedError if that is permanent.
     """
-    if is_url(folder):
-        return remote.file_sizes(folder)
-    with _explained(folder):
-        files = [path for path in Path(folder).rglob("*") if path.is_file()]
-        return {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+    if not is_url(folder):
+        with _explained(folder):
+            files = [path for path in Path(folder).rglob("*") if path.is_file()]
+            return {path.relative_to(folder).as_posix(): path.stat().st_size for path in files}
+    try:
+        return _persist(folder, lambda timeout_s: sizes_below(folder, timeout_s), retries.DEFAULT, doing="read")
+    except FileNotFoundError:
+        if folder.startswith(("gs://", "gcs://")):  # which has no folders: only buckets can be missing
+            raise _no_bucket(folder) from None
+        return {}
 
 
 def try_writing(folder: str) -> None:
@@ -130,3 +151,16 @@ def _explained(path: str) -> Iterator[None]:
         kind = UnreachableError if error.errno in _AWAY else RefusedError
         found = f"cannot be written: {error.strerror or error}"
         raise kind(where=path, found=found, fix="Check its permissions, and the disk") from error
+
+
+def _persist(url: str, action: Callable[[float], _T], policy: RetryPolicy, doing: str = "written") -> _T:
+    try:
+        return retries.with_retries(url, action, policy=policy, access=login_hint(url), doing=doing)
+    except NotImplementedError:
+        found = f"{url.partition('://')[0]}:// cannot be written"
+        raise RefusedError(where=url, found=found, needed="a folder of this machine, gs:// or s3://") from None
+
+
+def _no_bucket(url: str) -> RefusedError:
+    bucket = url.partition("://")[2].split("/", 1)[0]
+    return RefusedError(where=url, found=f"there is no bucket {bucket}", fix="Make it, or check its name")

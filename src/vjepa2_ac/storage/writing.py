@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.partial import is_partial, partial_file, partial_folder
+from vjepa2_ac.storage.partial import is_partial, new_partial
 
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 _UNWRITABLE = _FULL | {
@@ -28,8 +28,7 @@ def atomic_writer(path: str | Path) -> Iterator[BinaryIO]:
     Missing folders are created. The bytes are on the disk (fsync) before the file gets its name.
     """
     target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with partial_file(target) as temporary:
+    with new_partial(target.parent, target.name) as temporary:
         try:
             with temporary.open("wb") as file:  # opened by name: some libraries determine the format by it
                 yield file
@@ -73,18 +72,18 @@ def folder_writer(folder: str | Path, manifest: str) -> Iterator[Path]:
             if target.exists() and not there:
                 raise NotADirectoryError(errno.ENOTDIR, "it is a file")
             parent = target if there else target.parent
-            partial = while_writing.enter_context(partial_folder(parent, target.name))
+            filling = while_writing.enter_context(new_partial(parent, target.name, is_folder=True))
         try:
             with user_can_write(folder, errors=_FULL):  # any other error of the block is the caller's
-                yield partial
+                yield filling
             with user_can_write(folder):
                 if there:
-                    _move_into(target, partial, manifest)
+                    _move_into(target, filling, manifest)
                 else:
-                    partial.replace(target)
+                    filling.replace(target)
                 sync(target if there else target.parent)
         except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
+            shutil.rmtree(filling, ignore_errors=True)
             raise
 
 
@@ -135,13 +134,13 @@ def user_can_write(path: str | Path, errors: Set[int] = _UNWRITABLE) -> Iterator
         raise InputError(where=str(path), found=f"cannot be written: {error.strerror}", fix=fix) from None
 
 
-def _move_into(target: Path, partial: Path, manifest: str) -> None:
+def _move_into(target: Path, filled: Path, manifest: str) -> None:
     (target / manifest).unlink(missing_ok=True)
-    files = [path.relative_to(partial) for path in partial.rglob("*") if path.is_file()]
+    files = [path.relative_to(filled) for path in filled.rglob("*") if path.is_file()]
     for file in sorted(files, key=lambda file: file == Path(manifest)):
         (target / file).parent.mkdir(parents=True, exist_ok=True)
-        (partial / file).replace(target / file)
-    shutil.rmtree(partial)
+        (filled / file).replace(target / file)
+    shutil.rmtree(filled)
 
 
 def sync(path: str | Path) -> None:

@@ -107,7 +107,7 @@ def test_broken_episodes_met_later_count_once_each() -> None:
     ledger = BrokenEpisodes(DataConfig(path="the set", broken_episodes="skip"), 300)
     for name in ("a", "b", "a", "c", "b"):
         ledger.met(name, f"{name} is damaged")
-    assert ledger.names == ("a", "b", "c")
+    assert list(ledger.reasons) == ["a", "b", "c"]
     with pytest.raises(InputError, match=r"4 of 300 episodes are broken: a, b, c, d\. The first, a: a is damaged\."):
         ledger.met("d", "d is damaged")
 

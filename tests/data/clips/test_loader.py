@@ -18,16 +18,17 @@ import numpy as np
 import pytest
 import torch
 
+from clips import clip_at
 from memory_source import MemorySource
 from recording_cuda import Pinning, RecordingCuda, recorded_copies
 from synthetic import synthetic_states, write_synthetic_droid
+from tfrecords import index_records
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips import dataset as opening
 from vjepa2_ac.data.clips import loader
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import ProcessShare, clip_at, collate, training_loader, validation_batches
+from vjepa2_ac.data.clips.loader import ProcessShare, collate, training_loader, validation_batches
 from vjepa2_ac.data.clips.streams import copies_for
-from vjepa2_ac.data.sources.rlds.tfrecord import index_records
 from vjepa2_ac.episode import Batch, Episode
 from vjepa2_ac.errors import InputError, UnreachableError
 from vjepa2_ac.geometry import actions_from_states, apply_action, matrices_from_euler, states_in_camera_frame
@@ -177,7 +178,7 @@ def test_a_clip_of_a_damaged_record_says_how_to_leave_it_out(droid: Path, tmp_pa
     shard.write_bytes(whole)
     dataset = open_dataset(config)
     with pytest.raises(InputError, match=r"CRC of the data.*add to data\.exclude: .*episode_0000"):
-        clip_at(dataset, 0, 0)
+        next(loader.batches_of(dataset, [(0, 0)], batch_size=1))
 
 
 RUN_THAT_DIES = """
@@ -420,7 +421,7 @@ def test_a_camera_without_a_pose_cannot_be_the_frame(in_memory: Callable[..., Da
     dataset = in_memory(MemorySource([30]))
     dataset = replace(dataset, config=dataset.config.model_copy(update={"pose_frame": "camera"}))
     with pytest.raises(InputError, match=r"episode 0: no pose of the camera.*pose_frame: base.*data\.exclude"):
-        clip_at(dataset, 0, 0)
+        next(loader.batches_of(dataset, [(0, 0)], batch_size=1))
 
 
 def test_a_batch_has_camera_poses_if_all_its_clips_have(in_memory: Callable[..., Dataset]) -> None:
@@ -450,7 +451,7 @@ def test_a_clip_that_cannot_be_read_is_missing_and_no_other_takes_its_place(
     found = first(dataset, 80, batch_size=4)
     assert [names([batch]) for batch in found] == [[one for one in row if one[0] not in broken] for row in whole]
     assert any(len(batch.starts) < 4 for batch in found)
-    assert set(dataset.broken.names) == broken
+    assert set(dataset.broken.reasons) == broken
     assert sum("A clip is left out" in record.getMessage() for record in caplog.records) == 2
     assert "memory: pictures of episode 17: damaged." in caplog.text
 

@@ -9,6 +9,7 @@ import torch
 
 from paths import GOLDEN
 from vjepa2_ac.data.clips import transforms
+from vjepa2_ac.data.clips.augmentation import per_channel
 from vjepa2_ac.data.clips.transforms import CropBox, crop_box, pixels_to_input, view
 
 FLOAT16_ROUNDING = 2.0**-10  # half a step between 2 and 4
@@ -91,7 +92,9 @@ def test_a_frame_of_the_mean_colour_becomes_zero() -> None:
 
 
 def test_what_inference_has_kept_can_be_trained_with() -> None:
-    transforms._mean_and_std.cache_clear()
+    per_channel.cache_clear()
     with torch.inference_mode():
         pixels_to_input(torch.zeros(1, 1, 8, 8, 3, dtype=torch.uint8), 8)
-    assert not any(kept.is_inference() for kept in transforms._mean_and_std(torch.device("cpu")))
+    assert not any(
+        per_channel(kept, torch.device("cpu")).is_inference() for kept in (transforms._MEAN, transforms._STD)
+    )

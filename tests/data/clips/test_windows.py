@@ -10,12 +10,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from clips import split_of
 from paths import GOLDEN, ROOT
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.config.loading import load_config
 from vjepa2_ac.data.clips.permutation import permuted
-from vjepa2_ac.data.clips.windows import ClipOrder, Windows, far_neighbours, in_split, split_of, spread
+from vjepa2_ac.data.clips.windows import ClipOrder, Windows, far_neighbours, in_split, spread
 from vjepa2_ac.data.clips.windows import windows_of as windows_of_starts
 from vjepa2_ac.data.filters.exclusion import included
 from vjepa2_ac.data.filters.step_ranges import StepSelection, clip_starts

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from clips import split_of
 from copied_sets import write_lerobot, write_npz, write_raw, write_rlds
 from latent_sets import write_cache
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips import dataset as opening
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.windows import split_of
 from vjepa2_ac.data.filters import bounded_match
 from vjepa2_ac.data.filters.grouping import split_hash
 from vjepa2_ac.data.index.episode_table import EpisodeTable

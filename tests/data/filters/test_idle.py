@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from clips import clip_at
 from gcs import Gcs
 from memory_source import MemorySource
 from paths import GOLDEN
@@ -17,7 +18,6 @@ from synthetic import synthetic_states
 from vjepa2_ac.config import DataConfig, IdleConfig
 from vjepa2_ac.data.clips import dataset as opening
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import clip_at
 from vjepa2_ac.data.filters.idle_ranges import FoundRanges
 from vjepa2_ac.data.filters.idle_rules import idle_by_commands, idle_by_motion, kept_ranges, moving_ranges
 from vjepa2_ac.data.filters.step_ranges import drawn

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from clips import split_of
 from memory_source import MemorySource
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.windows import split_of
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
 from vjepa2_ac.data.filters.step_ranges import StepSelection
 from vjepa2_ac.data.inspection.statistics import (
@@ -101,7 +101,7 @@ def in_memory(broken: frozenset[int], policy: str, pictureless: frozenset[int] =
 def test_an_episode_of_the_sample_that_cannot_be_read_is_counted_and_named(caplog: pytest.LogCaptureFixture) -> None:
     dataset = in_memory(frozenset({7}), "skip")
     assert len(inspect_dataset(dataset).sample) == 99
-    assert dataset.broken.names == ("episode 7",)
+    assert list(dataset.broken.reasons) == ["episode 7"]
     assert "memory: episode 7: damaged" in caplog.text
     with pytest.raises(InputError, match="2 of 100 episodes are broken"):
         inspect_dataset(in_memory(frozenset({7, 8}), "skip"))
@@ -115,7 +115,7 @@ def test_a_broken_frame_is_left_out_of_the_contact_sheet(monkeypatch: pytest.Mon
     dataset = in_memory(frozenset(), "skip", frozenset({7}))
     plot_dataset(dataset, inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)
     assert len(sheets[0].strips) == 99
-    assert dataset.broken.names == ("episode 7",)
+    assert list(dataset.broken.reasons) == ["episode 7"]
     dataset = in_memory(frozenset(), "error", frozenset({7}))
     with pytest.raises(InputError, match=r"pictures of episode 7: damaged\..*add to data\.exclude"):
         plot_dataset(dataset, inspect_dataset(dataset), tmp_path / "sheet.png", rows=100)

@@ -15,10 +15,11 @@ import pytest
 import simplejpeg
 
 from synthetic import synthetic_episode, synthetic_states, write_synthetic_droid
+from tfrecords import index_records
 from vjepa2_ac.config import DataConfig, RldsFields
 from vjepa2_ac.data.index.episode_table import EpisodeProblem
 from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.data.sources.rlds.tfrecord import index_records, write_record
+from vjepa2_ac.data.sources.rlds.tfrecord import write_record
 from vjepa2_ac.data.sources.rlds.writing.droid_writer import CAMERAS, write_droid_rlds
 from vjepa2_ac.errors import InputError
 

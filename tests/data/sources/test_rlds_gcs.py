@@ -12,15 +12,10 @@ import pytest
 
 from gcs import Gcs
 from synthetic import write_synthetic_droid
+from tfrecords import decode_example, index_records, read_record
 from vjepa2_ac.config import DataConfig, RldsFields
 from vjepa2_ac.data.sources.rlds.source import RldsSource
-from vjepa2_ac.data.sources.rlds.tfrecord import (
-    decode_example,
-    encode_example,
-    index_records,
-    read_record,
-    write_record,
-)
+from vjepa2_ac.data.sources.rlds.tfrecord import encode_example, write_record
 from vjepa2_ac.episode import Episode
 from vjepa2_ac.errors import InputError, UnreachableError
 
@@ -61,7 +56,7 @@ def in_any_order(folder: Path, target: Path, seed: int) -> Path:
             continue
         with (target / file.name).open("wb") as stream:
             for span in index_records(file):
-                features = decode_example(read_record(span), where="")
+                features = decode_example(read_record(span))
                 entries = [encode_example({name: features[name]}) for name in generator.permutation(list(features))]
                 write_record(stream, joined(entries))
     return target

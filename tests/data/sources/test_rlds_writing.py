@@ -12,14 +12,14 @@ import pytest
 
 from paths import GOLDEN
 from synthetic import synthetic_episode, write_synthetic_droid
-from vjepa2_ac.data.sources.rlds.tfrecord import decode_example, index_records, read_record
+from tfrecords import decode_example, index_records, read_record
 from vjepa2_ac.data.sources.rlds.writing.droid_writer import CAMERAS, DroidEpisode, write_droid_rlds
 from vjepa2_ac.errors import InputError
 
 
 def layout(shard: Path) -> dict[str, list[object]]:
     """Return kind and number of values (per step) of the features of the first record."""
-    features = decode_example(read_record(index_records(shard)[0]), where="")
+    features = decode_example(read_record(index_records(shard)[0]))
     steps = len(features["steps/is_first"][1])
     return {
         name: [kind, len(values) // (steps if name.startswith("steps/") else 1)]
@@ -65,7 +65,7 @@ def test_flags_and_reward_follow_from_length_and_path(tmp_path: Path) -> None:
     folder = write_droid_rlds(tmp_path / "set", episodes, shards=1)
     spans = index_records(next(folder.glob("*.tfrecord-*")))
     for span, reward in zip(spans, ([0, 0, 1], [0, 0, 0]), strict=True):
-        features = decode_example(read_record(span), where="")
+        features = decode_example(read_record(span))
         flags = {
             name: list(features[f"steps/{name}"][1])
             for name in ("is_first", "is_last", "is_terminal", "reward", "discount")
@@ -82,7 +82,7 @@ def test_flags_and_reward_follow_from_length_and_path(tmp_path: Path) -> None:
 def test_values_and_images_are_written_unchanged(tmp_path: Path) -> None:
     episode = synthetic_episode(0, steps=5, size=(16, 32))
     folder = write_droid_rlds(tmp_path / "set", [episode], shards=1)
-    features = decode_example(read_record(index_records(next(folder.glob("*.tfrecord-*")))[0]), where="")
+    features = decode_example(read_record(index_records(next(folder.glob("*.tfrecord-*")))[0]))
     for name, array in (
         ("action", episode.action),
         ("action_dict/joint_velocity", episode.action_dict.joint_velocity),

@@ -9,15 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vjepa2_ac.data.sources.rlds.tfrecord import (
-    decode_example,
-    decode_feature,
-    encode_example,
-    index_records,
-    read_record,
-    write_record,
-)
-from vjepa2_ac.data.sources.rlds.wire_format import NotAnExampleError, features_behind, locate_features
+from tfrecords import decode_example, index_records, read_record
+from vjepa2_ac.data.sources.rlds.tfrecord import decode_feature, encode_example, write_record
+from vjepa2_ac.data.sources.rlds.wire_format import NotAnExampleError, features_behind, iterate_features
 from vjepa2_ac.errors import InputError
 
 RECORDS = [b"", b"one", bytes(1000), b"trailing zeros\0\0\0"]
@@ -36,8 +30,8 @@ def reader_of(data: bytes) -> Callable[[int, int], bytes]:
     return lambda offset, length: data[offset : offset + length]
 
 
-def read_all(path: Path, *, check_crc: bool = True) -> list[bytes]:
-    return [read_record(span, check_crc=check_crc) for span in index_records(path)]
+def read_all(path: Path) -> list[bytes]:
+    return [read_record(span) for span in index_records(path)]
 
 
 def test_records_come_back_in_order(file: Path) -> None:
@@ -83,23 +77,11 @@ def test_every_flipped_bit_is_noticed(file: Path) -> None:
         whole[position // 8] ^= 1 << position % 8
 
 
-def test_damaged_data_may_be_read_when_told_to(file: Path) -> None:
-    whole = bytearray(file.read_bytes())
-    whole[-5] ^= 1
-    file.write_bytes(whole)
-    assert read_all(file, check_crc=False)[:-1] == RECORDS[:-1]
-
-
 @pytest.mark.parametrize("content", [b"not a TFRecord, but a text that is long enough", bytes(100), b"\x89PNG" * 20])
 def test_a_foreign_file_is_called_one(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(InputError, match=r"file: record 0 at byte 0: .*not a TFRecord"):
         index_records(tmp_path / "file")
-
-
-def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"none.*cannot be read"):
-        index_records(tmp_path / "none")
 
 
 features = st.dictionaries(
@@ -117,14 +99,14 @@ features = st.dictionaries(
 @given(features=features)
 def test_features_are_found_without_reading_the_others(features: dict) -> None:
     data = b"before" + encode_example(features) + b"after"
-    located = locate_features(reader_of(data), 6, len(data) - 11)
+    located = dict(iterate_features(reader_of(data), 6, len(data) - 11))
     assert located.keys() == features.keys()
     for name, (kind, values) in features.items():
         offset, length = located[name]
         found_kind, found = decode_feature(data[offset : offset + length], where="")
         assert list(found) == values
         assert found_kind == kind
-    decoded = decode_example(data[6:-5], where="")
+    decoded = decode_example(data[6:-5])
     assert {name: list(values) for name, (_, values) in decoded.items()} == {n: v for n, (_, v) in features.items()}
 
 
@@ -132,7 +114,7 @@ def test_features_are_found_without_reading_the_others(features: dict) -> None:
 @given(features=features, share=st.floats(0, 1))
 def test_what_is_found_from_the_end_lies_where_it_does(features: dict, share: float) -> None:
     data = encode_example(features)
-    located = locate_features(reader_of(data), 0, len(data))
+    located = dict(iterate_features(reader_of(data), 0, len(data)))
     cut = int(share * len(data))
     for place, name in enumerate(located):
         behind = dict(list(located.items())[place:])
@@ -146,8 +128,6 @@ def test_bytes_that_are_no_example_are_refused() -> None:
     example = encode_example({"name": ("bytes_list", [b"value" * 10])})
     for length in range(1, len(example)):
         with pytest.raises(NotAnExampleError):
-            locate_features(reader_of(example), 0, length)
-    with pytest.raises(InputError, match=r"here.*not a tf\.train\.Example"):
-        decode_example(example[:-1], where="here")
+            dict(iterate_features(reader_of(example), 0, length))
     with pytest.raises(InputError, match=r"here.*not a tf\.train\.Feature"):
         decode_feature(b"\xff\xff", where="here")

@@ -139,7 +139,7 @@ def test_one_episode_gives_no_certainty() -> None:
 
 
 def split_is_train() -> bool:
-    from vjepa2_ac.data.clips.windows import split_of
+    from clips import split_of
 
     return split_of("track 0", dataset_of(Tracks([80])).config) == "train"
 

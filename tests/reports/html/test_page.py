@@ -25,8 +25,8 @@ from vjepa2_ac.reports.html.examples import MOST_EXAMPLES
 from vjepa2_ac.reports.html.formatting import decimal, percent, signed
 from vjepa2_ac.reports.html.heatmaps import MapAxis, heat_map
 from vjepa2_ac.reports.html.images import jpeg_urls, png_url
-from vjepa2_ac.reports.html.markup import element, text
 from vjepa2_ac.reports.html.page import report_page, write_report
+from vjepa2_ac.reports.html.templates import render
 
 VOID = {"br", "hr", "img", "input", "meta", "wbr"}
 VERDICT = "The adapter predicts 0.8 s ahead 18 % better than the base."
@@ -331,10 +331,11 @@ def test_every_moving_image_turns_through_its_frames_and_can_be_halted() -> None
 
 
 def test_words_are_escaped_once_and_markup_is_not_escaped_again() -> None:
-    inner = element("b", "1 < 2 & 3")
-    assert element("p", inner, " > ", title='a"b') == '<p title="a&quot;b"><b>1 &lt; 2 &amp; 3</b> &gt; </p>'
-    assert text("\x07\ud800") == "\N{REPLACEMENT CHARACTER}" * 2
-    assert element("input", type="checkbox", checked=True, hidden=None) == '<input type="checkbox" checked>'
+    axis = nice_axis("", [0.0, 1.0])
+    chart = line_chart('1 < "2" & 3 \x07\ud800', [], axis, axis)
+    assert "<title>1 &lt; &#34;2&#34; &amp; 3 \N{REPLACEMENT CHARACTER}\N{REPLACEMENT CHARACTER}</title>" in chart
+    assert 'aria-label="1 &lt; &#34;2&#34; &amp; 3 ' in chart
+    assert chart in render("base", evaluation=evaluation(), chart=chart, tables=[])
 
 
 def test_numbers_have_a_true_minus_and_no_negative_zero() -> None:
@@ -408,8 +409,8 @@ def test_the_darkest_point_of_a_map_is_under_the_ring() -> None:
     x, y = (float(re.search(rf'<circle[^>]* {key}="([\d.]+)"', drawn)[1]) for key in ("cx", "cy"))
     at_ring = image.getpixel((int((x - left) / width * image.width), int((y - top) / height * image.height)))
     assert at_ring == (0x44, 0x01, 0x54)
-    cross = re.search(r'd="M([\d.]+) ([\d.]+)H', drawn)
-    x, y = float(cross[1]) + 6, float(cross[2])
+    cross = re.search(r'transform="translate\(([\d.]+) ([\d.]+)\)" class="cross', drawn)
+    x, y = float(cross[1]), float(cross[2])
     at_cross = image.getpixel((int((x - left) / width * image.width), int((y - top) / height * image.height)))
     assert at_cross == (0xFD, 0xE7, 0x25)
 

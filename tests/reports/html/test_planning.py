@@ -22,7 +22,7 @@ def found() -> Evaluation:
 
 @pytest.fixture(scope="module")
 def page(found: Evaluation) -> str:
-    return planning_section(found).markup()
+    return planning_section(found)
 
 
 def row(page: str, name: str) -> list[str]:
@@ -49,7 +49,7 @@ def test_every_way_of_planning_has_its_score_beside_those_that_take_no_model(fou
 
 
 def test_the_charts_put_each_plan_where_it_ends(found: Evaluation, page: str) -> None:
-    charts = re.findall("<svg.*?</svg>", page)
+    charts = re.findall("<svg.*?</svg>", page, re.DOTALL)
     assert sum("planned along" in chart for chart in charts) == 3
     assert [chart.count('class="mark s-trained"') for chart in charts[:3]] == [8, 8, 8]
     study, plans = found.planning, found.models["adapter"].plans
@@ -68,19 +68,19 @@ def test_steps_of_limits_and_settings_are_named(found: Evaluation) -> None:
     limits = LimitsConfig(xyz=(0.05, 0.02, 0.01))
     settings = PlanningConfig(planner="gradient", iterations=33, limits=limits)
     other = replace(found, planning=replace(study, settings=settings, one_step_beyond=0.25, three_steps_beyond=0.5))
-    words = planning_section(other).body
+    words = planning_section(other)
     assert "gradient, 8 starts, 33 iterations, L1 energy, at most 5, 2, 1 cm" in words
     assert re.search(r"25\W% of the demonstrated steps", words)
     assert re.search(r"Of the demonstrated steps 50\W% go", words)
 
 
 def test_without_a_base_nothing_is_compared_with_it() -> None:
-    words = planning_section(with_plans(evaluation(with_base=False))).body
+    words = planning_section(with_plans(evaluation(with_base=False)))
     assert "difference to the base" not in words
 
 
 def test_a_report_without_plans_says_how_to_get_them_or_why_there_are_none() -> None:
-    assert "evaluate --planning" in planning_section(evaluation()).body
+    assert "evaluate --planning" in planning_section(evaluation())
     vectors = replace(evaluation(), notes=("No plans: the states here are plain numbers.",))
-    assert "plain numbers" in planning_section(vectors).body
+    assert "plain numbers" in planning_section(vectors)
     assert 'id="planning"' in report_page(evaluation(), "")

@@ -40,7 +40,7 @@ STEPS = st.lists(
 @given(size=st.integers(0, 3000), steps=STEPS)
 def test_reading_and_seeking_equal_those_of_a_file_in_memory(size: int, steps: list[tuple[str, int]]) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(buffered_file, "_BLOCK_BYTES", 64)
+        patch.setattr(buffered_file, "BLOCK_BYTES", 64)
         patch.setattr(buffered_file, "_CACHED_BLOCKS", 8)
         data = DATA[:size]
         ours, theirs = Served(data).file, io.BytesIO(data)

@@ -27,11 +27,6 @@ def test_a_run_that_cannot_reach_anything_gives_up_within_minutes() -> None:
     assert policy.attempts * policy.timeout_s + waits <= 300
 
 
-def test_a_policy_that_never_tries_is_a_mistake() -> None:
-    with pytest.raises(ValueError, match="never tries"):
-        RetryPolicy(attempts=0)
-
-
 @pytest.mark.parametrize("error", [TypeError("ours"), KeyError("ours"), AssertionError("ours")])
 def test_a_mistake_of_ours_is_neither_tried_again_nor_blamed_on_the_network(error: Exception) -> None:
     calls = []

@@ -98,7 +98,6 @@ def bad_clip(make_config: Any, reporter: Any, monkeypatch: pytest.MonkeyPatch) -
         return clip
 
     monkeypatch.setattr(loader, "read_clip", poisoned)
-    monkeypatch.setattr("vjepa2_ac.data.clips.clip_reader.read_clip", poisoned)
     return bad
 
 

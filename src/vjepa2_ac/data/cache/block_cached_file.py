@@ -6,9 +6,7 @@ from itertools import groupby
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.cache.disk_cache import DiskCache
-from vjepa2_ac.storage.remote.buffered_file import RangedFile
-
-_BLOCK_BYTES = 128 << 10
+from vjepa2_ac.storage.remote.buffered_file import BLOCK_BYTES, RangedFile
 
 
 class BlockCachedFile(RangedFile):
@@ -30,13 +28,12 @@ class BlockCachedFile(RangedFile):
         self.failure: Exception | None = None
 
     def _fetched(self, start: int, length: int) -> bytes:
-        first, last = start // _BLOCK_BYTES, (start + length - 1) // _BLOCK_BYTES
+        """Return whole blocks: no others are requested."""
         try:
-            data = b"".join(self._blocks_of(first, last))
+            return b"".join(self._blocks_of(start // BLOCK_BYTES, (start + length - 1) // BLOCK_BYTES))
         except Exception as error:
             self.failure = error
             raise
-        return data[start - first * _BLOCK_BYTES :][:length]
 
     def _blocks_of(self, first: int, last: int) -> list[bytes]:
         """Return blocks from the disk; missing ones are fetched, adjacent ones together."""
@@ -45,10 +42,10 @@ class BlockCachedFile(RangedFile):
         runs = [
             [number for _, number in run] for _, run in groupby(enumerate(lacking), key=lambda pair: pair[1] - pair[0])
         ]
-        ranges = [(run[0] * _BLOCK_BYTES, sum(map(self._length_of, run))) for run in runs]
+        ranges = [(run[0] * BLOCK_BYTES, sum(map(self._length_of, run))) for run in runs]
         for run, data in zip(runs, storage.read_ranges(self._path, ranges), strict=True):
             for place, number in enumerate(run):
-                block = data[place * _BLOCK_BYTES :][: self._length_of(number)]
+                block = data[place * BLOCK_BYTES :][: self._length_of(number)]
                 self._cache.write(f"{self._key} {number}", block)
                 found[number] = block
         return [block for block in found.values() if block is not None]
@@ -58,4 +55,4 @@ class BlockCachedFile(RangedFile):
         return block if block is not None and len(block) == self._length_of(number) else None
 
     def _length_of(self, number: int) -> int:
-        return min(_BLOCK_BYTES, self._bytes - number * _BLOCK_BYTES)
+        return min(BLOCK_BYTES, self._bytes - number * BLOCK_BYTES)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
@@ -27,11 +29,7 @@ class EpisodeFiles:
         """
         if not storage.is_url(path):
             return path
-        key = f"size {path} {version}"
-        size = self._cache.read(key)
-        if size is None:
-            size = str(storage.file_size(path)).encode()
-            self._cache.write(key, size)
+        size = self._cached(f"size {path} {version}", lambda: str(storage.file_size(path)).encode())
         return BlockCachedFile(path, version=version, size=int(size), cache=self._cache)
 
     def read(self, path: str, *, version: str, where: str) -> bytes:
@@ -48,10 +46,12 @@ class EpisodeFiles:
         """
         if not storage.is_url(path):
             return _read(path, where)
-        key = f"{path}@{version}"
+        return self._cached(f"{path}@{version}", lambda: _read(path, where))
+
+    def _cached(self, key: str, fetch: Callable[[], bytes]) -> bytes:
         data = self._cache.read(key)
         if data is None:
-            data = _read(path, where)
+            data = fetch()
             self._cache.write(key, data)
         return data
 

@@ -41,8 +41,6 @@ class DiskCache:
     """
 
     def __init__(self, folder: str | Path, limit_bytes: int) -> None:
-        if limit_bytes < 0:
-            raise ValueError(f"limit_bytes is {limit_bytes}")
         self._folder, self._limit = Path(folder), limit_bytes
         self._warned = False
 

@@ -15,7 +15,7 @@ from vjepa2_ac.episode import Augmentation
 
 _STREAM = 0xA6  # separates these random numbers from others of the same seed and position
 
-_RED, _GREEN, _BLUE = 0.299, 0.587, 0.114  # weights of a colour's brightness, ITU-R BT.601
+_BRIGHTNESS = (0.299, 0.587, 0.114)  # weights of red, green and blue, ITU-R BT.601
 
 
 def draw(config: AugmentConfig, height: int, width: int, *, seed: int, position: int) -> Augmentation | None:
@@ -87,10 +87,11 @@ def _blend(pixels: Tensor, plainer: Tensor, factor: float) -> Tensor:
 
 
 def _grey(pixels: Tensor) -> Float[Tensor, "time 1 height width"]:
-    return (pixels * _weights(pixels.device)).sum(dim=1, keepdim=True)
+    return (pixels * per_channel(_BRIGHTNESS, pixels.device)).sum(dim=1, keepdim=True)
 
 
-@lru_cache(maxsize=8)
-def _weights(device: torch.device) -> Float[Tensor, "3 1 1"]:
-    with torch.inference_mode(False):  # once for each device, as the mean and std of `transforms`
-        return torch.tensor((_RED, _GREEN, _BLUE), device=device).view(3, 1, 1)
+@lru_cache(maxsize=32)
+def per_channel(values: tuple[float, float, float], device: torch.device) -> Float[Tensor, "3 1 1"]:
+    """Return numbers for red, green and blue on a device: copied there once, since the copy blocks the host."""
+    with torch.inference_mode(False):  # tensors of inference mode could not be trained with
+        return torch.tensor(values, device=device).view(3, 1, 1)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
+from torch import Tensor
 
 from vjepa2_ac.data.clips.actions import actions_of, require_widths
 from vjepa2_ac.data.clips.dataset import Dataset
@@ -22,33 +23,12 @@ Augment = Callable[[int, int], Augmentation | None]  # from the height and width
 
 @dataclass(frozen=True)
 class ClipRequest:
-    """A request for a clip."""
+    """A request for the clip that starts at a control step of an episode."""
 
-    episode: int
-    start: int
-    camera: str | None
-    augmentation: Augment | None = None
-
-
-def clip_at(
-    dataset: Dataset, episode: int, start: int, *, camera: str | None = None, augmentation: Augment | None = None
-) -> Clip:
-    """Return the clip that starts at a control step of an episode; decodes its frames only.
-
-    Args:
-        dataset: Its data set.
-        episode: Index into the data set's table.
-        start: First control step.
-        camera: Whose frames; None: the config's (first) camera.
-        augmentation: Draws the augmentation, given the size of the frames.
-
-    Raises:
-        InputError: The episode or one of the frames cannot be read; says how to leave the episode out.
-    """
-    try:
-        return read_clip(dataset, ClipRequest(episode, start, camera, augmentation))
-    except InputError as error:
-        raise with_way_out(error, [dataset.table.identity(episode)]) from None
+    episode: int  # index into the data set's table
+    start: int  # first control step
+    camera: str | None = None  # whose frames; None: the config's (first) camera
+    augmentation: Augment | None = None  # draws the augmentation
 
 
 def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
@@ -72,7 +52,7 @@ def collate(clips: Sequence[Clip], bytes_fetched: int = 0) -> Batch:
         starts=tuple(clip.start for clip in clips),
         augmentations=augmentations,
         bytes_fetched=bytes_fetched,
-        latents=_stacked(latents) if latents else None,
+        latents=joined_latents(latents, torch.stack) if latents else None,
         cameras=tuple(clip.camera for clip in clips),
     )
 
@@ -107,13 +87,18 @@ def _require_one_size(clips: Sequence[Clip]) -> None:
             raise with_way_out(error, [clip.episode_id], skippable=False)
 
 
-def _stacked(latents: Sequence[StoredLatents]) -> StoredLatents:
+def joined_latents(latents: Sequence[StoredLatents], join: Callable[[list[Tensor]], Tensor]) -> StoredLatents:
+    """Return latents joined by `torch.stack` or `torch.cat`, and their scales likewise."""
     scales = [one.scales for one in latents if one.scales is not None]
-    return StoredLatents(torch.stack([one.values for one in latents]), torch.stack(scales) if scales else None)
+    return StoredLatents(join([one.values for one in latents]), join(scales) if scales else None)
 
 
 def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
-    """Return a clip; unlike those of `clip_at`, its errors do not say how to exclude the episode."""
+    """Return a clip; decodes its frames only.
+
+    Raises:
+        InputError: The episode or one of the frames cannot be read; does not say how to leave the episode out.
+    """
     config = dataset.config
     steps = range(request.start, request.start + config.clip_steps, config.model_stride)
     recording = dataset.source.read(request.episode, request.camera, dataset.needed_steps(request.episode))
@@ -123,8 +108,8 @@ def read_clip(dataset: Dataset, request: ClipRequest) -> Clip:
         latents = recording.read_latents(steps)
     else:
         frames = view(recording.read_frames(steps), config.crop)
-        draw_change = request.augmentation
-        augmentation = None if draw_change is None else draw_change(frames.shape[1], frames.shape[2])
+        if request.augmentation is not None:
+            augmentation = request.augmentation(frames.shape[1], frames.shape[2])
     states, extrinsics = _states(recording, list(steps), in_camera_frame=config.pose_frame == "camera")
     return Clip(
         frames=frames,

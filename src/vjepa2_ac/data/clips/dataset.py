@@ -57,9 +57,7 @@ class Dataset:
     table: EpisodeTable
     kept: StepSelection
     broken: BrokenEpisodes  # grows in the process that opened the set
-    groups: UInt64[np.ndarray, " episodes"] | None = (
-        None  # hash of each episode's group; None: `data.split_by` names none
-    )
+    groups: UInt64[np.ndarray, " episodes"] | None = None  # hash of each one's group; None: `data.split_by` names none
 
     @property
     def split_hash(self) -> UInt64[np.ndarray, " episodes"]:
@@ -95,23 +93,16 @@ class Dataset:
         included_ones = included(self.table, self.config)
         of_outcome = included_ones & _of_outcome(self.table, self.config)
         excluded = sum(problem.name in self.config.exclude for problem in self.table.problems)
-        stages = (
-            ("excluded", np.ones(len(self.table), bool), excluded),
-            ("outcome", included_ones, 0),
-            ("broken", of_outcome, len(self.table.problems) - excluded),
-            ("idle", self.kept.taking_part, 0),
-        )
-        left = [self._count(StepSelection.whole(self.table, mask)) for _, mask, _ in stages]
-        pairs = zip(stages, left, [*left[1:], self._count(self.kept)], strict=True)
+        unread = {"excluded": excluded, "broken": len(self.table.problems) - excluded}
+        stays = {"idle": self.config.idle.keep_share}
+        everyone = np.ones(len(self.table), bool)
+        stages = {"excluded": everyone, "outcome": included_ones, "broken": of_outcome, "idle": self.kept.taking_part}
+        left = [self._count(StepSelection.whole(self.table, mask)) for mask in stages.values()]
+        gone = -np.diff([*left, self._count(self.kept)], axis=0)
+        is_known = self.config.stride != "auto"
         return tuple(
-            Removed(
-                name,
-                before[0] - after[0] + unread,
-                before[1] - after[1],
-                before[2] - after[2] if self.config.stride != "auto" else None,
-                self.config.idle.keep_share if name == "idle" else 0.0,
-            )
-            for (name, _, unread), before, after in pairs
+            Removed(name, count + unread.get(name, 0), steps, windows if is_known else None, stays.get(name, 0.0))
+            for name, (count, steps, windows) in zip(stages, gone.tolist(), strict=True)
         )
 
     def _count(self, kept: StepSelection) -> tuple[int, int, int]:

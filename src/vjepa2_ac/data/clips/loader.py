@@ -8,11 +8,11 @@ from __future__ import annotations
 import atexit
 import itertools
 import multiprocessing
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,16 +23,15 @@ from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.augmentation import draw
-from vjepa2_ac.data.clips.clip_reader import ClipRequest, clip_at, collate, no_clips, read_clip
+from vjepa2_ac.data.clips.clip_reader import ClipRequest, collate, no_clips, read_clip
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.prefetch import Batches, MicroBatch
 from vjepa2_ac.data.clips.streams import NO_COPIES, Copies
 from vjepa2_ac.data.clips.windows import ClipOrder, far_neighbours, spread
 from vjepa2_ac.data.clips.worker_processes import end_with_the_run, end_workers, start_servers_deaf
-from vjepa2_ac.data.filters.exclusion import named
+from vjepa2_ac.data.filters.exclusion import named, with_way_out
 from vjepa2_ac.data.filters.step_ranges import drawn
-from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.episode import Augmentation, Batch, Clip, Skipped
+from vjepa2_ac.episode import Batch, Clip, Skipped
 from vjepa2_ac.errors import InputError, UserError
 
 CLIPS_WORTH_WORKERS = 256  # starting workers takes longer than reading fewer validation clips
@@ -70,8 +69,9 @@ def training_loader(
     Raises:
         InputError: There is nothing to train on, or a clip cannot be read, also in a worker.
     """
-    clips = _Clips(dataset, _TrainingClips(dataset.config, ClipOrder(dataset.windows("train"), seed)))
-    rows = _rows(start_position + share.rank * batch_size, batch_size, batch_size * share.processes)
+    clips = _Clips(dataset, partial(_training_clip, dataset.config, ClipOrder(dataset.windows("train"), seed)))
+    firsts = itertools.count(start_position + share.rank * batch_size, batch_size * share.processes)
+    rows = (list(range(first, first + batch_size)) for first in firsts)
     return _batches(clips, rows, dataset.config.workers, copies)
 
 
@@ -112,7 +112,7 @@ def batches_of(
     count = len(windows)
     rows = [list(range(first, min(first + batch_size, count))) for first in range(0, count, batch_size)]
     workers = dataset.config.workers if count >= CLIPS_WORTH_WORKERS else 0
-    clips = _Clips(dataset, _ChosenClips(dataset.config, dataset.table, list(windows)))
+    clips = _Clips(dataset, partial(_chosen_clip, dataset, windows))
     return _some_of(_batches(clips, iter(rows), workers, copies), dataset)
 
 
@@ -130,49 +130,26 @@ def _some_of(batches: Iterator[Batch], dataset: Dataset) -> Iterator[Batch]:
     if empty:
         raise InputError(
             where=f"data.path: {dataset.config.path}",
-            found=f"none of the clips can be read; broken episodes: {named(dataset.broken.names)}",
+            found=f"none of the clips can be read; broken episodes: {named(tuple(dataset.broken.reasons))}",
             needed="at least one",
             fix="Repair or fetch these episodes again, or add them to data.exclude",
         )
 
 
-@runtime_checkable
-class _Requests(Protocol):
-    """The clip at each position; a pure function, the same in every worker."""
-
-    def at(self, position: int) -> ClipRequest: ...
-
-
-@dataclass(frozen=True)
-class _TrainingClips:
-    """The endless sequence of a run: a permutation of all windows per epoch; camera and augmentation drawn per clip."""
-
-    config: DataConfig
-    order: ClipOrder
-
-    def at(self, position: int) -> ClipRequest:
-        def augmentation(height: int, width: int) -> Augmentation | None:
-            return draw(self.config.augment, height, width, seed=self.order.seed, position=position)
-
-        cameras = self.config.cameras
-        return ClipRequest(
-            *self.order.window(position), cameras[self.order.choice(position, len(cameras))], augmentation
-        )
+def _training_clip(config: DataConfig, order: ClipOrder, position: int) -> ClipRequest:
+    """Return a clip of the endless sequence of a run: camera and augmentation are drawn per clip."""
+    camera = config.cameras[order.choice(position, len(config.cameras))]
+    augmentation = partial(draw, config.augment, seed=order.seed, position=position)
+    return ClipRequest(*order.window(position), camera, augmentation)
 
 
-@dataclass(frozen=True)
-class _ChosenClips:
-    """A fixed list of windows; the camera is drawn per window."""
-
-    config: DataConfig
-    table: EpisodeTable
-    windows: list[tuple[int, int]]
-
-    def at(self, position: int) -> ClipRequest:
-        episode, start = self.windows[position]
-        # Not the number by which idle windows were drawn: kept ones have a small number, and would share a camera.
-        number = drawn(~self.table.id_hash[[episode]], np.array([start], np.int32))[0]
-        return ClipRequest(episode, start, self.config.cameras[int(number * len(self.config.cameras))])
+def _chosen_clip(dataset: Dataset, windows: Sequence[tuple[int, int]], position: int) -> ClipRequest:
+    """Return a clip of a list of windows; the camera is drawn per window."""
+    episode, start = windows[position]
+    # Not the number by which idle windows were drawn: kept ones have a small number, and would share a camera.
+    number = drawn(~dataset.table.id_hash[[episode]], np.array([start], np.int32))[0]
+    cameras = dataset.config.cameras
+    return ClipRequest(episode, start, cameras[int(number * len(cameras))])
 
 
 @dataclass(frozen=True)
@@ -180,7 +157,7 @@ class _Clips(TorchDataset[MicroBatch]):
     """Clips by position, read a micro-batch at a time."""
 
     dataset: Dataset
-    requests: _Requests
+    request_at: Callable[[int], ClipRequest]  # a pure function of the position, the same in every worker
 
     def __getitems__(self, positions: list[int]) -> MicroBatch | UserError:
         """Return a micro-batch, or its error: DataLoader would change an error that is raised."""
@@ -204,20 +181,14 @@ class _Clips(TorchDataset[MicroBatch]):
             return list(pool.map(self._clip, positions))
 
     def _clip(self, position: int) -> Clip | Skipped:
-        request = self.requests.at(position)
-        if self.dataset.config.broken_episodes == "error":
-            return clip_at(
-                self.dataset, request.episode, request.start, camera=request.camera, augmentation=request.augmentation
-            )
+        request = self.request_at(position)
         try:
             return read_clip(self.dataset, request)
         except InputError as error:
-            return Skipped(self.dataset.table.identity(request.episode), str(error))
-
-
-def _rows(first: int, length: int, distance: int) -> Iterator[list[int]]:
-    for start in itertools.count(first, distance):
-        yield list(range(start, start + length))
+            name = self.dataset.table.identity(request.episode)
+            if self.dataset.config.broken_episodes == "error":
+                raise with_way_out(error, [name]) from None
+            return Skipped(name, str(error))
 
 
 def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int, copies: Copies) -> Batches:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
 
 from vjepa2_ac.data.clips.streams import Copies
 from vjepa2_ac.data.filters.broken_episodes import BrokenEpisodes
@@ -24,18 +23,9 @@ class MicroBatch:
         return replace(self, batch=self.batch.pin_memory())
 
 
-@runtime_checkable
-class SupportsPrefetch(Protocol):
-    """Batches whose next one can be prefetched."""
-
-    def prefetch_next(self) -> None:
-        """Prefetch it now."""
-        ...
-
-
 def prefetch_next(batches: Iterator[Batch]) -> None:
     """Prefetch the next batch if these batches support it: to be called before the host waits for the device."""
-    if isinstance(batches, SupportsPrefetch):
+    if hasattr(batches, "prefetch_next"):
         batches.prefetch_next()
 
 
@@ -55,7 +45,7 @@ class Batches(Iterator[Batch]):
         self, rows: Generator[MicroBatch | UserError, None, None], broken: BrokenEpisodes, copies: Copies
     ) -> None:
         self._rows, self._broken, self._copies = rows, broken, copies
-        self._prefetched: Exception | _Fetched | None = None
+        self._prefetched: Exception | MicroBatch | None = None
 
     def __next__(self) -> Batch:
         """Return the next batch.
@@ -67,9 +57,9 @@ class Batches(Iterator[Batch]):
         if isinstance(fetched, Exception):
             self.close()
             raise fetched
-        for one in fetched.row.skipped:
+        for one in fetched.skipped:
             self._broken.met(one.episode_id, one.reason)
-        return replace(fetched.row.batch, on_device=fetched.on_device)
+        return fetched.batch
 
     def prefetch_next(self) -> None:
         """Fetch the next batch and start its copy to the device."""
@@ -81,21 +71,15 @@ class Batches(Iterator[Batch]):
         self._prefetched = None
         self._rows.close()
 
-    def _fetched(self) -> Exception | _Fetched:
+    def _fetched(self) -> Exception | MicroBatch:
         try:
             row = next(self._rows)
-            if isinstance(row, UserError):
+            if isinstance(row, UserError) or not self._copies.overlap:
                 return row
-            on_device = _take_once(self._copies.to_device.start(row.batch.mapped)) if self._copies.overlap else None
+            on_device = _take_once(self._copies.to_device.start(row.batch.mapped))
         except Exception as error:  # also the end of the rows
             return error
-        return _Fetched(row, on_device)
-
-
-@dataclass(frozen=True)
-class _Fetched:
-    row: MicroBatch
-    on_device: Callable[[], Batch | None] | None
+        return replace(row, batch=replace(row.batch, on_device=on_device))
 
 
 def _take_once(taken: Callable[[], Batch]) -> Callable[[], Batch | None]:

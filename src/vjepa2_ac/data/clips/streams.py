@@ -160,14 +160,13 @@ class Copies:
     overlap: bool  # whether copies overlap with computation
 
 
-_HOST = torch.device("cpu")
-NO_COPIES = Copies(AtOnce(_HOST), AtOnce(_HOST), overlap=False)
-
-
 @lru_cache(maxsize=8)
 def copies_for(device: torch.device) -> Copies:
     """Return the copies to a device and back; always the same streams."""
     if device.type != "cuda":
-        return Copies(AtOnce(device), AtOnce(_HOST), overlap=False)
+        return Copies(AtOnce(device), AtOnce(torch.device("cpu")), overlap=False)
     cuda = Cuda(device)
     return Copies(ToDevice(cuda), ToHost(cuda), overlap=True)
+
+
+NO_COPIES = copies_for(torch.device("cpu"))

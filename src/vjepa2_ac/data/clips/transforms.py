@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -18,7 +17,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.data.clips.augmentation import jittered
+from vjepa2_ac.data.clips.augmentation import jittered, per_channel
 from vjepa2_ac.episode import Augmentation
 
 Crop = Literal["released", "square", "letterbox"]
@@ -44,11 +43,8 @@ def crop_box(height: int, width: int, kind: Crop = "released") -> CropBox:
 
     released: an aspect between 0.75 and 1.35. square: 1, as upstream evaluates. letterbox: all.
     """
-    narrowest, widest = {
-        "released": (NARROWEST, WIDEST),
-        "square": (1.0, 1.0),
-        "letterbox": (0.0, float("inf")),
-    }[kind]
+    aspects = {"released": (NARROWEST, WIDEST), "square": (1.0, 1.0), "letterbox": (0.0, float("inf"))}
+    narrowest, widest = aspects[kind]
     box_height, box_width = height, width
     if width / height < narrowest:
         box_height = round(width / narrowest)
@@ -71,20 +67,15 @@ def view(
 
 
 def _with_bars(frames: UInt8[np.ndarray, "time height width 3"]) -> UInt8[np.ndarray, "time side side 3"]:
-    time, height, width, channels = frames.shape
+    height, width = frames.shape[1:3]
     if height == width:
         return frames
-    side = max(height, width)
-    top, left = (side - height) // 2, (side - width) // 2
-    square = np.zeros((time, side, side, channels), np.uint8)
-    square[:, top : top + height, left : left + width] = frames
-    return square
+    rows, columns = max(0, width - height), max(0, height - width)  # missing ones, in all
+    return np.pad(frames, ((0, 0), (rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0)))
 
 
 def pixels_to_input(
-    frames: UInt8[Tensor, "batch time height width 3"],
-    image_size: int,
-    augmentations: Sequence[Augmentation] = (),
+    frames: UInt8[Tensor, "batch time height width 3"], image_size: int, augmentations: Sequence[Augmentation] = ()
 ) -> Float[Tensor, "batch time 3 size size"]:
     """Return cropped frames as encoder input: squashed to a square (bilinear), ImageNet mean 0 and std 1.
 
@@ -104,19 +95,8 @@ def pixels_to_input(
         resized = torch.cat([_augmented(clip, image_size, augmentation) for clip, augmentation in pairs])
     else:
         raise ValueError(f"{len(augmentations)} augmentations for {batch} clips")
-    mean, std = _mean_and_std(frames.device)
-    normalised: Tensor = (resized - mean) / std
+    normalised: Tensor = (resized - per_channel(_MEAN, frames.device)) / per_channel(_STD, frames.device)
     return normalised.reshape(batch, time, 3, image_size, image_size)
-
-
-@lru_cache(maxsize=8)
-def _mean_and_std(device: torch.device) -> tuple[Float[Tensor, "3 1 1"], Float[Tensor, "3 1 1"]]:
-    # Once per device, since the copy blocks the host; not as a tensor of inference mode.
-    with torch.inference_mode(False):
-        return (
-            torch.tensor(_MEAN, device=device).view(3, 1, 1),
-            torch.tensor(_STD, device=device).view(3, 1, 1),
-        )
 
 
 def _augmented(clip: Tensor, image_size: int, augmentation: Augmentation) -> Float[Tensor, "time 3 size size"]:

@@ -20,7 +20,7 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.permutation import permuted
 from vjepa2_ac.data.filters.exclusion import NAMED, named
 from vjepa2_ac.data.filters.step_ranges import ClipStarts
-from vjepa2_ac.data.index.episode_table import EpisodeTable, identity_hash
+from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.errors import InputError
 
 logger = logging.getLogger(__name__)
@@ -44,16 +44,14 @@ class Windows:
         if not 0 <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
         run = int(np.searchsorted(self.ends, index, side="right"))
-        episode, first, span, count = (int(column[run]) for column in self.starts.columns)
-        place = index - (int(self.ends[run]) - count)
-        if count == span:
-            return episode, first + self.starts.every * place
-        return episode, int(self.starts.steps_of(run, self.id_hash, self.keep_share)[place])
+        place = index - (int(self.ends[run]) - int(self.starts.count[run]))
+        steps = self.starts.steps_of(run, self.id_hash, self.keep_share)
+        return int(self.starts.episode[run]), int(steps[place])
 
     @property
     def episodes(self) -> Int32[np.ndarray, " episodes"]:
         """The episodes that clips come from; an index into the source."""
-        return np.unique(self.starts.episode)
+        return self.starts.episodes
 
 
 @dataclass(frozen=True)
@@ -74,28 +72,19 @@ class ClipOrder:
         return int.from_bytes(digest, "big") % count
 
 
-def split_of(name: str, config: DataConfig) -> Split:
-    """Return the split of an episode: a hash of its identity, as a number in [0, 1), compared with the shares.
-
-    Args:
-        name: Its identity; with `data.split_by`, the name of its group.
-        config: The shares.
-    """
-    number = identity_hash(name) / 2**64
-    if number < config.test_share:
-        return "test"
-    return "validation" if number < config.test_share + config.validation_share else "train"
-
-
 def in_split(
     split_hash: UInt64[np.ndarray, " episodes"], config: DataConfig, split: Split
 ) -> Bool[np.ndarray, " episodes"]:
-    """Return which episodes belong to a split: `split_of` for all at once, from the hashes of the names."""
+    """Return which episodes belong to a split: a hash, as a number in [0, 1), is compared with the shares.
+
+    Args:
+        split_hash: Of each episode's identity; with `data.split_by`, of the name of its group.
+        config: The shares.
+        split: Which split.
+    """
     number = split_hash.astype(np.float64) / 2**64
-    held_out = config.test_share + config.validation_share
-    low, high = {"test": (0.0, config.test_share), "validation": (config.test_share, held_out)}.get(
-        split, (held_out, 2.0)
-    )
+    test, held_out = config.test_share, config.test_share + config.validation_share
+    low, high = {"test": (0.0, test), "validation": (test, held_out), "train": (held_out, 2.0)}[split]
     return np.asarray((number >= low) & (number < high))
 
 
@@ -134,8 +123,29 @@ def windows_of(
         _warn_of_short(config.path, split, config.clip_steps, int(members.sum()), len(short), names)
     own = starts[members[starts.episode]]
     if not own.windows:
-        raise _no_steps_left(config, split)
+        raise InputError(
+            where=f"data.path: {config.path}",
+            found=f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})",
+            needed=_length_of(config),
+            fix="Lower data.frames or data.stride, raise data.idle.keep_share, or set data.idle.rule: none",
+        )
     return Windows(own, np.cumsum(own.count, dtype=np.int64), short, table.id_hash, config.idle.keep_share)
+
+
+def require_stride(config: DataConfig, *, to: str, fix: str = "`vjepa2-ac data calibrate CONFIG` finds one") -> int:
+    """Return the stride of a config.
+
+    Args:
+        config: The data.
+        to: What it is needed for.
+        fix: How to say it.
+
+    Raises:
+        InputError: It is auto.
+    """
+    if config.stride == "auto":
+        raise InputError(where="data.stride", found="auto", needed=f"a number of control steps, to {to}", fix=fix)
+    return config.stride
 
 
 def spread(size: int, count: int) -> list[int]:
@@ -188,15 +198,10 @@ def _too_short(
         where=f"data.path: {config.path}",
         found=f"{len(short)} of {members} {split} episodes are shorter than a clip; the longest of these,"
         f" {table.identity(longest)}, has {table.num_steps[longest]} steps. Too short: {named(names, len(short))}",
-        needed=f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}",
+        needed=_length_of(config),
         fix=fix,
     )
 
 
-def _no_steps_left(config: DataConfig, split: Split) -> InputError:
-    return InputError(
-        where=f"data.path: {config.path}",
-        found=f"no {split} episode has a range of kept steps as long as a clip (data.idle.rule {config.idle.rule})",
-        needed=f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}",
-        fix="Lower data.frames or data.stride, raise data.idle.keep_share, or set data.idle.rule: none",
-    )
+def _length_of(config: DataConfig) -> str:
+    return f"{config.clip_steps} steps for a clip of {config.frames} frames at stride {config.stride}"

@@ -33,11 +33,6 @@ class BrokenEpisodes:
         """The broken episodes and their errors, in the order in which they were found."""
         return dict(self._reasons)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The broken episodes, in the order in which they were found."""
-        return tuple(self._reasons)
-
     def found(self, problems: Sequence[EpisodeProblem]) -> None:
         """Record the problems found while the data set was opened or indexed.
 
@@ -79,7 +74,7 @@ class BrokenEpisodes:
         name, reason = next(iter(self._reasons.items()))
         raise InputError(
             where=f"data.path: {self._config.path}",
-            found=f"{len(self)} of {self._episodes} episodes are broken: {named(self.names)}."
+            found=f"{len(self)} of {self._episodes} episodes are broken: {named(tuple(self._reasons))}."
             f" The first, {name}: {reason.rstrip('.')}",
             needed=f"{MOST_BROKEN:.0%} at most: data.broken_episodes is skip",
             fix="Repair or fetch them again, or add them to data.exclude",

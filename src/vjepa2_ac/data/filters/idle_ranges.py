@@ -8,6 +8,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Int32
@@ -21,7 +22,7 @@ from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable, Not
 from vjepa2_ac.data.index.index_cache import fingerprints_of, get_or_make, key_of
 from vjepa2_ac.episode import EpisodeSource, Progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.arrays import read_arrays
+from vjepa2_ac.storage.npz_reader import read_arrays
 from vjepa2_ac.storage.structured import json_object, record_of, shown
 
 logger = logging.getLogger(__name__)
@@ -111,13 +112,10 @@ def find_ranges(
     if storage.is_url(config.path):  # its fingerprint is what it was, and so is this key
         knobs["path"] = config.path
     parts: dict[str, object] = {"found": "idle ranges", "table": fingerprints_of(table)[0], "data": knobs}
+    make = partial(_computed, source, table, config, progress)
     if config.idle.rule == "published":
         path = str(config.idle.ranges)
-        return _cached(config, parts | {"list": _version(path)}, lambda: _published(path, table))
-    return _cached(config, parts, lambda: _computed(source, table, config, progress))
-
-
-def _cached(config: DataConfig, parts: dict[str, object], make: Callable[[], FoundRanges]) -> FoundRanges:
+        make, parts["list"] = partial(_published, path, table), _version(path)
     return get_or_make(
         config.disk_cache, key_of(parts), make, to_bytes=FoundRanges.to_bytes, from_bytes=FoundRanges.from_bytes
     )
@@ -156,20 +154,18 @@ def _refuse_all_broken(found: list[Found]) -> None:
 
 def _published(path: str, table: EpisodeTable) -> FoundRanges:
     lists = _read_list(path)
-    found: list[Found] = []
-    listed = 0
-    for place in range(len(table)):
-        name = table.identity(place)
-        listed += name in lists
-        found.append(_checked(lists.get(name, []), name, int(table.num_steps[place]), path))
+    names = [table.identity(place) for place in range(len(table))]
+    listed = sum(name in lists for name in names)
     if not listed:
         first = next(iter(lists), "none at all")
         raise InputError(
             where=f"data.idle.ranges: {path}",
             found=f"none of the {len(table)} episodes; its first is {first}",
-            needed="the identities of the episodes" + (f", such as {table.identity(0)}" if len(table) else ""),
+            needed="the identities of the episodes" + (f", such as {names[0]}" if names else ""),
             fix="Name the list of this version of the data set, or set data.idle.rule: commands or motion",
         )
+    steps = table.num_steps.tolist()
+    found = [_checked(lists.get(name, []), name, count, path) for name, count in zip(names, steps, strict=True)]
     return FoundRanges.of(found, listed=listed)
 
 

@@ -104,17 +104,15 @@ def clip_starts(table: EpisodeTable, kept: StepSelection, config: DataConfig) ->
     """Return all clip starts, sorted by the episodes' identities: in kept steps, and in a share of the idle ones."""
     counts = kept.end - kept.start - (config.clip_steps - 1)
     fits = counts > 0
-    runs = ClipStarts(kept.episode[fits], kept.start[fits], counts[fits], counts[fits])
+    every_step = ClipStarts(kept.episode[fits], kept.start[fits], counts[fits], counts[fits])
     every, phase = config.start_every, np.zeros(len(table), np.int32)
     phase[kept.episode[::-1]] = kept.start[::-1]  # the last write counts: an episode's first range
+    runs = every_step.thinned(phase, every)
     if config.idle.rule != "none" and config.idle.keep_share > 0:
-        gaps = _gaps(table, kept.taking_part, runs, config).thinned(phase, every)
+        gaps = _gaps(table, kept.taking_part, every_step, config).thinned(phase, every)
         still = _still(table, gaps, config.idle.keep_share)
-        runs = runs.thinned(phase, every)
         episode, first, span, count = map(np.concatenate, zip(runs.columns, still.columns, strict=True))
         runs = ClipStarts(episode, first, span, count, every)
-    else:
-        runs = runs.thinned(phase, every)
     return runs[np.lexsort((runs.first, table.id_rank[runs.episode]))]
 
 

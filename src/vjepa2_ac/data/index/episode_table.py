@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, overload
 
@@ -16,10 +16,10 @@ import numpy as np
 from jaxtyping import Int8, Int32, Int64, UInt8, UInt64
 
 from vjepa2_ac.data.index.labels import Labels
-from vjepa2_ac.data.index.packed_text import NotPackedTextError, pack_texts, require_texts, text_of
+from vjepa2_ac.data.index.packed_text import are_texts, pack_texts, text_of
 from vjepa2_ac.episode import EpisodeInfo
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage.arrays import read_arrays
+from vjepa2_ac.storage.npz_reader import read_arrays
 from vjepa2_ac.storage.structured import json_object, record_of
 
 FORMAT = 2  # of `to_bytes`: an index with another number is rebuilt
@@ -116,9 +116,6 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             success=None if success == _UNKNOWN else bool(success),
         )
 
-    def __iter__(self) -> Iterator[EpisodeInfo]:
-        return (self[number] for number in range(len(self)))
-
     def identity(self, index: int) -> str:
         """Return the identity of one episode."""
         return text_of("id", {"id_ends": self.id_ends, "id_bytes": self.id_bytes}, index)
@@ -159,9 +156,8 @@ class EpisodeTable(Sequence[EpisodeInfo]):
             raise NotATableError(str(error)) from None
         locators = {name.removeprefix(_LOCATOR): one for name, one in arrays.items() if name.startswith(_LOCATOR)}
         _require_columns(arrays, locators)
-        columns = {name: arrays[name] for name in _COLUMNS}
         return cls(
-            **columns,
+            **{name: arrays[name] for name in _COLUMNS},
             problems=text.problems,
             locators=locators,
             texts=text.texts,
@@ -181,13 +177,9 @@ class _Text:
 
 _HASH = "state_hash"
 _COLUMNS = {
-    "num_steps": np.int32,
-    "success": np.int8,
-    "id_ends": np.int64,
-    "id_bytes": np.uint8,
-    "id_hash": np.uint64,
+    "num_steps": np.int32, "success": np.int8, "id_ends": np.int64, "id_bytes": np.uint8, "id_hash": np.uint64,
     "id_rank": np.int32,
-}
+}  # fmt: skip
 
 
 def _require_columns(arrays: Mapping[str, np.ndarray], locators: Mapping[str, np.ndarray]) -> None:
@@ -202,13 +194,12 @@ def _require_columns(arrays: Mapping[str, np.ndarray], locators: Mapping[str, np
     episodes = len(arrays["num_steps"])
     whole = {name: arrays[name] for name in _COLUMNS} | {f"locator {name}": one for name, one in locators.items()}
     for name, column in whole.items():
-        if column.ndim != 1 or column.dtype.kind not in "iuf" or (len(column) != episodes and not _is_packed(name)):
+        fits = len(column) == episodes or name.endswith("_bytes")  # of packed texts
+        if column.ndim != 1 or column.dtype.kind not in "iuf" or not fits:
             raise NotATableError(f"the column {name} is {column.dtype} of shape {column.shape}, of {episodes} episodes")
     for packed in [name.removesuffix("_ends") for name in whole if name.endswith("_ends")]:
-        try:
-            require_texts(whole[f"{packed}_ends"], whole.get(f"{packed}_bytes"))
-        except NotPackedTextError:
-            raise NotATableError(f"the texts of {packed} do not fit together") from None
+        if not are_texts(whole[f"{packed}_ends"], whole.get(f"{packed}_bytes")):
+            raise NotATableError(f"the texts of {packed} do not fit together")
     if (arrays["num_steps"] < 0).any():
         raise NotATableError("an episode of less than no steps")
 
@@ -230,10 +221,6 @@ def _labels(arrays: Mapping[str, np.ndarray], name: str, names: tuple[str, ...])
         return Labels(names, _column(arrays, f"{_LABEL}{name}", np.int32))
     except ValueError as error:
         raise NotATableError(str(error)) from None
-
-
-def _is_packed(name: str) -> bool:
-    return name.endswith("_bytes")
 
 
 def identity_hash(identity: str) -> int:

@@ -45,8 +45,7 @@ _watch: ContextVar[Usage | None] = ContextVar("watch", default=None)
 @contextlib.contextmanager
 def record_usage(*, rebuild: bool = False) -> Iterator[Usage]:
     """Record which files of the index are used within the block; with `rebuild`, none is read, and all are rebuilt."""
-    watch = Usage(rebuild)
-    token = _watch.set(watch)
+    token = _watch.set(watch := Usage(rebuild))
     try:
         yield watch
     finally:
@@ -126,7 +125,7 @@ def get_or_build(
 
     def build_marked() -> EpisodeTable:
         former = _index_file(config, f"{keys.before}.table{FORMAT}")
-        if keys.before != keys.now and former.exists() and not _is_rebuilt():
+        if keys.before != keys.now and not _is_rebuilt():
             with contextlib.suppress(OSError, NotATableError):
                 return marked(EpisodeTable.from_bytes(_checked(former.read_bytes())))
         return marked(build())
@@ -143,11 +142,8 @@ def get_or_build(
 def _at(table: EpisodeTable, place: str) -> EpisodeTable:
     """Return the table of a data set that was moved, with its problems where they are now."""
     former = table.texts.get(_PLACE, place)
-    if former == place:
-        return table
-    return replace(
-        table, problems=tuple(replace(one, where=one.where.replace(former, place, 1)) for one in table.problems)
-    )
+    problems = tuple(replace(one, where=one.where.replace(former, place, 1)) for one in table.problems)
+    return replace(table, problems=problems)
 
 
 def get_or_make(
@@ -163,11 +159,10 @@ def get_or_make(
     It is damaged if its CRC is wrong, or `from_bytes` raises NotATableError.
     """
     path = _index_file(config, key)
-    watch = _watch.get()
-    if watch is not None:
+    if watch := _watch.get():
         watch.files.append(path)
     try:
-        if watch is None or not watch.rebuild:
+        if not _is_rebuilt():
             return from_bytes(_checked(path.read_bytes()))
     except FileNotFoundError:
         pass

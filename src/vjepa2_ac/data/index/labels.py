@@ -20,8 +20,6 @@ class Labels:
 
     def __post_init__(self) -> None:
         """Refuse numbers without a name, which a damaged file may contain."""
-        if not all(isinstance(name, str) for name in self.names):
-            raise ValueError("labels that are no text")
         if len(self.number) and not _MISSING <= self.number.min() <= self.number.max() < len(self.names):
             raise ValueError(f"labels of {len(self.names)} names with numbers up to {self.number.max()}")
 
@@ -31,11 +29,6 @@ class Labels:
         names = sorted({value for value in values if value})
         place = {name: number for number, name in enumerate(names)}
         return cls(tuple(names), np.array([place.get(value or "", _MISSING) for value in values], np.int32))
-
-    @property
-    def is_present(self) -> bool:
-        """Whether there is a name for any episode."""
-        return bool(self.names)
 
     def of_episode(self, index: int) -> str | None:
         """Return the name of one episode, or None if unknown."""
@@ -47,4 +40,4 @@ def labels_of(values: Sequence[Mapping[str, str | None]]) -> dict[str, Labels]:
     """Return the labels of episodes, each given as {label: name}; unused labels are dropped."""
     every = {label for of_one in values for label in of_one}
     found = {label: Labels.of([of_one.get(label) for of_one in values]) for label in sorted(every)}
-    return {label: labels for label, labels in found.items() if labels.is_present}
+    return {label: labels for label, labels in found.items() if labels.names}

@@ -7,10 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 
-class NotPackedTextError(ValueError):
-    """Columns are not a result of `pack_texts`."""
-
-
 def pack_texts(name: str, lines: Sequence[str]) -> dict[str, np.ndarray]:
     """Return columns with these texts under a name."""
     encoded = [line.encode() for line in lines]
@@ -18,16 +14,12 @@ def pack_texts(name: str, lines: Sequence[str]) -> dict[str, np.ndarray]:
     return {f"{name}_ends": ends, f"{name}_bytes": np.frombuffer(b"".join(encoded), np.uint8)}
 
 
-def require_texts(ends: np.ndarray, data: np.ndarray | None) -> None:
-    """Refuse columns that `pack_texts` cannot have made.
-
-    Raises:
-        NotPackedTextError: The ends are not within the bytes, or not in order.
-    """
-    fits = data is not None and data.dtype == np.uint8 and ends.dtype == np.int64
-    edges = np.concatenate([[0], ends, [0 if data is None else len(data)]])
-    if not fits or (np.diff(edges) < 0).any() or edges[-2] != edges[-1]:
-        raise NotPackedTextError("no lines")
+def are_texts(ends: np.ndarray, data: np.ndarray | None) -> bool:
+    """Return whether `pack_texts` may have made these columns: the ends are in order, and the last is that of data."""
+    if data is None or data.dtype != np.uint8 or ends.dtype != np.int64:
+        return False
+    edges = np.concatenate([[0], ends, [len(data)]])
+    return bool((np.diff(edges) >= 0).all() and edges[-2] == edges[-1])
 
 
 def text_of(name: str, columns: Mapping[str, np.ndarray], index: int) -> str:

@@ -47,8 +47,9 @@ def list_folder(root: str, folder: str) -> tuple[list[FileInfo], list[str]]:
     """
     place = storage.join(root, folder) if folder else root
     files, names = storage.list_files(place), storage.list_names(place)
-    for name in names:
-        _require_text(name, place)
+    for name in names:  # the identity of an episode must be text that can be encoded
+        if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
+            raise InputError(where=place, found=f"the name {name!r}", needed="names in UTF-8", fix="Rename it")
     known = {file.name for file in files}
     return files, [name for name in names if name not in known and not name.startswith(".")]
 
@@ -58,15 +59,13 @@ def within(folder: str, name: str) -> str:
     return f"{folder}/{name}" if folder else name
 
 
-def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> list[Result]:
-    """Apply a function to every item in several threads; return the results in order, or raise the first error."""
+def in_parallel(function: Callable[[Item], Result], items: Sequence[Item], connections: int) -> Iterator[Result]:
+    """Yield the result of a function for every item, in order, from several threads; or raise the first error."""
     if connections == 1 or len(items) < 2:
-        return [function(item) for item in items]
-    with ThreadPoolExecutor(max_workers=connections) as pool:
-        return list(pool.map(function, items))
-
-
-def _require_text(name: str, place: str) -> None:
-    """Refuse a name that cannot be encoded, as the identity of an episode must be."""
-    if not name.isascii() and any("\ud800" <= letter <= "\udfff" for letter in name):
-        raise InputError(where=place, found=f"the name {name!r}", needed="names in UTF-8", fix="Rename it")
+        yield from map(function, items)
+        return
+    pool = ThreadPoolExecutor(min(connections, len(items)))
+    try:
+        yield from pool.map(function, items)
+    finally:
+        pool.shutdown(cancel_futures=True)

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.reports.figures.page import Page, new_figure
-from vjepa2_ac.storage import atomic_writer
+from vjepa2_ac.reports.figures.page import Page, written_page
 
 _WIDTH, _SIDE, _TITLE = 16.0, 0.3, 0.6  # inches, as all below
 _NAME, _FILM, _LABEL, _PLOT, _BETWEEN = 0.25, 1.4, 0.3, 0.9, 0.35
@@ -39,14 +37,10 @@ def plot_clips(title: str, clips: Sequence[ClipFigure], path: Path) -> Path:
         raise ValueError("no clip to show")
     row = _NAME + _FILM + _LABEL + _PLOT + _BETWEEN
     height = _TITLE + row * len(clips)
-    with mpl.rc_context({"font.size": 8, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = new_figure(_WIDTH, height, facecolor="white")
-        page = Page(figure, _WIDTH, height)
+    with written_page(path, _WIDTH, height, dpi=80, style={"font.size": 8}, facecolor="white") as page:
         page.text(_SIDE, 0.2, title, size=12.0)
         for number, clip in enumerate(clips):
             _draw(page, clip, top=_TITLE + row * number)
-        with atomic_writer(path) as file:
-            figure.savefig(file, format="png", dpi=80)
     return path
 
 
@@ -76,5 +70,5 @@ def _plot(axes: Any, what: str, values: Float[np.ndarray, "_ _"]) -> None:
     for step in bad:
         axes.axvspan(step - 0.5, step + 0.5, color=_BAD, alpha=0.3, linewidth=0)
     label = f"{what}: not finite in {len(bad)} of {len(values)} steps" if len(bad) else what
-    axes.set_title(label, loc="left", fontsize=8, color=_BAD if len(bad) else "black")
+    axes.set_title(label, fontsize=8, color=_BAD if len(bad) else "black")
     axes.set_xlim(-0.5, len(values) - 0.5)

@@ -8,18 +8,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.clips.transforms import CropBox
-from vjepa2_ac.reports.figures.page import Page, new_figure
-from vjepa2_ac.storage import atomic_writer
+from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, Page, written_page
 
-_INK, _FAINT, _SPEED, _GRIPPER, _IDLE = "#222222", "#8a8a8a", "#1f6fb4", "#d1762a", "#c9c9c9"
-_OUTCOME = {True: ("success", "#2b8a3e"), False: ("failure", "#c0392b"), None: ("", "#b5b5b5")}
-_STRIDES = ("#7fb3dd", "#1f6fb4", "#0b3558", "#7a4fa3", "#333333")
+_INK, _FAINT, _SPEED, _GRIPPER, _IDLE = "#222222", GREY, BLUE, ORANGE, "#c9c9c9"
+_OUTCOME = {True: ("success", GREEN), False: ("failure", "#c0392b"), None: ("", "#b5b5b5")}
+_STRIDES = ("#7fb3dd", BLUE, "#0b3558", "#7a4fa3", "#333333")
 
 # Inches.
 _WIDTH, _SIDE, _LABEL, _PICTURE, _PLOT, _AXIS, _BETWEEN = 16.0, 0.2, 1.75, 1.3, 0.5, 0.2, 0.14
@@ -74,17 +72,8 @@ def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
     head = _TITLE + _LINE * len(facts) + 0.3 + _PANELS + 0.75
     row = _PICTURE + _PLOT + _AXIS + _BETWEEN
     height = head + row * len(sheet.strips) + 0.15
-    with mpl.rc_context(
-        {
-            "text.color": _INK,
-            "font.size": 8,
-            "axes.spines.top": False,
-            "axes.spines.right": False,
-            "axes.linewidth": 0.6,
-        }
-    ):
-        figure = new_figure(_WIDTH, height, facecolor="white")
-        page = Page(figure, _WIDTH, height)
+    style = {"text.color": _INK, "font.size": 8, "axes.linewidth": 0.6}
+    with written_page(path, _WIDTH, height, dpi=100, style=style, facecolor="white") as page:
         page.text(_SIDE, 0.16, sheet.title, size=13, weight="bold")
         for number, line in enumerate(facts):
             page.text(_SIDE, _TITLE + 0.06 + _LINE * number, line, size=9)
@@ -93,8 +82,6 @@ def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
         fastest = _fastest(sheet.strips)
         for number, strip in enumerate(sheet.strips):
             _strip(page, strip, sheet.control_rate_hz, fastest, top=head + row * number)
-        with atomic_writer(path) as file:
-            figure.savefig(file, format="png", dpi=100)
     return path
 
 
@@ -102,7 +89,7 @@ def _panels(page: Page, sheet: ContactSheet, top: float) -> None:
     """Draw the three small plots of the whole set: lengths, motion per model step, places."""
     lengths = page.axes(0.6, top, 3.6, _PANELS)
     lengths.hist(sheet.lengths_s, bins=min(40, max(5, len(sheet.lengths_s) // 2)), color=_FAINT)
-    lengths.set_title("Length of episodes (s)", loc="left", fontsize=9)
+    lengths.set_title("Length of episodes (s)")
     lengths.locator_params(axis="y", nbins=4, integer=True)
     _motion(page.axes(5.0, top, 5.2, _PANELS), sheet)
     if sheet.places_m is not None:
@@ -115,7 +102,7 @@ def _places(page: Page, places_m: Float[np.ndarray, "points 3"], top: float) -> 
     places = page.axes(11.1, top, 4.3, _PANELS)
     shown = places.scatter(-places_m[:, 1], places_m[:, 0], c=places_m[:, 2], s=2, cmap="viridis", linewidths=0)
     places.set_aspect("equal", adjustable="datalim")
-    places.set_title("Where the flange was, from above (m; colour: height)", loc="left", fontsize=9)
+    places.set(title="Where the flange was, from above (m; colour: height)")
     places.set(xlabel="-y: to the robot's right", ylabel="x: forward")
     places.locator_params(nbins=5)
     page.figure.colorbar(shown, ax=places, fraction=0.04, pad=0.02)
@@ -123,8 +110,7 @@ def _places(page: Page, places_m: Float[np.ndarray, "points 3"], top: float) -> 
 
 def _ranges(axes: Any, ranges: Float[np.ndarray, "state_dim 2"]) -> None:
     axes.bar(np.arange(len(ranges)), ranges[:, 1] - ranges[:, 0], bottom=ranges[:, 0], color=_SPEED)
-    axes.set_title("Range of each number of the state", loc="left", fontsize=9)
-    axes.set(xlabel="number, from 0")
+    axes.set(title="Range of each number of the state", xlabel="number, from 0")
     axes.locator_params(axis="x", integer=True)
 
 
@@ -142,14 +128,9 @@ def _motion(axes: Any, sheet: ContactSheet) -> None:
         axes.plot(reached, share, color=colour, linewidth=1.5, label=label)
     if sheet.reference is not None:
         axes.axvline(sheet.reference, color=_GRIPPER, linestyle="--", linewidth=1.2, label="upstream's example pair")
-    less = (
-        "that move the flange less far than this (cm)"
-        if has_poses
-        else "that change no number by more (% of its range)"
-    )
-    axes.set_title(f"Share of model steps (%) {less}", loc="left", fontsize=9)
-    axes.set(xlim=(0, far), ylim=(0, 102))
-    axes.legend(framealpha=0.85, edgecolor="none", fontsize=8, loc="lower right")
+    less = "move the flange less far than this (cm)" if has_poses else "change no number by more (% of its range)"
+    axes.set(title=f"Share of model steps (%) that {less}", xlim=(0, far), ylim=(0, 102))
+    axes.legend(frameon=True, framealpha=0.85, edgecolor="none", fontsize=8, loc="lower right")
 
 
 def _legend(page: Page, sheet: ContactSheet, top: float) -> None:

@@ -2,82 +2,78 @@
 
 from __future__ import annotations
 
+import itertools
 import textwrap
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from jaxtyping import UInt8
 
-from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence
-from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.evaluation.estimates import Curve, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Example
 from vjepa2_ac.evaluation.verdict import verdict
 from vjepa2_ac.reports.comparison import Comparison
-from vjepa2_ac.reports.figures.page import new_figure
-from vjepa2_ac.storage import atomic_writer
+from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, RED, written_page
 
-_COLOURS = {"persistence": "#8a8a8a", "base": "#d1762a", "adapter": "#1f6fb4", "model": "#1f6fb4"}
-_RUNS = ("#1f6fb4", "#d1762a", "#2b8a3e", "#8f5bb0", "#b3246b", "#0b7f8a", "#8a6d0b", "#333333")
+_NOTHING = "persistence (doing nothing)"
+_COLOURS = {"base": ORANGE, "adapter": BLUE, "model": BLUE}
+_RUNS = (BLUE, ORANGE, GREEN, "#8f5bb0", RED, "#0b7f8a", "#8a6d0b", "#333333")
 _DASHES = ("-", "--", ":")  # after all colours
-# What people call things is shown as it is: a dollar sign begins no formula.
-_STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False}
+_STYLE = {"font.size": 9}
 _OTHERS = ("#3a9155", "#8f5bb0", "#b0873a", "#4aa3a8")
 _SHAPE = 1.3  # width over height of what there is for the filmstrip
 
 
 def plot_evaluation(evaluation: Evaluation, path: Path) -> Path:
     """Write the figure of an evaluation as PNG; it is written atomically."""
-    with mpl.rc_context(_STYLE):
-        figure = new_figure(13.0, 6.2, layout="constrained")
-        figure.suptitle("\n".join(textwrap.wrap(verdict(evaluation), 150)), fontsize=10.5, x=0.01, ha="left")
-        halves: Any = figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
+    with written_page(path, 13.0, 6.2, dpi=110, style=_STYLE, layout="constrained") as page:
+        page.headline(verdict(evaluation))
+        halves = page.figure.subfigures(1, 2, width_ratios=[5, 6], wspace=0.02)
         upper, lower = halves[0].subplots(2, 1, height_ratios=[3, 2])
-        _curves(upper, evaluation)
+        _error_by_horizon(upper, evaluation)
         _use_of_actions(lower, evaluation)
         if evaluation.examples:
             _filmstrip(halves[1], evaluation.examples[0], evaluation.about.seconds_per_step)
-        with atomic_writer(path) as file:
-            figure.savefig(file, format="png", dpi=110)
     return path
 
 
 def plot_comparison(comparison: Comparison, path: Path) -> Path:
     """Write the curves of several runs as PNG; it is written atomically."""
-    with mpl.rc_context(_STYLE):
-        figure = new_figure(9.5, 4.5, layout="constrained")
-        axes = figure.subplots()
-        drawn = [axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--")]
-        for number, curve in enumerate(comparison.curves.values()):
-            colour, dashes = _RUNS[number % len(_RUNS)], _DASHES[number // len(_RUNS) % len(_DASHES)]
-            low, high = [one.low for one in curve], [one.high for one in curve]
-            axes.fill_between(comparison.seconds, low, high, color=colour, alpha=0.13, linewidth=0)
-            values = [one.value for one in curve]
-            drawn += axes.plot(comparison.seconds, values, marker="o", color=colour, linestyle=dashes)
-        names = ["persistence (doing nothing)", *(textwrap.fill(name, 34) for name in comparison.curves)]
-        axes.set(xlabel="seconds ahead (open loop)", ylabel="latent error / persistence", ylim=(0, None))
-        axes.set_title(f"{comparison.title} (band: 95 % over episodes)", loc="left", fontsize=9)
-        figure.legend(drawn, names, frameon=False, loc="outside right upper")
-        with atomic_writer(path) as file:
-            figure.savefig(file, format="png", dpi=110)
+    styles = itertools.cycle({"linestyle": dashes, "color": colour} for dashes in _DASHES for colour in _RUNS)
+    with written_page(path, 9.5, 4.5, dpi=110, style=_STYLE, layout="constrained") as page:
+        axes = page.figure.subplots()
+        drawn = _curves(axes, comparison.seconds, zip(comparison.curves.values(), styles, strict=False))
+        axes.set(title=f"{comparison.title} (band: 95 % over episodes)")
+        names = [_NOTHING, *(textwrap.fill(name, 34) for name in comparison.curves)]
+        page.figure.legend(drawn, names, loc="outside right upper")
     return path
 
 
-def _curves(axes: Any, evaluation: Evaluation) -> None:
-    axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--", label="persistence (doing nothing)")
-    seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
-    shown = seconds[:: -(-len(seconds) // 8)]
-    for name, colour in _colours(evaluation).items():
-        ratios = over_persistence(evaluation.models[name].errors, "rollout")
-        axes.plot(seconds, [r.value for r in ratios], "o-", color=colour, label=name)
-        axes.fill_between(
-            seconds, [r.low for r in ratios], [r.high for r in ratios], color=colour, alpha=0.2, linewidth=0
-        )
+def _curves(axes: Any, seconds: np.ndarray, curves: Iterable[tuple[Curve, dict[str, str]]]) -> list[Any]:
+    """Draw persistence and errors over it with their intervals, each in its style; return the lines."""
+    drawn = [axes.axhline(1.0, color=GREY, linestyle="--")]
+    for curve, style in curves:
+        low, high = [one.low for one in curve], [one.high for one in curve]
+        axes.fill_between(seconds, low, high, color=style["color"], alpha=0.15, linewidth=0)
+        drawn += axes.plot(seconds, [one.value for one in curve], marker="o", **style)
     axes.set(xlabel="seconds ahead (open loop)", ylabel="latent error / persistence", ylim=(0, None))
+    return drawn
+
+
+def _error_by_horizon(axes: Any, evaluation: Evaluation) -> None:
+    seconds = evaluation.about.seconds_per_step * np.arange(1, evaluation.horizon + 1)
+    colours = _colours(evaluation)
+    drawn = _curves(
+        axes,
+        seconds,
+        ((over_persistence(evaluation.models[name].errors, "rollout"), {"color": colours[name]}) for name in colours),
+    )
+    shown = seconds[:: -(-len(seconds) // 8)]
     axes.set_xticks(shown, [f"{value:.2f}" for value in shown])
-    axes.legend(frameon=False, loc="lower right")
-    axes.set_title("Prediction error by horizon (band: 95 % over episodes)", loc="left", fontsize=9)
+    axes.set(title="Prediction error by horizon (band: 95 % over episodes)")
+    axes.legend(drawn, [_NOTHING, *colours], loc="lower right")
 
 
 def _use_of_actions(axes: Any, evaluation: Evaluation) -> None:
@@ -85,26 +81,18 @@ def _use_of_actions(axes: Any, evaluation: Evaluation) -> None:
     for i, (name, colour) in enumerate(_colours(evaluation).items()):
         ratios = [one_step_over_persistence(evaluation.models[name].errors, actions) for actions in ACTIONS]
         places = np.arange(len(ratios)) + (i - (len(evaluation.models) - 1) / 2) * width
-        values = [r.value for r in ratios]
-        spread = np.array([_reach(r) for r in ratios]).T
-        axes.bar(places, values, width, color=colour, yerr=spread, error_kw={"elinewidth": 1}, label=name)
-    axes.axhline(1.0, color=_COLOURS["persistence"], linestyle="--")
-    axes.set_xticks(range(3), ["true", "zero", "shuffled"])
-    axes.set(xlabel="actions given", ylabel="one-step error / persistence")
-    axes.set_title("Does it use the actions?", loc="left", fontsize=9)
+        spread = np.array([(r.value - r.low, r.high - r.value) for r in ratios]).T
+        spread = np.nan_to_num(spread.clip(min=0))  # rounding could make it negative; NaN: there is no interval
+        axes.bar(places, [r.value for r in ratios], width, color=colour, yerr=spread, error_kw={"elinewidth": 1})
+    axes.axhline(1.0, color=GREY, linestyle="--")
+    axes.set_xticks(range(len(ACTIONS)), ACTIONS)
+    axes.set(title="Does it use the actions?", xlabel="actions given", ylabel="one-step error / persistence")
 
 
 def _colours(evaluation: Evaluation) -> dict[str, str]:
     """Return a colour for each model."""
     others = iter(_OTHERS * len(evaluation.models))
     return {name: _COLOURS.get(name) or next(others) for name in evaluation.models}
-
-
-def _reach(value: Estimate) -> tuple[float, float]:
-    """Return the length of an error bar downwards and upwards; never negative, which rounding could make it."""
-    if not value.has_interval:
-        return 0.0, 0.0
-    return max(0.0, value.value - value.low), max(0.0, value.high - value.value)
 
 
 def _filmstrip(figure: Any, example: Example, seconds_per_step: float) -> None:

@@ -1,12 +1,29 @@
-"""Page layout of a figure: positions in inches from the top left."""
+"""Figures as PNG files in one style, and their layout: positions in inches from the top left."""
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+
+from vjepa2_ac.storage import atomic_writer
+
+GREY, BLUE, ORANGE, GREEN, RED = "#8a8a8a", "#1f6fb4", "#d1762a", "#2b8a3e", "#b3246b"
+_STYLE = {
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "axes.titlesize": 9,
+    "legend.frameon": False,
+    "text.parse_math": False,  # what people call things is shown as it is: a dollar sign begins no formula
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +44,31 @@ class Page:
         """Write text with its top left corner at this position."""
         style = {"va": "top", "ha": "left", **style}
         self.figure.text(left / self.width, 1 - top / self.height, words, **style)
+
+    def headline(self, words: str) -> None:
+        """Write lines of text above a page of 13 inches, whose layout makes room for them."""
+        self.figure.suptitle(textwrap.fill(words, 150), fontsize=10.5, x=0.01, ha="left")
+
+
+@contextmanager
+def written_page(
+    path: Path, width: float, height: float, *, dpi: int, style: dict[str, Any], **options: Any
+) -> Iterator[Page]:
+    """Yield a page of so many inches to draw on, which is then written as PNG, atomically.
+
+    Args:
+        path: The file.
+        width: In inches.
+        height: Likewise.
+        dpi: Pixels per inch.
+        style: Settings of matplotlib beside those of all our figures.
+        options: Of the figure.
+    """
+    with mpl.rc_context(_STYLE | style):
+        page = Page(new_figure(width, height, **options), width, height)
+        yield page
+        with atomic_writer(path) as file:
+            page.figure.savefig(file, format="png", dpi=dpi)
 
 
 def new_figure(width: float, height: float, **options: Any) -> Figure:

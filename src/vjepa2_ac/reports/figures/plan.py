@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -15,33 +14,29 @@ from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.planning.energy_slices import EnergySlice
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.summary import summarize
-from vjepa2_ac.reports.figures.page import new_figure
-from vjepa2_ac.storage import atomic_writer
+from vjepa2_ac.reports.figures.page import BLUE, GREY, RED, written_page
 
 PLAN_IMAGE = "plan.png"
 
-_STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False}
-_GREY, _BLUE, _RED, _FRAME = "#8a8a8a", "#1f6fb4", "#b3246b", "#e8b10c"
+_STYLE = {"font.size": 9, "legend.fontsize": 7.5}
+_FRAME = "#e8b10c"
 _MOST_NUMBERS = 8  # of a vector
 _MOST_GOALS = 3  # that are shown: the first ones, and the last
-_STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": _RED, "edgecolors": "white", "zorder": 5}
+_STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": RED, "edgecolors": "white", "zorder": 5}
 
 
 def plot_plan(answer: PlanResult, path: Path) -> Path:
     """Write the figure of a decision as PNG; it is written atomically."""
-    with mpl.rc_context(_STYLE):
-        plan = answer.decision.plan
-        rows = 1 if plan is None else 3 if answer.slices else 2
-        figure = new_figure(13.0, 0.9 + 3.4 * rows, layout="constrained")
-        figure.suptitle("\n".join(textwrap.wrap(summarize(answer), 165)), fontsize=10.5, x=0.01, ha="left")
-        parts: Any = figure.subfigures(rows, 1, squeeze=False)[:, 0]
+    plan = answer.decision.plan
+    rows = 1 if plan is None else 3 if answer.slices else 2
+    with written_page(path, 13.0, 0.9 + 3.4 * rows, dpi=100, style=_STYLE, layout="constrained") as page:
+        page.headline(summarize(answer))
+        parts = page.figure.subfigures(rows, 1, squeeze=False)[:, 0]
         _pictures(parts[0], answer)
         if plan is not None:
             _search(parts[1], answer, plan)
             if answer.slices:
                 _slices(parts[2], answer)
-        with atomic_writer(path) as file:
-            figure.savefig(file, format="png", dpi=100)
     return path
 
 
@@ -59,14 +54,14 @@ def _pictures(part: Any, answer: PlanResult) -> None:
         axes.add_patch(
             Rectangle((box.left - 0.5, box.top - 0.5), box.width, box.height, fill=False, color=_FRAME, linewidth=1.2)
         )
-        axes.set_title(f"{name} (frame: what the model sees)", loc="left", fontsize=9)
+        axes.set_title(f"{name} (frame: what the model sees)")
         axes.set_axis_off()
 
 
 def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     elites, heights, energies, path = part.subplots(1, 4, width_ratios=[3, 3, 3, 3])
     colours = mpl.colormaps["viridis"](np.linspace(0.9, 0.0, len(plan.iterations)))
-    factor = _factor(answer)
+    factor = answer.state_space.shown_factor
     first, upper = answer.actions[0] * factor, answer.space.upper[0].double().numpy() * factor
     across, up, third = _three(answer)
     for number, (one, colour) in enumerate(zip(plan.iterations, colours, strict=True), start=1):
@@ -76,11 +71,11 @@ def _search(part: Any, answer: PlanResult, plan: Plan) -> None:
     _limits(elites, upper[across], upper[up])
     elites.scatter(first[across], first[up], **_STAR)
     elites.set(xlabel=_label(answer, across), ylabel=_label(answer, up), aspect="equal")
-    elites.set_title("Best of each iteration,\nfirst action (dark: last)", loc="left", fontsize=9)
-    heights.axhspan(-upper[third], upper[third], color=_GREY, alpha=0.12, linewidth=0)
+    elites.set(title="Best of each iteration,\nfirst action (dark: last)")
+    heights.axhspan(-upper[third], upper[third], color=GREY, alpha=0.12, linewidth=0)
     heights.scatter(len(plan.iterations) + 1, first[third], **_STAR)
-    heights.set(xlabel="iteration (star: chosen)", ylabel=_label(answer, third))
-    heights.set_title("Their height" if answer.state_space.is_pose else "Another number", loc="left", fontsize=9)
+    title = "Their height" if answer.state_space.is_pose else "Another number"
+    heights.set(title=title, xlabel="iteration (star: chosen)", ylabel=_label(answer, third))
     _energies(energies, answer, plan)
     _path(path, answer)
 
@@ -93,22 +88,18 @@ def _three(answer: PlanResult) -> tuple[int, int, int]:
 
 def _label(answer: PlanResult, axis: int) -> str:
     name = answer.state_space.change_names[axis]
-    return f"{name} (cm)" if answer.state_space.is_pose else name
-
-
-def _factor(answer: PlanResult) -> float:
-    return answer.state_space.shown_factor if answer.state_space.is_pose else 1.0
+    return f"{name} ({unit})" if (unit := answer.state_space.shown_unit) else name
 
 
 def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
     numbers = np.arange(1, len(plan.iterations) + 1)
     elites, lowest = ([getattr(one, kind) for one in plan.iterations] for kind in ("elite_energy", "lowest"))
-    axes.plot(numbers, elites, "o-", color=_BLUE, markersize=3, label="mean of the best")
-    axes.plot(numbers, lowest, "o--", color=_BLUE, markersize=3, label="lowest")
+    axes.plot(numbers, elites, "o-", color=BLUE, markersize=3, label="mean of the best")
+    axes.plot(numbers, lowest, "o--", color=BLUE, markersize=3, label="lowest")
     levels = {
-        "now": (answer.decision.energy_now, _GREY, "-"),
-        "doing nothing": (answer.doing_nothing, _GREY, ":"),
-        "the plan": (plan.energy, _RED, "--"),
+        "now": (answer.decision.energy_now, GREY, "-"),
+        "doing nothing": (answer.doing_nothing, GREY, ":"),
+        "the plan": (plan.energy, RED, "--"),
     }
     for name, (level, colour, dashes) in levels.items():
         if np.isfinite(level):
@@ -118,27 +109,25 @@ def _energies(axes: Any, answer: PlanResult, plan: Plan) -> None:
     if len(seen):  # the lines of the present may lie beyond: the legend has their numbers
         room = max(0.15 * float(np.ptp(seen)), 1e-4)
         axes.set_ylim(seen.min() - room, seen.max() + 3 * room)
-    axes.set(xlabel="iteration", ylabel=f"energy ({answer.controller.config.energy.distance})")
-    axes.legend(frameon=False, fontsize=7.5, loc="upper right")
-    axes.set_title("Energy", loc="left", fontsize=9)
+    axes.set(title="Energy", xlabel="iteration", ylabel=f"energy ({answer.controller.config.energy.distance})")
+    axes.legend(loc="upper right")
 
 
 def _path(axes: Any, answer: PlanResult) -> None:
     space = answer.state_space
-    way = (answer.states - answer.states[0]) * _factor(answer)
+    way = (answer.states - answer.states[0]) * answer.state_space.shown_factor
     if not space.is_pose:
         for number in answer.space.free[:_MOST_NUMBERS].tolist():
             axes.plot(way[:, number], "o-", markersize=4, label=space.names[number])
-        axes.set(xlabel="model step", ylabel="change from now")
-        axes.set_title("Planned states", loc="left", fontsize=9)
+        axes.set(title="Planned states", xlabel="model step", ylabel="change from now")
     else:
-        axes.plot(way[:, 0], way[:, 1], "o-", color=_RED, markersize=4, label="x, y (from above)")
-        axes.plot(way[:, 0], way[:, 2], "s:", color=_BLUE, markersize=4, label="x, z (from the side)")
+        axes.plot(way[:, 0], way[:, 1], "o-", color=RED, markersize=4, label="x, y (from above)")
+        axes.plot(way[:, 0], way[:, 2], "s:", color=BLUE, markersize=4, label="x, z (from the side)")
         axes.plot(0, 0, "o", color="black", markersize=6, zorder=6)
         reach = 1.2 * max(float(np.abs(way[:, space.position]).max()), 1.0)
         axes.set(xlabel="x from here (cm)", xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-        axes.set_title("Planned path of the flange,\nrobot base frame", loc="left", fontsize=9)
-    axes.legend(frameon=False, fontsize=7.5)
+        axes.set_title("Planned path of the flange,\nrobot base frame")
+    axes.legend()
 
 
 def _slices(part: Any, answer: PlanResult) -> None:
@@ -152,7 +141,7 @@ def _slices(part: Any, answer: PlanResult) -> None:
 
 def _slice(axes: Any, one: EnergySlice, answer: PlanResult, lowest: float, highest: float) -> Any:
     first, second = one.axes
-    factor = _factor(answer)
+    factor = answer.state_space.shown_factor
     across, up = one.across * factor, one.up * factor
     image = axes.pcolormesh(across, up, one.energy, shading="nearest", cmap="viridis", vmin=lowest, vmax=highest)
     upper = answer.space.upper[0].double().numpy() * factor
@@ -161,10 +150,10 @@ def _slice(axes: Any, one: EnergySlice, answer: PlanResult, lowest: float, highe
     axes.scatter(answer.actions[0, first] * factor, answer.actions[0, second] * factor, **_STAR)
     axes.set(xlabel=_label(answer, first), ylabel=_label(answer, second), aspect="equal")
     title = "Energy around the first action\n(star; +: no motion; box: limits)" if one is answer.slices[0] else "\n"
-    axes.set_title(title, loc="left", fontsize=9)
+    axes.set_title(title)
     return image
 
 
 def _limits(axes: Any, across: float, up: float) -> None:
-    axes.add_patch(Rectangle((-across, -up), 2 * across, 2 * up, fill=False, color=_GREY, linewidth=1))
+    axes.add_patch(Rectangle((-across, -up), 2 * across, 2 * up, fill=False, color=GREY, linewidth=1))
     axes.margins(0.08)

@@ -1,96 +1,76 @@
-"""Report section on action use: costs of wrong actions, the rank of the true action, energy landscapes."""
+"""Report sections on action use: costs of wrong actions, the rank of the true action, energy landscapes."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
+from markupsafe import Markup
 
 from vjepa2_ac.evaluation.estimates import cost_of_actions, one_step_over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscape, Landscapes, Ranking
-from vjepa2_ac.reports.html.distributions import rank_chart
-from vjepa2_ac.reports.html.formatting import NOT_MEASURED, decimal, percent
+from vjepa2_ac.reports.html.charts import Line, line_chart, nice_axis
+from vjepa2_ac.reports.html.formatting import NOT_MEASURED, decimal, percent, share, value
 from vjepa2_ac.reports.html.heatmaps import MapAxis, heat_map
-from vjepa2_ac.reports.html.layout import (
-    ReportSection,
-    figure,
-    not_measured,
-    paragraph,
-    scrolling,
-    share,
-    side_by_side,
-    table,
-    value,
-    why_not,
-)
-from vjepa2_ac.reports.html.markup import Markup, element, joined, text
-from vjepa2_ac.reports.html.series import models_of
+from vjepa2_ac.reports.html.series import Series, models_of
+from vjepa2_ac.reports.html.templates import render
 
+_POINTS = 51  # of a curve
 _MOST_LANDSCAPES = 3  # clips whose maps are shown
 
+Table = tuple[list[str], list[list[str]]]  # head, rows
 
-def actions_section(evaluation: Evaluation) -> ReportSection:
+
+def actions_section(evaluation: Evaluation) -> Markup:
     """Return the section on how predictions depend on the actions, and on the rank of the true action."""
-    drawings = [_ranks(evaluation, place) for place in range(2)]
-    parts = [
-        paragraph(
-            "A world model is of use for planning only if its prediction changes with the action, and in the right way:"
-            " the true action should give the lowest energy, the L1 distance between the prediction and what really"
-            " came.",
-            class_="how",
-        ),
-        _costs(evaluation),
-        _sensitivity(evaluation),
-        side_by_side(*drawings),
-    ]
-    return ReportSection("actions", "Does it use the actions?", joined(*parts))
+    sensitivities = [(one, one.model.sensitivity) for one in models_of(evaluation)]
+    drawings = []
+    for place in range(2):  # among the actions of other clips, and of a box
+        rankings = [
+            (one, found.rankings[place]) for one, found in sensitivities if found and place < len(found.rankings)
+        ]
+        if rankings:
+            drawings.append((f"{rankings[0][1].samples} {rankings[0][1].words}", _rank_chart(rankings)))
+    return render(
+        "actions", evaluation=evaluation, costs=_costs(evaluation), ranks=_ranks(evaluation), drawings=drawings
+    )
 
 
-def landscape_section(evaluation: Evaluation) -> ReportSection:
+def landscape_section(evaluation: Evaluation) -> Markup:
     """Return the section on energy landscapes around the true action, as maps and as numbers."""
-    title = "Energy landscapes"
     measured = {name: model.landscapes for name, model in evaluation.models.items() if model.landscapes is not None}
     if not measured:
-        why = why_not(evaluation, "energy landscapes", "This evaluation made none.")
-        return ReportSection("landscapes", title, not_measured("Energy landscapes", why))
+        return render("landscapes", evaluation=evaluation, measured=0)
     shown = measured.get(evaluation.trained) or next(iter(measured.values()))
     drawn = {name: one for name, one in measured.items() if one is shown or name == evaluation.base}
-    maps = [_maps(drawn, place) for place in _typical(shown.maps)]
-    how = (
-        "Each map tries actions along two axes while the third axis and the rest of the action are the true ones. Dark"
-        " is low energy: what the model thinks was done. The cross is the true action, the ring is the minimum over"
-        " the whole grid (it may be off the map, along the third axis): the closer, the better. The"
-        " dotted lines are zero motion; a ring there means that the model expects too little to happen. Each clip and"
-        f" model has its own range of colours. Of {len(shown.maps)} clips those with the nearest, the median and the"
-        " farthest minimum are shown."
-    )
-    drawing = figure("Energy around the true action", element("div", *maps, class_="maps"), how)
-    return ReportSection("landscapes", title, joined(_landscape_table(measured), drawing))
+    clips = [
+        [
+            (name, f" {found.unit}".rstrip(), found.maps[place], _planes(name, found, found.maps[place]))
+            for name, found in drawn.items()
+            if place < len(found.maps)
+        ]
+        for place in _typical(shown.maps)
+    ]
+    head, rows = _landscape_table(measured)
+    return render("landscapes", measured=len(shown.maps), clips=clips, head=head, rows=rows)
 
 
-def _costs(evaluation: Evaluation) -> Markup:
+def _costs(evaluation: Evaluation) -> Table:
     rows = []
     for one in models_of(evaluation):
         ratios = [value(one_step_over_persistence(one.model.errors, actions)) for actions in ACTIONS]
         costs = [share(cost_of_actions(one.model.errors, actions), with_sign=True) for actions in ACTIONS[1:]]
         rows.append([one.label, *ratios, *costs])
     head = ["model", *(f"error with {actions} actions" for actions in ACTIONS)]
-    head += [f"growth of the error with {actions} actions" for actions in ACTIONS[1:]]
-    caption = (
-        "One-step L1 error over persistence with the true, zero and another clip's actions, and by how much a wrong"
-        " action makes the error grow (value [95 % interval]; a growth of 0 % means that actions are ignored)"
-    )
-    return table(caption, head, rows)
+    return [*head, *(f"growth of the error with {actions} actions" for actions in ACTIONS[1:])], rows
 
 
-def _sensitivity(evaluation: Evaluation) -> Markup:
+def _ranks(evaluation: Evaluation) -> Table | None:
     measured = {name: model.sensitivity for name, model in evaluation.models.items() if model.sensitivity is not None}
     if not measured:
-        return not_measured(
-            "Action sensitivity and ranks", why_not(evaluation, "other actions", "This evaluation left them out.")
-        )
+        return None
     tops = sorted({k for one in measured.values() for ranking in one.rankings for k in ranking.top})
     rows = [
         [
@@ -101,56 +81,45 @@ def _sensitivity(evaluation: Evaluation) -> Markup:
         for ranking in sensitivity.rankings
     ]
     head = ["model", "change of the prediction", "among", "mean rank of the true action"]
-    head += [f"true action among the best {k}" for k in tops]
-    caption = (
-        "How much predictions change with the action (mean L1 distance between predictions with the true and with other"
-        " actions, as a share of the persistence error; 0: not at all), and the rank of the true action among others"
-        " by energy (rank 0: always first, 1: always last; by chance 0.5; value [95 % interval])"
+    return [*head, *(f"true action among the best {k}" for k in tops)], rows
+
+
+def _rank_chart(rankings: Sequence[tuple[Series, Ranking]]) -> Markup:
+    """Return the cumulative distribution of the true action's rank over clips, for each model and by chance."""
+    reached = np.linspace(0, 1, _POINTS).tolist()
+    by_chance = Line("chance", [0.0, 1.0], [0.0, 100.0], "s-persistence")
+    lines = [by_chance, *(Line(one.label, reached, _shares(ranking, reached), one.style) for one, ranking in rankings)]
+    x_axis = nice_axis("rank of the true action (0: best)", [0.0, 1.0], most=5)
+    description = "Share of clips by rank of the true action: " + "; ".join(
+        f"{line.name} {line.y[_POINTS // 10]:.0f} % among the best tenth" for line in lines[1:]
     )
-    return table(caption, head, rows, class_="wordy")
+    return line_chart(f"{description}.", lines, x_axis, nice_axis("share of clips (%)", [0.0, 100.0]), key=lines)
 
 
-def _top(ranking: Ranking, k: int) -> Markup:
+def _shares(ranking: Ranking, reached: Sequence[float]) -> list[float]:
+    ranks = np.sort(ranking.rank)
+    return [float(100 * np.searchsorted(ranks, each, side="right") / max(len(ranks), 1)) for each in reached]
+
+
+def _top(ranking: Ranking, k: int) -> str:
     if k not in ranking.top:
-        return text(NOT_MEASURED)
-    return joined(share(ranking.top[k]), f" (chance {percent(ranking.chance_of_top(k), 1)})")
+        return NOT_MEASURED
+    return share(ranking.top[k]) + f" (chance {percent(ranking.chance_of_top(k), 1)})"
 
 
-def _ranks(evaluation: Evaluation, place: int) -> Markup:
-    measured = [
-        (one, sensitivity.rankings[place])
-        for one in models_of(evaluation)
-        if (sensitivity := one.model.sensitivity) is not None and place < len(sensitivity.rankings)
-    ]
-    if not measured:
-        return Markup()
-    how = (
-        "In how many clips at most this share of the others has a lower energy than the true action. The curve of a"
-        " model that knows what its actions do rises at once (hardly any other explains better what came); one that"
-        " ignores them follows the dashed line of chance."
-    )
-    ranking = measured[0][1]
-    return figure(f"Rank of the true action among {ranking.samples} {ranking.words}", rank_chart(measured), how)
-
-
-def _landscape_table(measured: dict[str, Landscapes]) -> Markup:
+def _landscape_table(measured: Mapping[str, Landscapes]) -> Table:
     rows = []
     for name, one in measured.items():
         unit = f" {one.unit}".rstrip()
-        distance = joined(value(one.distance, 2), unit)
         signs = [
-            joined(share(agreement, 0), f" of {clips} clips (chance {percent(chance)})") if clips else NOT_MEASURED
+            share(agreement, 0) + f" of {clips} clips (chance {percent(chance)})" if clips else NOT_MEASURED
             for agreement, chance, clips in zip(one.sign_agreement, one.sign_chance, one.sign_clips, strict=True)
         ]
-        rows.append([name, str(len(one.maps)), distance, f"{decimal(one.chance_distance, 2)}{unit}", *signs])
+        chance = f"{decimal(one.chance_distance, 2)}{unit}"
+        rows.append([name, str(len(one.maps)), value(one.distance, 2) + unit, chance, *signs])
     names = next(iter(measured.values())).axis_names
     head = ["model", "clips", "distance of the minimum to the true action", "by chance"]
-    head += [f"right sign of {name}" for name in names]
-    caption = (
-        "Where the energy is lowest: mean distance to the true action, and how often the minimum has the sign of the"
-        " true action along each axis, among clips that move along it (value [95 % interval])"
-    )
-    return table(caption, head, rows, class_="wordy")
+    return [*head, *(f"right sign of {name}" for name in names)], rows
 
 
 def _typical(maps: Sequence[Landscape]) -> list[int]:
@@ -161,23 +130,9 @@ def _typical(maps: Sequence[Landscape]) -> list[int]:
     return [order[0], order[len(order) // 2], order[-1]]
 
 
-def _maps(measured: dict[str, Landscapes], place: int) -> Markup:
-    """Return the maps of one clip, a row for each model."""
-    parts: list[Markup] = []
-    for model, landscapes in measured.items():
-        if place >= len(landscapes.maps):
-            continue
-        one = landscapes.maps[place]
-        if not parts:
-            parts.append(element("h4", f"{one.episode_id}, control step {one.start}"))
-        distance = f"{decimal(one.distance, 2)} {landscapes.unit}".rstrip()
-        low, high = decimal(float(one.energy.min()), 4), decimal(float(one.energy.max()), 4)
-        words = f": minimum {distance} from the true action; energy {low} (dark) to {high} (bright)"
-        parts.append(element("p", element("strong", model), words, class_="of"))
-        planes = [_plane(model, landscapes, one, first, second) for first, second in combinations(range(3), 2)]
-        maps = element("div", *planes, class_="planes")
-        parts.append(scrolling(maps, f"Energy maps of {model}, {one.episode_id}"))
-    return element("div", *parts, class_="landscape")
+def _planes(model: str, landscapes: Landscapes, one: Landscape) -> list[Markup]:
+    """Return the maps of one clip over each pair of axes."""
+    return [_plane(model, landscapes, one, first, second) for first, second in combinations(range(3), 2)]
 
 
 def _plane(model: str, landscapes: Landscapes, one: Landscape, first: int, second: int) -> Markup:

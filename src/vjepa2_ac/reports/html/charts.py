@@ -1,17 +1,17 @@
-"""Charts as SVG in the page's colours, light or dark: lines, bands, legend, axes."""
+"""Charts as SVG in the page's colours, light or dark: lines, bands, dots, axes."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
+
+from markupsafe import Markup
 
 from vjepa2_ac.reports.html.formatting import decimal
-from vjepa2_ac.reports.html.markup import Markup, element, joined
+from vjepa2_ac.reports.html.templates import render
 
-_WIDTH, _HEIGHT = 440.0, 270.0  # in units of the drawing; on a phone one is 0.8 px
-_LEFT, _RIGHT, _TOP, _BOTTOM = 52.0, 12.0, 12.0, 44.0
-_RADIUS = 3.2
 _TINY = 1e-4  # steps below it are written with an exponent
 _MOST_MARKED = 40  # points; a line of more has no markers
 
@@ -60,9 +60,15 @@ def axis_at(label: str, values: Sequence[float], shown: Sequence[str], *, most: 
 
 
 def line_chart(
-    description: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis, *, level: float | None = None
+    description: str,
+    lines: Sequence[Line],
+    x_axis: Axis,
+    y_axis: Axis,
+    *,
+    level: float | None = None,
+    key: Sequence[Line] = (),
 ) -> Markup:
-    """Return curves as SVG.
+    """Return curves as SVG, and below them their legend.
 
     Args:
         description: Description of the chart, as alternative text.
@@ -70,23 +76,12 @@ def line_chart(
         x_axis: The horizontal axis.
         y_axis: The vertical axis; values outside are clipped.
         level: Height of a horizontal reference line.
+        key: What the legend names; empty: there is none.
     """
     place = _Place(x_axis, y_axis)
-    drawn = [_band(line, place) for line in lines] + [_curve(line, place) for line in lines]
-    reference = element(
-        "line", class_="level", x1=_LEFT, x2=_WIDTH - _RIGHT, y1=place.down(level), y2=place.down(level)
-    ) if level is not None else Markup()  # fmt: skip
-    return element(
-        "svg",
-        element("title", description),
-        _grid(place),
-        reference,
-        *drawn,
-        class_="chart",
-        viewBox=f"0 0 {_WIDTH:g} {_HEIGHT:g}",
-        role="img",
-        aria_label=description,
-    )
+    references = [] if level is None else [place.horizontal(level, "level")]
+    drawn = {"lines": lines, "connected": True, "most_marked": _MOST_MARKED, "references": references, "key": key}
+    return render("chart", description=description, place=place, **drawn)
 
 
 def dot_chart(description: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axis) -> Markup:
@@ -99,34 +94,10 @@ def dot_chart(description: str, lines: Sequence[Line], x_axis: Axis, y_axis: Axi
         y_axis: The vertical axis, zero included.
     """
     place = _Place(x_axis, y_axis)
-    low, high = max(x_axis.low, y_axis.low), min(x_axis.high, y_axis.high)
-    ends = {"x1": place.across(low), "x2": place.across(high), "y1": place.down(low), "y2": place.down(high)}
-    zero = {"x1": _LEFT, "x2": _WIDTH - _RIGHT, "y1": place.down(0.0), "y2": place.down(0.0)}
-    return element(
-        "svg",
-        element("title", description),
-        _grid(place),
-        element("line", class_="axis", **zero),
-        element("line", class_="level", **ends),
-        *(_mark(line, x, y, place) for line in lines for x, y in zip(line.x, line.y, strict=True)),
-        class_="chart",
-        viewBox=f"0 0 {_WIDTH:g} {_HEIGHT:g}",
-        role="img",
-        aria_label=description,
-    )
-
-
-def legend(lines: Sequence[Line]) -> Markup:
-    """Return the legend: each name beside a sample of its line."""
-    entries = [element("li", swatch(line.style), line.name) for line in lines]
-    return element("ul", *entries, class_="legend")
-
-
-def swatch(style: str) -> Markup:
-    """Return a sample of a line, as it is drawn in the charts."""
-    line = element("line", x1=1, x2=27, y1=6, y2=6, class_=f"curve {style}")
-    mark = element("circle", cx=14, cy=6, r=_RADIUS, class_=f"mark {style}")
-    return element("svg", line, mark, class_="swatch", viewBox="0 0 28 12", width=28, height=12, aria_hidden="true")
+    ends = (max(x_axis.low, y_axis.low), min(x_axis.high, y_axis.high))
+    diagonal = Line("", [place.across(end) for end in ends], [place.down(end) for end in ends], "level")
+    drawn = {"lines": lines, "connected": False, "references": [place.horizontal(0.0, "axis"), diagonal], "key": ()}
+    return render("chart", description=description, place=place, **drawn)
 
 
 def _written(ticks: Sequence[float], step: float) -> tuple[str, ...]:
@@ -151,84 +122,58 @@ def _nice_step(least: float) -> float:
 
 @dataclass(frozen=True)
 class _Place:
-    """The mapping of values to positions in the drawing."""
+    """The mapping of values to positions in the drawing, whose units are 0.8 pixels on a phone."""
 
     x_axis: Axis
     y_axis: Axis
+    width: float = 440.0
+    height: float = 270.0
+    left: float = 52.0
+    right: float = 428.0
+    top: float = 12.0
+    bottom: float = 226.0
+
+    @property
+    def ticks_across(self) -> list[tuple[float, str]]:
+        return [(self.across(value), text) for value, text in zip(self.x_axis.ticks, self.x_axis.shown, strict=True)]
+
+    @property
+    def ticks_up(self) -> list[tuple[float, str]]:
+        return [(self.down(value), text) for value, text in zip(self.y_axis.ticks, self.y_axis.shown, strict=True)]
 
     def across(self, value: float) -> float:
         share = (value - self.x_axis.low) / (self.x_axis.high - self.x_axis.low)
-        return round(_LEFT + share * (_WIDTH - _LEFT - _RIGHT), 2)
+        return round(self.left + share * (self.right - self.left), 2)
 
     def down(self, value: float) -> float:
         share = (value - self.y_axis.low) / (self.y_axis.high - self.y_axis.low)
-        return round(_HEIGHT - _BOTTOM - min(max(share, 0.0), 1.0) * (_HEIGHT - _TOP - _BOTTOM), 2)
+        return round(self.bottom - min(max(share, 0.0), 1.0) * (self.bottom - self.top), 2)
 
+    def horizontal(self, value: float, style: str) -> Line:
+        """Return the ends of a reference line at a height."""
+        return Line("", [self.left, self.right], [self.down(value)] * 2, style)
 
-def _grid(place: _Place) -> Markup:
-    bottom, right = _HEIGHT - _BOTTOM, _WIDTH - _RIGHT
-    parts = []
-    for value, shown in zip(place.y_axis.ticks, place.y_axis.shown, strict=True):
-        y = place.down(value)
-        parts += [
-            element("line", x1=_LEFT, x2=right, y1=y, y2=y, class_="grid"),
-            element("text", shown, x=_LEFT - 6, y=y + 4, text_anchor="end"),
+    def band(self, line: Line) -> list[tuple[float, float, float]]:
+        """Return x, low and high of the points that have an interval."""
+        if line.low is None or line.high is None:
+            return []
+        sides = zip(line.x, line.low, line.high, strict=True)
+        return [
+            (self.across(x), self.down(low), self.down(high))
+            for x, low, high in sides
+            if math.isfinite(low) and math.isfinite(high)
         ]
-    for value, shown in zip(place.x_axis.ticks, place.x_axis.shown, strict=True):
-        x = place.across(value)
-        parts += [
-            element("line", x1=x, x2=x, y1=bottom, y2=bottom + 4, class_="axis"),
-            element("text", shown, x=x, y=bottom + 17, text_anchor="middle"),
+
+    def pieces(self, line: Line) -> list[list[tuple[float, float]]]:
+        """Return the points of a curve, split at missing values."""
+        points = zip(line.x, line.y, strict=True)
+        pieces = [list(piece) for known, piece in groupby(points, lambda point: math.isfinite(point[1])) if known]
+        return [[(self.across(x), self.down(y)) for x, y in piece] for piece in pieces if len(piece) > 1]
+
+    def marks(self, line: Line) -> list[tuple[float, float, str]]:
+        """Return the places of values, each with its name."""
+        return [
+            (self.across(x), self.down(y), f"{line.name}: {decimal(y, 3)} at {decimal(x, 2)}")
+            for x, y in zip(line.x, line.y, strict=True)
+            if math.isfinite(y)
         ]
-    middle = (_TOP + bottom) / 2
-    return joined(
-        *parts,
-        element("line", x1=_LEFT, x2=right, y1=bottom, y2=bottom, class_="axis"),
-        element("text", place.x_axis.label, x=(_LEFT + right) / 2, y=_HEIGHT - 8, text_anchor="middle"),
-        element("text", place.y_axis.label, transform=f"translate(13 {middle:g}) rotate(-90)", text_anchor="middle"),
-    )
-
-
-def _band(line: Line, place: _Place) -> Markup:
-    if line.low is None or line.high is None:
-        return Markup()
-    sides = [
-        (place.across(x), place.down(low), place.down(high))
-        for x, low, high in zip(line.x, line.low, line.high, strict=True)
-        if math.isfinite(low) and math.isfinite(high)
-    ]
-    if len(sides) < 2:
-        return joined(*(element("line", class_=f"curve {line.style}", x1=x, x2=x, y1=a, y2=b) for x, a, b in sides))
-    upper = [f"{x:g} {high:g}" for x, _, high in sides]
-    lower = [f"{x:g} {low:g}" for x, low, _ in reversed(sides)]
-    return element("path", class_=f"band {line.style}", d=f"M{' L'.join(upper + lower)}Z")
-
-
-def _curve(line: Line, place: _Place) -> Markup:
-    points = list(zip(line.x, line.y, strict=True))
-    parts = [
-        element("polyline", class_=f"curve {line.style}", points=" ".join(f"{a:g},{b:g}" for a, b in piece))
-        for piece in _pieces(points, lambda x, y: (place.across(x), place.down(y)))
-    ]
-    if len(points) <= _MOST_MARKED:
-        parts += [_mark(line, x, y, place) for x, y in points if math.isfinite(y)]
-    return joined(*parts)
-
-
-def _mark(line: Line, x: float, y: float, place: _Place) -> Markup:
-    words = f"{line.name}: {decimal(y, 3)} at {decimal(x, 2)}"
-    centre = {"cx": place.across(x), "cy": place.down(y)}
-    return element("circle", element("title", words), class_=f"mark {line.style}", r=_RADIUS, **centre)
-
-
-def _pieces(
-    points: Sequence[tuple[float, float]], placed: Callable[[float, float], tuple[float, float]]
-) -> list[list[tuple[float, float]]]:
-    """Split a curve at missing values."""
-    pieces: list[list[tuple[float, float]]] = [[]]
-    for x, y in points:
-        if math.isfinite(y):
-            pieces[-1].append(placed(x, y))
-        elif pieces[-1]:
-            pieces.append([])
-    return [piece for piece in pieces if len(piece) > 1]

@@ -1,9 +1,11 @@
-"""Report section on errors: curves and tables by horizon and by stratum, compared between models."""
+"""Report sections on errors: curves and tables by horizon and by stratum, compared between models."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+
+from markupsafe import Markup
 
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
@@ -16,105 +18,53 @@ from vjepa2_ac.evaluation.estimates import (
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import MODES, Evaluation, Mode, ModelResult, PredictionErrors, Stratum, Way
-from vjepa2_ac.reports.html.charts import Axis, Line, axis_at, legend, line_chart, nice_axis
-from vjepa2_ac.reports.html.formatting import seconds
-from vjepa2_ac.reports.html.layout import (
-    ReportSection,
-    figure,
-    folded,
-    not_measured,
-    paragraph,
-    share,
-    side_by_side,
-    signed_value,
-    table,
-    value,
-)
-from vjepa2_ac.reports.html.markup import Markup, joined
+from vjepa2_ac.reports.html.charts import Axis, Line, axis_at, line_chart, nice_axis
+from vjepa2_ac.reports.html.formatting import seconds, share, signed_value, value
 from vjepa2_ac.reports.html.series import Series, models_of, persistence, wrong_actions_of
+from vjepa2_ac.reports.html.templates import render
 
 _MODES = {"rollout": "open-loop rollout", "teacher_forced": "teacher-forced"}
 _MOTIONS = ("moving", "idle")
-_HOW = {
-    "rollout": (
-        "The model sees the first frame and the actions, and feeds its own predictions back. The dashed line at 1 is"
-        " persistence: copying the first frame. Lower is better; above 1, doing nothing would have been better. Bands:"
-        " 95 % intervals over episodes; those of wrong actions are in the table."
-    ),
-    "teacher_forced": (
-        "The model predicts each frame from all true frames before it: always one step ahead, later ones with more"
-        " context. The dashed line at 1 is persistence: copying the frame before."
-    ),
-}
 
 CurveOf = Callable[[PredictionErrors, Mode, Metric, Way], Sequence[Estimate]]  # of `evaluation.estimates`
+Table = tuple[str, list[str], list[list[str]]]  # caption, head, rows
 
 
-def error_section(evaluation: Evaluation) -> ReportSection:
+def error_section(evaluation: Evaluation) -> Markup:
     """Return the section on the error by horizon of every model, as curves and as numbers."""
-    drawings = []
-    for mode in reversed(MODES):
-        wrong, right = (
-            [_line(evaluation, one, over_persistence(one.model.errors, mode, L1, one.way)) for one in shown]
-            for shown in (wrong_actions_of(evaluation), models_of(evaluation))
-        )
-        lines = [*(replace(line, low=None, high=None) for line in wrong), *right]
-        y_axis = nice_axis("L1 error / persistence", [*_reached(lines), 1.0], from_zero=True)
-        description = f"Error over persistence by horizon, {_MODES[mode]}: {_as_text(lines)}."
-        chart = line_chart(description, lines, _time_axis(evaluation), y_axis, level=1.0)
-        key = legend([Line("persistence (doing nothing)", (), (), "s-persistence"), *reversed(lines)])
-        drawings.append(figure(f"Error by horizon, {_MODES[mode]}", joined(chart, key), _HOW[mode]))
-    tables = _tables(evaluation, L1, over_persistence, "over persistence")
+    ratios = [("", _tables(evaluation, L1, over_persistence, "over persistence"))]
     for metric in evaluation.metrics[1:]:
-        ratios = _tables(evaluation, metric, over_persistence, "over persistence")
-        tables.append(folded(f"Error over persistence, {metric.heading}: {metric.explanation}", *ratios))
-    for metric in evaluation.metrics:
-        means = _tables(evaluation, metric, mean_error, "")
-        tables.append(folded(f"The errors themselves, {metric.heading}: {metric.explanation}", *means))
-    return ReportSection("errors", "Error by horizon", joined(side_by_side(*drawings), *tables))
+        summary = f"Error over persistence, {metric.heading}: {metric.explanation}"
+        ratios.append((summary, _tables(evaluation, metric, over_persistence, "over persistence")))
+    means = [
+        (f"The errors themselves, {one.heading}: {one.explanation}", _tables(evaluation, one, mean_error, ""))
+        for one in evaluation.metrics
+    ]
+    return render("errors", ratios=ratios, means=means, **{mode: _error_by_horizon(evaluation, mode) for mode in MODES})
 
 
-def base_section(evaluation: Evaluation) -> ReportSection:
+def base_section(evaluation: Evaluation) -> Markup:
     """Return the section that compares the trained and other models with the base: paired, clip by clip."""
-    title = "Compared with the base"
     if evaluation.base is None:
-        why = "There is no base model in this evaluation to compare with."
-        return ReportSection("base", title, not_measured("Differences to the base", why))
+        return render("base", chart=None)
     compared = [one for one in models_of(evaluation) if one.model.role != "base"]
     base = evaluation.models[evaluation.base]
-    lines = [_line(evaluation, one, gain_over(one.model.errors, base.errors)) for one in compared]
-    in_percent = [
-        replace(line, y=[100 * y for y in line.y], low=_in_percent(line.low), high=_in_percent(line.high))
-        for line in lines
-    ]
-    y_axis = nice_axis("gain over the base (%)", [*_reached(in_percent), 0.0])
-    description = f"Gain over the base in percent by horizon, open-loop rollout: {_as_text(in_percent, 1)}."
-    chart = joined(line_chart(description, in_percent, _time_axis(evaluation), y_axis, level=0.0), legend(in_percent))
-    how = (
-        "By which share of the base's error the model's is smaller. Both predict the same clips, so what makes a clip"
-        " hard for both cancels out. Above 0 is better than the base; where the band includes 0, nothing is shown."
-    )
-    drawing = figure("Gain over the base by horizon, open-loop rollout", chart, how)
+    lines = [_line(evaluation, one, _in_percent(gain_over(one.model.errors, base.errors))) for one in compared]
+    y_axis = nice_axis("gain over the base (%)", [*_reached(lines), 0.0])
+    description = f"Gain over the base in percent by horizon, open-loop rollout: {_as_text(lines, 1)}."
+    chart = line_chart(description, lines, _time_axis(evaluation), y_axis, level=0.0, key=lines)
     tables = [_compared_table(evaluation, one.model, base) for one in compared]
-    return ReportSection("base", title, joined(drawing, *tables))
+    return render("base", evaluation=evaluation, chart=chart, tables=tables)
 
 
-def strata_section(evaluation: Evaluation) -> ReportSection:
+def strata_section(evaluation: Evaluation) -> Markup:
     """Return the section on the one-step error of groups of steps."""
-    title = "Where it helps: moving and idle, small and large actions"
-    if not evaluation.strata:
-        return ReportSection("strata", title, not_measured("Strata", "This result holds no strata."))
-    how = paragraph(
-        "One-step, teacher-forced L1 error over persistence. While nothing moves, copying the frame is hard to beat and"
-        " a ratio above 1 matters little; where much moves, it matters most. ",
-        f"A step counts as moving by this rule: {evaluation.clips.moving_means}.",
-        class_="how",
-    )
-    motions = {stratum.name for stratum in evaluation.strata}
-    kinds = list(dict.fromkeys(stratum.kind for stratum in evaluation.strata))
+    kinds = dict.fromkeys(stratum.kind for stratum in evaluation.strata)
     tables = [_strata_table(evaluation, kind, [one for one in evaluation.strata if one.kind == kind]) for kind in kinds]
-    without = [paragraph(f"None of the steps is {name}.") for name in _MOTIONS if name not in motions]
-    return ReportSection("strata", title, joined(how, *tables, *(without if len(without) < len(_MOTIONS) else ())))
+    missing = [name for name in _MOTIONS if name not in {stratum.name for stratum in evaluation.strata}]
+    return render(
+        "strata", evaluation=evaluation, tables=tables, missing=missing if len(missing) < len(_MOTIONS) else ()
+    )
 
 
 def horizon_name(evaluation: Evaluation, horizon: int) -> str:
@@ -122,7 +72,19 @@ def horizon_name(evaluation: Evaluation, horizon: int) -> str:
     return f"{horizon} ({seconds(horizon * evaluation.about.seconds_per_step)})"
 
 
-def _tables(evaluation: Evaluation, metric: Metric, curve_of: CurveOf, over: str) -> list[Markup]:
+def _error_by_horizon(evaluation: Evaluation, mode: Mode) -> Markup:
+    wrong, right = (
+        [_line(evaluation, one, over_persistence(one.model.errors, mode, L1, one.way)) for one in shown]
+        for shown in (wrong_actions_of(evaluation), models_of(evaluation))
+    )
+    lines = [*(replace(line, low=None, high=None) for line in wrong), *right]
+    y_axis = nice_axis("L1 error / persistence", [*_reached(lines), 1.0], from_zero=True)
+    description = f"Error over persistence by horizon, {_MODES[mode]}: {_as_text(lines)}."
+    key = [Line("persistence (doing nothing)", (), (), "s-persistence"), *reversed(lines)]
+    return line_chart(description, lines, _time_axis(evaluation), y_axis, level=1.0, key=key)
+
+
+def _tables(evaluation: Evaluation, metric: Metric, curve_of: CurveOf, over: str) -> list[Table]:
     """Return a table of the rollout and a teacher-forced one; of the errors themselves also persistence has some."""
     shown = (*models_of(evaluation), *wrong_actions_of(evaluation))
     shown = shown if over else (persistence(evaluation), *shown)
@@ -134,12 +96,12 @@ def _tables(evaluation: Evaluation, metric: Metric, curve_of: CurveOf, over: str
             for h in range(evaluation.horizon)
         ]
         name = f"{metric.heading} {'error' if metric.smaller_is_better else ''} {over}"
-        caption = f"{' '.join(name.split())} by horizon, {_MODES[mode]} (no unit; value [95 % interval])"
-        tables.append(table(caption, ["model steps ahead", *(one.label for one in shown)], rows))
+        caption = f"{' '.join(name.split())} by horizon, {_MODES[mode]}"
+        tables.append((caption, ["model steps ahead", *(one.label for one in shown)], rows))
     return tables
 
 
-def _compared_table(evaluation: Evaluation, one: ModelResult, base: ModelResult) -> Markup:
+def _compared_table(evaluation: Evaluation, one: ModelResult, base: ModelResult) -> Table:
     pair = one.errors, base.errors
     columns = [(gain_over(*pair, mode), difference_to(*pair, mode)) for mode in reversed(MODES)]
     rows = [
@@ -153,11 +115,10 @@ def _compared_table(evaluation: Evaluation, one: ModelResult, base: ModelResult)
     head = ["model steps ahead"] + [
         f"{what}, {_MODES[mode]}" for mode in reversed(MODES) for what in ("gain", "L1 difference")
     ]
-    caption = f"{one.name} against {base.name}, paired by clip (value [95 % interval]; a gain above 0 is better)"
-    return table(caption, head, rows)
+    return one.name, head, rows
 
 
-def _strata_table(evaluation: Evaluation, kind: str, strata: Sequence[Stratum]) -> Markup:
+def _strata_table(evaluation: Evaluation, kind: str, strata: Sequence[Stratum]) -> Table:
     shown = models_of(evaluation)
     base = evaluation.base_errors
     what = kind if kind == "motion" or evaluation.about.space.position is not None else "norm of the action"
@@ -169,7 +130,7 @@ def _strata_table(evaluation: Evaluation, kind: str, strata: Sequence[Stratum]) 
         rows.append([stratum.name, str(int(stratum.steps.sum())), *cells])
     head = [what, "steps", *(one.label for one in shown)]
     head += [f"gain of {evaluation.trained} over {evaluation.base}"] if base is not None else []
-    return table(f"One-step L1 error over persistence by {kind} (value [95 % interval])", head, rows)
+    return kind, head, rows
 
 
 def _line(evaluation: Evaluation, one: Series, curve: Sequence[Estimate]) -> Line:
@@ -181,8 +142,8 @@ def _line(evaluation: Evaluation, one: Series, curve: Sequence[Estimate]) -> Lin
     )
 
 
-def _in_percent(side: Sequence[float] | None) -> Sequence[float] | None:
-    return None if side is None else [100 * each for each in side]
+def _in_percent(curve: Sequence[Estimate]) -> list[Estimate]:
+    return [Estimate(100 * each.value, 100 * each.low, 100 * each.high) for each in curve]
 
 
 def _reached(lines: Sequence[Line]) -> list[float]:

@@ -11,13 +11,12 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from types import TracebackType
 
 from vjepa2_ac.config import CheckpointConfig
 from vjepa2_ac.errors import RefusedError, UnreachableError, UserError
 from vjepa2_ac.runs.folder import CHECKPOINTS
-from vjepa2_ac.runs.mirror.upload import ForeignRunError, OvertakenError, RemoteUpdate
-from vjepa2_ac.storage.remote import quietly
+from vjepa2_ac.runs.mirror.upload import LostPlaceError, RemoteUpdate
+from vjepa2_ac.storage.remote.retries import quietly
 
 logger = logging.getLogger(__name__)
 
@@ -92,9 +91,7 @@ class Mirror:
         """Return the mirror."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, _kind: object, error: object, _traceback: object) -> None:
         """Stop uploading; if the run ends with an error, upload what exists first."""
         if isinstance(error, Exception) and not self._stop.is_set():
             self.finish(lambda: True)
@@ -117,20 +114,9 @@ class Mirror:
             self._outage_reported = False
         except _BrokenOffError:
             pass
-        except ForeignRunError as error:
+        except LostPlaceError as error:
             self._is_off = True
-            logger.warning(
-                "checkpoint.remote: %s holds a checkpoint of another run, %s. Nothing was written there, and nothing"
-                " will be: this run is on this machine alone. Name another place when you start it again",
-                self._update.place, error,
-            )  # fmt: skip
-        except OvertakenError as error:
-            self._is_off = True
-            logger.warning(
-                "checkpoint.remote: %s is used by a later start of this run, %s. This one continues without it;"
-                " stop one of the two",
-                self._update.place, error,
-            )  # fmt: skip
+            logger.warning("checkpoint.remote: %s", error)
         except (UserError, OSError) as error:
             log = logger.info if self._outage_reported else logger.warning
             log(

@@ -17,7 +17,7 @@ from pathlib import Path
 from vjepa2_ac.config import Config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.reporter import Reporter
-from vjepa2_ac.runs.checkpoint import FETCHING, checkpoint_name, remove_leavings, written_state
+from vjepa2_ac.runs.checkpoint import FETCHING, remove_leavings, written_state
 from vjepa2_ac.runs.folder import CHECKPOINTS, check_run_folder, with_settled_stride
 from vjepa2_ac.runs.mirror.remote_checkpoints import RemoteCheckpoints
 from vjepa2_ac.runs.mirror.upload import SMALL_FILES
@@ -55,14 +55,17 @@ def fetch_newest(
     folder, damaged = Path(config.run_dir), []
     with tempfile.TemporaryDirectory() as temporary:
         small = Path(temporary)
-        _fetch_small_files(remote.place, small)
+        for name in SMALL_FILES:
+            with suppress(FileNotFoundError):
+                download(join(remote.place, name), small / name)
         _require_this_config(config, small, remote.place, allow_config_change=allow_config_change)
         claim()
         for name in SMALL_FILES:  # config.yaml first: without it the folder would be no run's
             if (small / name).is_file():
                 write_atomically(folder / name, (small / name).read_bytes())
+    remove_leavings(folder / CHECKPOINTS)
     for name in names:
-        fetched = _fetch(remote, name, folder)
+        fetched = _fetch(remote, name, folder, name)
         if fetched is not None:
             _fetch_best(remote, fetched, folder)
             _give_name(fetched, folder / CHECKPOINTS / name)
@@ -72,53 +75,36 @@ def fetch_newest(
     return damaged
 
 
-def _fetch_small_files(place: str, folder: Path) -> None:
-    for name in SMALL_FILES:
-        with suppress(FileNotFoundError):
-            download(join(place, name), folder / name)
-
-
 def _require_this_config(config: Config, fetched: Path, place: str, *, allow_config_change: bool) -> None:
     """Check that the run there is the requested one, as for a local folder."""
     try:
         there = with_settled_stride(config.model_copy(update={"run_dir": str(fetched)}))
         check_run_folder(there, allow_config_change=allow_config_change)
     except InputError as error:
-        raise InputError(
-            where=f"checkpoint.remote {place}",
-            found=error.found,
-            needed=error.needed,
-            fix="Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change",
-        ) from None
+        fix = "Set another checkpoint.remote for a new run; where the change is meant, add --allow-config-change"
+        where = f"checkpoint.remote {place}"
+        raise InputError(where=where, found=error.found, needed=error.needed, fix=fix) from None
 
 
-def _fetch(remote: RemoteCheckpoints, name: str, folder: Path) -> Path | None:
+def _fetch(remote: RemoteCheckpoints, name: str, folder: Path, described: str) -> Path | None:
     """Download a checkpoint under a temporary name; None, and a warning, if it is damaged."""
-    remove_leavings(folder / CHECKPOINTS)
     fetched = folder / CHECKPOINTS / f"{FETCHING}{name}"
     problem = remote.fetch(name, fetched)
     if problem is None:
         return fetched
     shutil.rmtree(fetched)
-    logger.warning("%s: %s: %s; passed over", remote.place, name, problem)
+    logger.warning("%s: %s: %s; passed over", remote.place, described, problem)
     return None
 
 
 def _fetch_best(remote: RemoteCheckpoints, newest: Path, folder: Path) -> None:
     """Download the best checkpoint, if the newest names one that exists there and not on this machine."""
-    step = written_state(newest).best_step
-    if step is None or newest.name == f"{FETCHING}{checkpoint_name(step)}":
+    name = written_state(newest).best_name
+    if name is None or newest.name == f"{FETCHING}{name}" or (folder / CHECKPOINTS / name).is_dir():
         return
-    best = folder / CHECKPOINTS / checkpoint_name(step)
-    if best.is_dir():
-        return
-    fetched = best.with_name(f"{FETCHING}{best.name}")
-    problem = remote.fetch(best.name, fetched)
-    if problem is None:
-        _give_name(fetched, best)
-        return
-    shutil.rmtree(fetched)
-    logger.warning("%s: the best checkpoint, %s: %s; passed over", remote.place, best.name, problem)
+    fetched = _fetch(remote, name, folder, f"the best checkpoint, {name}")
+    if fetched is not None:
+        _give_name(fetched, folder / CHECKPOINTS / name)
 
 
 def _give_name(fetched: Path, name: Path) -> None:

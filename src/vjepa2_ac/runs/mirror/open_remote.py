@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,9 +21,11 @@ from vjepa2_ac.runs.mirror.fetch import fetch_newest
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.runs.mirror.upload import RemoteUpdate
 from vjepa2_ac.storage import is_url, place, try_writing
-from vjepa2_ac.storage.remote import quietly
+from vjepa2_ac.storage.remote.retries import quietly
 
 logger = logging.getLogger(__name__)
+
+_KNOB = "checkpoint.remote"
 
 
 @dataclass(frozen=True)
@@ -94,7 +97,10 @@ def open_remote(
         _warn(f"{reason_of(error)}. Training goes on after step {step}, though {further[0]} is there")
         return remote
     if further and damaged == further:
-        _refuse_all_damaged(remote.place, damaged, step)
+        if step is None:
+            found = f"{remote.place}: none of {len(damaged)} checkpoints is whole"
+            fix = "To start the run anew, remove them, or set another checkpoint.remote"
+            raise InputError(where=_KNOB, found=found, fix=fix)
         return replace(remote, damaged=tuple(damaged))
     return replace(remote, config=target, damaged=tuple(damaged))
 
@@ -111,12 +117,9 @@ def _look(checkpoints: RemoteCheckpoints, run_id: str | None) -> tuple[Listing, 
         listing = checkpoints.listing()
         owner = _refuse_foreign(checkpoints, listing, run_id)
     except RefusedError as error:
-        raise InputError(
-            where="checkpoint.remote",
-            found=f"{checkpoints.place}: {error.found}",
-            needed="a place where files can be written and removed",
-            fix=f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out",
-        ) from error
+        found, needed = f"{checkpoints.place}: {error.found}", "a place where files can be written and removed"
+        fix = f"{error.fix.rstrip('.')}. Or name another place, or leave checkpoint.remote out"
+        raise InputError(where=_KNOB, found=found, needed=needed, fix=fix) from error
     return listing, owner
 
 
@@ -126,46 +129,28 @@ def _refuse_foreign(checkpoints: RemoteCheckpoints, listing: Listing, run_id: st
         owner = checkpoints.run_id(name)
         run_id = owner if run_id is None else run_id
         if owner is not None and owner != run_id:
-            raise InputError(
-                where="checkpoint.remote",
-                found=f"{checkpoints.place} holds a checkpoint of another run, {name}",
-                needed="an empty place, or the one of this run",
-                fix="Set another checkpoint.remote; nothing was written there",
-            )
+            found = f"{checkpoints.place} holds a checkpoint of another run, {name}"
+            fix = "Set another checkpoint.remote; nothing was written there"
+            raise InputError(where=_KNOB, found=found, needed="an empty place, or the one of this run", fix=fix)
     return run_id
 
 
 def _refuse_own_folder(remote: str, run_dir: Path) -> None:
     own = run_dir.resolve()
     if not is_url(remote) and (Path(remote) == own or own in Path(remote).parents):
-        raise InputError(
-            where="checkpoint.remote",
-            found=f"{remote}, and run_dir is {own}",
-            needed="a place outside the run's folder",
-            fix="Set checkpoint.remote to a folder on another disk, or a URL such as gs://bucket/run",
-        )
-
-
-def _refuse_all_damaged(remote: str, damaged: list[str], step: int | None) -> None:
-    if step is None:
-        raise InputError(
-            where="checkpoint.remote",
-            found=f"{remote}: none of {len(damaged)} checkpoints is whole",
-            fix="To start the run anew, remove them, or set another checkpoint.remote",
-        )
+        found, needed = f"{remote}, and run_dir is {own}", "a place outside the run's folder"
+        fix = "Set checkpoint.remote to a folder on another disk, or a URL such as gs://bucket/run"
+        raise InputError(where=_KNOB, found=found, needed=needed, fix=fix)
 
 
 def _where_this_machine_stands(run_dir: Path) -> tuple[int | None, str | None]:
     """Return step and run of the newest complete local checkpoint."""
-    try:
-        checkpoint = newest_checkpoint(run_dir / CHECKPOINTS)
-    except InputError:  # none is complete: a remote one may be
-        return None, None
-    if checkpoint is None:
-        return None, None
-    state = written_state(checkpoint)
-    return state.step, state.run_id
+    with suppress(InputError):  # none is complete: a remote one may be
+        if (checkpoint := newest_checkpoint(run_dir / CHECKPOINTS)) is not None:
+            state = written_state(checkpoint)
+            return state.step, state.run_id
+    return None, None
 
 
 def _warn(text: str) -> None:
-    logger.warning("checkpoint.remote: %s", text)
+    logger.warning("%s: %s", _KNOB, text)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.runs.checkpoint import checkpoint_name, find_damage, listed, step_of, written_state
+from vjepa2_ac.runs.checkpoint import find_damage, listed, step_of, written_state
 from vjepa2_ac.runs.folder import CALIBRATION, CHANGES, CHECKPOINTS, CONFIG, ENVIRONMENT, HELD, METRICS, RUN_ID
 from vjepa2_ac.runs.mirror.remote_checkpoints import Listing, RemoteCheckpoints, complete
 from vjepa2_ac.storage import join, read_bounded, upload
@@ -27,12 +27,8 @@ GoOn = Callable[[], None]
 """Called before each file; raises to break off."""
 
 
-class ForeignRunError(Exception):
-    """There are another run's checkpoints; the argument is the name of one."""
-
-
-class OvertakenError(Exception):
-    """A later start of the same run uses the place; the argument describes it."""
+class LostPlaceError(Exception):
+    """The place is another run's, or a later start's of the same run; the argument says so, and what follows."""
 
 
 class RemoteUpdate:
@@ -61,8 +57,7 @@ class RemoteUpdate:
         """Upload what is missing; return the newest checkpoint there, None if there is none to upload.
 
         Raises:
-            ForeignRunError: The place is another run's.
-            OvertakenError: Another machine has resumed this run, and uses the place.
+            LostPlaceError: The place is another run's, or another machine has resumed this run, and uses it.
             UnreachableError: It cannot be reached.
             OSError: The run's folder cannot be read, or written for the links.
         """
@@ -73,18 +68,21 @@ class RemoteUpdate:
             self._remote.remove(name)
             listing = {other: files for other, files in listing.items() if other != name}
         self._damaged.clear()
-        newest = self._hold_newest()
+        newest = next(filter(None, map(self._hold, self._names_here())), None)
         if newest is None:
             return None
-        best_name = _best_of(newest)
+        best_name = written_state(newest).best_name
         best = self._hold(best_name) if best_name not in {None, newest.name} else None
-        self._remove_halves(listing, newest.name, best_name, go_on)
+        # Older incomplete ones: else a full place would never have room again; newer ones stay.
+        halves = set(listing) - {*complete(listing), newest.name, best_name}
+        self._remove([name for name in halves if (step_of(name) or 0) < (step_of(newest.name) or 0)], go_on)
         self._send_small_files(go_on)
         for checkpoint in (newest, best):
             if checkpoint is not None:
                 self._remote.send(checkpoint, listing.get(checkpoint.name, {}), before_each=go_on)
                 self._ours.add(checkpoint.name)
-        self._rotate(newest.name, best_name, go_on)
+        whole = complete(self._remote.listing())
+        self._remove(set(whole) - {*whole[: self._keep], newest.name, best_name}, go_on)
         return newest.name
 
     def release(self) -> None:
@@ -99,7 +97,10 @@ class RemoteUpdate:
         for name in sorted(set(listing) - self._ours):
             owner = self._remote.run_id(name)
             if owner is not None and owner != self._run_id:
-                raise ForeignRunError(name)
+                raise LostPlaceError(
+                    f"{self.place} holds a checkpoint of another run, {name}. Nothing was written there, and nothing"
+                    " will be: this run is on this machine alone. Name another place when you start it again"
+                )
             if owner is not None:
                 self._ours.add(name)
 
@@ -114,7 +115,10 @@ class RemoteUpdate:
             self._small.pop(ENVIRONMENT, None)
             return
         if there != self._starts:
-            raise OvertakenError(_last_start(there, path))
+            raise LostPlaceError(
+                f"{self.place} is used by a later start of this run, {_last_start(there, path)}. This one continues"
+                " without it; stop one of the two"
+            )
 
     def _send_small_files(self, go_on: GoOn) -> None:
         """Upload the changed files of the run's folder in their current state: they may grow meanwhile."""
@@ -131,9 +135,6 @@ class RemoteUpdate:
                     self._starts = copy.read_bytes()
                 self._small[name] = version
 
-    def _hold_newest(self) -> Path | None:
-        return next(filter(None, map(self._hold, self._names_here())), None)
-
     def _hold(self, name: str | None) -> Path | None:
         """Link a checkpoint's files into an own folder; None if it is incomplete, or just being removed."""
         held = self.folder / HELD / str(name)
@@ -144,17 +145,8 @@ class RemoteUpdate:
             return None
         return held if find_damage(held) is None else None
 
-    def _remove_halves(self, listing: Listing, newest: str, best: str | None, go_on: GoOn) -> None:
-        """Remove older incomplete ones: else a full place would never have room again; newer ones stay."""
-        for name in sorted(set(listing) - {*complete(listing), newest, best}):
-            if (step_of(name) or 0) < (step_of(newest) or 0):
-                go_on()
-                self._remote.remove(name)
-
-    def _rotate(self, newest: str, best: str | None, go_on: GoOn) -> None:
-        """Remove checkpoints that are no longer kept."""
-        whole = complete(self._remote.listing())
-        for name in sorted(set(whole) - {*whole[: self._keep], newest, best}):
+    def _remove(self, names: Collection[str], go_on: GoOn) -> None:
+        for name in sorted(names):
             go_on()
             self._remote.remove(name)
 
@@ -163,11 +155,6 @@ class RemoteUpdate:
         with contextlib.suppress(FileNotFoundError):
             return [path.name for path in reversed(listed(self.folder / CHECKPOINTS))]
         return []
-
-
-def _best_of(checkpoint: Path) -> str | None:
-    step = written_state(checkpoint).best_step
-    return None if step is None else checkpoint_name(step)
 
 
 def _last_start(starts: bytes, where: str) -> str:
@@ -182,7 +169,5 @@ def _last_start(starts: bytes, where: str) -> str:
 def _link(source: str, target: str) -> None:
     try:
         os.link(source, target)
-    except FileNotFoundError:
-        raise
     except OSError:  # a file system without hard links
         shutil.copyfile(source, target)

@@ -12,6 +12,7 @@ from typing import Any
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import RldsData
+from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_writer import video_library
 from vjepa2_ac.planning.session import PlanningSession
@@ -78,14 +79,7 @@ def run_benchmark(
         InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, or a folder that is not
             writable.
     """
-    stride = session.config.data.stride
-    if stride == "auto":
-        raise InputError(
-            where="data.stride",
-            found="auto",
-            needed="a number of control steps, to steer",
-            fix="Say which, as data.stride=4",
-        )
+    stride = require_stride(session.config.data, to="steer", fix="Say which, as data.stride=4")
     if session.config.data.pose_frame != "base":
         raise InputError(
             where=f"data.pose_frame: {session.config.data.pose_frame}",

@@ -19,11 +19,11 @@ from vjepa2_ac.data.sources.rlds.writing.droid_writer import (
     DroidCommands,
     DroidEpisode,
     DroidMeasurements,
-    encode_jpeg,
     write_droid_rlds,
 )
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.jpeg import encode_jpeg
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
 from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching

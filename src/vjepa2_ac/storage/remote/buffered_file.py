@@ -6,7 +6,7 @@ import io
 from collections import OrderedDict
 from collections.abc import Callable
 
-_BLOCK_BYTES = 128 << 10
+BLOCK_BYTES = 128 << 10
 _READ_AHEAD_BLOCKS = 32  # at most, for sequential reads
 _CACHED_BLOCKS = 128
 
@@ -18,7 +18,7 @@ class RangedFile(io.RawIOBase):
     or one group of its frames, costs little more than its bytes, and a whole file few reads.
 
     Args:
-        fetch: Returns exactly `length` bytes from `start`: called with (start, length).
+        fetch: Returns exactly `length` bytes from `start`: called with (start, length), which are of whole blocks.
         size: Size of the file.
     """
 
@@ -37,12 +37,8 @@ class RangedFile(io.RawIOBase):
         """Return that it can seek."""
         return True
 
-    def tell(self) -> int:
-        """Return the offset of the next byte."""
-        return self._position
-
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
-        """Go to an offset from the start, the current position or the end; return it from the start."""
+        """Go to an offset from the start, the current position or the end; return it from the start, as `tell` does."""
         base = {io.SEEK_SET: 0, io.SEEK_CUR: self._position, io.SEEK_END: self._size}[whence]
         if base + offset < 0:
             raise ValueError(f"negative position {base + offset}")
@@ -73,13 +69,13 @@ class RangedFile(io.RawIOBase):
     def _range(self, start: int, end: int) -> bytes:
         if start >= end:
             return b""
-        first, last = start // _BLOCK_BYTES, (end - 1) // _BLOCK_BYTES
+        first, last = start // BLOCK_BYTES, (end - 1) // BLOCK_BYTES
         pieces: dict[int, bytes] = {}
         for number in range(first, last + 1):
             if number not in pieces:
                 pieces |= self._load(number, last)
         data = b"".join(pieces[number] for number in range(first, last + 1))
-        return data[start - first * _BLOCK_BYTES : end - first * _BLOCK_BYTES]
+        return data[start - first * BLOCK_BYTES : end - first * BLOCK_BYTES]
 
     def _load(self, number: int, last: int) -> dict[int, bytes]:
         """Return a block by number; if it must be fetched, also the wanted ones up to the next cached block."""
@@ -89,9 +85,9 @@ class RangedFile(io.RawIOBase):
         self._read_ahead = min(2 * self._read_ahead, _READ_AHEAD_BLOCKS) if number == self._fetched_to else 1
         stop = max(last + 1, number + self._read_ahead)
         stop = next((other for other in range(number + 1, stop) if other in self._blocks), stop)
-        start = number * _BLOCK_BYTES
-        data = self._fetch(start, min(stop * _BLOCK_BYTES, self._size) - start)
-        blocks = {number + i: data[i * _BLOCK_BYTES : (i + 1) * _BLOCK_BYTES] for i in range(stop - number)}
+        start = number * BLOCK_BYTES
+        data = self._fetch(start, min(stop * BLOCK_BYTES, self._size) - start)
+        blocks = {number + i: data[i * BLOCK_BYTES : (i + 1) * BLOCK_BYTES] for i in range(stop - number)}
         self._fetched_to = stop
         self._blocks |= blocks
         while len(self._blocks) > _CACHED_BLOCKS:

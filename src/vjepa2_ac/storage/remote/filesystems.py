@@ -23,14 +23,21 @@ _MACHINE = Path("/sys/class/dmi/id/product_name")
 _PIECE_BYTES = 16 << 20  # of an upload; it is read while other reads wait
 
 
-def ask(url: str, method: str, timeout_s: float, **arguments: Any) -> Any:
+def ask(url: str, method: str, timeout_s: float, *, writing: bool = False, **arguments: Any) -> Any:
     """Call a method of the URL's file system with the URL's path, once; with a time-out where that is possible.
+
+    Args:
+        url: What it is about.
+        method: Its name.
+        timeout_s: The time-out.
+        writing: Whether it changes something: only then is permission to do so requested.
+        arguments: Others of the method.
 
     Raises:
         Exception: Whatever the library raises.
         InputError: The library is not installed, or does not exist.
     """
-    filesystem = _filesystem(url)
+    filesystem = _filesystem(url, writing=writing)
     return _once(filesystem, method, timeout_s, filesystem._strip_protocol(url), **arguments)
 
 
@@ -44,17 +51,6 @@ def send(source: Path, url: str, timeout_s: float) -> None:
     filesystem = _filesystem(url, writing=True)
     pieces = {"chunksize": _PIECE_BYTES} if _protocol(url) == "gs" else {}
     _once(filesystem, "put_file", timeout_s, str(source), filesystem._strip_protocol(url), **pieces)
-
-
-def discard(url: str, timeout_s: float) -> None:
-    """Remove the file of a URL, once.
-
-    Raises:
-        Exception: Whatever the library raises.
-        InputError: As `ask`.
-    """
-    filesystem = _filesystem(url, writing=True)
-    _once(filesystem, "rm_file", timeout_s, filesystem._strip_protocol(url))
 
 
 def sizes_below(url: str, timeout_s: float) -> dict[str, int]:

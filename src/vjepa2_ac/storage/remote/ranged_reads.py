@@ -25,26 +25,13 @@ _PIECE_BYTES = 16 << 20  # longer reads are split: each piece has the full time-
 _VERSION_KEYS = ("generation", "etag", "ETag", "blob_id", "mtime", "last_modified", "LastModified", "created")
 
 
-class Entry(NamedTuple):
-    """A file or folder in a listing."""
+class FileInfo(NamedTuple):
+    """A file or folder in a listing, on this machine or at a server."""
 
     name: str
-    is_file: bool
     size: int
-    version: str  # as the server gives it
-
-
-def exists(url: str) -> bool:
-    """Return whether there is a file or folder.
-
-    Raises:
-        UnreachableError: The server cannot be reached.
-    """
-    try:
-        _call(url, "info")
-    except FileNotFoundError:
-        return False
-    return True
+    version: str  # changes with the content, as far as is known without reading it
+    is_file: bool = True
 
 
 def file_size(url: str) -> int:
@@ -58,32 +45,34 @@ def file_size(url: str) -> int:
 
 
 def file_version(url: str) -> str:
-    """Return the server's version of a file's content, which changes with the content; empty if it has none.
+    """Return the server's version of a file's content, which changes with the content; empty where there is none.
 
     Raises:
-        FileNotFoundError: There is no such file.
+        FileNotFoundError: There is no such file or folder.
         UnreachableError: It cannot be reached.
     """
     return _version_of(_call(url, "info"))
 
 
-def list_folder(url: str) -> list[Entry]:
-    """Return the entries of a folder, sorted by name: one listing, one call per page.
+def list_folder(url: str) -> list[FileInfo]:
+    """Return the entries of a folder, sorted by name: one listing, one call per page; none if there is no such folder.
 
     Raises:
-        FileNotFoundError: There is no such folder.
         UnreachableError: It cannot be reached.
     """
-    entries = [
-        Entry(
+    try:
+        listed = _call(url, "ls", detail=True, refresh=True)
+    except FileNotFoundError:
+        return []
+    return sorted(
+        FileInfo(
             name=str(found["name"]).rstrip("/").rsplit("/", 1)[-1],
-            is_file=found["type"] == "file",
             size=int(found.get("size") or 0),
             version=_version_of(found),
+            is_file=found["type"] == "file",
         )
-        for found in _call(url, "ls", detail=True, refresh=True)
-    ]
-    return sorted(entries)
+        for found in listed
+    )
 
 
 def read_range(url: str, start: int, length: int) -> bytes:
@@ -161,7 +150,7 @@ def _version_of(found: Mapping[str, Any]) -> str:
 
 def _read_once(url: str, start: int, length: int, timeout_s: float) -> bytes:
     """Read a range; accept a short answer only at the end of the file."""
-    bare = {} if is_asynchronous(url) else {"cache_type": "none"}  # else megabytes are prefetched
+    bare: dict[str, Any] = {} if is_asynchronous(url) else {"cache_type": "none"}  # else megabytes are prefetched
     try:
         data: bytes = ask(url, "cat_file", timeout_s, start=start, end=start + length, **bare)
     except Exception as error:
@@ -193,7 +182,7 @@ def _require_bucket(url: str) -> None:
     """
     protocol, _, path = url.partition("://")
     bucket = path.split("/", 1)[0]
-    if protocol not in GOOGLE or (os.getpid(), bucket) in _known_buckets:
+    if protocol not in GOOGLE or bucket in _known_buckets:
         return
     root = f"{protocol}://{bucket}"
 
@@ -207,7 +196,7 @@ def _require_bucket(url: str) -> None:
     except UnreachableError as error:
         if "no permission" not in error.found:
             raise
-    _known_buckets.add((os.getpid(), bucket))
+    _known_buckets.add(bucket)
 
 
-_known_buckets: set[tuple[int, str]] = set()
+_known_buckets: set[str] = set()

@@ -47,10 +47,6 @@ class RetryPolicy:
     timeout_s: float = 30.0
     total_s: float = 300.0
 
-    def __post_init__(self) -> None:
-        if self.attempts < 1 or self.timeout_s <= 0:
-            raise ValueError(f"{self} never tries")
-
     def wait_s(self, failures: int) -> float:
         """Return how long to wait after so many failures."""
         longest: float = min(self.first_wait_s * 2 ** (failures - 1), self.longest_wait_s)
@@ -146,8 +142,8 @@ def status_of(error: BaseException) -> int | None:
 
 def _comes_from_outside(error: Exception) -> bool:
     """Distinguish external failures from bugs."""
-    is_of_a_library = _is_of_network(error) or _is_of_google_login(error)
-    return isinstance(error, OSError | ValueError | EOFError) or status_of(error) is not None or is_of_a_library
+    of_the_system = isinstance(error, OSError | ValueError | EOFError)
+    return of_the_system or status_of(error) is not None or _is_of_network(error) or _is_of_google_login(error)
 
 
 def _is_of_network(error: Exception) -> bool:

@@ -11,11 +11,13 @@ import json
 import math
 import re
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage import read_bounded
 from vjepa2_ac.storage.structured.nesting import require_shallow, too_deep
+
+T = TypeVar("T")
 
 MOST_BYTES = 16 << 20
 _MOST_DIGITS = 20  # of a whole number: as many as 64 bits have
@@ -38,14 +40,12 @@ def json_object(
     Raises:
         InputError: It is not JSON, not within the bounds, or no object.
     """
-    value: dict[str, Any] = _parsed(data, dict, where, needed, fix, allow_nan=allow_nan)
-    return value
+    return _parsed(data, dict, where, needed, fix, allow_nan=allow_nan)
 
 
-def json_list(data: bytes | str, *, where: str, needed: str = "", fix: str = "", allow_nan: bool = False) -> list[Any]:
+def json_list(data: bytes | str, *, where: str) -> list[Any]:
     """Return the values of a JSON list; arguments and errors as of `json_object`."""
-    value: list[Any] = _parsed(data, list, where, needed, fix, allow_nan=allow_nan)
-    return value
+    return _parsed(data, list, where, "", "", allow_nan=False)
 
 
 def read_json_object(
@@ -61,15 +61,7 @@ def read_json_object(
     return json_object(data, where=str(path), needed=needed, fix=fix, allow_nan=allow_nan)
 
 
-def read_json_list(
-    path: str | Path, *, most_bytes: int = MOST_BYTES, needed: str = "", fix: str = "", allow_nan: bool = False
-) -> list[Any]:
-    """Return the values of a JSON list in a file; arguments and errors as of `read_json_object`."""
-    data = read_bounded(path, most_bytes)
-    return json_list(data, where=str(path), needed=needed, fix=fix, allow_nan=allow_nan)
-
-
-def _parsed(data: bytes | str, kind: type, where: str, needed: str, fix: str, *, allow_nan: bool) -> Any:
+def _parsed(data: bytes | str, kind: type[T], where: str, needed: str, fix: str, *, allow_nan: bool) -> T:
     needed = needed or f"a JSON {_NAMES[kind]}"
     try:
         text = data if isinstance(data, str) else data.decode(json.detect_encoding(data))

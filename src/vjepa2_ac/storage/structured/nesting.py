@@ -32,6 +32,5 @@ def too_deep(where: str, fix: str = "") -> InputError:
 
 def _inside(value: Any) -> Iterable[Any]:
     """Return the mappings and lists in a value."""
-    if isinstance(value, dict):
-        return [inner for inner in value.values() if isinstance(inner, dict | list)]
-    return [inner for inner in value if isinstance(inner, dict | list)] if isinstance(value, list) else ()
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return [inner for inner in inside if isinstance(inner, dict | list)]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import cache
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -16,6 +16,7 @@ from vjepa2_ac.storage.structured.messages import message_of
 T = TypeVar("T")
 
 _MOST_PROBLEMS = 5  # shown of one file
+_adapter: Callable[[Any], Any] = cache(TypeAdapter)
 
 
 def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: str = "", fix: str = "") -> T:
@@ -34,22 +35,13 @@ def record_of(kind: type[T], values: Mapping[str, Any], *, where: str, needed: s
     known = {field.name for field in fields(kind)}  # type: ignore[arg-type] # that is what `kind` is
     problems = [f"{key}: unknown" for key in values if key not in known]
     try:
-        record: T = _adapter(cast("Any", kind)).validate_json(json.dumps(dict(values)), strict=True)
+        record: T = _adapter(kind).validate_json(json.dumps(dict(values)), strict=True)
     except ValidationError as error:
-        problems += [f"{_place(detail)}: {_problem_of(detail)}" for detail in error.errors()]
+        problems += [f"{'.'.join(map(str, detail['loc']))}: {_problem_of(detail)}" for detail in error.errors()]
     if problems:
         more = f"; and {len(problems) - _MOST_PROBLEMS} more" if len(problems) > _MOST_PROBLEMS else ""
         raise InputError(where=where, found="; ".join(problems[:_MOST_PROBLEMS]) + more, needed=needed, fix=fix)
     return record
-
-
-@cache
-def _adapter(kind: Any) -> Any:
-    return TypeAdapter(kind)
-
-
-def _place(detail: Any) -> str:
-    return ".".join(str(part) for part in detail["loc"])
 
 
 def _problem_of(detail: Any) -> str:

@@ -13,12 +13,8 @@ from functools import lru_cache
 from typing import Any
 
 import yaml
-from yaml.composer import Composer
 from yaml.nodes import CollectionNode, MappingNode, Node, ScalarNode, SequenceNode
-from yaml.parser import Parser
-from yaml.reader import Reader, ReaderError
-from yaml.resolver import BaseResolver
-from yaml.scanner import Scanner
+from yaml.reader import ReaderError
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured.messages import shown
@@ -62,15 +58,11 @@ def _composed(text: str) -> Node | None:
     return _Composed(text).get_single_node()
 
 
-class _Composed(Reader, Scanner, Parser, Composer, BaseResolver):
-    """A document as nodes, bounded in number and depth; scalars are not resolved here."""
+class _Composed(yaml.SafeLoader):
+    """A document as nodes, bounded in number and depth; scalars are not resolved here, and nothing is constructed."""
 
     def __init__(self, text: str) -> None:
-        Reader.__init__(self, text)
-        Scanner.__init__(self)
-        Parser.__init__(self)
-        Composer.__init__(self)
-        BaseResolver.__init__(self)
+        super().__init__(text)
         self._depth = self._count = 0
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:

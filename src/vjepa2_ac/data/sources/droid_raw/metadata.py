@@ -39,12 +39,8 @@ class DroidMetadata:
         path = self.values.get(key)
         name = PurePosixPath(path).name if isinstance(path, str) else ""
         if not name.endswith(".mp4") or name == ".mp4":
-            raise InputError(
-                where=self.where,
-                found=f"{key}: {path!r}",
-                needed="the path of an MP4",
-                fix="Set data.camera to one that every episode has",
-            )
+            found, fix = f"{key}: {path!r}", "Set data.camera to one that every episode has"
+            raise InputError(where=self.where, found=found, needed="the path of an MP4", fix=fix)
         return name.removesuffix(".mp4")
 
     @property

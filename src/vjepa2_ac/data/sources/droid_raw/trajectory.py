@@ -56,7 +56,7 @@ def parse_trajectory(data: bytes, *, where: str, serials: Sequence[str], frame_c
     Raises:
         InputError: Not HDF5, damaged, incomplete, or of another length than an MP4.
     """
-    h5py = _library(where)
+    h5py = require_library("h5py", where=where, called="h5py, which reads trajectory.h5", extra="raw")
     try:
         # From memory: HDF5 then never waits for a network, nor crashes on a file that is being truncated.
         with h5py.File(h5py.h5f.open_file_image(data)) as file:
@@ -126,19 +126,11 @@ class _Reader:
         rows = shape[0] if shape else 0
         as_asked = shape == (rows, width) or (width == 1 and shape == (rows,))
         if not as_asked or rows != (rows if steps is None else steps) or rows > _MOST_STEPS or kind not in "fiub":
-            raise InputError(
-                where=f"{self.where}: {name}",
-                found=f"shape {shape} of kind {kind!r}",
-                needed=f"{width} numbers for each of {steps or 'the'} steps",
-                fix=_FIX,
-            )
+            found, needed = f"shape {shape} of kind {kind!r}", f"{width} numbers for each of {steps or 'the'} steps"
+            raise InputError(where=f"{self.where}: {name}", found=found, needed=needed, fix=_FIX)
         values = np.asarray(data[()], dtype=np.float64).reshape(-1, width)
         if not np.isfinite(values).all():
             step = int((~np.isfinite(values)).any(axis=1).argmax())
             found, needed = f"{values[step]} at step {step}", "finite numbers"
             raise InputError(where=f"{self.where}: {name}", found=found, needed=needed, fix=_FIX)
         return values
-
-
-def _library(where: str) -> Any:
-    return require_library("h5py", where=where, called="h5py, which reads trajectory.h5", extra="raw")

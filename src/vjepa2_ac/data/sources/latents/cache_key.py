@@ -76,18 +76,13 @@ class CacheKey:
         named = isinstance(cameras, list) and cameras and all(isinstance(camera, str) for camera in cameras)
         if not named or not isinstance(kind, str) or kind not in DTYPES:
             found = f"a key with data.camera {shown(cameras)} and data.cache_dtype {shown(kind)}"
-            raise InputError(
-                where=where, found=found, needed=f"names of cameras, and one of {', '.join(DTYPES)}", fix=fix
-            )
+            needed = f"names of cameras, and one of {', '.join(DTYPES)}"
+            raise InputError(where=where, found=found, needed=needed, fix=fix)
 
     def differences(self, wanted: Mapping[str, Any], names: Collection[str] | None = None) -> list[str]:
         """Return the differences from the wanted key, as "data.stride: 8, not 4"; of these names, or of all."""
-        differing = []
-        for name in sorted(self.parts.keys() | wanted) if names is None else names:
-            here, there = self.parts.get(name), wanted.get(name)
-            if here != there:
-                differing += _differences(name, here, there)
-        return differing
+        names = sorted(self.parts.keys() | wanted) if names is None else names
+        return [text for name in names for text in _differences(name, self.parts.get(name), wanted.get(name))]
 
 
 def key_of_cache(config: DataConfig, fingerprint: str, encoding: Encoding) -> CacheKey:
@@ -120,13 +115,11 @@ def clip_parts(config: DataConfig) -> dict[str, Any]:
 
 
 def _differences(name: str, here: Any, there: Any) -> list[str]:
+    if here == there:
+        return []
     if isinstance(here, dict) and isinstance(there, dict):
-        return [
-            difference
-            for inner in sorted(here.keys() | there)
-            if here.get(inner) != there.get(inner)
-            for difference in _differences(f"{name}.{inner}", here.get(inner), there.get(inner))
-        ]
+        inner = sorted(here.keys() | there)
+        return [text for key in inner for text in _differences(f"{name}.{key}", here.get(key), there.get(key))]
     return [f"{name}: {_as_text(here)}, not {_as_text(there)}"]
 
 

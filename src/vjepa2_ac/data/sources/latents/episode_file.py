@@ -78,17 +78,15 @@ def write_episode_file(path: str | Path, layout: EpisodeLayout, encoded: Encoded
         ValueError: The arguments do not fit together.
     """
     episode, steps, latents, pictures = encoded.episode, encoded.steps, encoded.latents, encoded.pictures
-    values, scales = latents.values.detach().cpu(), None if latents.scales is None else latents.scales.cpu()
-    if list(values.shape) != [len(steps), layout.tokens, layout.dim] or len(pictures) != len(steps):
-        raise ValueError(f"{len(steps)} steps, latents {tuple(values.shape)}, pictures {pictures.shape}")
-    if values.dtype != DTYPES[layout.kind]:
-        raise ValueError(f"latents of {values.dtype} for a cache of {layout.kind}")
+    latents = latents.mapped(lambda tensor: tensor.detach().cpu().contiguous())
+    if list(latents.values.shape) != [len(steps), layout.tokens, layout.dim] or len(pictures) != len(steps):
+        raise ValueError(f"{len(steps)} steps, latents {tuple(latents.values.shape)}, pictures {pictures.shape}")
+    if latents.values.dtype != DTYPES[layout.kind]:
+        raise ValueError(f"latents of {latents.values.dtype} for a cache of {layout.kind}")
     if any(after <= before for before, after in zip([-1, *steps], [*steps, episode.info.num_steps], strict=True)):
         raise ValueError(f"steps {list(steps)} of {episode.info.num_steps}")
     jpegs = [encode_jpeg(frame, quality=_JPEG_QUALITY) for frame in pictures]
-    tensors = _small_tensors(episode, steps, jpegs) | {
-        "frame_crc": torch.tensor([_crc_of_frame(frame) for frame in _frames_of(values, scales)], dtype=torch.int64)
-    }
+    tensors = _small_tensors(episode, steps, latents, jpegs)
     about = {
         "format": FORMAT,
         "id": episode.info.id,
@@ -99,21 +97,24 @@ def write_episode_file(path: str | Path, layout: EpisodeLayout, encoded: Encoded
         "key": layout.key,
     }
     about["crc"] = str(_crc_of_rest(about, tensors))
-    tensors["latents"] = values.contiguous()
+    tensors["latents"] = latents.values
     tensors["pictures"] = torch.from_numpy(np.array(np.frombuffer(b"".join(jpegs), np.uint8)))
-    if scales is not None:
-        tensors["scales"] = scales.contiguous()
+    if latents.scales is not None:
+        tensors["scales"] = latents.scales
     content = save(tensors, metadata=about)
     with storage.user_can_write(path), storage.atomic_writer(path) as file:
         file.write(content)
     return len(content)
 
 
-def _small_tensors(episode: Episode, steps: Sequence[int], jpegs: Sequence[bytes]) -> dict[str, Tensor]:
+def _small_tensors(
+    episode: Episode, steps: Sequence[int], latents: StoredLatents, jpegs: Sequence[bytes]
+) -> dict[str, Tensor]:
     arrays: dict[str, np.ndarray | None] = {
         "states": episode.states,
         **{name: getattr(episode, name) for name in _OPTIONAL},
         "frame_steps": np.array(steps, np.int32),
+        "frame_crc": np.array([_crc_of_frame(latents, place) for place in range(len(steps))], np.int64),
         "picture_ends": np.cumsum([len(jpeg) for jpeg in jpegs], dtype=np.int64),
         "picture_crc": np.array([zlib.crc32(jpeg) for jpeg in jpegs], np.int64),
     }
@@ -193,9 +194,7 @@ class EpisodeFile:
         with _reading(self.path):
             frames = StoredLatents(*(self._rows(name, places) for name in ("latents", "scales")))
         for place in check:
-            number = list(places).index(place)
-            scales = None if frames.scales is None else frames.scales[number]
-            if _crc_of_frame(StoredLatents(frames.values[number], scales)) != self._arrays["frame_crc"][place]:
+            if _crc_of_frame(frames, list(places).index(place)) != self._arrays["frame_crc"][place]:
                 raise _damaged(self.path, f"damaged: the CRC of control step {self.frame_steps[place]} is wrong")
         return frames
 
@@ -222,22 +221,18 @@ class EpisodeFile:
 
     def _require_shapes(self, layout: EpisodeLayout) -> None:
         """Refuse latents of another type or shape: their bytes would be misread."""
-        names = {"latents": [len(self.frame_steps), layout.tokens, layout.dim]}
+        frames, tokens = len(self.frame_steps), layout.tokens
+        wanted = {"latents": (_SAFETENSORS_NAMES[layout.kind], [frames, tokens, layout.dim])}
         if layout.kind == "int8":
-            names["scales"] = names["latents"][:2]
+            wanted["scales"] = ("F32", [frames, tokens])
+        wanted["pictures"] = ("U8", [max(self._arrays["picture_ends"].tolist(), default=0)])  # as many bytes
         with _reading(self.path):
-            found = {name: self._file.get_slice(name) for name in names}
-            types = {name: slice_.get_dtype() for name, slice_ in found.items()}
-            shapes = {name: list(slice_.get_shape()) for name, slice_ in found.items()}
-            images = self._file.get_slice("pictures")
-            image_bytes, image_type = images.get_shape(), images.get_dtype()
-        if shapes != names or types["latents"] != _SAFETENSORS_NAMES[layout.kind]:
-            raise _damaged(self.path, f"{types} {shapes}", f"latents of {_SAFETENSORS_NAMES[layout.kind]}, {names}")
-        if "scales" in names and types["scales"] != "F32":
-            raise _damaged(self.path, f"scales of {types['scales']}", "F32")
-        if image_type != "U8" or image_bytes != [max(self._arrays["picture_ends"], default=0)]:
-            text = f"pictures of {image_bytes} values of {image_type}"
-            raise _damaged(self.path, text, "as many bytes as picture_ends says")
+            slices = {name: self._file.get_slice(name) for name in wanted}
+            found = {name: (one.get_dtype(), list(one.get_shape())) for name, one in slices.items()}
+        for name, (kind, shape) in wanted.items():
+            if found[name] != (kind, shape):
+                text = f"{name} of {found[name][1]} values of {found[name][0]}"
+                raise _damaged(self.path, text, f"{name} of {shape} values of {kind}")
 
 
 _NUMBERS = (torch.float32, torch.float64)
@@ -283,14 +278,9 @@ def _damaged(path: str, found: str, needed: str = "") -> InputError:
     return InputError(where=path, found=found, needed=needed, fix=_FIX)
 
 
-def _frames_of(values: Tensor, scales: Tensor | None) -> Iterator[StoredLatents]:
-    for place, frame in enumerate(values):
-        yield StoredLatents(frame, None if scales is None else scales[place])
-
-
-def _crc_of_frame(frame: StoredLatents) -> int:
-    crc = zlib.crc32(_bytes_of(frame.values))
-    return crc if frame.scales is None else zlib.crc32(_bytes_of(frame.scales), crc)
+def _crc_of_frame(latents: StoredLatents, place: int) -> int:
+    crc = zlib.crc32(_bytes_of(latents.values[place]))
+    return crc if latents.scales is None else zlib.crc32(_bytes_of(latents.scales[place]), crc)
 
 
 def _crc_of_rest(about: Mapping[str, str], tensors: Mapping[str, Tensor]) -> int:

@@ -39,10 +39,8 @@ def parts_of(
         values = part.to_pydict()
         total += _bytes_in(values)
         if total > most_bytes:
-            raise InputError(
-                where=path, found=f"more than {most_bytes:,} bytes of {', '.join(columns)[:200]}",
-                needed="a table that fits into memory", fix=FIX,
-            )  # fmt: skip
+            found = f"more than {most_bytes:,} bytes of {', '.join(columns)[:200]}"
+            raise InputError(where=path, found=found, needed="a table that fits into memory", fix=FIX)
         yield values
 
 
@@ -67,10 +65,8 @@ def require_few(file: Any, number: int, columns: Sequence[str], path: str) -> No
             continue
         column = group.column(place)
         if column.num_values > MOST_NUMBERS:
-            raise InputError(
-                where=f"{path}: {column.path_in_schema}", found=f"{column.num_values:,} numbers in a row group",
-                needed=f"at most {MOST_NUMBERS:,}", fix=FIX,
-            )  # fmt: skip
+            where, found = f"{path}: {column.path_in_schema}", f"{column.num_values:,} numbers in a row group"
+            raise InputError(where=where, found=found, needed=f"at most {MOST_NUMBERS:,}", fix=FIX)
 
 
 def require_sane(rows: Sequence[int], path: str, total: int | None = None) -> None:
@@ -80,6 +76,5 @@ def require_sane(rows: Sequence[int], path: str, total: int | None = None) -> No
         InputError: There are such.
     """
     if any(not 0 <= count <= MOST_ROWS for count in rows) or (total is not None and sum(rows) != total):
-        raise InputError(
-            where=path, found=f"damaged: row groups of {list(rows[:5])} rows", needed="a whole Parquet file", fix=FIX
-        )
+        found = f"damaged: row groups of {list(rows[:5])} rows"
+        raise InputError(where=path, found=found, needed="a whole Parquet file", fix=FIX)

@@ -12,13 +12,14 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_bytes
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo
 from vjepa2_ac.data.sources.lerobot.parquet import Opener, read_table
-from vjepa2_ac.data.sources.lerobot.path_templates import filled, list_by_template
+from vjepa2_ac.data.sources.lerobot.path_templates import filled
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import json_object
 
-EPISODES_V21 = "meta/episodes.jsonl"
-EPISODES_V30 = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES = {  # templates of the files that list the episodes
+    "v2.1": "meta/episodes.jsonl",
+    "v3.0": "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+}
 
 _T = TypeVar("_T")
 
@@ -52,8 +53,8 @@ class EpisodeRow:
 
     @property
     def id(self) -> str:
-        """Its identity."""
-        return identity(self.index)
+        """Its identity: its number, the only name in LeRobot."""
+        return f"episode_{self.index:06d}"
 
 
 @dataclass(frozen=True)
@@ -64,27 +65,8 @@ class StatisticsColumns:
     success: str | None  # the episode's success
 
 
-def identity(index: int) -> str:
-    """Return the identity of an episode: its number, the only name in LeRobot."""
-    return f"episode_{index:06d}"
-
-
-def tables_of_episodes(info: DatasetInfo, connections: int) -> dict[str, FileInfo]:
-    """Return the files that list the episodes.
-
-    Raises:
-        OSError: They cannot be listed.
-    """
-    template = EPISODES_V30 if info.version == "v3.0" else EPISODES_V21
-    return list_by_template(info.root, template, connections=connections)
-
-
 def read_episodes(
-    info: DatasetInfo,
-    tables: Sequence[str],
-    keys: Sequence[str],
-    wanted: StatisticsColumns,
-    open_file: Opener,
+    info: DatasetInfo, tables: Sequence[str], keys: Sequence[str], wanted: StatisticsColumns, open_file: Opener
 ) -> list[EpisodeRow]:
     """Return every episode, sorted by number.
 
@@ -107,12 +89,10 @@ def read_episodes(
     rows.sort(key=lambda row: row.index)
     numbers = [row.index for row in rows]
     if len(set(numbers)) != len(numbers) or len(rows) != info.episodes:
-        raise InputError(
-            where=storage.join(info.root, tables[0] if tables else "meta"),
-            found=f"{len(rows)} episodes, of {len(set(numbers))} numbers",
-            needed=f"{info.episodes} of as many numbers, says {info.where}",
-            fix=_FIX,
-        )
+        where = storage.join(info.root, tables[0] if tables else "meta")
+        found = f"{len(rows)} episodes, of {len(set(numbers))} numbers"
+        needed = f"{info.episodes} of as many numbers, says {info.where}"
+        raise InputError(where=where, found=found, needed=needed, fix=_FIX)
     return rows
 
 
@@ -127,7 +107,7 @@ def video_file(info: DatasetInfo, place: VideoPlace, key: str) -> str:
 
 
 def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[EpisodeRow]:
-    where = storage.join(info.root, EPISODES_V21)
+    where = storage.join(info.root, EPISODES["v2.1"])
     try:
         lines = storage.read_bounded(where, _MOST_BYTES).decode().splitlines()
     except FileNotFoundError:
@@ -145,14 +125,8 @@ def _rows_of_lines(info: DatasetInfo, videos: Sequence[str]) -> Iterator[Episode
 def _episode_of_line(info: DatasetInfo, row: Mapping[str, Any], videos: Sequence[str]) -> EpisodeRow:
     index = _count(row["episode_index"])
     chunk = index // info.chunk_episodes
-    return EpisodeRow(
-        index=index,
-        length=_count(row["length"]),
-        tasks=_texts(row.get("tasks")),
-        chunk=chunk,
-        file=index,
-        videos={key: VideoPlace(chunk, index, 0.0, None) for key in videos},
-    )
+    places = {key: VideoPlace(chunk, index, 0.0, None) for key in videos}
+    return EpisodeRow(index, _count(row["length"]), _texts(row.get("tasks")), chunk, index, places)
 
 
 def _rows_of_table(

@@ -1,22 +1,26 @@
-"""The rows of one LeRobot episode, checked for completeness: states, commands, outcome."""
+"""The rows of one LeRobot episode, checked for completeness: states in our convention, commands, outcome."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Shaped
+from scipy.spatial.transform import Rotation
 
-from vjepa2_ac.config import LeRobotData
+from vjepa2_ac.config import LeRobotData, LeRobotFields
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, missing
-from vjepa2_ac.data.sources.lerobot.parquet import EPISODE
-from vjepa2_ac.data.sources.lerobot.row_cache import Columns
-from vjepa2_ac.data.sources.lerobot.states import states_of, vectors_of
+from vjepa2_ac.data.sources.lerobot.parquet import EPISODE, Columns
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.spaces import POSE, require_finite
 
 FRAME, TIME = "frame_index", "timestamp"
 
 _FIX = "Copy the file again, or leave the episode out"
+_FIX_STATES = "Check data.lerobot: state, select, rotation, gripper_open and gripper_closed"
+_FIX_VECTORS = "Leave the episode out, or check data.lerobot: state, select and action"
+_UNIT_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True)
@@ -52,12 +56,19 @@ def content_of(rows: Columns, length: int, info: DatasetInfo, config: LeRobotDat
     """
     _require_rows(rows, length, info.fps, where)
     fields = config.lerobot
-    columns = [_column(rows, name, info, where) for name in fields.state]
-    poses = config.states == "pose"
-    states = states_of(columns, fields, where) if poses else vectors_of(columns, fields.select, where)
-    commands = None
+
+    def joined(names: Sequence[str], select: Sequence[int] | None) -> Float[np.ndarray, "steps width"]:
+        columns = [_column(rows, name, info, where).astype(np.float64) for name in names]
+        return np.concatenate(columns, axis=1)[:, slice(None) if select is None else list(select)]
+
+    states, commands = joined(fields.state, fields.select), None
+    if config.states == "pose":
+        states = _poses(states, fields, where)
+    else:
+        require_finite(states, where, fix=_FIX_VECTORS)
     if config.actions == "recorded":
-        commands = vectors_of([_column(rows, name, info, where) for name in fields.action], None, where)
+        commands = joined(fields.action, None)
+        require_finite(commands, where, fix=_FIX_VECTORS)
     for name in (fields.joint_velocity, fields.success):
         if name is not None and name in info.features and name not in rows:
             raise missing("data.lerobot", "column", name, where, rows)
@@ -66,26 +77,47 @@ def content_of(rows: Columns, length: int, info: DatasetInfo, config: LeRobotDat
         velocities = _column(rows, fields.joint_velocity, info, where).astype(np.float64)
         if not np.isfinite(velocities).all():
             step = int((~np.isfinite(velocities)).any(axis=1).argmax())
-            raise InputError(
-                where=f"{where}: step {step}: {fields.joint_velocity}",
-                found=f"{velocities[step]}",
-                needed="finite numbers",
-                fix="Leave the episode out, or set data.lerobot.joint_velocity: null",
-            )
+            at, fix = f"{where}: step {step}: {fields.joint_velocity}", "set data.lerobot.joint_velocity: null"
+            fix = f"Leave the episode out, or {fix}"
+            raise InputError(where=at, found=f"{velocities[step]}", needed="finite numbers", fix=fix)
     success = bool(rows[fields.success].any()) if fields.success is not None and fields.success in rows else None
     return EpisodeContent(states, velocities, success, commands)
 
 
+def _poses(numbers: Float[np.ndarray, "steps _"], fields: LeRobotFields, where: str) -> Float[np.ndarray, "steps 7"]:
+    """Return states (legend: `vjepa2_ac.episode`) from the numbers of an episode.
+
+    Raises:
+        InputError: They are implausible under these settings: NaN, no unit quaternion, out of reach.
+    """
+    require_finite(numbers, where, fix=_FIX_STATES)
+    gripper = (numbers[:, -1:] - fields.gripper_open) / (fields.gripper_closed - fields.gripper_open)
+    states = np.concatenate([numbers[:, POSE.position], _euler(numbers[:, 3:-1], fields, where), gripper], axis=1)
+    POSE.require_plausible(states, where, fix=_FIX_STATES)
+    return states
+
+
+def _euler(rotation: Float[np.ndarray, "steps _"], fields: LeRobotFields, where: str) -> Float[np.ndarray, "steps 3"]:
+    if fields.rotation == "euler_xyz":
+        return rotation
+    lengths = np.linalg.norm(rotation, axis=1)
+    if (wrong := abs(lengths - 1) > _UNIT_TOLERANCE).any():
+        step = int(wrong.argmax())
+        found = f"the quaternion {np.array2string(rotation[step], precision=4)} of length {lengths[step]:.4g}"
+        raise InputError(where=f"{where}: step {step}", found=found, needed="a unit quaternion", fix=_FIX_STATES)
+    x_first = rotation if fields.rotation == "quaternion_xyzw" else np.roll(rotation, -1, axis=1)
+    return np.asarray(Rotation.from_quat(x_first).as_euler("xyz")) if len(rotation) else np.zeros((0, 3))
+
+
 def _require_rows(rows: Columns, length: int, fps: float, where: str) -> None:
     """Check that the rows are those of the episode, complete, in order, at the data set's rate."""
-    found = len(rows[EPISODE]) if rows else 0
-    if found != length:
-        raise InputError(where=where, found=f"{found} rows", needed=f"{length}, says the data set", fix=_FIX)
+    count = len(rows[EPISODE]) if rows else 0
+    if count != length:
+        raise InputError(where=where, found=f"{count} rows", needed=f"{length}, says the data set", fix=_FIX)
     order = np.arange(length)
     if FRAME in rows and not np.array_equal(rows[FRAME][:, 0], order):
-        raise InputError(
-            where=where, found=f"{FRAME} that is not 0 to {length - 1} in order", needed="a row for each step", fix=_FIX
-        )
+        found = f"{FRAME} that is not 0 to {length - 1} in order"
+        raise InputError(where=where, found=found, needed="a row for each step", fix=_FIX)
     if TIME in rows and not (wrong := abs(rows[TIME][:, 0] - order / fps)).max() < 0.5 / fps:  # NaN is wrong, too
         step = int(np.argmax(~(wrong < 0.5 / fps)))
         raise InputError(
@@ -103,17 +135,9 @@ def _column(rows: Columns, name: str, info: DatasetInfo, where: str) -> Shaped[n
     if feature is None:
         return column
     if column.shape[1] != feature.width:
-        raise InputError(
-            where=f"{where}: {name}",
-            found=f"{column.shape[1]} numbers a row",
-            needed=f"{feature.width}, says {info.where}",
-            fix=_FIX,
-        )
+        found, needed = f"{column.shape[1]} numbers a row", f"{feature.width}, says {info.where}"
+        raise InputError(where=f"{where}: {name}", found=found, needed=needed, fix=_FIX)
     if feature.dtype.startswith("float") and column.dtype.kind != "f":
-        raise InputError(
-            where=f"{where}: {name}",
-            found=f"values of type {column.dtype}",
-            needed=f"{feature.dtype}, says {info.where}",
-            fix=_FIX,
-        )
+        found, needed = f"values of type {column.dtype}", f"{feature.dtype}, says {info.where}"
+        raise InputError(where=f"{where}: {name}", found=found, needed=needed, fix=_FIX)
     return column

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence, Set
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -17,9 +16,12 @@ from vjepa2_ac.data.index.state_hash import hash_of_states
 from vjepa2_ac.data.sources.lerobot.episode_list import EpisodeRow, VideoPlace, data_file, video_file
 from vjepa2_ac.data.sources.lerobot.episode_rows import EpisodeContent
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo
+from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.episode import EpisodeInfo, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import zero_steps
+
+_FIX = "Copy the data set again, or leave the episode out"
 
 Check = Callable[[EpisodeRow], EpisodeContent]  # reads an episode's rows
 
@@ -35,13 +37,8 @@ def find_problems(
         files: The existing files, within the data set.
         keys: Features of the cameras that are used.
     """
-    found: dict[int, InputError] = {}
-    for row in rows:
-        try:
-            _require_usable(info, row, files, keys)
-        except InputError as error:
-            found[row.index] = error
-    return found
+    found = {row.index: _problem_of(info, row, files, keys) for row in rows}
+    return {index: problem for index, problem in found.items() if problem is not None}
 
 
 def check_rows(
@@ -51,9 +48,9 @@ def check_rows(
     check: Check,
     *,
     connections: int,
-    progress: Progress | None,
+    progress: Progress,
 ) -> list[EpisodeRow]:
-    """Return the episodes with the facts in their rows; unusable ones are added to `problems`.
+    """Return the episodes with the facts in their rows; those that turn out unusable are added to `problems`.
 
     Raises:
         OSError: A remote file cannot be read.
@@ -62,16 +59,25 @@ def check_rows(
     for row in rows:
         if row.index not in problems:
             by_file.setdefault(data_file(info, row), []).append(row)
-    done, checked = 0, []
-    with ThreadPoolExecutor(max_workers=connections) as pool:
-        for results in pool.map(lambda file: [_checked(row, check) for row in by_file[file]], by_file):
-            for row, error in results:
+
+    def check_file(file: str) -> list[EpisodeRow]:
+        checked = []
+        for row in by_file[file]:
+            try:
+                content = check(row)
+            except InputError as error:
+                problems[row.index] = error
                 checked.append(row)
-                if error is not None:
-                    problems[row.index] = error
-            done += len(results)
-            if progress is not None:
-                progress(done, len(rows))
+            else:
+                success = row.success if content.success is None else content.success
+                checked.append(replace(row, success=success, state_hash=hash_of_states(content.states)))
+        return checked
+
+    checked, done = [row for row in rows if row.index in problems], 0
+    for of_file in in_parallel(check_file, list(by_file), connections):
+        checked += of_file
+        done += len(of_file)
+        progress(done, len(rows))
     return sorted(checked, key=lambda row: row.index)
 
 
@@ -84,15 +90,14 @@ def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], tex
     usable = [row for row in rows if row.index not in problems]
     if not usable and problems:
         raise problems[min(problems)]
-    tasks = sorted({"; ".join(row.tasks) for row in usable})
+    task_of = ["; ".join(row.tasks) for row in usable]
+    labels, hashes, tasks = Labels.of(task_of), [row.state_hash for row in usable], sorted(set(task_of))
     number = {task: place for place, task in enumerate(tasks)}
-    hashes = [row.state_hash for row in usable]
-    labels = Labels.of(["; ".join(row.tasks) for row in usable])
     locators: dict[str, np.ndarray] = {
         "index": np.array([row.index for row in usable], np.int64),
         "chunk": np.array([row.chunk for row in usable], np.int32),
         "file": np.array([row.file for row in usable], np.int32),
-        "task": np.array([number["; ".join(row.tasks)] for row in usable], np.int32),
+        "task": np.array([number[task] for task in task_of], np.int32),
     }
     for key in usable[0].videos if usable else ():
         places = [row.videos[key] for row in usable]
@@ -105,65 +110,38 @@ def table_of(rows: Sequence[EpisodeRow], problems: Mapping[int, InputError], tex
         locators=locators,
         texts={"tasks": json.dumps(tasks), **texts},
         state_hashes=hashes if any(hashes) else None,
-        labels={"task": labels} if labels.is_present else {},
+        labels={"task": labels} if labels.names else {},
     )
 
 
 def row_of(table: EpisodeTable, place: int) -> EpisodeRow:
     """Return the location of an episode of a table; its tasks stay in the table."""
-    at = table.locators
+    at = {name: column[place] for name, column in table.locators.items()}
     keys = [name.removesuffix(".start_s") for name in at if name.endswith(".start_s")]
-    return EpisodeRow(
-        index=int(at["index"][place]),
-        length=int(table.num_steps[place]),
-        tasks=(),
-        chunk=int(at["chunk"][place]),
-        file=int(at["file"][place]),
-        videos={
-            key: VideoPlace(
-                int(at[f"{key}.chunk"][place]), int(at[f"{key}.file"][place]), float(at[f"{key}.start_s"][place]), None
-            )
-            for key in keys
-        },
-    )
+    videos = {
+        key: VideoPlace(int(at[f"{key}.chunk"]), int(at[f"{key}.file"]), float(at[f"{key}.start_s"]), None)
+        for key in keys
+    }
+    length = int(table.num_steps[place])
+    return EpisodeRow(int(at["index"]), length, (), int(at["chunk"]), int(at["file"]), videos)
 
 
-def _checked(row: EpisodeRow, check: Check) -> tuple[EpisodeRow, InputError | None]:
-    try:
-        content = check(row)
-    except InputError as error:
-        return row, error
-    success = row.success if content.success is None else content.success
-    return replace(row, success=success, state_hash=hash_of_states(content.states)), None
-
-
-def _require_usable(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> None:
+def _problem_of(info: DatasetInfo, row: EpisodeRow, files: Set[str], keys: Sequence[str]) -> InputError | None:
     if row.length == 0:
-        raise zero_steps(f"{info.root}: {row.id}")
+        return zero_steps(f"{info.root}: {row.id}")
     rows_in = data_file(info, row)
     if rows_in not in files:
-        raise InputError(
-            where=f"{storage.join(info.root, rows_in)}: {row.id}",
-            found="no such file",
-            needed=f"the {row.length} rows of the episode",
-            fix="Copy the data set again, or leave the episode out",
-        )
+        where, needed = f"{storage.join(info.root, rows_in)}: {row.id}", f"the {row.length} rows of the episode"
+        return InputError(where=where, found="no such file", needed=needed, fix=_FIX)
     for key, place in row.videos.items():
         if key not in keys:
             continue
         shown_in = video_file(info, place, key)
+        where, of_rows = f"{storage.join(info.root, shown_in)}: {row.id}", f"for {row.length} rows in {rows_in}"
         if shown_in not in files:
-            raise InputError(
-                where=f"{storage.join(info.root, shown_in)}: {row.id}",
-                found=f"no such video, for {row.length} rows in {rows_in}",
-                needed=f"the frames of {key}",
-                fix="Copy the data set again, or leave the episode out",
-            )
-        needed_s = (row.length - 0.5) / info.fps
-        if place.length_s is not None and not place.length_s > needed_s:
-            raise InputError(
-                where=f"{storage.join(info.root, shown_in)}: {row.id}",
-                found=f"{place.length_s:.3f} s of video, says the data set, for {row.length} rows in {rows_in}",
-                needed=f"{row.length / info.fps:.3f} s",
-                fix="Leave the episode out",
-            )
+            return InputError(where=where, found=f"no such video, {of_rows}", needed=f"the frames of {key}", fix=_FIX)
+        if place.length_s is not None and not place.length_s > (row.length - 0.5) / info.fps:
+            found = f"{place.length_s:.3f} s of video, says the data set, {of_rows}"
+            needed = f"{row.length / info.fps:.3f} s"
+            return InputError(where=where, found=found, needed=needed, fix="Leave the episode out")
+    return None

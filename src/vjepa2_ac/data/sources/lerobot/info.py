@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,8 @@ from vjepa2_ac.storage.structured import read_json_object
 INFO = "meta/info.json"
 VERSIONS = ("v2.1", "v3.0")
 
-_STATE_NUMBERS = {"euler_xyz": 7, "quaternion_wxyz": 8, "quaternion_xyzw": 8}
+_QUATERNION = (8, "a quaternion's 4")
+_STATE_NUMBERS = {"euler_xyz": (7, "3 Euler angles"), "quaternion_wxyz": _QUATERNION, "quaternion_xyzw": _QUATERNION}
 _FIX = "Get meta/info.json again"
 _WAY_TO_HUB = "Check the name in hf://datasets/owner/name; for a private data set, `hf auth login` or set HF_TOKEN"
 
@@ -92,22 +93,14 @@ class DatasetInfo:
             raise InputError(where=self.where, found=f"no video_path, and {key} is a video", needed="one", fix=_FIX)
         return key
 
-    def known_keys(self, fields: LeRobotFields) -> list[str]:
-        """Return the cameras that both the config and the data set have."""
-        return [key for key in dict.fromkeys(fields.cameras.values()) if key in self.features]
-
 
 def missing(where: str, kind: str, name: str, place: str, known: Iterable[str]) -> InputError:
     """Return the error of a missing name, with the existing ones, and a suggestion."""
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1)
     hint = f"Did you mean {close[0]}? " if close else ""
-    return InputError(
-        where=where,
-        found=f"no {kind} {name} in {place}",
-        needed=f"one of its {kind}s",
-        fix=f"{hint}It has: {', '.join(known) or 'none'}",
-    )
+    fix = f"{hint}It has: {', '.join(known) or 'none'}"
+    return InputError(where=where, found=f"no {kind} {name} in {place}", needed=f"one of its {kind}s", fix=fix)
 
 
 def read_info(root: str) -> DatasetInfo:
@@ -121,19 +114,19 @@ def read_info(root: str) -> DatasetInfo:
     try:
         content = read_json_object(where, needed="a description of a data set", fix=_FIX, allow_nan=True)
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(
-            where="data.path",
-            found=f"no {INFO} in {root}",
-            needed="a LeRobot data set",
-            fix=_WAY_TO_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos",
-        ) from None
+        fix = _WAY_TO_HUB if root.startswith("hf://") else "Set data.path to the folder with meta, data and videos"
+        found = f"no {INFO} in {root}"
+        raise InputError(where="data.path", found=found, needed="a LeRobot data set", fix=fix) from None
     except OSError as error:
         raise storage.unreadable(where, error) from None
+    if (version := content.get("codebase_version")) not in VERSIONS:
+        fix = "Convert the data set with the lerobot package, which has a script for each step from older versions"
+        raise InputError(where=where, found=f"codebase_version {version!r}", needed=" or ".join(VERSIONS), fix=fix)
     try:
-        _require_version(where, content.get("codebase_version"))
         return _parsed(root, where, content)
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
-        raise _damaged(where, error) from None
+        found = f"not a description of a data set ({error!r})"
+        raise InputError(where=where, found=found, needed="LeRobot's own", fix=_FIX) from None
 
 
 def _parsed(root: str, where: str, content: Mapping[str, Any]) -> DatasetInfo:
@@ -162,29 +155,16 @@ def _feature(content: Mapping[str, Any]) -> Feature:
     return Feature(dtype, shape, tuple(map(str, names)) if isinstance(names, list) else ())
 
 
-def _require_version(where: str, version: object) -> None:
-    if version in VERSIONS:
-        return
-    raise InputError(
-        where=where,
-        found=f"codebase_version {version!r}",
-        needed=" or ".join(VERSIONS),
-        fix="Convert the data set with the lerobot package, which has a script for each step from older versions",
-    )
-
-
 def _require_state(info: DatasetInfo, config: LeRobotData) -> None:
     fields = config.lerobot
     described = " + ".join(_described(name, info.features[name]) for name in fields.state)
     where = "data.lerobot.select" if fields.select is not None else "data.lerobot.state"
     joined = sum(info.features[name].width for name in fields.state)
     if fields.select is not None and (beyond := [number for number in fields.select if number >= joined]):
-        raise InputError(
-            where=where, found=f"{beyond[0]}, of {joined} numbers in {described}", needed=f"0 to {joined - 1}"
-        )
-    width, needed = len(fields.select or range(joined)), _STATE_NUMBERS[fields.rotation]
+        found = f"{beyond[0]}, of {joined} numbers in {described}"
+        raise InputError(where=where, found=found, needed=f"0 to {joined - 1}")
+    width, (needed, rotation) = len(fields.select or range(joined)), _STATE_NUMBERS[fields.rotation]
     if config.states == "pose" and width != needed:
-        rotation = "3 Euler angles" if needed == STATE_WITH_EULER else "a quaternion's 4"
         raise InputError(
             where=where,
             found=f"{width} numbers a step from {described}",
@@ -193,15 +173,5 @@ def _require_state(info: DatasetInfo, config: LeRobotData) -> None:
         )
 
 
-STATE_WITH_EULER = _STATE_NUMBERS["euler_xyz"]
-
-
 def _described(name: str, feature: Feature) -> str:
-    names: Collection[str] = feature.names
-    return f"{name} [{', '.join(names) if len(names) == feature.width else feature.width}]"
-
-
-def _damaged(where: str, error: Exception) -> InputError:
-    return InputError(
-        where=where, found=f"not a description of a data set ({error!r})", needed="LeRobot's own", fix=_FIX
-    )
+    return f"{name} [{', '.join(feature.names) if len(feature.names) == feature.width else feature.width}]"

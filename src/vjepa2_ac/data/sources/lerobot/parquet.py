@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import io
+import math
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Shaped
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
+from vjepa2_ac.data.cache.disk_cache import DiskCache
 from vjepa2_ac.data.sources.lerobot.bounds import (
     FIX,
     MOST_IMAGE_BYTES,
@@ -22,14 +24,15 @@ from vjepa2_ac.data.sources.lerobot.bounds import (
     require_few,
     require_sane,
 )
-from vjepa2_ac.data.sources.lerobot.row_cache import Columns, RowCache
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.libraries import require_library
+from vjepa2_ac.storage.npz_reader import read_arrays
 
 if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow import parquet
 
+Columns = Mapping[str, Shaped[np.ndarray, "rows _"]]
 Opener = Callable[[str], "str | BlockCachedFile"]  # a path, or a remote file
 
 EPISODE = "episode_index"
@@ -39,28 +42,24 @@ _BUFFER_BYTES = 4096  # of a column that is not read
 _CACHED_FOOTERS = 256
 
 
-@dataclass(frozen=True)
-class _Footer:
-    metadata: parquet.FileMetaData
-    schema: pa.Schema
-    first: list[int | None]  # least and greatest episode of each row group, if the file has them
-    last: list[int | None]
-
-
 class ParquetRows:
-    """Reads rows of Parquet files; the last footers and decoded row groups are cached. Thread-safe.
+    """Reads rows of Parquet files; decoded row groups, and which episodes are in which, are cached. Thread-safe.
 
     Args:
         open_file: Returns the path or file to open for a path.
         columns: The wanted ones, if a file has them; the index of the episode is always read.
-        row_cache: Local cache of rows that share their row group with other episodes.
+        cache: On this machine's disk, of rows that share their row group with other episodes: so that a row group of
+            hundreds of episodes is not decoded for each of them.
+        version: Of the cached rows: changes with the data set or the wanted columns.
     """
 
-    def __init__(self, open_file: Opener, columns: Sequence[str], row_cache: RowCache | None = None) -> None:
-        self._row_cache = row_cache
+    def __init__(
+        self, open_file: Opener, columns: Sequence[str], cache: DiskCache | None = None, version: str = ""
+    ) -> None:
+        self._cache, self._version = cache, version
         self._open, self._columns = open_file, list(dict.fromkeys([EPISODE, *columns]))
         self._lock = threading.Lock()
-        self._footers: OrderedDict[str, _Footer] = OrderedDict()
+        self._ranges: OrderedDict[str, list[tuple[float, float]]] = OrderedDict()
         self._groups: OrderedDict[tuple[str, int], Columns] = OrderedDict()
 
     def rows(self, path: str, episode: int) -> Columns:
@@ -70,22 +69,23 @@ class ParquetRows:
             InputError: The file is missing or damaged, or a column does not contain numbers.
             OSError: A remote file cannot be read.
         """
-        if self._row_cache is not None and (known := self._row_cache.read(path, episode)) is not None:
+        key = f"rows {self._version} {path} {episode}"
+        if (known := self._cached(key)) is not None:
             return known
         parts, shared = [], False
         opened = self._open(path)
         with _opened(opened, path) as file:
-            footer = self._footer(path, file, opened)
-            for number, (first, last) in enumerate(zip(footer.first, footer.last, strict=True)):
-                if (first is None or first <= episode) and (last is None or episode <= last):
-                    group = self._group(path, file, number)
-                    chosen = _places_of(group, episode)
-                    parts.append({name: column[chosen] for name, column in group.items()})
-                    shared |= len(parts[-1][EPISODE]) < len(group[EPISODE])
-                    require_sane([sum(len(part[EPISODE]) for part in parts)], path)
+            for number in self._groups_with(path, file, opened, episode):
+                group = self._group(path, file, number)
+                chosen = _places_of(group, episode)
+                parts.append({name: column[chosen] for name, column in group.items()})
+                shared |= len(parts[-1][EPISODE]) < len(group[EPISODE])
+                require_sane([sum(len(part[EPISODE]) for part in parts)], path)
         rows = {name: np.concatenate([part[name] for part in parts]) for name in (parts[0] if parts else ())}
-        if self._row_cache is not None and shared:
-            self._row_cache.write(path, episode, rows)
+        if self._cache is not None and shared:
+            content = io.BytesIO()
+            np.savez(content, **rows)  # type: ignore[arg-type] # names are columns, none is called allow_pickle
+            self._cache.write(key, content.getvalue())
         return rows
 
     def images(self, path: str, column: str, episode: int) -> list[bytes]:
@@ -98,25 +98,31 @@ class ParquetRows:
         found: list[bytes] = []
         opened = self._open(path)
         with _opened(opened, path) as file:
-            footer = self._footer(path, file, opened)
-            for number, (first, last) in enumerate(zip(footer.first, footer.last, strict=True)):
-                if (first is None or first <= episode) and (last is None or episode <= last):
-                    for part in parts_of(file, path, [EPISODE, column], MOST_IMAGE_BYTES, row_groups=[number]):
-                        found += _images_in(part[column], part[EPISODE], episode, f"{path}: {column}")
+            for number in self._groups_with(path, file, opened, episode):
+                for part in parts_of(file, path, [EPISODE, column], MOST_IMAGE_BYTES, row_groups=[number]):
+                    found += _images_in(part[column], part[EPISODE], episode, f"{path}: {column}")
         return found
 
-    def _footer(self, path: str, file: parquet.ParquetFile, opened: str | BlockCachedFile) -> _Footer:
+    def _cached(self, key: str) -> Columns | None:
+        data = None if self._cache is None else self._cache.read(key)
+        with suppress(InputError):  # damaged: read again
+            return None if data is None else read_arrays(data)
+        return None
+
+    def _groups_with(
+        self, path: str, file: parquet.ParquetFile, opened: str | BlockCachedFile, episode: int
+    ) -> list[int]:
+        """Return the row groups that may have rows of an episode, as far as the file's statistics say."""
         with self._lock:
-            known = self._footers.get(path)
-        if known is not None:
-            return known
-        _require_consistent(file, opened, self._columns)
-        footer = _footer_of(file, path)
-        with self._lock:
-            self._footers[path] = footer
-            if len(self._footers) > _CACHED_FOOTERS:
-                self._footers.popitem(last=False)
-        return footer
+            ranges = self._ranges.get(path)
+        if ranges is None:
+            _require_consistent(file, opened, self._columns)
+            ranges = _episodes_of_groups(file, path)
+            with self._lock:
+                self._ranges[path] = ranges
+                if len(self._ranges) > _CACHED_FOOTERS:
+                    self._ranges.popitem(last=False)
+        return [number for number, (first, last) in enumerate(ranges) if first <= episode <= last]
 
     def _group(self, path: str, file: parquet.ParquetFile, number: int) -> Columns:
         with self._lock:
@@ -131,7 +137,9 @@ class ParquetRows:
             raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=FIX)
         with self._lock:
             self._groups[path, number] = group
-            while len(self._groups) > 1 and sum(map(_size_of, self._groups.values())) > _CACHED_BYTES:
+            sizes = [sum(column.nbytes for column in columns.values()) for columns in self._groups.values()]
+            while len(sizes) > 1 and sum(sizes) > _CACHED_BYTES:
+                sizes.pop(0)
                 self._groups.popitem(last=False)
         return group
 
@@ -170,9 +178,8 @@ def numbers_in(column: pa.ChunkedArray, where: str) -> Shaped[np.ndarray, "rows 
             raise _no_numbers(where, str(column.type), array.null_count)
         lengths = np.unique(array.value_lengths().to_numpy(zero_copy_only=False))
         if len(lengths) > 1:
-            raise InputError(
-                where=where, found=f"{lengths[0]} numbers in one row and {lengths[-1]} in another", needed="as many"
-            )
+            found = f"{lengths[0]} numbers in one row and {lengths[-1]} in another"
+            raise InputError(where=where, found=found, needed="as many")
         width *= int(lengths[0]) if len(lengths) else 0
         array = array.flatten()
     kind = array.type
@@ -197,10 +204,8 @@ def _opened(opened: str | BlockCachedFile, path: str) -> Iterator[parquet.Parque
             raise opened.failure from None
         if isinstance(error, OSError) and error.errno is not None:  # a system error, not one of the content
             raise storage.unreadable(path, error, fix=FIX) from None
-        reason = str(error).strip().splitlines()[:1]
-        raise InputError(
-            where=path, found=f"damaged: {' '.join(reason)[:200]}", needed="a whole Parquet file", fix=FIX
-        ) from None
+        found = f"damaged: {' '.join(str(error).strip().splitlines()[:1])[:200]}"
+        raise InputError(where=path, found=found, needed="a whole Parquet file", fix=FIX) from None
 
 
 def _places_of(group: Columns, episode: int) -> slice | Shaped[np.ndarray, " rows"]:
@@ -210,21 +215,19 @@ def _places_of(group: Columns, episode: int) -> slice | Shaped[np.ndarray, " row
     return slice(int(places[0]), int(places[-1]) + 1) if together else places
 
 
-def _footer_of(file: parquet.ParquetFile, path: str) -> _Footer:
+def _episodes_of_groups(file: parquet.ParquetFile, path: str) -> list[tuple[float, float]]:
+    """Return the least and the greatest episode of each row group; infinite ones if the file does not say."""
     _require_sane_groups(file, path)
-    metadata, schema = file.metadata, file.schema_arrow
-    if EPISODE not in schema.names:
+    metadata = file.metadata
+    if EPISODE not in file.schema_arrow.names:
         raise InputError(where=path, found=f"no column {EPISODE}", needed="one", fix=FIX)
-    names = [metadata.schema.column(number).path for number in range(metadata.num_columns)]
-    place = names.index(EPISODE)
-    first: list[int | None] = []
-    last: list[int | None] = []
+    place = [metadata.schema.column(number).path for number in range(metadata.num_columns)].index(EPISODE)
+    ranges: list[tuple[float, float]] = []
     for number in range(metadata.num_row_groups):
         statistics = metadata.row_group(number).column(place).statistics
         known = statistics is not None and statistics.has_min_max and isinstance(statistics.min, int)
-        first.append(statistics.min if known else None)
-        last.append(statistics.max if known else None)
-    return _Footer(metadata, schema, first, last)
+        ranges.append((statistics.min, statistics.max) if known else (-math.inf, math.inf))
+    return ranges
 
 
 def _require_consistent(file: parquet.ParquetFile, opened: str | BlockCachedFile, columns: Sequence[str]) -> None:
@@ -250,25 +253,18 @@ def _require_sane_groups(file: parquet.ParquetFile, path: str) -> None:
 
 
 def _images_in(rows: list[Any], episodes: list[Any], episode: int, where: str) -> list[bytes]:
-    stored = [row.get("bytes") if isinstance(row, dict) else row for row in rows]
-    chosen = [image for image, its in zip(stored, episodes, strict=True) if its == episode]
-    images = [image for image in chosen if isinstance(image, bytes)]
-    if len(images) != len(chosen):
-        raise InputError(
-            where=where,
-            found="no images, or names of files in their place",
-            needed="PNG or JPEG bytes in the column",
-        )
+    chosen = [row for row, its in zip(rows, episodes, strict=True) if its == episode]
+    stored = [row.get("bytes") if isinstance(row, dict) else row for row in chosen]
+    images = [image for image in stored if isinstance(image, bytes)]
+    if len(images) != len(stored):
+        found, needed = "no images, or names of files in their place", "PNG or JPEG bytes in the column"
+        raise InputError(where=where, found=found, needed=needed)
     return images
 
 
 def _no_numbers(where: str, kind: str, gaps: int) -> InputError:
     found = f"{gaps} rows without a value" if gaps else f"values of type {kind}"
     return InputError(where=where, found=found, needed="numbers, as many in each row", fix=FIX)
-
-
-def _size_of(columns: Columns) -> int:
-    return sum(column.nbytes for column in columns.values())
 
 
 def _library(where: str) -> tuple[Any, Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
 
 from vjepa2_ac import storage
 from vjepa2_ac.data.sources.listing import in_parallel
@@ -22,14 +21,14 @@ def require_template(template: object, where: str) -> str:
     """
     if isinstance(template, str) and template and not template.startswith("/") and ".." not in template.split("/"):
         rest = _PLACE.sub("", template)
-        if "{" not in rest and "}" not in rest and set(_names(template)) <= _NUMBERS | {"video_key"}:
+        if (
+            "{" not in rest
+            and "}" not in rest
+            and {place[1] for place in _PLACE.finditer(template)} <= _NUMBERS | {"video_key"}
+        ):
             return template
-    raise InputError(
-        where=where,
-        found=f"the template {template!r}",
-        needed="one within the data set, with places such as {chunk_index:03d}",
-        fix="Get meta/info.json again",
-    )
+    needed = "one within the data set, with places such as {chunk_index:03d}"
+    raise InputError(where=where, found=f"the template {template!r}", needed=needed, fix="Get meta/info.json again")
 
 
 def filled(template: str, chunk: int, file: int, key: str = "") -> str:
@@ -54,30 +53,13 @@ def list_by_template(root: str, template: str, key: str = "", *, connections: in
     found = [""]
     for part in folders:
         if _PLACE.search(part):
-            names = [
-                [name for name in storage.list_names(storage.join(root, folder)) if _fits(name, part)]
-                for folder in found
-            ]
-            found = [f"{folder}{name}/" for folder, inside in zip(found, names, strict=True) for name in inside]
+            names = {folder: storage.list_names(storage.join(root, folder)) for folder in found}
+            found = [f"{folder}{inner}/" for folder in found for inner in names[folder] if _fits(inner, part)]
         else:
             found = [f"{folder}{part}/" for folder in found]
     listings = in_parallel(lambda folder: storage.list_files(storage.join(root, folder)), found, connections)
-    files = {
-        f"{folder}{info.name}": info
-        for folder, infos in zip(found, listings, strict=True)
-        for info in infos
-        if _fits(info.name, name)
-    }
-    return dict(sorted(files.items()))
-
-
-def fingerprint(*listings: Mapping[str, FileInfo]) -> Sequence[tuple[str, int, str]]:
-    """Return a version that changes with any of the files."""
-    return [(path, info.size, info.version) for files in listings for path, info in files.items()]
-
-
-def _names(template: str) -> list[str]:
-    return [place[1] for place in _PLACE.finditer(template)]
+    files = [(folder, file) for folder, inside in zip(found, listings, strict=True) for file in inside]
+    return dict(sorted((f"{folder}{file.name}", file) for folder, file in files if _fits(file.name, name)))
 
 
 def _fits(name: str, part: str) -> bool:

@@ -3,76 +3,46 @@
 from __future__ import annotations
 
 import logging
-import threading
-from dataclasses import replace
+from collections.abc import Set
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import LeRobotData
 from vjepa2_ac.config.effects import Affects, knobs_that_affect
 from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
-from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
 from vjepa2_ac.data.cache.disk_cache import fetched_data
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
-from vjepa2_ac.data.sources.lerobot.episode_list import (
-    EpisodeRow,
-    StatisticsColumns,
-    data_file,
-    read_episodes,
-    tables_of_episodes,
-    video_file,
-)
+from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened
+from vjepa2_ac.data.sources.lerobot import episode_list
+from vjepa2_ac.data.sources.lerobot.episode_list import EpisodeRow
 from vjepa2_ac.data.sources.lerobot.episode_rows import EpisodeContent, content_of, wanted_columns
-from vjepa2_ac.data.sources.lerobot.images import StoredImages, VideoFrames
+from vjepa2_ac.data.sources.lerobot.images import stored_images, video_frames
 from vjepa2_ac.data.sources.lerobot.index_build import check_rows, find_problems, row_of, table_of
 from vjepa2_ac.data.sources.lerobot.info import DatasetInfo, read_info
 from vjepa2_ac.data.sources.lerobot.parquet import ParquetRows
-from vjepa2_ac.data.sources.lerobot.path_templates import fingerprint, list_by_template
-from vjepa2_ac.data.sources.lerobot.row_cache import RowCache
-from vjepa2_ac.episode import Episode, FrameReader, Progress, StepRanges
+from vjepa2_ac.data.sources.lerobot.path_templates import list_by_template
+from vjepa2_ac.episode import Episode, Progress, StepRanges
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import Clock, require_decoder
-from vjepa2_ac.storage import FileInfo
 from vjepa2_ac.storage.structured import json_list
 
 logger = logging.getLogger(__name__)
 
 
-class LeRobotSource:
+@dataclass(frozen=True)
+class _Opened(Opened):
+    info: DatasetInfo
+
+
+class LeRobotSource(IndexedSource[LeRobotData, _Opened]):
     """The episodes of a LeRobot data set, v3.0 or v2.1, in the order of their numbers.
 
-    Nothing is read before the first call. Of a local data set `infos` checks the states of every episode; of a remote
-    one it reads the files in meta, and states are checked when an episode is read (all of them at once if
-    `data.outcome` needs a value that only the rows have). `read` fetches the row groups with the episode's rows;
-    frames are fetched and decoded on request.
+    Of a local data set `infos` checks the states of every episode; of a remote one it reads the files in meta, and
+    states are checked when an episode is read (all of them at once if `data.outcome` needs a value that only the rows
+    have). `read` fetches the row groups with the episode's rows; frames are fetched and decoded on request.
     """
-
-    def __init__(self, config: LeRobotData) -> None:
-        self._config = config
-        self._lock = threading.RLock()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickle for a loader worker: with the index, without cached data."""
-        return {name: self.__dict__[name] for name in ("_config", "_info", "_table") if name in self.__dict__}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Unpickle in a loader worker."""
-        self.__dict__ |= state | {"_lock": threading.RLock()}
-
-    def infos(self, progress: Progress | None = None) -> EpisodeTable:
-        """Return identity, length and outcome of every usable episode, and the problems of the others.
-
-        Raises:
-            InputError: No data set, one of another version, damaged metadata, or none of its episodes has the data that
-                the config names.
-            OSError: It is remote and cannot be read.
-        """
-        with self._lock:
-            if "_table" not in self.__dict__:
-                self._table = self._found_out(progress)
-            return self._table
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - frames are fetched one by one
         """Return one episode; see `episode.EpisodeSource`.
@@ -83,14 +53,13 @@ class LeRobotSource:
         """
         table = self.infos()
         info, row = table[index], row_of(table, index)
-        where = self._where(row)
         content = self._content(row)
         task = self._tasks[table.locators["task"][index]]
         key = self._info.camera_key(self._config.lerobot, camera or self._config.cameras[0])
         return Episode(
             info=info,
             states=content.states,
-            read_frames=self._frames(row, key, where),
+            read_frames=self._frames(row, key),
             control_rate_hz=self._control_rate_hz,
             joint_velocities=content.joint_velocities,
             metadata={"language": task} if task else {},
@@ -99,7 +68,7 @@ class LeRobotSource:
 
     @cached_property
     def _info(self) -> DatasetInfo:
-        return read_info(self._config.path)
+        return read_info(self._config.path) if self._known is None else self._known.info
 
     @property
     def _control_rate_hz(self) -> float:
@@ -111,79 +80,57 @@ class LeRobotSource:
 
     @cached_property
     def _parquet(self) -> ParquetRows:
-        row_cache = RowCache(fetched_data(self._config.disk_cache), self._data_version)
-        return ParquetRows(self._open, wanted_columns(self._config), row_cache)
-
-    @cached_property
-    def _files(self) -> EpisodeFiles:
-        return EpisodeFiles(self._config)
+        cache = fetched_data(self._config.disk_cache)
+        return ParquetRows(self._open_file, wanted_columns(self._config), cache, self._data_version)
 
     @property
     def _is_far(self) -> bool:
         return storage.is_url(self._config.path)
 
     @property
-    def _connections(self) -> int:
-        return self._config.connections if self._is_far else 1
-
-    @property
     def _data_version(self) -> str:
         """A version that changes with the data set's files and the wanted columns."""
-        return self._table.texts["version"] if "_table" in self.__dict__ else self._version
+        return self._version if self._known is None else self._known.table.texts["version"]
 
-    def _open(self, path: str) -> str | BlockCachedFile:
+    def _open_file(self, path: str) -> str | BlockCachedFile:
         return self._files.open(path, version=self._data_version)
 
-    def _found_out(self, progress: Progress | None) -> EpisodeTable:
+    def _look(self, progress: Progress) -> _Opened:
         info, config = self._info, self._config
         info.require_mapping(config)
         keys = [info.camera_key(config.lerobot, camera) for camera in config.cameras]
         if any(info.features[key].dtype == "video" for key in keys):
             require_decoder(info.where)
-        tables = tables_of_episodes(info, self._connections)
+        tables = list_by_template(info.root, episode_list.EPISODES[info.version], connections=self._connections)
         files = list_by_template(info.root, info.data_path, connections=self._connections)
         for key in keys:
             if info.features[key].dtype == "video":
                 files |= list_by_template(info.root, info.video_path or "", key, connections=self._connections)
-        vector = {"vector": wanted_columns(config)} if config.states == "vector" else {}
         fields = knobs_that_affect(Affects.INDEX, config.lerobot)
         fields.pop("action")  # where it matters, it is among the columns
-        index = IndexKeys.of(
-            {
-                **vector,
-                "source": "lerobot",
-                "fields": fields,
-                "keys": keys,
-                "outcome": self._is_far and config.outcome != "all",
-                "info": repr(replace(info, root="")),
-                "files": fingerprint(tables, files),
-            },
-            config.path,
-        )
+        parts = {
+            **({"vector": wanted_columns(config)} if config.states == "vector" else {}),
+            "source": "lerobot",
+            "fields": fields,
+            "keys": keys,
+            "outcome": self._is_far and config.outcome != "all",
+            "info": repr(replace(info, root="")),
+            "files": [(path, file.size, file.version) for path, file in [*tables.items(), *files.items()]],
+        }
+        index = IndexKeys.of(parts, config.path)
         self._version = index.now
-        build = partial(self._built, list(tables), files, keys, progress)
-        return get_or_build(config.disk_cache, index, config.path, build)
+        build = partial(self._built, list(tables), files.keys(), keys, progress)
+        return _Opened(get_or_build(config.disk_cache, index, config.path, build), info)
 
-    def _built(
-        self, tables: list[str], files: dict[str, FileInfo], keys: list[str], progress: Progress | None
-    ) -> EpisodeTable:
+    def _built(self, tables: list[str], files: Set[str], keys: list[str], progress: Progress) -> EpisodeTable:
         info, fields = self._info, self._config.lerobot
-        known = info.known_keys(fields)
-        statistics = StatisticsColumns(tuple(fields.state) if self._is_far else (), fields.success)
-        rows = read_episodes(info, tables, known, statistics, self._open)
-        problems = find_problems(info, rows, files.keys(), keys)
+        statistics = episode_list.StatisticsColumns(tuple(fields.state) if self._is_far else (), fields.success)
+        known = [key for key in dict.fromkeys(fields.cameras.values()) if key in info.features]
+        rows = episode_list.read_episodes(info, tables, known, statistics, self._open_file)
+        problems = find_problems(info, rows, files, keys)
         outcome_unknown = any(row.success is None for row in rows) and fields.success in info.features
         if not self._is_far or (self._config.outcome != "all" and outcome_unknown):
-            unusable = [row for row in rows if row.index in problems]
-            checked = check_rows(
-                info,
-                rows,
-                problems,
-                self._content,
-                connections=self._connections,
-                progress=progress,
-            )
-            rows = sorted(unusable + checked, key=lambda row: row.index)
+            rows = check_rows(info, rows, problems, self._content, connections=self._connections, progress=progress)
         if not rows:
             raise InputError(where=info.where, found="no episodes", needed="a data set with episodes")
         texts = {"version": self._version, "control_rate_hz": str(self._control_rate_hz)}
@@ -192,18 +139,19 @@ class LeRobotSource:
         return table
 
     def _content(self, row: EpisodeRow) -> EpisodeContent:
-        rows = self._parquet.rows(storage.join(self._info.root, data_file(self._info, row)), row.index)
+        rows = self._parquet.rows(storage.join(self._info.root, episode_list.data_file(self._info, row)), row.index)
         return content_of(rows, row.length, self._info, self._config, self._where(row))
 
-    def _frames(self, row: EpisodeRow, key: str, where: str) -> FrameReader:
+    def _frames(self, row: EpisodeRow, key: str) -> FramesByStep:
         info = self._info
         if info.features[key].dtype == "image":
-            path = storage.join(info.root, data_file(info, row))
-            return StoredImages(lambda: self._parquet.images(path, key, row.index), row.length, f"{where}: {key}")
+            path = storage.join(info.root, episode_list.data_file(info, row))
+            read = partial(self._parquet.images, path, key, row.index)
+            return stored_images(read, row.length, f"{self._where(row)}: {key}")
         place = row.videos[key]
-        path = storage.join(info.root, video_file(info, place, key))
+        path = storage.join(info.root, episode_list.video_file(info, place, key))
         clock = Clock(start_s=place.start_s, rate_hz=info.fps)
-        return VideoFrames(self._open, path, clock, row.length, f"{path}: {row.id}")
+        return video_frames(self._open_file, path, clock, row.length, f"{path}: {row.id}")
 
     def _where(self, row: EpisodeRow) -> str:
-        return f"{storage.join(self._info.root, data_file(self._info, row))}: {row.id}"
+        return f"{storage.join(self._info.root, episode_list.data_file(self._info, row))}: {row.id}"

@@ -94,9 +94,7 @@ def read_episode(opened: str | BlockCachedFile, path: str, cameras: Sequence[str
                 raise InputError(where=path, found=found, needed=needed, fix="Set data.pose_frame: base")
         fps_hz = float(arrays.numbers("fps_hz", ()))
         if fps_hz <= 0:
-            raise InputError(
-                where=f"{path}: fps_hz", found=f"{fps_hz:g}", needed="control steps per second", fix=FORMAT_HELP
-            )
+            raise _refused(f"{path}: fps_hz", f"{fps_hz:g}", "control steps per second")
         has_velocities = "joint_velocities" in file.names
         return NpzEpisode(
             states=states,
@@ -143,8 +141,7 @@ def require_frames(file: NpzFile, camera: str, steps: int, path: str, *, count: 
     header = file.header_of_rows(camera)
     require_bounded(header.shape[1], header.shape[2], f"{path}: {camera}", count=count)
     if header.dtype != np.uint8:
-        found = f"frames of {header.dtype}"
-        raise InputError(where=f"{path}: {camera}", found=found, needed="uint8, 0 to 255", fix=FORMAT_HELP)
+        raise _refused(f"{path}: {camera}", f"frames of {header.dtype}", "uint8, 0 to 255")
 
 
 @dataclass(frozen=True)
@@ -156,27 +153,23 @@ class _Arrays:
 
     def numbers(self, name: str, shape: tuple[int | None, ...]) -> Float64[np.ndarray, ...]:
         """Return finite numbers of a shape; None stands for any length."""
-        self._require(name, shape, "biuf", "numbers")
+        _require_array(self.file, name, shape, "biuf", "numbers", self.path)
         self._require_small(name, prod(self.file.header(name).shape), _MOST_NUMBERS, "numbers")
         values = self.file.array(name).astype(np.float64)
         if not np.isfinite(values).all():
             step = np.argwhere(~np.isfinite(values))[0][:1].tolist()
             at = f" at step {step[0]}" if step else ""
-            raise InputError(
-                where=f"{self.path}: {name}", found=f"NaN or infinity{at}", needed="numbers", fix=FORMAT_HELP
-            )
+            raise _refused(f"{self.path}: {name}", f"NaN or infinity{at}", "numbers")
         return values
 
     def is_text(self, name: str) -> bool:
         """Return whether there is an array of this name with one text; a camera may have that name, too."""
-        return name in self.file.names and (self.file.header(name).shape, self.file.header(name).dtype.kind) == (
-            (),
-            "U",
-        )
+        header = self.file.header(name) if name in self.file.names else None
+        return header is not None and header.shape == () and header.dtype.kind == "U"
 
     def text(self, name: str) -> str:
         """Return a text."""
-        self._require(name, (), "U", "one text")
+        _require_array(self.file, name, (), "U", "one text", self.path)
         self._require_small(name, self.file.header(name).dtype.itemsize // 4, _MOST_LETTERS, "letters")
         return str(self.file.array(name))
 
@@ -192,15 +185,7 @@ class _Arrays:
     def _require_small(self, name: str, count: int, most: int, of_what: str) -> None:
         """Refuse an array far larger than any episode's before it is decompressed: zeros compress a thousandfold."""
         if count > most:
-            raise InputError(
-                where=f"{self.path}: {name}",
-                found=f"{count:,} {of_what}",
-                needed=f"at most {most:,} in an episode",
-                fix=FORMAT_HELP,
-            )
-
-    def _require(self, name: str, shape: tuple[int | None, ...], kinds: str, meaning: str) -> None:
-        _require_array(self.file, name, shape, kinds, meaning, self.path)
+            raise _refused(f"{self.path}: {name}", f"{count:,} {of_what}", f"at most {most:,} in an episode")
 
 
 def _require_array(
@@ -209,16 +194,13 @@ def _require_array(
     """Refuse an array that is missing, or of another shape or type."""
     if name not in file.names:
         there = ", ".join(file.names)[:200] or "none"
-        raise InputError(
-            where=f"{path}: {name}", found="no such array", needed=f"{meaning}; there are {there}", fix=FORMAT_HELP
-        )
+        raise _refused(f"{path}: {name}", "no such array", f"{meaning}; there are {there}")
     header = file.header(name)
     alike = len(header.shape) == len(shape) and all(b in {a, None} for a, b in zip(header.shape, shape, strict=True))
     if not alike or header.dtype.kind not in kinds or (0 in header.shape[1:]):
         wanted = " x ".join("any" if size is None else str(size) for size in shape) or "a single one"
-        raise InputError(
-            where=f"{path}: {name}",
-            found=f"shape {header.shape} of {header.dtype}",
-            needed=f"{meaning}: {wanted}",
-            fix=FORMAT_HELP,
-        )
+        raise _refused(f"{path}: {name}", f"shape {header.shape} of {header.dtype}", f"{meaning}: {wanted}")
+
+
+def _refused(where: str, found: str, needed: str) -> InputError:
+    return InputError(where=where, found=found, needed=needed, fix=FORMAT_HELP)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,12 +14,12 @@ from jaxtyping import UInt8
 from vjepa2_ac import storage
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.cache.block_cached_file import BlockCachedFile
-from vjepa2_ac.data.cache.cached_reads import EpisodeFiles
 from vjepa2_ac.data.filters.broken_episodes import as_error, as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeProblem, EpisodeTable
 from vjepa2_ac.data.index.index_cache import IndexKeys, get_or_build
 from vjepa2_ac.data.index.labels import labels_of
 from vjepa2_ac.data.index.state_hash import hash_of_states
+from vjepa2_ac.data.sources.indexed_source import FramesByStep, IndexedSource, Opened, require_as_indexed
 from vjepa2_ac.data.sources.listing import in_parallel, walk, within
 from vjepa2_ac.data.sources.npz.npz_episode import FORMAT_HELP, NpzEpisode, opened_npz, read_episode, require_frames
 from vjepa2_ac.episode import Episode, EpisodeInfo, Progress, StepRanges
@@ -31,30 +30,16 @@ logger = logging.getLogger(__name__)
 _SUFFIX = ".npz"
 
 
-class NpzSource:
+@dataclass(frozen=True)
+class _Opened(Opened):
+    version: str  # of all files: the key of the index
+
+
+class NpzSource(IndexedSource[DataConfig, _Opened]):
     """The episodes of a folder of .npz files, in the order of their paths; a path without .npz is the identity.
 
-    Nothing is read before the first call. `infos` reads every file except the frames. Data from URLs is cached on this
-    machine.
+    `infos` reads every file except the frames. Data from URLs is cached on this machine.
     """
-
-    def __init__(self, config: DataConfig) -> None:
-        self._config = config
-        self._root = config.path
-        self._files = EpisodeFiles(config)
-        self._version = ""  # of all files: the key of the index
-        self._table: EpisodeTable | None = None
-
-    def infos(self, progress: Progress | None = None) -> EpisodeTable:
-        """Return identity, length and outcome of every usable episode.
-
-        Raises:
-            InputError: There are no episodes, or none can be used.
-            OSError: Data behind a URL cannot be read.
-        """
-        if self._table is None:
-            self._table = self._indexed(progress)
-        return self._table
 
     def read(self, index: int, camera: str | None = None, needed: StepRanges | None = None) -> Episode:  # noqa: ARG002 - files are fetched in blocks
         """Return one episode; only requested frames are read.
@@ -63,21 +48,15 @@ class NpzSource:
             InputError: The file is missing or damaged, or has changed since it was indexed.
             OSError: Data behind a URL cannot be read.
         """
-        info = self.infos()[index]
-        path = self._path(info.id)
-        camera = camera or self._config.cameras[0]
-        found = read_episode(self._opened(path), path, (camera,), self._config)
-        if len(found.states) != info.num_steps:
-            raise InputError(
-                where=path,
-                found=f"{len(found.states)} steps",
-                needed=f"the {info.num_steps} that were indexed",
-                fix="Do not change files while a run reads them",
-            )
+        opened = self._open()
+        info = opened.table[index]
+        path, camera = self._path(info.id), camera or self._config.cameras[0]
+        found = read_episode(self._opened(path, opened.version), path, (camera,), self._config)
+        require_as_indexed(len(found.states), info, path)
         return Episode(
             info=info,
             states=found.states,
-            read_frames=_FrameReader(partial(self._opened, path), path, camera, info.num_steps),
+            read_frames=FramesByStep(info.num_steps, path, partial(self._frames, path, camera, info.num_steps)),
             control_rate_hz=found.fps_hz,
             extrinsics=found.extrinsics[camera],
             joint_velocities=found.joint_velocities,
@@ -85,53 +64,51 @@ class NpzSource:
             commands=found.commands,
         )
 
-    def _indexed(self, progress: Progress | None) -> EpisodeTable:
+    def _frames(
+        self, path: str, camera: str, num_steps: int, steps: Sequence[int]
+    ) -> UInt8[np.ndarray, "time height width 3"]:
+        with opened_npz(self._opened(path, self._open().version), path) as file:
+            require_frames(file, camera, num_steps, path, count=len(set(steps)))
+            return np.asarray(file.rows(camera, steps))
+
+    def _look(self, progress: Progress) -> _Opened:
         """Return the cached table, or read every episode; a changed file changes the key."""
-        config = self._config
+        config, root = self._config, self._config.path
         listed = sorted(
             (within(folder, file.name), file.size, file.version)
-            for folder, file in walk(self._root, config.connections)
+            for folder, file in walk(root, config.connections)
             if file.name.endswith(_SUFFIX)
         )
         if not listed:
-            raise InputError(
-                where="data.path",
-                found=f"no .npz files under {self._root}",
-                needed="one for each episode",
-                fix=FORMAT_HELP,
-            )
+            found = f"no .npz files under {root}"
+            raise InputError(where="data.path", found=found, needed="one for each episode", fix=FORMAT_HELP)
         knobs: dict[str, object] = {"cameras": config.cameras, "pose_frame": config.pose_frame}
         if config.states == "vector":
             knobs |= {"states": config.states, "actions": config.actions}
-        keys = IndexKeys.of({"source": "npz", **knobs, "listed": listed}, self._root)
-        self._version = keys.now
+        keys = IndexKeys.of({"source": "npz", **knobs, "listed": listed}, root)
         ids = [path.removesuffix(_SUFFIX) for path, _, _ in listed]
-        return get_or_build(config.disk_cache, keys, self._root, lambda: self._scan_all(ids, progress))
+        build = partial(self._scan_all, ids, keys.now, progress)
+        return _Opened(get_or_build(config.disk_cache, keys, root, build), keys.now)
 
-    def _scan_all(self, ids: list[str], progress: Progress | None) -> EpisodeTable:
-        counter = itertools.count(1)
-
-        def scan(identity: str) -> NpzEpisode | EpisodeProblem:
-            found = self._scan(identity)
-            if progress is not None:
-                progress(next(counter), len(ids))
-            return found
-
-        connections = self._config.connections if storage.is_url(self._root) else 1
-        scanned = dict(zip(ids, in_parallel(scan, ids, connections), strict=True))
-        found = {identity: one for identity, one in scanned.items() if isinstance(one, NpzEpisode)}
-        problems = [one for one in scanned.values() if isinstance(one, EpisodeProblem)]
+    def _scan_all(self, ids: list[str], version: str, progress: Progress) -> EpisodeTable:
+        found: dict[str, NpzEpisode] = {}
+        problems: list[EpisodeProblem] = []
+        results = in_parallel(partial(self._scan, version=version), ids, self._connections)
+        for done, (identity, one) in enumerate(zip(ids, results, strict=True), start=1):
+            progress(done, len(ids))
+            if isinstance(one, EpisodeProblem):
+                problems.append(one)
+            else:
+                found[identity] = one
         if not found:
             raise as_error(problems[0])
         rate = Counter(one.fps_hz for one in found.values()).most_common(1)[0][0]
         problems += [self._other_rate(name, one.fps_hz, rate) for name, one in found.items() if one.fps_hz != rate]
-        found = {name: one for name, one in found.items() if one.fps_hz == rate}
-        widths = Counter(one.widths for one in found.values()).most_common(1)[0][0]
-        problems += [
-            self._other_widths(name, one.widths, widths) for name, one in found.items() if one.widths != widths
-        ]
-        usable = {name: one for name, one in found.items() if one.widths == widths}
-        logger.info("%s: %d episodes, %d that cannot be used", self._root, len(usable), len(problems))
+        alike = {name: one for name, one in found.items() if one.fps_hz == rate}
+        usual = Counter(one.widths for one in alike.values()).most_common(1)[0][0]
+        problems += [self._other_widths(name, one.widths, usual) for name, one in alike.items() if one.widths != usual]
+        usable = {name: one for name, one in alike.items() if one.widths == usual}
+        logger.info("%s: %d episodes, %d that cannot be used", self._config.path, len(usable), len(problems))
         return EpisodeTable.of(
             [EpisodeInfo(name, len(one.states), one.success) for name, one in usable.items()],
             problems=problems,
@@ -140,10 +117,10 @@ class NpzSource:
             labels=labels_of([{"task": one.language, **one.labels} for one in usable.values()]),
         )
 
-    def _scan(self, identity: str) -> NpzEpisode | EpisodeProblem:
+    def _scan(self, identity: str, version: str) -> NpzEpisode | EpisodeProblem:
         try:
             path = self._path(identity)
-            return read_episode(self._opened(path), path, self._config.cameras, self._config)
+            return read_episode(self._opened(path, version), path, self._config.cameras, self._config)
         except InputError as error:
             return as_problem(error, identity)
 
@@ -161,32 +138,8 @@ class NpzSource:
         fix = "Keep the recordings of different robots in different folders"
         return EpisodeProblem(identity, self._path(identity), found, f"{needed}, as in most episodes", fix)
 
-    def _opened(self, path: str) -> str | BlockCachedFile:
-        return self._files.open(path, version=self._version)
+    def _opened(self, path: str, version: str) -> str | BlockCachedFile:
+        return self._files.open(path, version=version)
 
     def _path(self, identity: str) -> str:
-        return storage.join(self._root, identity + _SUFFIX)
-
-
-@dataclass(frozen=True)
-class _FrameReader:
-    """Reads requested frames of one camera."""
-
-    opened: Callable[[], str | BlockCachedFile]
-    path: str
-    camera: str
-    steps: int
-
-    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB frames at these control steps, in this order.
-
-        Raises:
-            InputError: The file is missing or damaged.
-            OSError: A file behind a URL cannot be read.
-            ValueError: No steps, or a step outside the episode.
-        """
-        if not steps or min(steps) < 0 or max(steps) >= self.steps:
-            raise ValueError(f"{self.path}: steps {list(steps)} of {self.steps}")
-        with opened_npz(self.opened(), self.path) as file:
-            require_frames(file, self.camera, self.steps, self.path, count=len(set(steps)))
-            return np.asarray(file.rows(self.camera, steps))
+        return storage.join(self._config.path, identity + _SUFFIX)

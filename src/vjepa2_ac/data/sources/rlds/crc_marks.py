@@ -26,15 +26,11 @@ class CrcMarks:
     def __contains__(self, number: int) -> bool:
         """Return whether a record has been checked."""
         try:
-            handle = os.open(self._path, os.O_RDONLY)
+            with self._path.open("rb") as file:
+                file.seek(number)
+                return file.read(1) == _CHECKED
         except OSError:
             return False
-        try:
-            return os.pread(handle, 1, number) == _CHECKED
-        except OSError:
-            return False
-        finally:
-            os.close(handle)
 
     def add(self, number: int) -> None:
         """Mark a record as checked."""

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from vjepa2_ac import storage
-from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan, index_records
+from vjepa2_ac.data.sources.rlds.shard_reader import Shard
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import read_json_object
 
@@ -14,21 +14,6 @@ _INFO = "dataset_info.json"
 _DEFAULT_TEMPLATE = "{DATASET}-{SPLIT}.{FILEFORMAT}-{SHARD_X_OF_Y}"
 _MOST_NAMES = 5
 _MOST_EPISODES = 100_000  # of a shard; DROID's have some 50
-
-
-@dataclass(frozen=True)
-class Shard:
-    """One TFRecord file of a data set, and its expected number of episodes."""
-
-    path: str
-    episodes: int
-    size: int = 0  # bytes
-    version: str = ""  # as from `storage.list_files`: changes with the content
-
-    @property
-    def name(self) -> str:
-        """The file's name."""
-        return self.path.replace("\\", "/").rsplit("/", 1)[-1]
 
 
 def find_shards(folder: str) -> list[Shard]:
@@ -39,51 +24,25 @@ def find_shards(folder: str) -> list[Shard]:
     """
     where = storage.join(folder, _INFO)
     info = _read_info(folder, where)
-    if info.get("fileFormat", "tfrecord") != "tfrecord":
-        raise InputError(
-            where=where, found=f"fileFormat {info['fileFormat']}", needed="tfrecord", fix="Convert it with TFDS"
-        )
+    if (form := info.get("fileFormat", "tfrecord")) != "tfrecord":
+        raise InputError(where=where, found=f"fileFormat {form}", needed="tfrecord", fix="Convert it with TFDS")
     try:
         shards = [shard for split in info["splits"] for shard in _shards_of(folder, str(info["name"]), split)]
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(
-            where=where, found=f"not a description of a data set ({error!r})", needed="TFDS's own"
-        ) from None
+        found = f"not a description of a data set ({error!r})"
+        raise InputError(where=where, found=found, needed="TFDS's own") from None
     if not shards:
         raise InputError(where=where, found="no episodes in any split", needed="a data set with episodes")
     return _as_listed(folder, shards)
-
-
-def index_shards(shards: list[Shard]) -> list[RecordSpan]:
-    """Return the position of every episode, shard by shard.
-
-    Raises:
-        InputError: A shard is not a TFRecord, is truncated, or has another number of episodes than expected.
-    """
-    spans: list[RecordSpan] = []
-    for shard in shards:
-        found = index_records(shard.path)
-        if len(found) != shard.episodes:
-            raise InputError(
-                where=shard.path,
-                found=f"{len(found)} records",
-                needed=f"{shard.episodes}, says {_INFO}",
-                fix="Download the file again",
-            )
-        spans += found
-    return spans
 
 
 def _read_info(folder: str, where: str) -> dict[str, Any]:
     try:
         return read_json_object(where, needed="a description as TFDS writes it", allow_nan=True)
     except FileNotFoundError:
-        raise InputError(
-            where="data.path",
-            found=_nothing_in(folder),
-            needed=f"a folder with {_INFO}",
-            fix="Set data.path to the data set; docs/QUICKSTART.md says how to get DROID",
-        ) from None
+        fix = "Set data.path to the data set; docs/QUICKSTART.md says how to get DROID"
+        found, needed = _nothing_in(folder), f"a folder with {_INFO}"
+        raise InputError(where="data.path", found=found, needed=needed, fix=fix) from None
     except OSError as error:
         raise storage.unreadable(where, error) from None
 
@@ -130,18 +89,13 @@ def _count(value: object) -> int:
 def _as_listed(folder: str, shards: list[Shard]) -> list[Shard]:
     """Return the shards with size and version, from one listing of the folder."""
     if len({shard.path for shard in shards}) < len(shards):
-        raise InputError(
-            where=storage.join(folder, _INFO), found="shards of one name", needed="a filepathTemplate that numbers them"
-        )
+        needed = "a filepathTemplate that numbers them"
+        raise InputError(where=storage.join(folder, _INFO), found="shards of one name", needed=needed)
     present = {file.name: file for file in storage.list_files(folder)}
     missing = [shard.name for shard in shards if shard.name not in present]
     if missing:
-        raise InputError(
-            where=folder,
-            found=f"{len(missing)} of {len(shards)} shards are missing: {_shorten(missing)}",
-            needed=f"every shard that {_INFO} lists",
-            fix="Download them",
-        )
+        found = f"{len(missing)} of {len(shards)} shards are missing: {_shorten(missing)}"
+        raise InputError(where=folder, found=found, needed=f"every shard that {_INFO} lists", fix="Download them")
     return [replace(shard, size=present[shard.name].size, version=present[shard.name].version) for shard in shards]
 
 

@@ -10,18 +10,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32
 
+from vjepa2_ac.data.sources.rlds import wire_format
 from vjepa2_ac.data.sources.rlds.tfrecord import Kind, RecordSpan, decode_feature
-from vjepa2_ac.data.sources.rlds.wire_format import (
-    DELIMITED,
-    FLOAT_LIST,
-    INT64_LIST,
-    Located,
-    NotAnExampleError,
-    Read,
-    locate_features,
-    locate_items,
-    packed_numbers,
-)
+from vjepa2_ac.data.sources.rlds.wire_format import Located, NotAnExampleError, Read
 from vjepa2_ac.errors import InputError
 
 
@@ -43,15 +34,26 @@ class ExampleRecord:
     def located(self) -> dict[str, Located]:
         """The position of each feature."""
         try:
-            return locate_features(self._read, self._span.data_offset, self._span.length)
+            return dict(wire_format.iterate_features(self._read, self._span.data_offset, self._span.length))
         except NotAnExampleError as error:
             raise not_an_example(self._span, error) from None
 
     def require(self, names: Iterable[str]) -> None:
-        """Refuse a record that lacks a feature."""
+        """Refuse a record that lacks a feature.
+
+        Raises:
+            InputError: It does; names the features that it has.
+        """
         for name in names:
             if name not in self.located:
-                raise self._missing(name)
+                known = sorted(self.located)
+                close = difflib.get_close_matches(name, known, n=1)
+                raise InputError(
+                    where=str(self._span),
+                    found=f"no feature {name}; the record has {', '.join(known) or 'none'}",
+                    needed="the features that data.fields names",
+                    fix=f"Did you mean {close[0]}? Set data.fields" if close else "Set data.fields",
+                )
 
     def floats(self, name: str) -> Float32[np.ndarray, " values"]:
         """Return the numbers of a feature.
@@ -59,14 +61,14 @@ class ExampleRecord:
         Raises:
             InputError: There is no such feature, or it has no floats.
         """
-        packed = packed_numbers(self.serialised(name), FLOAT_LIST)
+        packed = wire_format.packed_numbers(self.serialised(name), wire_format.FLOAT_LIST)
         if packed is None or len(packed) % 4:
             return np.asarray(self.values(name, "float_list"), np.float32)
         return np.frombuffer(packed, "<f4")
 
     def is_float(self, name: str) -> bool:
         """Return whether a feature has floats, judged by its first byte."""
-        return self._read(self.located[name].offset, 1) == bytes([FLOAT_LIST << 3 | DELIMITED])
+        return self._read(self.located[name].offset, 1) == bytes([wire_format.FLOAT_LIST << 3 | wire_format.DELIMITED])
 
     def count_integers(self, name: str) -> int:
         """Return the number of integers in a feature.
@@ -74,7 +76,7 @@ class ExampleRecord:
         Raises:
             InputError: There is no such feature, or it has no integers.
         """
-        packed = packed_numbers(self.serialised(name), INT64_LIST)
+        packed = wire_format.packed_numbers(self.serialised(name), wire_format.INT64_LIST)
         if packed is None or (packed and packed[-1] >= 0x80):
             return len(self.values(name, "int64_list"))
         return int(np.count_nonzero(np.frombuffer(packed, np.uint8) < 0x80))
@@ -87,7 +89,7 @@ class ExampleRecord:
         """
         self.require([name])
         try:
-            return locate_items(self._read, self.located[name], count)
+            return wire_format.locate_items(self._read, self.located[name], count)
         except NotAnExampleError as error:
             self.values(name, "bytes_list")  # has a better message, if it raises
             raise not_an_example(self._span, error) from None
@@ -125,21 +127,9 @@ class ExampleRecord:
         offset, length = self.located[name]
         data = self._read(offset, length)
         if len(data) < length:
-            raise InputError(
-                where=f"{self._span}: {name}", found=f"{len(data)} bytes at {offset}", needed=f"{length} bytes"
-            )
+            where, found = f"{self._span}: {name}", f"{len(data)} bytes at {offset}"
+            raise InputError(where=where, found=found, needed=f"{length} bytes")
         return data
-
-    def _missing(self, name: str) -> InputError:
-        names = sorted(self.located)
-        close = difflib.get_close_matches(name, names, n=1)
-        hint = f"Did you mean {close[0]}? " if close else ""
-        return InputError(
-            where=str(self._span),
-            found=f"no feature {name}; the record has {', '.join(names) or 'none'}",
-            needed="the features that data.fields names",
-            fix=f"{hint}Set data.fields",
-        )
 
 
 def not_an_example(span: RecordSpan, error: NotAnExampleError) -> InputError:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,15 +17,13 @@ from jaxtyping import Int64, UInt8
 from vjepa2_ac.config import DiskCacheConfig
 from vjepa2_ac.data.cache.disk_cache import DiskCache, fetched_data
 from vjepa2_ac.data.index.index_cache import cache_folder
-from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.indexed_source import FramesByStep
 from vjepa2_ac.data.sources.rlds.example import ExampleRecord
-from vjepa2_ac.data.sources.rlds.images_local import require_steps, wrong_count
-from vjepa2_ac.data.sources.rlds.range_reader import RemoteFile, read_in_parallel
-from vjepa2_ac.data.sources.rlds.shard_reader import unreadable
+from vjepa2_ac.data.sources.rlds.images import items_of, wrong_count
+from vjepa2_ac.data.sources.rlds.shard_reader import RemoteFile, Shard, read_in_parallel
 from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan
-from vjepa2_ac.data.sources.rlds.wire_format import Located, NotAnExampleError, Read, locate_items
+from vjepa2_ac.data.sources.rlds.wire_format import Located, Read
 from vjepa2_ac.episode import StepRanges
-from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.jpeg import decode_jpegs, looks_like_jpeg
 from vjepa2_ac.storage.structured import json_object
 
@@ -61,7 +59,8 @@ class RemoteEpisode:
     """
 
     def __init__(self, shard: Shard, span: RecordSpan, cache: RemoteCache) -> None:
-        self._shard, self._span, self._cache = shard, span, cache
+        self._shard, self._span = shard, span
+        self._places, self._contents = cache.places, cache.contents
         self._key = f"{cache.key} {shard.name} {span.offset}"  # independent of its position in a rebuilt index
 
     def record(self, whole: Sequence[str], texts: Sequence[str]) -> ExampleRecord:
@@ -77,33 +76,46 @@ class RemoteEpisode:
         file = RemoteFile(self._shard, window=_HOP_WINDOW)
         try:
             located = self._located(file)
-            kept = self._cache.contents.read(self._key)
+            cached = self._contents.read(self._key)
             places: list[tuple[int, int]] = [*(located[name] for name in whole if name in located)]
             places += [self._head_of(located[name]) for name in texts if name in located]
-            file.hold(list(_unpack(kept)) if kept is not None else [])
+            file.hold(list(_unpack(cached)) if cached is not None else [])
             pieces = file.pieces_of(places)
         except OSError as error:
-            raise unreadable(self._shard, error) from None
-        if kept is None:
-            self._cache.contents.write(self._key, _pack(pieces))
+            raise self._shard.unreadable(error) from None
+        if cached is None:
+            self._contents.write(self._key, _pack(pieces))
         return ExampleRecord(file, self._span, located)
 
     def images(
-        self, feature: str, located: Mapping[str, Located], num_steps: int, needed: StepRanges | None, where: str
-    ) -> RemoteImages:
-        """Return the reader of one camera's images.
+        self, name: str, feature: Located, num_steps: int, needed: StepRanges | None, where: str
+    ) -> FramesByStep:
+        """Return the reader of one camera's images: from the cache, or from the URL.
+
+        The first time all of the camera's images are fetched, because only that gives their positions; those of the
+        needed steps are cached.
 
         Args:
-            feature: The camera's.
-            located: Positions of the record's features.
+            name: The feature's.
+            feature: Its position.
             num_steps: Of the episode.
             needed: Steps whose images are cached; None: all.
             where: File, record, identity and feature, for messages.
         """
-        keep = tuple((max(0, start), min(end, num_steps)) for start, end in needed or [(0, num_steps)])
-        return RemoteImages(
-            self._shard, located[feature], num_steps, keep, where, self._cache, f"{self._key} {feature}"
-        )
+        key = f"{self._key} {name}"
+
+        def decode(steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
+            try:
+                table = self._places.read(key)
+                if table is None:
+                    images = self._fetch_all(key, feature, needed, num_steps, where)
+                else:
+                    images = self._cached_or_fetched(key, np.frombuffer(table, np.int64).reshape(-1, 2), steps)
+            except OSError as error:
+                raise self._shard.unreadable(error) from None
+            return decode_jpegs([images[step] for step in steps], steps, where)
+
+        return FramesByStep(num_steps, where, decode)
 
     def _head_of(self, place: Located) -> tuple[int, int]:
         """Return enough of a feature for its first text, and a little more."""
@@ -111,96 +123,52 @@ class RemoteEpisode:
         return place.offset, end - place.offset
 
     def _located(self, file: RemoteFile) -> dict[str, Located]:
-        kept = self._cache.places.read(self._key)
-        if kept is not None:
-            return {name: Located(*place) for name, place in json_object(kept, where=self._key).items()}
+        cached = self._places.read(self._key)
+        if cached is not None:
+            return {name: Located(*place) for name, place in json_object(cached, where=self._key).items()}
         located = ExampleRecord(file, self._span).located
-        self._cache.places.write(self._key, json.dumps(located).encode())
+        self._places.write(self._key, json.dumps(located).encode())
         return located
 
-
-@dataclass(frozen=True)
-class RemoteImages:
-    """Reads requested images of one camera of one episode: from the cache, or from the URL.
-
-    The first time all of the camera's images are fetched, because only that gives their positions; those of the needed
-    steps are cached.
-    """
-
-    shard: Shard
-    feature: Located
-    num_steps: int
-    needed: StepRanges
-    where: str
-    cache: RemoteCache
-    key: str
-
-    def __call__(self, steps: Sequence[int]) -> UInt8[np.ndarray, "time height width 3"]:
-        """Return the RGB frames at these control steps, in this order.
-
-        Raises:
-            InputError: There is not one image for each step, one is not a JPEG, or differs in size.
-            UnreachableError: The network fails.
-            ValueError: No steps, or a step outside the episode.
-        """
-        require_steps(steps, self.num_steps, self.where)
-        try:
-            found = self._cached_or_fetched(sorted(set(steps)))
-        except OSError as error:
-            raise unreadable(self.shard, error) from None
-        return decode_jpegs([found[step] for step in steps], steps, self.where)
-
-    def _cached_or_fetched(self, steps: Sequence[int]) -> dict[int, bytes]:
-        table = self.cache.places.read(self.key)
-        if table is None:
-            return self._first_time(steps)
-        places = np.frombuffer(table, np.int64).reshape(-1, 2)
+    def _cached_or_fetched(
+        self, key: str, places: Int64[np.ndarray, "steps 2"], steps: Sequence[int]
+    ) -> dict[int, bytes]:
+        """Return images whose positions are known; adjacent ones are fetched by one read."""
         found: dict[int, bytes] = {}
         for group in sorted({step // _GROUP_STEPS for step in steps}):
-            kept = self.cache.contents.read(f"{self.key} {group}")
-            found |= dict(_unpack(kept)) if kept is not None else {}
-        missing = [step for step in steps if step not in found]
-        return found | self._fetch(missing, places)
-
-    def _fetch(self, steps: Sequence[int], places: Int64[np.ndarray, "steps 2"]) -> dict[int, bytes]:
-        """Fetch single images, adjacent ones by one read."""
+            cached = self._contents.read(f"{key} {group}")
+            found |= dict(_unpack(cached)) if cached is not None else {}
         runs: list[list[int]] = []
-        for step in steps:
+        for step in sorted(set(steps) - found.keys()):
             if runs and int(places[step, 0]) - int(places[runs[-1][-1]].sum()) <= _GAP_BYTES:
                 runs[-1].append(step)
             else:
                 runs.append([step])
         wanted = [(int(places[run[0], 0]), int(places[run[-1]].sum() - places[run[0], 0])) for run in runs]
-        found: dict[int, bytes] = {}
-        for run, (start, _), piece in zip(runs, wanted, read_in_parallel(self.shard.path, wanted), strict=True):
+        for run, (start, _), piece in zip(runs, wanted, read_in_parallel(self._shard.path, wanted), strict=True):
             for step in run:
                 offset, length = (int(value) for value in places[step])
                 found[step] = piece[offset - start : offset - start + length]
         return found
 
-    def _first_time(self, steps: Sequence[int]) -> dict[int, bytes]:
-        """Fetch all of the camera's images, and cache their positions and the needed ones."""
-        [data] = read_in_parallel(self.shard.path, [self.feature])
-        start = self.feature.offset
-
-        def read(offset: int, length: int) -> bytes:
-            return data[offset - start : offset - start + length]
-
-        try:
-            offsets, lengths = locate_items(read, self.feature)
-        except NotAnExampleError as error:
-            raise InputError(where=self.where, found=str(error), needed="a list of images") from None
-        if len(offsets) != self.num_steps:
-            raise wrong_count(len(offsets), self.num_steps, self.where)
-        images = [read(offset, length) for offset, length in zip(offsets, lengths, strict=True)]
-        self.cache.places.write(self.key, np.array([offsets, lengths], np.int64).T.tobytes())
+    def _fetch_all(
+        self, key: str, feature: Located, needed: StepRanges | None, num_steps: int, where: str
+    ) -> dict[int, bytes]:
+        """Fetch all of a camera's images, and cache their positions and the needed ones."""
+        read = _fetched(self._shard, *feature)
+        offsets, lengths = items_of(read, feature, where)
+        if len(offsets) != num_steps:
+            raise wrong_count(len(offsets), num_steps, where)
+        images = {step: read(*place) for step, place in enumerate(zip(offsets, lengths, strict=True))}
+        self._places.write(key, np.array([offsets, lengths], np.int64).T.tobytes())
         groups: dict[int, list[tuple[int, bytes]]] = {}
-        for step in (step for first, end in self.needed for step in range(first, end)):
-            if looks_like_jpeg(images[step]):  # anything else may be a network error
-                groups.setdefault(step // _GROUP_STEPS, []).append((step, images[step]))
+        for first, end in needed or [(0, num_steps)]:
+            for step in range(max(0, first), min(end, num_steps)):
+                if looks_like_jpeg(images[step]):  # anything else may be a network error
+                    groups.setdefault(step // _GROUP_STEPS, []).append((step, images[step]))
         for group, members in groups.items():
-            self.cache.contents.write(f"{self.key} {group}", _pack(members))
-        return {step: images[step] for step in steps}
+            self._contents.write(f"{key} {group}", _pack(members))
+        return images
 
 
 def whole_record(shard: Shard, span: RecordSpan) -> Read:
@@ -209,11 +177,15 @@ def whole_record(shard: Shard, span: RecordSpan) -> Read:
     Raises:
         InputError: It cannot be read.
     """
-    start = span.data_offset
     try:
-        [data] = read_in_parallel(shard.path, [(start, span.end - start)])
+        return _fetched(shard, span.data_offset, span.end - span.data_offset)
     except OSError as error:
-        raise unreadable(shard, error) from None
+        raise shard.unreadable(error) from None
+
+
+def _fetched(shard: Shard, start: int, length: int) -> Read:
+    """Fetch a part of a file completely, and return how to read it."""
+    [data] = read_in_parallel(shard.path, [(start, length)])
     return lambda offset, length: data[offset - start : offset - start + length]
 
 

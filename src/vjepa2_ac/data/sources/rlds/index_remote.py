@@ -12,34 +12,19 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 from vjepa2_ac.config import RldsData, RldsFields
 from vjepa2_ac.data.filters.broken_episodes import as_problem
 from vjepa2_ac.data.index.episode_table import EpisodeTable
-from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.data.sources.rlds.example import ExampleRecord, not_an_example
-from vjepa2_ac.data.sources.rlds.features import (
-    STEP_FLAG,
-    commands_of,
-    features_of_steps,
-    identity_of,
-    info_of,
-    num_steps_of,
-    states_of,
-)
-from vjepa2_ac.data.sources.rlds.index_local import Found, ScannedEpisode, in_parallel, place_of, scan_shard, table_of
+from vjepa2_ac.data.sources.rlds.features import STEP_FLAG, check_record, identity_of, info_of, num_steps_of
+from vjepa2_ac.data.sources.rlds.index_local import Found, ScannedEpisode, scan_shard, table_of
 from vjepa2_ac.data.sources.rlds.lookalikes import hashes_of_lookalikes
-from vjepa2_ac.data.sources.rlds.range_reader import RemoteFile
+from vjepa2_ac.data.sources.rlds.shard_reader import RemoteFile, Shard
 from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, RecordSpan, span_at
-from vjepa2_ac.data.sources.rlds.wire_format import (
-    Located,
-    NotAnExampleError,
-    Read,
-    features_behind,
-    iterate_features,
-)
+from vjepa2_ac.data.sources.rlds.wire_format import Located, NotAnExampleError, Read, features_behind, iterate_features
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import zero_steps
@@ -74,7 +59,7 @@ class RecordLayout:
 
 
 def index_remote(
-    shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], *, threads: int, progress: Progress | None
+    shards: Sequence[Shard], config: RldsData, cameras: Sequence[str], *, threads: int, progress: Progress
 ) -> EpisodeTable:
     """Return every episode of shards behind a URL, by identity and number of steps.
 
@@ -90,14 +75,23 @@ def index_remote(
     """
     layout = learn_layout(shards, config, cameras)
 
-    def examine(read: Read, span: RecordSpan) -> Found:
-        return _examine(read, span, config, layout)
+    def examine(read: Read, span: RecordSpan, name: str) -> Found:
+        try:
+            found, steps = _search(read, span, config.fields, layout)
+            record = ExampleRecord(read, span, found)
+            name = identity_of(record, config.fields)
+            steps = num_steps_of(record, config) if steps is None else steps
+            if steps == 0:
+                raise zero_steps(f"{span} ({name})")
+        except InputError as error:
+            return as_problem(error, name)
+        return ScannedEpisode(info_of(name, steps), span)
 
     def scan(shard: Shard) -> list[Found]:
         return list(scan_shard(RemoteFile(shard, window=layout.window, buffered=_PIECES), shard, examine))
 
     threads = max(threads, FEWEST_IN_FLIGHT)
-    table = table_of(shards, in_parallel(scan, shards, threads, progress))
+    table = table_of(shards, in_parallel(scan, shards, threads), progress)
     return replace(table, state_hash=hashes_of_lookalikes(table, shards, config, threads=threads))
 
 
@@ -110,35 +104,26 @@ def learn_layout(shards: Sequence[Shard], config: RldsData, cameras: Sequence[st
 
     def first_record(shard: Shard) -> tuple[ExampleRecord, int] | InputError:
         try:
-            return _whole_record(shard, config, cameras)
+            read = RemoteFile(shard, window=_SAMPLE_WINDOW)
+            span = span_at(read(0, HEADER_BYTES), shard.path, 0, 0, shard.size)
+            record = ExampleRecord(read, span)
+            return record, check_record(record, config, cameras, str(span))[0]
         except InputError as error:
             return error
 
     chosen = [shards[number * len(shards) // _SAMPLES] for number in range(_SAMPLES)]
-    with ThreadPoolExecutor(_SAMPLES) as pool:
-        looked = list(pool.map(first_record, dict.fromkeys(chosen)))
+    looked = list(in_parallel(first_record, list(dict.fromkeys(chosen)), _SAMPLES))
     good = [one for one in looked if not isinstance(one, InputError)]
     if not good:
         raise next(one for one in looked if isinstance(one, InputError))
-    fields = config.fields
-    step_bytes = _step_bytes(good, fields)
-    seconds = {
-        window: sum(_cost_s(record, fields, step_bytes.keys(), window) for record, _ in good) for window in _WINDOWS
-    }
-    window = min(seconds, key=seconds.__getitem__)
+    step_bytes = _step_bytes(good, config.fields)
+
+    def cost_s(window: int) -> float:
+        return sum(_cost_s(record, config.fields, step_bytes.keys(), window) for record, _ in good)
+
+    window = min(_WINDOWS, key=cost_s)
     logger.info("the index is made with reads of %d KB", window >> 10)
     return RecordLayout(step_bytes, window)
-
-
-def _whole_record(shard: Shard, config: RldsData, cameras: Sequence[str]) -> tuple[ExampleRecord, int]:
-    read = RemoteFile(shard, window=_SAMPLE_WINDOW)
-    span = span_at(read(0, HEADER_BYTES), shard.path, 0, 0, shard.size)
-    record = ExampleRecord(read, span)
-    record.require([*config.fields.identity, *features_of_steps(config), *cameras])
-    steps = num_steps_of(record, config)
-    states_of(record, config, steps, str(span))
-    commands_of(record, config, steps, str(span))
-    return record, steps
 
 
 def _step_bytes(records: Iterable[tuple[ExampleRecord, int]], fields: RldsFields) -> dict[str, int]:
@@ -182,21 +167,6 @@ def _cost_s(record: ExampleRecord, fields: RldsFields, telling: Iterable[str], w
     read_bytes = window * (1 + reads)
     shared_s = max(1, reads) * _ASSUMED_REQUEST_S + read_bytes / _ASSUMED_BYTES_PER_S
     return max(1, reads) * _ASSUMED_LATENCY_S + FEWEST_IN_FLIGHT * shared_s
-
-
-def _examine(read: Read, span: RecordSpan, config: RldsData, layout: RecordLayout) -> Found:
-    """Read the record's head; if needed its end, with the head of the next; then the features between."""
-    name = place_of(span)
-    try:
-        found, steps = _search(read, span, config.fields, layout)
-        record = ExampleRecord(read, span, found)
-        name = identity_of(record, config.fields)
-        steps = num_steps_of(record, config) if steps is None else steps
-        if steps == 0:
-            raise zero_steps(f"{span} ({name})")
-    except InputError as error:
-        return as_problem(error, name)
-    return ScannedEpisode(info_of(name, steps), span)
 
 
 def _search(

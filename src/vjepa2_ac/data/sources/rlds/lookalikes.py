@@ -9,7 +9,6 @@ copy whose images or texts were encoded again has another length, and is not fou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from jaxtyping import Int64, UInt64
@@ -17,11 +16,11 @@ from jaxtyping import Int64, UInt64
 from vjepa2_ac.config import RldsData
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.state_hash import UNKNOWN, hash_of_states
-from vjepa2_ac.data.sources.rlds.dataset_info import Shard
+from vjepa2_ac.data.sources.listing import in_parallel
 from vjepa2_ac.data.sources.rlds.example import ExampleRecord
 from vjepa2_ac.data.sources.rlds.features import states_of
-from vjepa2_ac.data.sources.rlds.range_reader import RemoteFile
-from vjepa2_ac.data.sources.rlds.tfrecord import RecordSpan
+from vjepa2_ac.data.sources.rlds.index_local import position_of
+from vjepa2_ac.data.sources.rlds.shard_reader import RemoteFile, Shard
 from vjepa2_ac.errors import InputError
 
 _WINDOW = 1 << 16
@@ -38,9 +37,7 @@ def hashes_of_lookalikes(
     """
 
     def look(index: int) -> int:
-        at = {name: int(column[index]) for name, column in table.locators.items()}
-        shard = shards[at["shard"]]
-        span = RecordSpan(path=shard.path, number=at["record"], offset=at["offset"], length=at["length"])
+        shard, span = position_of(table, shards, index)
         try:
             record = ExampleRecord(RemoteFile(shard, window=_WINDOW), span)
             return hash_of_states(states_of(record, config, int(table.num_steps[index]), str(span)))
@@ -49,9 +46,7 @@ def hashes_of_lookalikes(
 
     found = np.full(len(table), UNKNOWN, np.uint64)
     chosen = lookalikes(table, tolerance=_LENGTH_BYTES * max(1, len(config.fields.identity)))
-    with ThreadPoolExecutor(threads) as pool:
-        for index, value in zip(chosen.tolist(), pool.map(look, chosen.tolist()), strict=True):
-            found[index] = value
+    found[chosen] = np.fromiter(in_parallel(look, chosen.tolist(), threads), np.uint64)
     return found
 
 

@@ -35,17 +35,10 @@ class Located(NamedTuple):
     length: int
 
 
-def locate_features(read: Read, start: int, length: int) -> dict[str, Located]:
-    """Return the position of each feature's serialised tf.train.Feature. No CRC is checked.
-
-    Raises:
-        NotAnExampleError: The bytes are not an Example.
-    """
-    return dict(iterate_features(read, start, length))
-
-
 def iterate_features(read: Read, start: int, length: int) -> Iterator[tuple[str, Located]]:
     """Yield the name and position of each feature in file order, reading only as far as the caller iterates.
+
+    A position is that of the serialised tf.train.Feature. No CRC is checked.
 
     Raises:
         NotAnExampleError: The bytes are not an Example.

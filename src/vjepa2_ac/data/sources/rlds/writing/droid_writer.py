@@ -20,9 +20,6 @@ from vjepa2_ac import storage
 from vjepa2_ac.data.sources.rlds.tfrecord import Kind, encode_example, write_record
 from vjepa2_ac.data.sources.rlds.writing.droid_schema import dataset_info, droid_features
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.media.jpeg import encode_jpeg
-
-__all__ = ["CAMERAS", "DroidCommands", "DroidEpisode", "DroidMeasurements", "encode_jpeg", "write_droid_rlds"]
 
 CAMERAS = ("exterior_image_1_left", "exterior_image_2_left", "wrist_image_left")
 
@@ -92,9 +89,8 @@ def write_droid_rlds(
     with storage.folder_writer(folder, _INFO) as partial:
         counts, num_bytes, sizes = _write_shards(partial, episodes, shards, name)
         if min(counts) == 0:
-            raise InputError(
-                where=str(folder), found=f"{sum(counts)} episodes", needed=f"at least one for each of {shards} shards"
-            )
+            found, needed = f"{sum(counts)} episodes", f"at least one for each of {shards} shards"
+            raise InputError(where=str(folder), found=found, needed=needed)
         _write_json(partial / "features.json", droid_features(sizes), indent=4)
         _write_json(partial / _INFO, dataset_info(name, version, counts, num_bytes), indent=2)
     return folder
@@ -133,32 +129,26 @@ def _check(episode: DroidEpisode, sizes: dict[str, tuple[int, int]]) -> None:
         height, width, _, _ = simplejpeg.decode_jpeg_header(images[0])
         expected = sizes.setdefault(camera, (height, width))
         if len(images) != steps or expected != (height, width):
-            raise ValueError(
-                f"{episode.file_path}: {camera} has {len(images)} images of {height}x{width};"
-                f" needed: {steps} of {'x'.join(map(str, expected))}"
-            )
+            found, needed = f"{len(images)} images of {height}x{width}", f"{steps} of {expected[0]}x{expected[1]}"
+            raise ValueError(f"{episode.file_path}: {camera} has {found}; needed: {needed}")
 
 
 def _features_of(episode: DroidEpisode) -> dict[str, tuple[Kind, Sequence[Any] | np.ndarray]]:
     steps = episode.num_steps
     first, last = np.eye(1, steps, 0, dtype=int)[0], np.eye(1, steps, steps - 1, dtype=int)[0]
-    success = "/success/" in episode.file_path
-
-    def text(value: str) -> tuple[Kind, list[bytes]]:
-        return "bytes_list", [value.encode()]
-
     features: dict[str, tuple[Kind, Sequence[Any] | np.ndarray]] = {
-        "episode_metadata/file_path": text(episode.file_path),
-        "episode_metadata/recording_folderpath": text(episode.recording_folderpath),
+        "episode_metadata/file_path": ("bytes_list", [episode.file_path.encode()]),
+        "episode_metadata/recording_folderpath": ("bytes_list", [episode.recording_folderpath.encode()]),
         "steps/action": ("float_list", episode.action.ravel()),
         "steps/discount": ("float_list", np.ones(steps)),
-        "steps/reward": ("float_list", last * float(success)),
+        "steps/reward": ("float_list", last * float("/success/" in episode.file_path)),
         "steps/is_first": ("int64_list", first),
         "steps/is_last": ("int64_list", last),
         "steps/is_terminal": ("int64_list", last),
+        "steps/language_instruction": ("bytes_list", [episode.language_instruction.encode()] * steps),
+        "steps/language_instruction_2": ("bytes_list", [b""] * steps),
+        "steps/language_instruction_3": ("bytes_list", [b""] * steps),
     }
-    for suffix, value in (("", episode.language_instruction), ("_2", ""), ("_3", "")):
-        features[f"steps/language_instruction{suffix}"] = ("bytes_list", [value.encode()] * steps)
     for prefix, group in (("action_dict", episode.action_dict), ("observation", episode.observation)):
         for item in fields(group):
             features[f"steps/{prefix}/{item.name}"] = ("float_list", getattr(group, item.name).ravel())

@@ -9,8 +9,8 @@ from fsspec import AbstractFileSystem, register_implementation
 from gcs import Failure, Gcs
 from vjepa2_ac import storage
 from vjepa2_ac.errors import RefusedError, UnreachableError
-from vjepa2_ac.storage import remote
-from vjepa2_ac.storage.remote import filesystems, retries, uploads
+from vjepa2_ac.storage import transfer
+from vjepa2_ac.storage.remote import filesystems, retries
 
 SMALL, LARGE = 3000, 6 << 20  # gcsfs sends more than 5 MB in pieces
 PLACE = "gs://bucket/run/file"
@@ -89,7 +89,7 @@ def test_an_upload_that_stalls_is_cut_off_and_begun_again(
 
 def test_a_large_file_has_longer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     allowed = []
-    monkeypatch.setattr(uploads, "send", lambda source, url, timeout_s: allowed.append((source, url, timeout_s)))
+    monkeypatch.setattr(transfer, "send", lambda source, url, timeout_s: allowed.append((source, url, timeout_s)))
     storage.upload(source_of(tmp_path, LARGE), PLACE)
     assert allowed == [(tmp_path / "source", PLACE, retries.DEFAULT.timeout_s + 6)]
 
@@ -196,7 +196,7 @@ def test_failures_are_said_below_warnings_where_that_is_asked_for(
 ) -> None:
     monkeypatch.setattr(retries, "_last_warning_s", [-1e9])
     bucket.fail_next(503, times=4)
-    with remote.quietly():
+    with retries.quietly():
         assert storage.file_sizes("gs://bucket/run") == {}
     assert not caplog.records
     bucket.fail_next(503, times=4)

@@ -1,0 +1,41 @@
+"""TFRecord files read completely: the positions of all records, and all features of one."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from vjepa2_ac.data.sources.rlds.dataset_info import find_shards
+from vjepa2_ac.data.sources.rlds.tfrecord import HEADER_BYTES, Kind, RecordSpan, decode_feature, require_intact, span_at
+from vjepa2_ac.data.sources.rlds.wire_format import iterate_features
+
+
+def index_records(path: str | Path) -> list[RecordSpan]:
+    """Return the positions of a file's records."""
+    data = Path(path).read_bytes()
+    spans: list[RecordSpan] = []
+    offset = 0
+    while offset < len(data):
+        header = data[offset : offset + HEADER_BYTES]
+        spans.append(span_at(header, str(path), len(spans), offset, len(data)))
+        offset = spans[-1].end
+    return spans
+
+
+def index_set(folder: str | Path) -> list[RecordSpan]:
+    """Return the positions of a data set's records, shard by shard."""
+    return [span for shard in find_shards(str(folder)) for span in index_records(shard.path)]
+
+
+def read_record(span: RecordSpan) -> bytes:
+    """Return the data of one record, whose CRC is checked."""
+    with Path(span.path).open("rb") as file:
+        file.seek(span.offset)
+        data = file.read(span.end - span.offset)
+    require_intact(lambda offset, length: data[offset - span.offset :][:length], span)
+    return data[HEADER_BYTES:][: span.length]
+
+
+def decode_example(data: bytes) -> dict[str, tuple[Kind | None, Sequence[Any]]]:
+    """Return kind and values of every feature of a serialised tf.train.Example."""
+    located = dict(iterate_features(lambda offset, length: data[offset : offset + length], 0, len(data)))
+    return {name: decode_feature(data[start : start + size], where=name) for name, (start, size) in located.items()}
