@@ -9,7 +9,7 @@ from vjepa2_ac.evaluation.action_score.metrics import AXES, metrics_of, signed_a
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
 from vjepa2_ac.evaluation.intervals import Estimate
-from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscapes, PlanningStudy, Sensitivity
+from vjepa2_ac.evaluation.result import ACTIONS, ActionRanking, Evaluation, Landscapes, PlanningStudy, Sensitivity
 from vjepa2_ac.reports.comparison import Comparison
 
 _MOST_HORIZONS = 8  # rows; of longer clips some are left out, but are in metrics.json
@@ -18,7 +18,7 @@ _TOP = 5
 
 def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
     """Return the tables of `evaluate`: errors over persistence, then the use of the actions."""
-    probed = any(model.sensitivity or model.landscapes for model in evaluation.models.values())
+    probed = any(model.sensitivity or model.ranking or model.landscapes for model in evaluation.models.values())
     study = evaluation.planning
     return (
         _errors(evaluation),
@@ -68,6 +68,10 @@ def _use_of_actions(evaluation: Evaluation) -> Table:
     sensitivities = [model.sensitivity for model in evaluation.models.values()]
     if all(sensitivities):
         _sensitivity_rows(table, [one for one in sensitivities if one is not None])
+    rankings = [model.ranking for model in evaluation.models.values()]
+    if all(rankings):
+        table.add_section()
+        _ranking_rows(table, [one for one in rankings if one is not None])
     landscapes = [model.landscapes for model in evaluation.models.values()]
     if all(landscapes):
         table.add_section()
@@ -85,6 +89,13 @@ def _sensitivity_rows(table: Table, models: list[Sensitivity]) -> None:
             shares = [str(one.rankings[number].top[_TOP]) for one in models]
             label = f"true action in the best {_TOP} of {ranking.samples + 1}"
             table.add_row(label, f"{ranking.chance_of_top(_TOP):.3f}", *shares)
+
+
+def _ranking_rows(table: Table, models: list[ActionRanking]) -> None:
+    table.add_row("moves as large as plans: rank of the true action", "0.500", *(str(one.rank) for one in models))
+    table.add_row("  among actions in a box", "0.500", *(str(one.box) for one in models))
+    table.add_row("  among other directions", "0.500", *(str(one.shell) for one in models))
+    table.add_row("  spread of the energy / energy now", "0.000", *(str(one.spread) for one in models))
 
 
 def _landscape_rows(table: Table, models: list[Landscapes]) -> None:

@@ -8,12 +8,14 @@ import numpy as np
 
 from vjepa2_ac.evaluation.action_score.metrics import differences_of, metrics_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
+from vjepa2_ac.evaluation.action_use.ranking import rank_difference
 from vjepa2_ac.evaluation.estimates import gain_over, gap_of_actions, one_step_over_persistence, over_persistence
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import Evaluation, Ranking
 
 _SIDES = {1: "better", 0: "no clear difference", -1: "NOT better"}  # of an error over persistence
+_PLANS = {-1: "better to plan with", 0: "no clear difference", 1: "WORSE to plan with"}  # of a difference of ranks
 _NEARER = {-1: "nearer than", 0: "no clear difference to", 1: "FARTHER than"}  # of a difference
 
 
@@ -22,7 +24,8 @@ def verdict(evaluation: Evaluation) -> str:
     error = over_persistence(evaluation.errors, "rollout")[-1]
     ahead = f"{evaluation.seconds_ahead:.1f} s ahead"
     absolute = f"Its error {ahead} is {_over_nothing(error, L1)}."
-    parts = [f"{_compared(evaluation, ahead)}.", absolute, *_disagreements(evaluation), _actions(evaluation)]
+    parts = [f"{_compared(evaluation, ahead)}.", absolute, *_disagreements(evaluation)]
+    parts += [_ranking(evaluation), _actions(evaluation)]
     return " ".join(part for part in (*parts, _planned(evaluation), *evaluation.notes) if part)
 
 
@@ -99,6 +102,23 @@ def _disagreement(evaluation: Evaluation, metric: Metric) -> list[str]:
 
 def _over_nothing(error: Estimate, metric: Metric) -> str:
     return f"{error.value:.2f} of doing nothing ({interval(error, '.2f')}): {_SIDES[metric.side(error)]}"
+
+
+def _ranking(evaluation: Evaluation) -> str:
+    """Return what the ranking of actions says about planning, and where it disagrees with the error."""
+    found = evaluation.models[evaluation.trained].ranking
+    base = None if evaluation.base is None else evaluation.models[evaluation.base].ranking
+    if found is None:
+        return ""
+    words = f"For moves as large as plans the true action's mean rank is {found.rank.value:.3f}"
+    words += f" ({interval(found.rank, '.3f')}; 0 is best, chance 0.5)"
+    if base is None:
+        return f"{words}."
+    beside, gain = rank_difference(found, base), improvement(evaluation, evaluation.horizon)
+    words += f", that of the base {base.rank.value:.3f}: {_PLANS[beside.side(of=0.0)]}"
+    if beside.side(of=0.0) == 1 and gain is not None and gain.side(of=0.0) == 1:
+        return f"It predicts better, but PLANS WORSE than the base. {words}."
+    return f"{words}."
 
 
 def _actions(evaluation: Evaluation) -> str:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.action_use.ranking import rank_difference
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
     gain_over,
@@ -31,6 +32,7 @@ from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
     MODES,
+    ActionRanking,
     Clips,
     Evaluation,
     Landscapes,
@@ -137,6 +139,7 @@ def _model(evaluation: Evaluation, model: ModelResult) -> dict[str, Any]:
         "gap_of_zero_actions": gap_of_actions(model.errors, "zero"),
         "gap_of_shuffled_actions": gap_of_actions(model.errors, "shuffled"),
         "sensitivity": None if model.sensitivity is None else _sensitivity(model.sensitivity),
+        "ranking": None if model.ranking is None else _ranking(evaluation, model.ranking),
         "landscapes": None if model.landscapes is None else _landscapes(model.landscapes),
         "planning": plans_as_dict(evaluation, model.name),
     }
@@ -191,6 +194,14 @@ def _sensitivity(sensitivity: Sensitivity) -> dict[str, Any]:
             for ranking in sensitivity.rankings
         ],
     }
+
+
+def _ranking(evaluation: Evaluation, ranking: ActionRanking) -> dict[str, Any]:
+    base = None if evaluation.base is None else evaluation.models[evaluation.base].ranking
+    compared = {} if base is None or base is ranking else {"difference_to_base": rank_difference(ranking, base)}
+    names = ("samples", "reach", "rank", "box", "shell", "spread")
+    moves = {"moves": len(ranking.ranks), "chance_rank": 0.5, "rank_by_move": ranking.ranks}
+    return {name: getattr(ranking, name) for name in names} | compared | moves
 
 
 def _landscapes(landscapes: Landscapes) -> dict[str, Any]:

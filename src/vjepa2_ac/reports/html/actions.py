@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup
 
+from vjepa2_ac.evaluation.action_use.ranking import rank_difference
 from vjepa2_ac.evaluation.estimates import cost_of_actions, one_step_over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscape, Landscapes, Ranking
 from vjepa2_ac.reports.html.charts import Line, line_chart, nice_axis
@@ -34,7 +35,12 @@ def actions_section(evaluation: Evaluation) -> Markup:
         if rankings:
             drawings.append((f"{rankings[0][1].samples} {rankings[0][1].words}", _rank_chart(rankings)))
     return render(
-        "actions", evaluation=evaluation, costs=_costs(evaluation), ranks=_ranks(evaluation), drawings=drawings
+        "actions",
+        evaluation=evaluation,
+        costs=_costs(evaluation),
+        ranks=_ranks(evaluation),
+        drawings=drawings,
+        moves=_moves(evaluation),
     )
 
 
@@ -82,6 +88,22 @@ def _ranks(evaluation: Evaluation) -> Table | None:
     ]
     head = ["model", "change of the prediction", "among", "mean rank of the true action"]
     return [*head, *(f"true action among the best {k}" for k in tops)], rows
+
+
+def _moves(evaluation: Evaluation) -> Table | None:
+    measured = {name: model.ranking for name, model in evaluation.models.items() if model.ranking is not None}
+    if not measured:
+        return None
+    base = measured.get(evaluation.base or "")
+    rows = [
+        [
+            *(name, value(one.rank), value(one.box), value(one.shell), value(one.spread)),
+            NOT_MEASURED if base is None or one is base else value(rank_difference(one, base), with_sign=True),
+        ]
+        for name, one in measured.items()
+    ]
+    head = ["model", "mean rank of the true action", "in a box", "among other directions"]
+    return [*head, "spread of the energy", "mean rank minus the base's"], rows
 
 
 def _rank_chart(rankings: Sequence[tuple[Series, Ranking]]) -> Markup:
