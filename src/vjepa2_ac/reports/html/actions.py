@@ -98,7 +98,7 @@ def _moves(evaluation: Evaluation) -> Table | None:
     rows = [
         [
             *(name, value(one.rank), value(one.box), value(one.shell), value(one.spread)),
-            NOT_MEASURED if base is None or one is base else value(rank_difference(one, base), with_sign=True),
+            NOT_MEASURED if base is None or one is base else signed_value(rank_difference(one, base)),
         ]
         for name, one in measured.items()
     ]
