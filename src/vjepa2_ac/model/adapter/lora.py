@@ -35,6 +35,7 @@ from vjepa2_ac.model.adapter.initialization import (
 from vjepa2_ac.model.adapter.lora_linear import LoraLinear
 from vjepa2_ac.model.adapter.targets import lora_arguments, peft_arguments
 from vjepa2_ac.model.network.input_heads import fit_heads, require_trained
+from vjepa2_ac.model.network.predictor_network import PredictorNetwork
 from vjepa2_ac.model.network.world_model import Adaptation, WorldModel, base_weights
 from vjepa2_ac.model.quiet_imports import quiet_imports
 
@@ -99,7 +100,7 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Pa
         _train_everything(model)
         return
     require_trained(_names_of_fresh_heads(model), config)
-    _wrap(model, LoraConfig(**lora_arguments(model.predictor, config, unused=_unused(model))))
+    _wrap(model, LoraConfig(**lora_arguments(model.base_predictor, config)))
     layers = lora_layers(model)
     if config.init == "pissa":
         parts = principal_parts(layers) if started is None else _read_principal_parts(model, started)
@@ -109,18 +110,17 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Pa
     measure_magnitudes(layers)
 
 
-def with_adapter(predictor: nn.Module, config: AdapterConfig, unused: tuple[str, ...] = ()) -> nn.Module:
+def with_adapter(predictor: PredictorNetwork, config: AdapterConfig) -> nn.Module:
     """Return a predictor with a LoRA adapter, as `add_adapter` makes it, but without initial values.
 
     Args:
         predictor: The predictor, not adapted.
         config: What is trained.
-        unused: Layers without input.
 
     Raises:
         InputError: A knob does not fit the predictor.
     """
-    return _with_peft(predictor, LoraConfig(**lora_arguments(predictor, config, unused)))
+    return _with_peft(predictor, LoraConfig(**lora_arguments(predictor, config)))
 
 
 def trainable_report(model: WorldModel) -> TrainableReport:
@@ -239,10 +239,6 @@ def _is_trained(name: str) -> bool:
     return ".lora_" in name or ".modules_to_save." in name
 
 
-def _unused(model: WorldModel) -> tuple[str, ...]:
-    return () if model.sizes.predictor.use_extrinsics else ("extrinsics_encoder",)
-
-
 def _start_from_principal_parts(model: WorldModel, parts: dict[str, Tensor]) -> None:
     adaptation, layers = adaptation_of(model), lora_layers(model)
     start = adaptation.start or original_weights(layers)
@@ -273,7 +269,7 @@ def _lora_config(model: WorldModel) -> Any:
 def _set_trainable(model: WorldModel, trainable: bool) -> None:
     lora = isinstance(model.predictor, PeftModel)
     for name, value in model.predictor.named_parameters():
-        chosen = _is_trained(name) if lora else name.split(".", 1)[0] not in _unused(model)
+        chosen = _is_trained(name) if lora else name.split(".", 1)[0] not in model.base_predictor.unused_layers
         value.requires_grad_(trainable and chosen)
 
 
@@ -296,7 +292,7 @@ def _read_lora_config(folder: Path, model: WorldModel) -> Any:
     if model.adaptation is not None:
         return LoraConfig(**peft_arguments(knobs, knobs.targets))
     try:
-        return LoraConfig(**lora_arguments(model.predictor, knobs, unused=_unused(model)))
+        return LoraConfig(**lora_arguments(model.base_predictor, knobs))
     except InputError as error:
         raise InputError(
             where=f"{folder / ADAPTER_FILE}: {error.where}", found=error.found, needed=error.needed, fix=error.fix

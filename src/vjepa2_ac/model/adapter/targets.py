@@ -10,19 +10,19 @@ from torch import nn
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.predictor_network import PredictorNetwork
 from vjepa2_ac.storage.structured import require_quick
 
 ATTENTION = ("q", "k", "v", "o")
 MLP = ("fc1", "fc2")
 
 
-def lora_arguments(predictor: nn.Module, config: AdapterConfig, unused: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return the arguments of PEFT's LoraConfig.
+def lora_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, Any]:
+    """Return the arguments of PEFT's LoraConfig; layers without input cannot have an adapter.
 
     Args:
         predictor: The predictor, not adapted.
         config: The knobs.
-        unused: Layers without input, by the last part of their name: they cannot have an adapter.
 
     Raises:
         InputError: A target or pattern matches no layer, a layer is named twice, or a rank is too large for a layer.
@@ -30,7 +30,7 @@ def lora_arguments(predictor: nn.Module, config: AdapterConfig, unused: tuple[st
     layers = {
         name: layer
         for name, layer in predictor.named_modules()
-        if isinstance(layer, nn.Linear) and _last(name) not in unused
+        if isinstance(layer, nn.Linear) and name not in predictor.unused_layers
     }
     targets = chosen_targets(config, {_last(name) for name in layers})
     adapted = {name: layer for name, layer in layers.items() if _last(name) in targets}
@@ -82,6 +82,17 @@ def chosen_targets(config: AdapterConfig, linear: set[str]) -> tuple[str, ...]:
             needed="each layer once: trained whole, or with an adapter",
         )
     return targets
+
+
+def adapter_ranks(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, int]:
+    """Return the rank of each layer that gets an adapter, by name.
+
+    Raises:
+        InputError: As of `lora_arguments`.
+    """
+    targets = lora_arguments(predictor, config)["target_modules"]
+    linear = [name for name, layer in predictor.named_modules() if isinstance(layer, nn.Linear)]
+    return {name: rank_of(config, name) for name in linear if _last(name) in targets}
 
 
 def rank_of(config: AdapterConfig, layer: str) -> int:

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.encoding.disk_space import FRAMES_AT_ONCE
-from vjepa2_ac.training.cost.fake_step import Kind, StepBytes, measure_step
-from vjepa2_ac.training.cost.parameters import Parameters, count_parameters, trained_tensors
+from vjepa2_ac.training.cost.fake_model import Kind
+from vjepa2_ac.training.cost.fake_step import StepBytes, measure_step
+from vjepa2_ac.training.cost.parameters import Parameters, count_parameters
 
 GIGABYTE = 10**9
 ALLOWANCE = 3 * GIGABYTE // 2  # CUDA context 0.5, cuBLAS workspaces, fragmentation: not computed but assumed
@@ -80,7 +81,7 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
         predictor_weights=parameters.predictor * number if config.adapter.kind == "lora" else 0,
         trained=parameters.trained * FLOAT32,
         gradients=parameters.trained * FLOAT32,
-        moments=sum(_moments(config, elements) for elements in trained_tensors(config, sizes)),
+        moments=sum(_moments(config, elements) for elements in parameters.trained_tensors),
         arriving=_arriving(config, sizes),
         latents=_latents(config, sizes, config.training.batch_size),
         encoding=_encoding(config, sizes, config.training.batch_size),
