@@ -154,7 +154,7 @@ def _steer(options: argparse.Namespace) -> int:
     named_domain(options.domain)
     require_to_plan(options)
 
-    from vjepa2_ac.console.closed_loop import contest_notes, contest_table
+    from vjepa2_ac.console.closed_loop import benchmark_notes, benchmark_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.planning.session import load_to_plan
     from vjepa2_ac.runs.own_files import refuse_links_out
@@ -162,7 +162,7 @@ def _steer(options: argparse.Namespace) -> int:
     from vjepa2_ac.simulation.world.scene import load_mujoco
 
     load_mujoco()
-    asked = BenchmarkOptions(
+    chosen = BenchmarkOptions(
         task=options.task,
         domain=options.domain,
         episodes=options.episodes,
@@ -174,18 +174,18 @@ def _steer(options: argparse.Namespace) -> int:
     session = load_to_plan(
         options.subject, checkpoint=options.checkpoint, config=options.config, overrides=options.overrides
     )
-    name = f"closed_loop/{asked.task}-{asked.domain}"
+    name = f"closed_loop/{chosen.task}-{chosen.domain}"
     if options.out is None and is_run(options.subject):
         refuse_links_out(Path(options.subject), [name])
     home = Path(options.subject) if is_run(options.subject) else Path()
     folder = options.out or home / name
     with ConsoleReporter() as reporter:
-        contest, files = run_benchmark(session, asked, folder, reporter)
+        benchmark, files = run_benchmark(session, chosen, folder, reporter)
     if session.checkpoint:
         console.print(f"{options.subject}: checkpoint {session.checkpoint}")
-    console.print(contest_table(contest))
-    for note in contest_notes(contest):
+    console.print(benchmark_table(benchmark))
+    for note in benchmark_notes(benchmark):
         console.print(note)
     for path in files:
         console.print(f"  {path}")
-    return int(any(set(result.why_counts) == {"no finite energy"} for result in contest.results))
+    return int(any(set(result.why_counts) == {"no finite energy"} for result in benchmark.results))

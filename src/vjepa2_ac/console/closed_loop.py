@@ -13,26 +13,27 @@ from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M
 _USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that are not mentioned
 
 
-def contest_table(contest: ClosedLoopBenchmark) -> Table:
+def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
     """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
-    asked, threshold = contest.asked, f"{100 * SUCCESS_M[contest.asked.task]:g} cm"
+    options = benchmark.options
+    threshold = f"{100 * SUCCESS_M[options.task]:g} cm"
     table = MetricsTable(
-        f"{asked.task} in domain {asked.domain}: {asked.episodes} problems of seed {asked.seed},"
-        f" {contest.results[0].steps} steps of {contest.seconds_per_step:.2f} s (95 % interval over episodes)",
+        f"{options.task} in domain {options.domain}: {options.episodes} problems of seed {options.seed},"
+        f" {benchmark.results[0].steps} steps of {benchmark.seconds_per_step:.2f} s (95 % interval over episodes)",
     )
     table.add_column("")
     columns = (f"within {threshold} at the end", "once on the way", "left at the end, cm", "steps", "s per decision")
     for column in columns:
         table.add_column(column, justify="right")
-    for result in contest.results:
+    for result in benchmark.results:
         table.add_row(result.policy, *_cells(result))
     return table
 
 
-def contest_notes(contest: ClosedLoopBenchmark) -> tuple[str, ...]:
+def benchmark_notes(benchmark: ClosedLoopBenchmark) -> tuple[str, ...]:
     """Return notes on unusual decisions and commands: a line each, none if all was as usual."""
     notes = []
-    for result in contest.results:
+    for result in benchmark.results:
         unusual = {why: number for why, number in result.why_counts.items() if why not in _USUAL}
         if unusual:
             counts = ", ".join(f"{why} {number}" for why, number in unusual.items())

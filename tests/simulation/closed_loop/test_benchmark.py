@@ -15,7 +15,7 @@ pytest.importorskip("av", reason="the extra `video` is not installed")
 
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
-from vjepa2_ac.console.closed_loop import contest_notes
+from vjepa2_ac.console.closed_loop import benchmark_notes
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import count_frames
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -118,9 +118,9 @@ def test_a_broken_model_does_nothing_says_so_and_ends_with_status_1(
 
 def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path: Path) -> None:
     asked = BenchmarkOptions(episodes=2, steps=1, films=1)
-    contest, files = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
+    benchmark, files = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
     assert [file.name for file in files] == [FILE, FILM]
-    steered = contest.results[0]
+    steered = benchmark.results[0]
     frames = list(film_frames([steered]))
     episode = steered.episodes[0]
     for frame, image in ((frames[0], episode.frames[0]), (frames[-1], episode.frames[1])):
@@ -131,8 +131,8 @@ def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path:
 
 def test_what_was_unusual_is_noted(model: str, tmp_path: Path) -> None:
     steering = load_to_plan(model, overrides=[*SMALL, "planning.budget_s=0.000001"])
-    contest, _ = run_benchmark(steering, BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path)
-    assert contest_notes(contest) == ("tiny: of 2 decisions out of time 2",)
+    benchmark, _ = run_benchmark(steering, BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path)
+    assert benchmark_notes(benchmark) == ("tiny: of 2 decisions out of time 2",)
 
 
 @pytest.mark.parametrize(
@@ -180,8 +180,8 @@ def test_a_model_of_states_in_the_cameras_frame_is_refused(model: str, tmp_path:
 
 def test_a_task_with_a_block_has_its_own_number_of_steps(model: str, tmp_path: Path) -> None:
     asked = BenchmarkOptions(task="pick", episodes=1, films=0)
-    contest, _ = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
-    assert metrics(tmp_path)["about"]["steps"] == contest.results[0].steps == 12
+    benchmark, _ = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
+    assert metrics(tmp_path)["about"]["steps"] == benchmark.results[0].steps == 12
     assert metrics(tmp_path)["policies"]["oracle"]["success"]["value"] == 1.0
 
 

@@ -6,8 +6,10 @@ as the command for `stride` control steps. Success is judged by the state at the
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -157,24 +159,14 @@ def _send_joints(arm: SimulatedArm, action: Float[np.ndarray, " 8"], stride: int
 
 def _send(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int) -> bool:
     """Command the state after an action, its closedness within 0 .. 1; return whether it can be reached."""
-    target = _with_real_gripper(apply_action(arm.state, action))
-    try:
+    target = apply_action(arm.state, action)
+    target[6] = np.clip(target[6], 0.0, 1.0)
+    with suppress(OutOfReachError):
         arm.command(target, stride)
-    except OutOfReachError:
-        pass
-    else:
         return True
-    reachable = None
-    for way in ways_along(arm.state, action):
-        if not arm.can_reach(way):
-            break
-        reachable = way
-    if reachable is None:
-        arm.command_joints(arm.joints, target[6], stride)
+    reachable = list(itertools.takewhile(arm.can_reach, ways_along(arm.state, action)))
+    if reachable:
+        arm.command(np.append(reachable[-1][:6], target[6]), stride)
     else:
-        arm.command(np.append(reachable[:6], target[6]), stride)
+        arm.command_joints(arm.joints, target[6], stride)
     return False
-
-
-def _with_real_gripper(state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
-    return np.append(state[:6], np.clip(state[6], 0.0, 1.0))
