@@ -55,14 +55,13 @@ def read_adapter_file(folder: Path, defaults: Mapping[str, Any]) -> AdapterConfi
     try:
         values = read_json_object(path, needed=_NEEDED, fix=_FIX)
     except OSError as error:
-        found = f"cannot be read ({error.strerror or error})"
-        raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX) from None
+        raise _refused(path, f"cannot be read ({error.strerror or error})") from None
     _require_plain_lora(values, defaults, path)
     try:
         config = AdapterConfig.model_validate_json(json.dumps({"kind": "lora", **_as_knobs(values)}))
     except ValidationError as error:
         problems = [f"{_peft_name(detail['loc'])}: {message_of(detail)}" for detail in error.errors()[:4]]
-        raise InputError(where=str(path), found="; ".join(problems), needed=_NEEDED, fix=_FIX) from None
+        raise _refused(path, "; ".join(problems)) from None
     for pattern in (*config.rank_pattern, *config.alpha_pattern):
         require_quick(pattern, where=str(path))
     return config
@@ -72,17 +71,19 @@ def _require_plain_lora(values: Mapping[str, Any], defaults: Mapping[str, Any], 
     """Refuse settings that change an adapter's effect, and for which this program has no knob."""
     for name, needed in _FIXED.items():
         if values.get(name) != needed:
-            found = f"an adapter with {name} {shown(values.get(name))}"
-            raise InputError(where=str(path), found=found, needed=f"{name} {needed}", fix=_FIX)
+            raise _refused(path, f"an adapter with {name} {shown(values.get(name))}", f"{name} {needed}")
     for name in ("r", "lora_alpha", "target_modules"):
         if name not in values:
-            raise InputError(where=str(path), found=f"no {name}", needed=_NEEDED, fix=_FIX)
-    others = {name: value for name, value in values.items() if name not in {*_KNOBS, *_FIXED, *_INFORMATIONAL}}
-    for name, value in others.items():
+            raise _refused(path, f"no {name}")
+    for name, value in values.items():
+        is_known = name in _KNOBS or name in _FIXED or name in _INFORMATIONAL
         is_off = value is None or value is False or value in ([], {})
-        if not is_off and (name not in defaults or value != defaults[name]):
-            found = f"an adapter with {shown(name)} {shown(value)}, which is not read here"
-            raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX)
+        if not is_known and not is_off and (name not in defaults or value != defaults[name]):
+            raise _refused(path, f"an adapter with {shown(name)} {shown(value)}, which is not read here")
+
+
+def _refused(path: Path, found: str, needed: str = _NEEDED) -> InputError:
+    return InputError(where=str(path), found=found, needed=needed, fix=_FIX)
 
 
 def _as_knobs(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,14 +14,16 @@ import torch
 from torch import Tensor, nn
 
 from vjepa2_ac.config import AdapterConfig
+from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE, read_adapter_file
 from vjepa2_ac.model.adapter.adapter_folder import (
     FULL_WEIGHTS,
     LORA_WEIGHTS,
     PRINCIPAL_PARTS,
-    read_fresh_heads,
-    read_kind,
+    Card,
+    Heads,
+    read_card,
     read_weights,
     write_trained,
 )
@@ -42,19 +44,6 @@ from vjepa2_ac.model.quiet_imports import quiet_imports
 with quiet_imports():
     from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
     from peft.tuners.lora import LoraLayer
-
-_COMPARED = (
-    "r",
-    "lora_alpha",
-    "use_rslora",
-    "target_modules",
-    "use_dora",
-    "bias",
-    "modules_to_save",
-    "rank_pattern",
-    "alpha_pattern",
-    "init_lora_weights",
-)
 
 
 class TrainableReport(NamedTuple):
@@ -99,7 +88,8 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Pa
     if config.kind == "none":
         _train_everything(model)
         return
-    require_trained(_names_of_fresh_heads(model), config)
+    if model.fresh_heads is not None:
+        require_trained(tuple(dict.fromkeys(name.split(".")[0] for name in model.fresh_heads.replaced)), config)
     _wrap(model, LoraConfig(**lora_arguments(model.base_predictor, config)))
     layers = lora_layers(model)
     if config.init == "pissa":
@@ -130,11 +120,6 @@ def trainable_report(model: WorldModel) -> TrainableReport:
     return TrainableReport(sum(p.numel() for p in model.parameters() if p.requires_grad), own, own + encoder)
 
 
-def has_adapter(model: WorldModel) -> bool:
-    """Return whether the model differs from its base: `base_only` restores the base temporarily."""
-    return model.adaptation is not None
-
-
 def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tensor] | None = None) -> None:
     """Write the trained weights: an adapter in PEFT's format, or the whole predictor; and the base's identity.
 
@@ -148,10 +133,10 @@ def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tenso
     """
     adaptation, folder = adaptation_of(model), Path(folder)
     if adaptation.kind == "lora":
-        write_trained(folder, adaptation, _lora_weights(model), _card_of_fresh_heads(model))  # and PiSSA's parts
+        write_trained(folder, _card_of(model), _lora_weights(model), adaptation.principal)
         _lora_config(model).save_pretrained(str(folder))
     else:
-        write_trained(folder, adaptation, weights or model.predictor.state_dict(), _card_of_fresh_heads(model))
+        write_trained(folder, _card_of(model), weights or model.predictor.state_dict())
 
 
 def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
@@ -167,11 +152,11 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
             one.
     """
     folder = Path(folder)
-    fresh = model.adaptation is None
-    kind, heads = read_kind(folder, model), read_fresh_heads(folder)
+    fresh, card = model.adaptation is None, read_card(folder, model)
+    heads = card.fresh_heads
     if heads is not None and fresh and model.fresh_heads is None:
-        fit_heads(model, *heads)
-    if kind == "lora":
+        fit_heads(model, Widths(heads.state_dim, heads.action_dim), heads.seed)
+    if card.kind == "lora":
         _load_lora(model, folder)
     else:
         _load_everything(model, folder)
@@ -196,16 +181,11 @@ def adaptation_of(model: WorldModel) -> Adaptation:
     return model.adaptation
 
 
-def _names_of_fresh_heads(model: WorldModel) -> tuple[str, ...]:
-    replaced = () if model.fresh_heads is None else model.fresh_heads.replaced
-    return tuple(dict.fromkeys(name.split(".")[0] for name in replaced))
-
-
-def _card_of_fresh_heads(model: WorldModel) -> dict[str, int] | None:
-    if model.fresh_heads is None:
-        return None
-    sizes = model.sizes.predictor
-    return {"action_dim": sizes.action_dim, "state_dim": sizes.state_dim, "seed": model.fresh_heads.seed}
+def _card_of(model: WorldModel) -> Card:
+    adaptation, sizes, heads = adaptation_of(model), model.sizes.predictor, None
+    if model.fresh_heads is not None:
+        heads = Heads(sizes.action_dim, sizes.state_dim, model.fresh_heads.seed)
+    return Card(adaptation.kind, adaptation.base, adaptation.encoder, heads)
 
 
 def _train_everything(model: WorldModel) -> None:
@@ -308,7 +288,7 @@ def _check_scales(model: WorldModel, *, where: str) -> None:
 
 
 def _check_same_adapter(own: Any, other: Any, *, where: str) -> None:
-    for key in _COMPARED:
+    for key in sorted(peft_arguments(AdapterConfig(), ()).keys() - {"lora_dropout"}):
         found, needed = (
             sorted(value) if isinstance(value, set | list) else value
             for value in (getattr(other, key), getattr(own, key))

@@ -16,10 +16,8 @@ from vjepa2_ac.model.network.world_model import FreshHeads, WorldModel
 
 def heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
     """Return the input heads of a model of these sizes that do not fit states and actions of these widths."""
-    fits = {
-        "action_encoder": sizes.predictor.action_dim == widths.action,
-        "state_encoder": sizes.predictor.state_dim == widths.state,
-    }
+    own = widths_of_model(sizes)
+    fits = {"action_encoder": own.action == widths.action, "state_encoder": own.state == widths.state}
     return tuple(name for name, does in fits.items() if not does)
 
 
@@ -68,8 +66,7 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
         lines.append(f"{_as_text([name])}: {width} numbers instead of the base's {own.in_features}: initialised anew")
     dims = {"action_dim": widths.action, "state_dim": widths.state}
     predictor.config.update(dims)
-    sizes = model.sizes.predictor.model_copy(update=dims)
-    model.sizes = model.sizes.model_copy(update={"predictor": sizes})
+    model.sizes = model.sizes.model_copy(update={"predictor": model.sizes.predictor.model_copy(update=dims)})
     model.fresh_heads = FreshHeads(replaced, seed)
     return lines
 

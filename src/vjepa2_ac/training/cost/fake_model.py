@@ -67,7 +67,7 @@ class FakeModel(LatentDynamics):
     def batch(self, clips: int, frames: int) -> LatentBatch:
         """Return so many clips of latents."""
         sizes = self.sizes
-        latents = torch.empty(clips, frames, (sizes.image_size // sizes.patch_size) ** 2, sizes.encoder.width)
+        latents = torch.empty(clips, frames, sizes.tokens_per_frame, sizes.encoder.width)
         states = torch.empty(clips, frames, sizes.predictor.state_dim)
         actions = torch.empty(clips, frames - 1, sizes.predictor.action_dim)
         extrinsics = torch.empty(clips, frames, 6) if sizes.predictor.use_extrinsics else None

@@ -72,7 +72,7 @@ def plan_flops(sizes: ModelSizes, steps: int, before: int = 0) -> int:
 def frame_flops(sizes: ModelSizes) -> int:
     """Return the operations of encoding one frame."""
     encoder = sizes.encoder
-    tokens, width, hidden = _patches(sizes), encoder.width, int(encoder.width * encoder.mlp_ratio)
+    tokens, width, hidden = sizes.tokens_per_frame, encoder.width, int(encoder.width * encoder.mlp_ratio)
     embedding = 2 * tokens * 3 * sizes.patch_size**2 * width  # the frames of a tubelet are one
     linear = 2 * tokens * (4 * width**2 + 2 * width * hidden)
     return embedding + encoder.depth * (linear + 4 * tokens**2 * width)
@@ -114,12 +114,12 @@ class _Passes:
             keys: For each of them, the number of steps that its tokens attend to.
             fed_back: Whether its latents are predictions, through which gradients flow.
         """
-        patches = steps * _patches(self._sizes)
+        patches = steps * self._sizes.tokens_per_frame
         work = self._linear("predictor_embed", patches, into=fed_back)
         for name in self._conditions:
             work += self._linear(name, steps, into=False)
         flowing = fed_back or any(self._changes(name) for name in ("predictor_embed", *self._conditions))
-        per_step = _patches(self._sizes) + len(self._conditions)
+        per_step = self._sizes.tokens_per_frame + len(self._conditions)
         pairs = per_step**2 * sum(keys)
         for index in range(self._sizes.predictor.depth):
             block, flowing = self._block(f"blocks.{index}", steps * per_step, pairs, flowing=flowing)
@@ -161,7 +161,3 @@ class _Passes:
 
     def _changes(self, name: str) -> bool:
         return name in self._whole or name in self._ranks
-
-
-def _patches(sizes: ModelSizes) -> int:
-    return (sizes.image_size // sizes.patch_size) ** 2
