@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.targets import PEFT_NAMES
 from vjepa2_ac.storage.structured import message_of, read_json_object, require_quick, shown
 
 ADAPTER_FILE = "adapter_config.json"  # PEFT's name
@@ -22,18 +23,6 @@ ADAPTER_FILE = "adapter_config.json"  # PEFT's name
 _NEEDED = "a LoRA adapter of V-JEPA 2-AC's predictor, as this program writes it in PEFT's format"
 _FIX = "Copy the adapter again, or train it again: other kinds of PEFT's are not read"
 
-_KNOBS = {  # PEFT's names, and ours
-    "r": "rank",
-    "lora_alpha": "alpha",
-    "lora_dropout": "dropout",
-    "target_modules": "targets",
-    "modules_to_save": "modules_to_save",
-    "use_rslora": "rslora",
-    "use_dora": "dora",
-    "init_lora_weights": "init",
-    "rank_pattern": "rank_pattern",
-    "alpha_pattern": "alpha_pattern",
-}
 _FIXED = {"peft_type": "LORA", "bias": "none"}
 _INFORMATIONAL = frozenset({  # origin and purpose
     "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_version", "revision",
@@ -76,7 +65,7 @@ def _require_plain_lora(values: Mapping[str, Any], defaults: Mapping[str, Any], 
         if name not in values:
             raise _refused(path, f"no {name}")
     for name, value in values.items():
-        is_known = name in _KNOBS or name in _FIXED or name in _INFORMATIONAL
+        is_known = name in PEFT_NAMES or name in _FIXED or name in _INFORMATIONAL
         is_off = value is None or value is False or value in ([], {})
         if not is_known and not is_off and (name not in defaults or value != defaults[name]):
             raise _refused(path, f"an adapter with {shown(name)} {shown(value)}, which is not read here")
@@ -87,7 +76,7 @@ def _refused(path: Path, found: str, needed: str = _NEEDED) -> InputError:
 
 
 def _as_knobs(values: Mapping[str, Any]) -> dict[str, Any]:
-    knobs = {ours: values[peft] for peft, ours in _KNOBS.items() if peft in values}
+    knobs = {ours: values[peft] for peft, ours in PEFT_NAMES.items() if peft in values}
     if "rslora" not in knobs:
         knobs["rslora"] = False  # PEFT's default
     if knobs.get("init") is True or "init" not in knobs:
@@ -98,5 +87,5 @@ def _as_knobs(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _peft_name(location: tuple[Any, ...]) -> str:
-    first = {ours: peft for peft, ours in _KNOBS.items()}.get(str(location[0]), str(location[0]))
+    first = {ours: peft for peft, ours in PEFT_NAMES.items()}.get(str(location[0]), str(location[0]))
     return ".".join([first, *map(str, location[1:])])

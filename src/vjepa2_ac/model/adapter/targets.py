@@ -16,6 +16,19 @@ from vjepa2_ac.storage.structured import require_quick
 ATTENTION = ("q", "k", "v", "o")
 MLP = ("fc1", "fc2")
 
+PEFT_NAMES = {  # of our knobs
+    "r": "rank",
+    "lora_alpha": "alpha",
+    "lora_dropout": "dropout",
+    "target_modules": "targets",
+    "modules_to_save": "modules_to_save",
+    "use_rslora": "rslora",
+    "use_dora": "dora",
+    "init_lora_weights": "init",
+    "rank_pattern": "rank_pattern",
+    "alpha_pattern": "alpha_pattern",
+}
+
 
 def lora_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, Any]:
     """Return the arguments of PEFT's LoraConfig; layers without input cannot have an adapter.
@@ -44,13 +57,9 @@ def lora_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[s
 def peft_arguments(config: AdapterConfig, targets: Iterable[str]) -> dict[str, Any]:
     """Return the arguments of PEFT's LoraConfig for layers of these names; not checked against a predictor."""
     return {
-        "r": config.rank,
-        "lora_alpha": config.alpha,
-        "use_rslora": config.rslora,
-        "lora_dropout": config.dropout,
+        **{peft: getattr(config, ours) for peft, ours in PEFT_NAMES.items()},
         "target_modules": list(targets),
         "bias": "none",
-        "use_dora": config.dora,
         "init_lora_weights": True if config.init == "default" else config.init,
         "rank_pattern": dict(config.rank_pattern),
         "alpha_pattern": dict(config.alpha_pattern),

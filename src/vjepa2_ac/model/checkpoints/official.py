@@ -112,11 +112,12 @@ def _open(path: Path) -> dict[str, dict[str, Tensor]]:
     if not isinstance(whole, dict):
         raise _refused(path, f"a {type(whole).__name__}")
     encoder = whole.get("encoder", whole.get("target_encoder"))
-    parts = {"encoder": encoder, "predictor": whole.get("predictor")}
+    parts: dict[str, Any] = {"encoder": encoder, "predictor": whole.get("predictor")}
     for part, weights in parts.items():
         if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
             raise _refused(path, f"no weights under {part!r} (keys: {', '.join(map(str, list(whole)[:8]))})")
-    return {part: _without_prefixes(weights) for part, weights in parts.items() if weights is not None}
+    prefixes = re.compile(r"^(?:(?:module|backbone)\.)+")
+    return {part: {prefixes.sub("", name): one for name, one in weights.items()} for part, weights in parts.items()}
 
 
 def _refused(where: str | Path, found: str) -> InputError:
@@ -128,10 +129,6 @@ def _foreign(path: Path, error: Exception) -> str:
         return kind
     size, reason = path.stat().st_size / 1e9, str(error).splitlines()[0][:120]
     return f"{size:.2f} GB that torch cannot read ({reason}): truncated, or of another kind"
-
-
-def _without_prefixes(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {re.sub(r"^(?:(?:module|backbone)\.)+", "", name): value for name, value in weights.items()}
 
 
 def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
@@ -229,8 +226,7 @@ def _to_official(weights: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     for name, value in weights.items():
         fused, third = official_name(name, part)
         pieces.setdefault(fused, {})[third] = value.detach()
-    return {f"module.{name}": _fuse(thirds) for name, thirds in pieces.items()}
-
-
-def _fuse(thirds: Mapping[int | None, Tensor]) -> Tensor:
-    return thirds[None] if None in thirds else torch.cat([thirds[index] for index in range(3)])
+    return {
+        f"module.{name}": thirds[None] if None in thirds else torch.cat([thirds[index] for index in range(3)])
+        for name, thirds in pieces.items()
+    }

@@ -103,7 +103,7 @@ def run_episode(
     actions, seconds, whys, unreachable = [], [], [], 0
     for _ in range(steps):
         began = time.perf_counter()
-        measured = states[-1] if policy.moves == Moves.FLANGE else arm.joint_state
+        measured = states[-1] if policy.moves == Moves.FLANGE else np.append(arm.joints, arm.closedness)
         action = np.asarray(policy.act(frames[-1], measured), dtype=np.float64)
         seconds.append(time.perf_counter() - began)
         actions.append(_checked(action, policy))

@@ -100,7 +100,9 @@ def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskP
     first, last = _states(drawn, domain)
     if drawn.blocks is None:
         return TaskProblem(task, index, first, last)
-    return TaskProblem(task, index, first, last, *_blocks_in_base(drawn.blocks, domain))
+    turns = drawn.blocks[:, 3:] - np.deg2rad(domain.base_yaw_deg)
+    blocks = np.concatenate([drawn.blocks[:, :3] @ domain.base_pose()[:3, :3], turns], axis=1)
+    return TaskProblem(task, index, first, last, *blocks)
 
 
 @dataclass(frozen=True)
@@ -165,11 +167,6 @@ def _states(drawn: _Drawn, domain: Domain) -> Float[np.ndarray, "2 7"]:
     """Return start and goal of the arm in the base frame: pointing down, rotated about z."""
     poses = poses_in_base(downward_poses(_with(drawn.flange, drawn.turn)), domain)
     return np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
-
-
-def _blocks_in_base(blocks: Float[np.ndarray, "blocks 4"], domain: Domain) -> Float[np.ndarray, "blocks 4"]:
-    turns = blocks[:, 3:] - np.deg2rad(domain.base_yaw_deg)
-    return np.concatenate([blocks[:, :3] @ domain.base_pose()[:3, :3], turns], axis=1)
 
 
 def arm_for(

@@ -55,13 +55,16 @@ def play(
     limits = LimitsConfig(xyz=(recipe.reach_m,) * 3)
     oracle = oracle_for(task, limits, arm)
     put(arm, problem.start, problem.block_start)
-    oracle.reset(problem, np.zeros((1, 1, 3), dtype=np.uint8))
+    unseen = np.zeros((1, 1, 3), dtype=np.uint8)
+    oracle.reset(problem, unseen)
     rows: list[tuple[np.ndarray, float, np.ndarray, float]] = []
     joints, grip = arm.joints, float(problem.start[6])
     for step in range(steps):
         if step % recipe.stride == 0:
             if script:
-                action = _with_noise(oracle.act(np.zeros((1, 1, 3), dtype=np.uint8), arm.state), limits, rng)
+                exact = oracle.act(unseen, arm.state)
+                noise = np.append(rng.normal(0.0, _NOISE_M, size=3), np.zeros(4))
+                action = shortened(exact + noise, limits)
             else:
                 action = _play_action(arm, problem, limits, rng)
             joints, grip = _sent(arm, action)
@@ -71,10 +74,6 @@ def play(
         arm.command_joints(joints, grip)
     commanded, commanded_grip, measured, measured_grip = zip(*rows, strict=True)
     return Motion(np.array(commanded), np.array(commanded_grip), np.array(measured), np.array(measured_grip))
-
-
-def _with_noise(action: Float[np.ndarray, " 7"], limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
-    return shortened(action + np.append(rng.normal(0.0, _NOISE_M, size=3), np.zeros(4)), limits)
 
 
 def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:

@@ -59,11 +59,6 @@ class SimulatedArm:
         return np.append(forward_kinematics(self.joints), self.closedness)
 
     @property
-    def joint_state(self) -> Float[np.ndarray, " 8"]:
-        """Measured joint angles in radians, and closedness of the gripper: the state as a vector."""
-        return np.append(self.joints, self.closedness)
-
-    @property
     def closedness(self) -> float:
         """Measured closedness of the gripper: 0 open .. 1 closed."""
         return self._closedness

@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.ray_renderer import Caster, Hits, View, lamp_view, unit
-from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, light_position, load_mujoco
+from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, light_position
 
 FRAME_SIZE = FRAME_HEIGHT, FRAME_WIDTH = 180, 320
 """Size of DROID's images in RLDS."""
@@ -109,16 +109,16 @@ class _Colours:
     """Colours by geom, and by position for those with a pattern, so that images have texture."""
 
     def __init__(self, model: Any) -> None:
-        mujoco = load_mujoco()
         self._colours = model.geom_rgba[:, :3].astype(np.float32)
-        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, index) or "" for index in range(model.ngeom)]
-        self._table = np.array([name == "table" for name in names])
-        self._floor = np.array([name == "floor" for name in names])
-        self._wall = np.array([name.startswith("wall") for name in names])
+        names = [model.geom(index).name for index in range(model.ngeom)]
+        patterns = {"table": _planks, "floor": _tiles, "wall": _panels}
+        self._patterns = [
+            (np.array([name.startswith(start) for name in names]), pattern) for start, pattern in patterns.items()
+        ]
 
     def at(self, geoms: Any, spots: Any) -> Any:
         colour = self._colours[geoms]
-        for chosen, pattern in ((self._table, _planks), (self._floor, _tiles), (self._wall, _panels)):
+        for chosen, pattern in self._patterns:
             index = np.flatnonzero(chosen[geoms])
             if len(index):
                 colour[index] *= pattern(spots[index])[:, None]
