@@ -97,7 +97,7 @@ def run_benchmark(
     )
     path = folder / FILE
     write_atomically(path, json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
-    return benchmark, (path, write_film(folder / FILM, results[:1])) if options.films else (path,)
+    return benchmark, (path, write_film(folder / FILM, results[0])) if options.films else (path,)
 
 
 def _require_steerable(session: PlanningSession) -> int:

@@ -135,12 +135,10 @@ def put(arm: SimulatedArm, state: Float[np.ndarray, " 7"], block: Float[np.ndarr
     return arm
 
 
-def ways_along(
-    state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], parts: int = _PARTS
-) -> Sequence[Float[np.ndarray, " 7"]]:
+def ways_along(state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"]) -> Sequence[Float[np.ndarray, " 7"]]:
     """Return equally spaced states on the straight line of an action, the nearest first."""
-    shares = np.arange(1, parts + 1)[:, None] / parts
-    return list(apply_action(np.tile(state, (parts, 1)), shares * action))
+    shares = np.arange(1, _PARTS + 1)[:, None] / _PARTS
+    return list(apply_action(np.tile(state, (_PARTS, 1)), shares * action))
 
 
 def _checked(action: Float[np.ndarray, " dim"], policy: Policy) -> Float[np.ndarray, " dim"]:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
 from vjepa2_ac.simulation.world.block_arm import ContactArm
-from vjepa2_ac.simulation.world.camera import FRAME_HEIGHT, FRAME_WIDTH
+from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
 from vjepa2_ac.simulation.world.scene import (
@@ -170,17 +170,11 @@ def _states(drawn: _Drawn, domain: Domain) -> Float[np.ndarray, "2 7"]:
 
 
 def arm_for(
-    task: TaskName,
-    domain: Domain,
-    *,
-    renderer: Renderer = "rays",
-    height: int = FRAME_HEIGHT,
-    width: int = FRAME_WIDTH,
+    task: TaskName, domain: Domain, *, renderer: Renderer = "rays", size: tuple[int, int] = FRAME_SIZE
 ) -> SimulatedArm:
     """Return an arm for a task: `reach` needs no contacts.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
     """
-    kind = SimulatedArm if task == "reach" else ContactArm
-    return kind(domain, renderer=renderer, height=height, width=width)
+    return (SimulatedArm if task == "reach" else ContactArm)(domain, renderer=renderer, size=size)

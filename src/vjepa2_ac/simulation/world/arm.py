@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.geometry import euler_from_matrices
-from vjepa2_ac.simulation.world.camera import FRAME_HEIGHT, FRAME_WIDTH, RayCamera
+from vjepa2_ac.simulation.world.camera import FRAME_SIZE, RayCamera
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.kinematics import OutOfReachError, forward_kinematics, inverse_kinematics
 from vjepa2_ac.simulation.world.motion import GRIPPER_LAG_S, rest_joints, tracking_share
@@ -29,20 +29,18 @@ class SimulatedArm:
     Args:
         domain: Its world.
         renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
-        height, width: Size of the images.
+        size: Height and width of the images.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
     """
 
-    def __init__(
-        self, domain: Domain, *, renderer: Renderer = "rays", height: int = FRAME_HEIGHT, width: int = FRAME_WIDTH
-    ) -> None:
+    def __init__(self, domain: Domain, *, renderer: Renderer = "rays", size: tuple[int, int] = FRAME_SIZE) -> None:
         self.domain = domain
         self._mujoco = load_mujoco()
         self._model = self._compiled(domain)
         self._data = self._mujoco.MjData(self._model)
-        self._renderer, self._size = renderer, (height, width)
+        self._renderer, self._size = renderer, size
         self._cameras: dict[str, Any] = {}
         self.set_joints(rest_joints(domain), 0.0)
         if renderer == "opengl":

@@ -30,7 +30,7 @@ class ContactArm(SimulatedArm):
     Args:
         domain: Its world.
         renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
-        height, width: Size of the images.
+        size: Height and width of the images.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
