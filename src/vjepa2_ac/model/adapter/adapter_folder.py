@@ -71,10 +71,9 @@ def read_card(folder: Path, model: WorldModel) -> Card:
     path, needed = folder / CARD, "the card of an adapter, as save_trained writes it"
     try:
         values = read_json_object(path, needed=needed)
-    except FileNotFoundError:
-        raise InputError(where=str(path), found="no such file", needed=needed) from None
     except OSError as error:
-        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=needed) from None
+        found = "no such file" if isinstance(error, FileNotFoundError) else f"cannot be read ({error})"
+        raise InputError(where=str(path), found=found, needed=needed) from None
     card = record_of(Card, values, where=str(path), needed=needed)
     _check_base(model, card, where=str(path))
     if model.adaptation is not None and model.adaptation.kind != card.kind:

@@ -6,6 +6,7 @@ Commands are as in the closed loop: one target state per model step, held for th
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Literal
 
 import numpy as np
@@ -19,8 +20,8 @@ from vjepa2_ac.simulation.closed_loop.policies import shortened
 from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.kinematics import OutOfReachError, inverse_kinematics
-from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, rest_joints
+from vjepa2_ac.simulation.world.kinematics import OutOfReachError
+from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe
 
 _NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's step
 _LOWEST_M, _HIGHEST_M = 0.155, 0.34  # of the flange while playing
@@ -100,12 +101,9 @@ def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, 
 
 def _sent(arm: SimulatedArm, action: Float[np.ndarray, " 7"]) -> tuple[np.ndarray, float]:
     """Return the joints and closedness of a step's command, as far along it as joint angles exist."""
-    rest, joints = rest_joints(arm.domain), arm.joints
-    target = apply_action(arm.state, action)
+    joints, target = arm.joints, apply_action(arm.state, action)
     for way in [target, *reversed(ways_along(arm.state, action)[:-1])]:
-        try:
-            joints = inverse_kinematics(way[:6], arm.joints, rest=rest)
-        except OutOfReachError:
-            continue
-        break
+        with suppress(OutOfReachError):
+            joints = arm.joints_for(way)
+            break
     return joints, float(np.clip(target[6], 0.0, 1.0))
