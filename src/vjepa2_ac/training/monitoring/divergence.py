@@ -98,8 +98,7 @@ class Watch:
         last = step == self._config.training.steps
         yield f"{worse} {beyond} {last}", f"{errors} of persistence's in the validation{copying}"
 
-    def _of_loss(self, step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        del step
+    def _of_loss(self, _step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         loss = _number(metrics.get("loss"))
         if not math.isfinite(loss):  # a step without clips, or one that was refused
             return
