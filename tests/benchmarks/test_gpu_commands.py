@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
 from benches import imported
 from paths import ROOT
-from vjepa2_ac.model.network.attention import ATTENTION_KINDS
+from vjepa2_ac.model.network.attention import AttentionKind
 
 SECTION = (ROOT / "docs/IMPLEMENTATION_NOTES.md").read_text().split("\n## On a GPU\n")[1].split("\n## ")[0]
 (PRELUDE,) = re.findall(r"```bash\n(.*?)```", SECTION, re.DOTALL)
@@ -48,7 +48,7 @@ def test_every_command_of_a_benchmark_can_be_given(command: str, monkeypatch: py
     for module in benchmark(script, monkeypatch):
         options = module.parse(given)
         attention = [*getattr(options, "attention", []), *getattr(options, "ways", [])]
-        assert set(attention) <= set(ATTENTION_KINDS)
+        assert set(attention) <= set(get_args(AttentionKind))
 
 
 def test_every_command_ends_within_nine_minutes_and_so_does_every_block() -> None:

@@ -77,19 +77,19 @@ def plans() -> list[Table]:
     return [plan_table(answer) for answer in answers]
 
 
-def contests() -> list[Table]:
+def benchmarks() -> list[Table]:
     result = Mock(
         spec=ClosedLoopResult,
         policy="the model of runs/of-another-day", steps=20, success_rate=SHARE, success_ever_rate=SHARE,
         final_distance_cm=Estimate(12.3, 10.1, 14.5), steps_needed=SHARE,
         seconds_per_decision=Estimate(16.2, 15.0, 17.0),
     )  # fmt: skip
-    asked = Mock(task="reach", domain="B", episodes=100, seed=5)
-    return [benchmark_table(Mock(spec=ClosedLoopBenchmark, asked=asked, results=(result,), seconds_per_step=0.27))]
+    options = Mock(task="reach", domain="B", episodes=100, seed=5)
+    return [benchmark_table(Mock(spec=ClosedLoopBenchmark, options=options, results=(result,), seconds_per_step=0.27))]
 
 
 @pytest.mark.parametrize("width", [80, 120])
-@pytest.mark.parametrize("made", [calibrations, probes, motions, evaluations, comparisons, plans, contests])
+@pytest.mark.parametrize("made", [calibrations, probes, motions, evaluations, comparisons, plans, benchmarks])
 def test_no_figure_and_no_word_is_cut_off(made: Callable[[], list[Table]], width: int) -> None:
     for table in made():
         console = PlainConsole(width=width)

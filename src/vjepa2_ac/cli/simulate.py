@@ -117,16 +117,16 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     from vjepa2_ac.simulation.world.scene import load_mujoco
 
     load_mujoco()
-    asked = record_of_options(BenchmarkOptions, options)
-    asked = replace(asked, films=min(asked.films, asked.episodes))
+    chosen = record_of_options(BenchmarkOptions, options)
+    chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
     session = load_planning_session(options)
-    name = f"closed_loop/{asked.task}-{asked.domain}"
+    name = f"closed_loop/{chosen.task}-{chosen.domain}"
     if options.out is None and is_run(options.subject):
         refuse_links_out(Path(options.subject), [name])
     home = Path(options.subject) if is_run(options.subject) else Path()
     folder = options.out or home / name
     with ConsoleReporter() as reporter:
-        benchmark, files = run_benchmark(session, asked, folder, reporter)
+        benchmark, files = run_benchmark(session, chosen, folder, reporter)
     if session.checkpoint:
         console.print(f"{options.subject}: checkpoint {session.checkpoint}")
     console.print(benchmark_table(benchmark))

@@ -65,6 +65,11 @@ class ModelSizes(Section):
     predictor: PredictorSizes = PredictorSizes()
     """The predictor."""
 
+    @property
+    def tokens_per_frame(self) -> int:
+        """Patches of one frame."""
+        return (self.image_size // self.patch_size) ** 2
+
     @model_validator(mode="after")
     def _sizes_divide(self) -> ModelSizes:
         if self.image_size % self.patch_size:
@@ -82,7 +87,7 @@ class ModelSizes(Section):
 
     @model_validator(mode="after")
     def _sizes_are_of_this_world(self) -> ModelSizes:
-        tokens = (self.image_size // self.patch_size) ** 2
+        tokens = self.tokens_per_frame
         if tokens > _MOST_TOKENS:
             raise ValueError(
                 f"image_size {self.image_size} and patch_size {self.patch_size} make {tokens:,} tokens a frame, more"

@@ -13,9 +13,10 @@ _USUAL = {"planned", "nothing", "random", "scripted"}  # reasons of actions that
 
 def benchmark_table(benchmark: ClosedLoopBenchmark) -> Table:
     """Return a table with a row for each policy; the intervals are 95 %, over episodes."""
-    asked, threshold = benchmark.asked, f"{100 * SUCCESS_M[benchmark.asked.task]:g} cm"
+    options = benchmark.options
+    threshold = f"{100 * SUCCESS_M[options.task]:g} cm"
     table = MetricsTable(
-        f"{asked.task} in domain {asked.domain}: {asked.episodes} problems of seed {asked.seed},"
+        f"{options.task} in domain {options.domain}: {options.episodes} problems of seed {options.seed},"
         f" {benchmark.results[0].steps} steps of {benchmark.seconds_per_step:.2f} s (95 % interval over episodes)",
         ["", f"within {threshold} at the end", "once on the way", "left at the end, cm", "steps", "s per decision"],
     )

@@ -57,6 +57,7 @@ def model_card(run: TrainedRun, name: str, evaluation: Mapping[str, Any] | None,
         loss=_loss(config),
         adapter_words=_adapter(config),
         curves=[] if evaluation is None else _curves(evaluation),
+        rankings={} if evaluation is None else _rankings(evaluation),
         base_arguments=_base_arguments(config),
         every_setting=config_as_yaml(config.model_copy(update={"run_dir": name})),
     )
@@ -101,6 +102,12 @@ def _eval_results(run: TrainedRun, measured: Mapping[str, Any]) -> list[EvalResu
         for step, ratio in enumerate(ratios, start=1)
         if ratio["value"] is not None
     ]
+
+
+def _rankings(evaluation: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the mean rank of the true action, by model; an earlier version did not measure it."""
+    found = {name: model.get("ranking") for name, model in evaluation["models"].items()}
+    return {name: ranking["rank"] for name, ranking in found.items() if ranking}
 
 
 def _loss(config: Config) -> str:

@@ -50,10 +50,7 @@ def _builtin(name: str) -> Path:
     path = ASSETS / name.removeprefix(BUILTIN)
     if not (path / CONFIG).is_file():
         there = sorted(f"{BUILTIN}{config.parent.name}" for config in ASSETS.glob(f"*/{CONFIG}"))
-        raise InputError(
-            where=f"model.base: {name}",
-            found=f"no model of that name in the package; it has {', '.join(there) or 'none'}",
-            needed=_TINY,
-            fix="" if _TINY in there else f"Install the package again, or make {_TINY} with `make base`",
-        )
+        found = f"no model of that name in the package; it has {', '.join(there) or 'none'}"
+        fix = "" if _TINY in there else f"Install the package again, or make {_TINY} with `make base`"
+        raise InputError(where=f"model.base: {name}", found=found, needed=_TINY, fix=fix)
     return path

@@ -62,12 +62,8 @@ def require_8_bits(kind: Kind, dtype: torch.dtype, device: torch.device, *, wher
         )
     _torchao(kind, where)
     if kind == "fp8" and not _has_fp8(device):
-        raise InputError(
-            where=where,
-            found=f"fp8, on {device.type}",
-            needed="a CUDA device of compute capability 8.9 or more (Ada, Hopper or later)",
-            fix=f"Set {where}=int8 or off",
-        )
+        needed = "a CUDA device of compute capability 8.9 or more (Ada, Hopper or later)"
+        raise InputError(where=where, found=f"fp8, on {device.type}", needed=needed, fix=f"Set {where}=int8 or off")
 
 
 def _torchao(kind: Kind, where: str) -> tuple[Any, Any]:
@@ -80,11 +76,8 @@ def _torchao(kind: Kind, where: str) -> tuple[Any, Any]:
             quantize_,
         )
     except ImportError:
-        raise InputError(
-            where=where,
-            found=f"{kind}, but torchao is not installed",
-            fix=f"Run {pip_install('quantize')}, or set {where}=off",
-        ) from None
+        fix = f"Run {pip_install('quantize')}, or set {where}=off"
+        raise InputError(where=where, found=f"{kind}, but torchao is not installed", fix=fix) from None
     if kind == "int8":
         return quantize_, Int8DynamicActivationInt8WeightConfig()
     return quantize_, Float8DynamicActivationFloat8WeightConfig(granularity=PerRow())
@@ -94,12 +87,8 @@ def _require_everywhere(blocks: nn.Module, kind: Kind, where: str) -> None:
     """Refuse layers that torchao skips silently: fp8 supports multiples of 16 only."""
     for name, layer in blocks.named_modules():
         if isinstance(layer, nn.Linear) and type(layer.weight.data) is torch.Tensor:
-            raise InputError(
-                where=where,
-                found=f"{kind}, and layer {name} from {layer.in_features} to {layer.out_features}",
-                needed="multiples of 16",
-                fix=f"Set {where}=off",
-            )
+            found = f"{kind}, and layer {name} from {layer.in_features} to {layer.out_features}"
+            raise InputError(where=where, found=found, needed="multiples of 16", fix=f"Set {where}=off")
 
 
 def _has_fp8(device: torch.device) -> bool:

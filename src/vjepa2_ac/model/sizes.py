@@ -27,10 +27,10 @@ def read_sizes(folder: Path) -> ModelSizes:
     fix = "Of a run, `vjepa2-ac export RUN FOLDER` makes one"
     try:
         card = read_json_object(folder / CONFIG, needed=needed, fix=fix)
-    except (FileNotFoundError, NotADirectoryError):
-        raise InputError(where=where, found="no such file", needed=needed, fix=fix) from None
     except OSError as error:
-        raise InputError(where=where, found=f"cannot be read ({error})", needed=needed, fix=fix) from None
+        is_missing = isinstance(error, FileNotFoundError | NotADirectoryError)
+        found = "no such file" if is_missing else f"cannot be read ({error})"
+        raise InputError(where=where, found=found, needed=needed, fix=fix) from None
     if card.get("format") != FORMAT:
         raise InputError(where=where, found="not the config of a world model", needed=needed, fix=fix)
     try:

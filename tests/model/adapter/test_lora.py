@@ -15,7 +15,7 @@ from torch.utils.checkpoint import checkpoint
 from model_fixtures import tiny_inputs, tiny_model
 from vjepa2_ac.config import AdapterConfig, ModelSizes
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.model.adapter.lora import add_adapter, has_adapter, load_trained, save_trained, trainable_report
+from vjepa2_ac.model.adapter.lora import add_adapter, load_trained, save_trained, trainable_report
 from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
 from vjepa2_ac.model.network import predictor_network
 from vjepa2_ac.model.network.predictor import ActionConditionedPredictor
@@ -184,7 +184,7 @@ def test_a_knob_that_does_not_fit_the_predictor_is_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         add_adapter(model, LORA.model_copy(update=knobs), seed=0)
-    assert not has_adapter(model)
+    assert model.adaptation is None
 
 
 @both_types
@@ -216,7 +216,7 @@ def test_pissa_starts_at_the_largest_singular_values(model: WorldModel) -> None:
 def test_a_target_that_matches_nothing_is_refused(model: WorldModel, targets: tuple[str, ...]) -> None:
     with pytest.raises(InputError, match=r"adapter\.targets: .* needed: some of action_encoder, .*fc1, .*q, "):
         add_adapter(model, LORA.model_copy(update={"targets": targets}), seed=0)
-    assert not has_adapter(model)
+    assert model.adaptation is None
 
 
 def test_the_seed_decides_the_fresh_adapter(fresh: Fresh) -> None:
@@ -360,7 +360,7 @@ def test_merged_it_predicts_the_same_and_is_a_plain_model_again(
     assert type(model.predictor) is ActionConditionedPredictor
     assert {value.dtype for value in model.parameters()} == {dtype}
     assert trainable_report(model).trained == 0
-    assert not has_adapter(model)
+    assert model.adaptation is None
     model.save_pretrained(tmp_path / "merged")
     assert torch.equal(predict(WorldModel.from_pretrained(tmp_path / "merged"), inputs), predict(model, inputs))
 

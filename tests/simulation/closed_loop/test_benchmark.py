@@ -121,7 +121,7 @@ def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path:
     benchmark, files = run_benchmark(load_to_plan(model, overrides=SMALL), asked, tmp_path)
     assert [file.name for file in files] == [FILE, FILM]
     steered = benchmark.results[0]
-    frames = list(film_frames([steered]))
+    frames = list(film_frames(steered))
     episode = steered.episodes[0]
     for frame, image in ((frames[0], episode.frames[0]), (frames[-1], episode.frames[1])):
         np.testing.assert_array_equal(frame[-360::2, :640:2], image)

@@ -18,7 +18,7 @@ LIMITS = LimitsConfig()
 
 @pytest.mark.parametrize(("task", "domain"), [("push", DOMAIN_A), ("pick", DOMAIN_B)], ids=["push", "pick"])
 def test_the_oracle_solves_it_and_nothing_and_chance_do_not(task: str, domain) -> None:
-    arm = arm_for(task, domain, height=18, width=32)
+    arm = arm_for(task, domain, size=(18, 32))
     oracle = run_task(RolloutSpec(task, domain, 4, seed=5), oracle_for(task, LIMITS, arm), arm)
     assert oracle.success_rate.value == 1.0
     assert oracle.final_distance_cm.value < 3.0
@@ -48,4 +48,4 @@ def test_the_goal_image_shows_the_block_at_its_goal() -> None:
 
 def test_an_arm_without_a_block_cannot_push() -> None:
     with pytest.raises(ValueError, match="no block"):
-        run_task(RolloutSpec("push", DOMAIN_A, 1), DoNothing(), arm_for("reach", DOMAIN_A, height=18, width=32))
+        run_task(RolloutSpec("push", DOMAIN_A, 1), DoNothing(), arm_for("reach", DOMAIN_A, size=(18, 32)))

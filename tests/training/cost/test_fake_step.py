@@ -145,9 +145,9 @@ def test_each_part_is_what_autograd_keeps_of_it(names: tuple[str, ...], monkeypa
 def all_blocks(config: Config, sizes: ModelSizes, monkeypatch: pytest.MonkeyPatch) -> StepBytes:
     """Return what is measured of all blocks, none of them inferred."""
     monkeypatch.setattr(fake_step, "over_depth", lambda measure, _config, sizes: measure(sizes))
-    fake_step._measured.cache_clear()
+    fake_step._measured.clear()
     found = measure_step(config, sizes)
-    fake_step._measured.cache_clear()
+    fake_step._measured.clear()
     monkeypatch.undo()
     return found
 
@@ -184,12 +184,10 @@ def test_plain_lora_needs_what_pefts_layers_need(adapter: str, monkeypatch: pyte
 
     def pefts(config: Config, sizes: ModelSizes) -> torch.nn.Module:
         with torch.device("meta"):
-            return with_adapter(
-                fake_model._Network(sizes).requires_grad_(False), config.adapter, ("extrinsics_encoder",)
-            )
+            return with_adapter(fake_model.meta_network(sizes).requires_grad_(False), config.adapter)
 
     monkeypatch.setattr(fake_step, "meta_predictor", pefts)
-    fake_step._measured.cache_clear()
+    fake_step._measured.clear()
     assert measure_step(config, sizes) == own
 
 

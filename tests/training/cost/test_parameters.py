@@ -7,7 +7,9 @@ import pytest
 from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.model.adapter.lora import trainable_report
-from vjepa2_ac.training.cost.parameters import adapter_ranks, count_parameters, trained_tensors
+from vjepa2_ac.model.adapter.targets import adapter_ranks
+from vjepa2_ac.training.cost.fake_model import meta_network
+from vjepa2_ac.training.cost.parameters import count_parameters
 
 HEADS = ["action_encoder", "state_encoder"]
 ADAPTERS: dict[str, dict[str, Any]] = {
@@ -44,7 +46,7 @@ def test_parameters_are_those_of_a_model_that_was_built(shape: str, adapter: str
     assert (counts.predictor, counts.encoder) == (report.predictor, report.total - report.predictor)
     assert counts.trained == report.trained
     found = sorted(value.numel() for value in model.parameters() if value.requires_grad)
-    assert sorted(trained_tensors(config, sizes)) == found
+    assert sorted(counts.trained_tensors) == found
 
 
 @pytest.mark.parametrize("rank", [1, 16])
@@ -56,7 +58,6 @@ def test_parameters_of_the_released_model_are_the_known_ones(rank: int) -> None:
 
 def test_layers_with_an_adapter_go_by_their_last_name() -> None:
     config = run_config(ADAPTERS["all but the heads"])
-    assert {name.rpartition(".")[2] for name in adapter_ranks(config, model_sizes())} == {
+    assert {name.rpartition(".")[2] for name in adapter_ranks(meta_network(model_sizes()), config.adapter)} == {
         "q", "k", "v", "o", "fc1", "fc2", "predictor_embed", "predictor_proj",
     }  # fmt: skip
-    assert adapter_ranks(run_config(ADAPTERS["none"]), model_sizes()) == {}

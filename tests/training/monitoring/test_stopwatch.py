@@ -10,7 +10,7 @@ import torch
 from recording_cuda import RecordingCuda
 from vjepa2_ac.data.clips.clip_reader import no_clips
 from vjepa2_ac.episode import POSE_WIDTHS, Batch
-from vjepa2_ac.training.monitoring.stopwatch import HostStopwatch, IdleStopwatch, stopwatch_for
+from vjepa2_ac.training.monitoring.stopwatch import IdleStopwatch, Stopwatch, stopwatch_for
 from vjepa2_ac.training.monitoring.throughput import TimedBatches
 
 
@@ -93,7 +93,7 @@ def test_batches_are_timed_also_when_they_are_fetched_ahead() -> None:
 
 def test_on_a_cpu_the_hosts_clock_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     watch = stopwatch_for(torch.device("cpu"))
-    assert isinstance(watch, HostStopwatch)
+    assert isinstance(watch, Stopwatch)
     times = iter([10.0, 12.5])
     monkeypatch.setattr(time, "perf_counter", lambda: next(times))
     with watch.running():

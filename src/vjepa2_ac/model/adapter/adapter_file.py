@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.adapter.targets import PEFT_NAMES
 from vjepa2_ac.storage.structured import message_of, read_json_object, require_quick, shown
 
 ADAPTER_FILE = "adapter_config.json"  # PEFT's name
@@ -22,18 +23,6 @@ ADAPTER_FILE = "adapter_config.json"  # PEFT's name
 _NEEDED = "a LoRA adapter of V-JEPA 2-AC's predictor, as this program writes it in PEFT's format"
 _FIX = "Copy the adapter again, or train it again: other kinds of PEFT's are not read"
 
-_KNOBS = {  # PEFT's names, and ours
-    "r": "rank",
-    "lora_alpha": "alpha",
-    "lora_dropout": "dropout",
-    "target_modules": "targets",
-    "modules_to_save": "modules_to_save",
-    "use_rslora": "rslora",
-    "use_dora": "dora",
-    "init_lora_weights": "init",
-    "rank_pattern": "rank_pattern",
-    "alpha_pattern": "alpha_pattern",
-}
 _FIXED = {"peft_type": "LORA", "bias": "none"}
 _INFORMATIONAL = frozenset({  # origin and purpose
     "auto_mapping", "base_model_name_or_path", "inference_mode", "megatron_core", "peft_version", "revision",
@@ -55,14 +44,13 @@ def read_adapter_file(folder: Path, defaults: Mapping[str, Any]) -> AdapterConfi
     try:
         values = read_json_object(path, needed=_NEEDED, fix=_FIX)
     except OSError as error:
-        found = f"cannot be read ({error.strerror or error})"
-        raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX) from None
+        raise _refused(path, f"cannot be read ({error.strerror or error})") from None
     _require_plain_lora(values, defaults, path)
     try:
         config = AdapterConfig.model_validate_json(json.dumps({"kind": "lora", **_as_knobs(values)}))
     except ValidationError as error:
         problems = [f"{_peft_name(detail['loc'])}: {message_of(detail)}" for detail in error.errors()[:4]]
-        raise InputError(where=str(path), found="; ".join(problems), needed=_NEEDED, fix=_FIX) from None
+        raise _refused(path, "; ".join(problems)) from None
     for pattern in (*config.rank_pattern, *config.alpha_pattern):
         require_quick(pattern, where=str(path))
     return config
@@ -72,21 +60,23 @@ def _require_plain_lora(values: Mapping[str, Any], defaults: Mapping[str, Any], 
     """Refuse settings that change an adapter's effect, and for which this program has no knob."""
     for name, needed in _FIXED.items():
         if values.get(name) != needed:
-            found = f"an adapter with {name} {shown(values.get(name))}"
-            raise InputError(where=str(path), found=found, needed=f"{name} {needed}", fix=_FIX)
+            raise _refused(path, f"an adapter with {name} {shown(values.get(name))}", f"{name} {needed}")
     for name in ("r", "lora_alpha", "target_modules"):
         if name not in values:
-            raise InputError(where=str(path), found=f"no {name}", needed=_NEEDED, fix=_FIX)
-    others = {name: value for name, value in values.items() if name not in {*_KNOBS, *_FIXED, *_INFORMATIONAL}}
-    for name, value in others.items():
+            raise _refused(path, f"no {name}")
+    for name, value in values.items():
+        is_known = name in PEFT_NAMES or name in _FIXED or name in _INFORMATIONAL
         is_off = value is None or value is False or value in ([], {})
-        if not is_off and (name not in defaults or value != defaults[name]):
-            found = f"an adapter with {shown(name)} {shown(value)}, which is not read here"
-            raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX)
+        if not is_known and not is_off and (name not in defaults or value != defaults[name]):
+            raise _refused(path, f"an adapter with {shown(name)} {shown(value)}, which is not read here")
+
+
+def _refused(path: Path, found: str, needed: str = _NEEDED) -> InputError:
+    return InputError(where=str(path), found=found, needed=needed, fix=_FIX)
 
 
 def _as_knobs(values: Mapping[str, Any]) -> dict[str, Any]:
-    knobs = {ours: values[peft] for peft, ours in _KNOBS.items() if peft in values}
+    knobs = {ours: values[peft] for peft, ours in PEFT_NAMES.items() if peft in values}
     if "rslora" not in knobs:
         knobs["rslora"] = False  # PEFT's default
     if knobs.get("init") is True or "init" not in knobs:
@@ -97,5 +87,5 @@ def _as_knobs(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _peft_name(location: tuple[Any, ...]) -> str:
-    first = {ours: peft for peft, ours in _KNOBS.items()}.get(str(location[0]), str(location[0]))
+    first = {ours: peft for peft, ours in PEFT_NAMES.items()}.get(str(location[0]), str(location[0]))
     return ".".join([first, *map(str, location[1:])])

@@ -14,14 +14,16 @@ import torch
 from torch import Tensor, nn
 
 from vjepa2_ac.config import AdapterConfig
+from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.adapter_file import ADAPTER_FILE, read_adapter_file
 from vjepa2_ac.model.adapter.adapter_folder import (
     FULL_WEIGHTS,
     LORA_WEIGHTS,
     PRINCIPAL_PARTS,
-    read_fresh_heads,
-    read_kind,
+    Card,
+    Heads,
+    read_card,
     read_weights,
     write_trained,
 )
@@ -35,25 +37,13 @@ from vjepa2_ac.model.adapter.initialization import (
 from vjepa2_ac.model.adapter.lora_linear import LoraLinear
 from vjepa2_ac.model.adapter.targets import lora_arguments, peft_arguments
 from vjepa2_ac.model.network.input_heads import fit_heads, require_trained
+from vjepa2_ac.model.network.predictor_network import PredictorNetwork
 from vjepa2_ac.model.network.world_model import Adaptation, WorldModel, base_weights
 from vjepa2_ac.model.quiet_imports import quiet_imports
 
 with quiet_imports():
     from peft import LoraConfig, PeftModel, get_peft_model, get_peft_model_state_dict, set_peft_model_state_dict
     from peft.tuners.lora import LoraLayer
-
-_COMPARED = (
-    "r",
-    "lora_alpha",
-    "use_rslora",
-    "target_modules",
-    "use_dora",
-    "bias",
-    "modules_to_save",
-    "rank_pattern",
-    "alpha_pattern",
-    "init_lora_weights",
-)
 
 
 class TrainableReport(NamedTuple):
@@ -98,8 +88,9 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Pa
     if config.kind == "none":
         _train_everything(model)
         return
-    require_trained(_names_of_fresh_heads(model), config)
-    _wrap(model, LoraConfig(**lora_arguments(model.predictor, config, unused=_unused(model))))
+    if model.fresh_heads is not None:
+        require_trained(tuple(dict.fromkeys(name.split(".")[0] for name in model.fresh_heads.replaced)), config)
+    _wrap(model, LoraConfig(**lora_arguments(model.base_predictor, config)))
     layers = lora_layers(model)
     if config.init == "pissa":
         parts = principal_parts(layers) if started is None else _read_principal_parts(model, started)
@@ -109,18 +100,17 @@ def add_adapter(model: WorldModel, config: AdapterConfig, seed: int, started: Pa
     measure_magnitudes(layers)
 
 
-def with_adapter(predictor: nn.Module, config: AdapterConfig, unused: tuple[str, ...] = ()) -> nn.Module:
+def with_adapter(predictor: PredictorNetwork, config: AdapterConfig) -> nn.Module:
     """Return a predictor with a LoRA adapter, as `add_adapter` makes it, but without initial values.
 
     Args:
         predictor: The predictor, not adapted.
         config: What is trained.
-        unused: Layers without input.
 
     Raises:
         InputError: A knob does not fit the predictor.
     """
-    return _with_peft(predictor, LoraConfig(**lora_arguments(predictor, config, unused)))
+    return _with_peft(predictor, LoraConfig(**lora_arguments(predictor, config)))
 
 
 def trainable_report(model: WorldModel) -> TrainableReport:
@@ -128,11 +118,6 @@ def trainable_report(model: WorldModel) -> TrainableReport:
     own = sum(value.numel() for value in base_weights(model.base_predictor).values())
     encoder = sum(value.numel() for value in model.encoder.parameters())
     return TrainableReport(sum(p.numel() for p in model.parameters() if p.requires_grad), own, own + encoder)
-
-
-def has_adapter(model: WorldModel) -> bool:
-    """Return whether the model differs from its base: `base_only` restores the base temporarily."""
-    return model.adaptation is not None
 
 
 def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tensor] | None = None) -> None:
@@ -148,10 +133,10 @@ def save_trained(model: WorldModel, folder: str | Path, weights: dict[str, Tenso
     """
     adaptation, folder = adaptation_of(model), Path(folder)
     if adaptation.kind == "lora":
-        write_trained(folder, adaptation, _lora_weights(model), _card_of_fresh_heads(model))  # and PiSSA's parts
+        write_trained(folder, _card_of(model), _lora_weights(model), adaptation.principal)
         _lora_config(model).save_pretrained(str(folder))
     else:
-        write_trained(folder, adaptation, weights or model.predictor.state_dict(), _card_of_fresh_heads(model))
+        write_trained(folder, _card_of(model), weights or model.predictor.state_dict())
 
 
 def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None = None) -> None:
@@ -167,11 +152,11 @@ def load_trained(model: WorldModel, folder: str | Path, trainable: bool | None =
             one.
     """
     folder = Path(folder)
-    fresh = model.adaptation is None
-    kind, heads = read_kind(folder, model), read_fresh_heads(folder)
+    fresh, card = model.adaptation is None, read_card(folder, model)
+    heads = card.fresh_heads
     if heads is not None and fresh and model.fresh_heads is None:
-        fit_heads(model, *heads)
-    if kind == "lora":
+        fit_heads(model, Widths(heads.state_dim, heads.action_dim), heads.seed)
+    if card.kind == "lora":
         _load_lora(model, folder)
     else:
         _load_everything(model, folder)
@@ -196,16 +181,11 @@ def adaptation_of(model: WorldModel) -> Adaptation:
     return model.adaptation
 
 
-def _names_of_fresh_heads(model: WorldModel) -> tuple[str, ...]:
-    replaced = () if model.fresh_heads is None else model.fresh_heads.replaced
-    return tuple(dict.fromkeys(name.split(".")[0] for name in replaced))
-
-
-def _card_of_fresh_heads(model: WorldModel) -> dict[str, int] | None:
-    if model.fresh_heads is None:
-        return None
-    sizes = model.sizes.predictor
-    return {"action_dim": sizes.action_dim, "state_dim": sizes.state_dim, "seed": model.fresh_heads.seed}
+def _card_of(model: WorldModel) -> Card:
+    adaptation, sizes, heads = adaptation_of(model), model.sizes.predictor, None
+    if model.fresh_heads is not None:
+        heads = Heads(sizes.action_dim, sizes.state_dim, model.fresh_heads.seed)
+    return Card(adaptation.kind, adaptation.base, adaptation.encoder, heads)
 
 
 def _train_everything(model: WorldModel) -> None:
@@ -239,10 +219,6 @@ def _is_trained(name: str) -> bool:
     return ".lora_" in name or ".modules_to_save." in name
 
 
-def _unused(model: WorldModel) -> tuple[str, ...]:
-    return () if model.sizes.predictor.use_extrinsics else ("extrinsics_encoder",)
-
-
 def _start_from_principal_parts(model: WorldModel, parts: dict[str, Tensor]) -> None:
     adaptation, layers = adaptation_of(model), lora_layers(model)
     start = adaptation.start or original_weights(layers)
@@ -273,7 +249,7 @@ def _lora_config(model: WorldModel) -> Any:
 def _set_trainable(model: WorldModel, trainable: bool) -> None:
     lora = isinstance(model.predictor, PeftModel)
     for name, value in model.predictor.named_parameters():
-        chosen = _is_trained(name) if lora else name.split(".", 1)[0] not in _unused(model)
+        chosen = _is_trained(name) if lora else name.split(".", 1)[0] not in model.base_predictor.unused_layers
         value.requires_grad_(trainable and chosen)
 
 
@@ -296,7 +272,7 @@ def _read_lora_config(folder: Path, model: WorldModel) -> Any:
     if model.adaptation is not None:
         return LoraConfig(**peft_arguments(knobs, knobs.targets))
     try:
-        return LoraConfig(**lora_arguments(model.predictor, knobs, unused=_unused(model)))
+        return LoraConfig(**lora_arguments(model.base_predictor, knobs))
     except InputError as error:
         raise InputError(
             where=f"{folder / ADAPTER_FILE}: {error.where}", found=error.found, needed=error.needed, fix=error.fix
@@ -312,7 +288,7 @@ def _check_scales(model: WorldModel, *, where: str) -> None:
 
 
 def _check_same_adapter(own: Any, other: Any, *, where: str) -> None:
-    for key in _COMPARED:
+    for key in sorted(peft_arguments(AdapterConfig(), ()).keys() - {"lora_dropout"}):
         found, needed = (
             sorted(value) if isinstance(value, set | list) else value
             for value in (getattr(other, key), getattr(own, key))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -24,13 +24,9 @@ def base_only(model: WorldModel) -> Iterator[None]:
         yield
         return
     trained = [(value, value.requires_grad) for value in model.predictor.parameters()]
-    switch = (
-        _lora_off(model, model.adaptation)
-        if model.adaptation.kind == "lora"
-        else _start_weights(model, model.adaptation)
-    )
+    switch = _lora_off if model.adaptation.kind == "lora" else _start_weights
     try:
-        with switch:
+        with switch(model, model.adaptation):
             yield
     finally:
         for value, requires_grad in trained:  # PEFT enables gradients when it enables an adapter
@@ -55,7 +51,9 @@ def merge_adapter(model: WorldModel) -> None:
     """
     dtype = base_dtype(model)
     if adaptation_of(model).kind == "lora":
-        with _without_autocast(model.device.type):  # or the update would be computed in its type
+        kind = model.device.type
+        has_autocast = torch.amp.is_autocast_available(kind)  # some, such as meta, have none
+        with torch.autocast(kind, enabled=False) if has_autocast else nullcontext():  # or its type would be computed in
             model.predictor = model.predictor.float().merge_and_unload()  # type: ignore[operator]  # PEFT is untyped
     model.predictor.to(dtype).requires_grad_(False)
     model.adaptation = model.fresh_heads = None
@@ -72,11 +70,6 @@ def unadapted_copy(model: WorldModel) -> WorldModel:
     if own.adaptation is not None:
         merge_adapter(own)
     return own.eval()
-
-
-def _without_autocast(device: str) -> AbstractContextManager[object]:
-    """Disable autocast on a kind of device; some, such as meta, have none."""
-    return torch.autocast(device, enabled=False) if torch.amp.is_autocast_available(device) else nullcontext()
 
 
 @contextmanager

@@ -10,19 +10,32 @@ from torch import nn
 
 from vjepa2_ac.config import AdapterConfig
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.predictor_network import PredictorNetwork
 from vjepa2_ac.storage.structured import require_quick
 
 ATTENTION = ("q", "k", "v", "o")
 MLP = ("fc1", "fc2")
 
+PEFT_NAMES = {  # of our knobs
+    "r": "rank",
+    "lora_alpha": "alpha",
+    "lora_dropout": "dropout",
+    "target_modules": "targets",
+    "modules_to_save": "modules_to_save",
+    "use_rslora": "rslora",
+    "use_dora": "dora",
+    "init_lora_weights": "init",
+    "rank_pattern": "rank_pattern",
+    "alpha_pattern": "alpha_pattern",
+}
 
-def lora_arguments(predictor: nn.Module, config: AdapterConfig, unused: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return the arguments of PEFT's LoraConfig.
+
+def lora_arguments(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, Any]:
+    """Return the arguments of PEFT's LoraConfig; layers without input cannot have an adapter.
 
     Args:
         predictor: The predictor, not adapted.
         config: The knobs.
-        unused: Layers without input, by the last part of their name: they cannot have an adapter.
 
     Raises:
         InputError: A target or pattern matches no layer, a layer is named twice, or a rank is too large for a layer.
@@ -30,7 +43,7 @@ def lora_arguments(predictor: nn.Module, config: AdapterConfig, unused: tuple[st
     layers = {
         name: layer
         for name, layer in predictor.named_modules()
-        if isinstance(layer, nn.Linear) and _last(name) not in unused
+        if isinstance(layer, nn.Linear) and name not in predictor.unused_layers
     }
     targets = chosen_targets(config, {_last(name) for name in layers})
     adapted = {name: layer for name, layer in layers.items() if _last(name) in targets}
@@ -44,13 +57,9 @@ def lora_arguments(predictor: nn.Module, config: AdapterConfig, unused: tuple[st
 def peft_arguments(config: AdapterConfig, targets: Iterable[str]) -> dict[str, Any]:
     """Return the arguments of PEFT's LoraConfig for layers of these names; not checked against a predictor."""
     return {
-        "r": config.rank,
-        "lora_alpha": config.alpha,
-        "use_rslora": config.rslora,
-        "lora_dropout": config.dropout,
+        **{peft: getattr(config, ours) for peft, ours in PEFT_NAMES.items()},
         "target_modules": list(targets),
         "bias": "none",
-        "use_dora": config.dora,
         "init_lora_weights": True if config.init == "default" else config.init,
         "rank_pattern": dict(config.rank_pattern),
         "alpha_pattern": dict(config.alpha_pattern),
@@ -82,6 +91,17 @@ def chosen_targets(config: AdapterConfig, linear: set[str]) -> tuple[str, ...]:
             needed="each layer once: trained whole, or with an adapter",
         )
     return targets
+
+
+def adapter_ranks(predictor: PredictorNetwork, config: AdapterConfig) -> dict[str, int]:
+    """Return the rank of each layer that gets an adapter, by name.
+
+    Raises:
+        InputError: As of `lora_arguments`.
+    """
+    targets = lora_arguments(predictor, config)["target_modules"]
+    linear = [name for name, layer in predictor.named_modules() if isinstance(layer, nn.Linear)]
+    return {name: rank_of(config, name) for name in linear if _last(name) in targets}
 
 
 def rank_of(config: AdapterConfig, layer: str) -> int:

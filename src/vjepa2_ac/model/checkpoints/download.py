@@ -5,8 +5,8 @@ from __future__ import annotations
 import http.client
 import logging
 import math
+import re
 import urllib.error
-import urllib.parse
 import urllib.request
 from collections.abc import Callable
 from pathlib import Path
@@ -47,7 +47,8 @@ def download(
             than that or than the official file can have; the address is none; the path cannot be written.
     """
     path = Path(path)
-    _require_address(url)
+    if not re.match(r"https?://[^/?#]", url, re.IGNORECASE):
+        raise _no_address(url)
     with storage.user_can_write(path):
         if path.exists():
             _require_file(url, path)
@@ -68,22 +69,24 @@ def download(
         here = f"{_size(part)} bytes are in {part}"
         fix = "Check the network and start again: it goes on where it stopped"
         raise UnreachableError(where=url, found=f"{error.found}; {here}", fix=fix) from None
-    _check_size(url, part, whole)
+    size = _size(part)
+    if size != whole:
+        part.unlink()
+        raise InputError(where=url, found=f"{size} bytes", needed=f"{whole} bytes", fix="Start the download again")
     return part.replace(path)
 
 
 def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) -> int:
     """Bring the rest of a file and return the size of the whole."""
     start = _size(part)
-    request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user's
     try:
+        request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})  # noqa: S310  # the user's
         answer = urllib.request.urlopen(request, timeout=timeout_s)  # noqa: S310  # a URL that the user gave
-    except (http.client.InvalidURL, UnicodeError):
+    except (http.client.InvalidURL, ValueError):
         raise _no_address(url) from None
     except urllib.error.HTTPError as error:
-        whole = _whole_of_range(error.headers.get("Content-Range"))
-        if error.code == 416 and whole == start:  # nothing is left to fetch
-            return whole
+        if error.code == 416 and error.headers.get("Content-Range", "").endswith(f"/{start}"):  # nothing is left
+            return start
         if error.code == 416:
             part.unlink()  # the part is not of this file
             raise http.client.HTTPException("the part that is here does not fit the file; starting again") from None
@@ -93,7 +96,15 @@ def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) ->
         if start and not (answer.status == 206 and resumes):
             logger.info("%s: the server cannot resume; starting again", url)
             start = 0
-        whole = start + _promised_bytes(url, answer.headers.get("Content-Length"))
+        promised = answer.headers.get("Content-Length", "")
+        if not promised.isdigit():
+            raise InputError(
+                where=url,
+                found="a server that does not say how large the file is",
+                needed="its size (Content-Length): without it, half a file looks like a whole one",
+                fix="Check the URL, and whether a proxy answers in its place",
+            )
+        whole = start + int(promised)
         _require_size(url, whole, where=url)
         with storage.user_can_write(part), part.open("ab" if start else "wb") as file:
             here = start
@@ -107,26 +118,6 @@ def _fetch(url: str, part: Path, progress: Progress | None, timeout_s: float) ->
     return whole
 
 
-def _promised_bytes(url: str, header: str | None) -> int:
-    if header is None or not header.isdigit():
-        raise InputError(
-            where=url,
-            found="a server that does not say how large the file is",
-            needed="its size (Content-Length): without it, half a file looks like a whole one",
-            fix="Check the URL, and whether a proxy answers in its place",
-        )
-    return int(header)
-
-
-def _require_address(url: str) -> None:
-    try:
-        parts = urllib.parse.urlsplit(url)
-    except ValueError:
-        raise _no_address(url) from None
-    if parts.scheme not in {"http", "https"} or not parts.netloc:
-        raise _no_address(url)
-
-
 def _require_file(url: str, path: Path) -> None:
     if not path.is_file():
         raise InputError(where=str(path), found="a folder", needed="the name of a file", fix="Name a file in it")
@@ -135,30 +126,14 @@ def _require_file(url: str, path: Path) -> None:
 
 def _require_size(url: str, size: int, *, where: str) -> None:
     if url == OFFICIAL_URL and size < OFFICIAL_LEAST_BYTES:
-        raise InputError(
-            where=where,
-            found=f"a file of {size:,} bytes",
-            needed=f"the official checkpoint, of more than {OFFICIAL_LEAST_BYTES:,}",
-            fix="Check whether a proxy answers in the server's place"
-            if where == url
-            else "Delete it, or name another file",
-        )
-
-
-def _whole_of_range(header: str | None) -> int | None:
-    total = (header or "").rpartition("/")[2]
-    return int(total) if total.isdigit() else None
+        needed = f"the official checkpoint, of more than {OFFICIAL_LEAST_BYTES:,}"
+        proxy, file = "Check whether a proxy answers in the server's place", "Delete it, or name another file"
+        fix = proxy if where == url else file
+        raise InputError(where=where, found=f"a file of {size:,} bytes", needed=needed, fix=fix)
 
 
 def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
-
-
-def _check_size(url: str, part: Path, whole: int) -> None:
-    size = _size(part)
-    if size != whole:
-        part.unlink()
-        raise InputError(where=url, found=f"{size} bytes", needed=f"{whole} bytes", fix="Start the download again")
 
 
 def _no_address(url: str) -> InputError:

@@ -27,10 +27,7 @@ from vjepa2_ac.model.sizes import check_sizes
 logger = logging.getLogger(__name__)
 
 GROUP_BYTES = 2**29  # of the file in memory at once, in addition to the weights
-IGNORED = {
-    "encoder": ("pos_embed",),
-    "predictor": (),
-}  # may exist: a network with rotary positions does not use it
+IGNORED = {"encoder": ("pos_embed",), "predictor": ()}  # may exist: a network with rotary positions does not use it
 
 _NEEDED = "a checkpoint of V-JEPA 2-AC as Meta publishes it (vjepa2-ac-vitg.pt)"
 _FIX = "`vjepa2-ac download` fetches it, and goes on with a part of it"
@@ -92,10 +89,7 @@ _NAMES: dict[str, list[tuple[str, str]]] = {
         (r"\.attention\.(q|k|v)(?:uery|ey|alue)\.", r".attn.\1."),
         (r"\.attention\.proj\.", ".attn.proj."),
     ],
-    "predictor": [
-        (r"^blocks\.", "predictor_blocks."),
-        (r"\.attn\.o\.", ".attn.proj."),
-    ],
+    "predictor": [(r"^blocks\.", "predictor_blocks."), (r"\.attn\.o\.", ".attn.proj.")],
 }
 
 
@@ -110,20 +104,24 @@ def official_name(name: str, part: str) -> tuple[str, int | None]:
 def _open(path: Path) -> dict[str, dict[str, Tensor]]:
     """Map a checkpoint and return encoder and predictor by Meta's names without prefixes; reads no values."""
     if not path.is_file():
-        raise InputError(where=str(path), found="no such file", needed=_NEEDED, fix=_FIX)
+        raise _refused(path, "no such file")
     try:
         whole = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except _DAMAGE as error:
         raise InputError(where=str(path), found=_foreign(path, error), needed=f"{_NEEDED}, 11.7 GB", fix=_FIX) from None
     if not isinstance(whole, dict):
-        raise InputError(where=str(path), found=f"a {type(whole).__name__}", needed=_NEEDED, fix=_FIX)
+        raise _refused(path, f"a {type(whole).__name__}")
     encoder = whole.get("encoder", whole.get("target_encoder"))
-    parts = {"encoder": encoder, "predictor": whole.get("predictor")}
+    parts: dict[str, Any] = {"encoder": encoder, "predictor": whole.get("predictor")}
     for part, weights in parts.items():
         if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
-            found = f"no weights under {part!r} (keys: {', '.join(map(str, list(whole)[:8]))})"
-            raise InputError(where=str(path), found=found, needed=_NEEDED, fix=_FIX)
-    return {part: _without_prefixes(weights) for part, weights in parts.items() if weights is not None}
+            raise _refused(path, f"no weights under {part!r} (keys: {', '.join(map(str, list(whole)[:8]))})")
+    prefixes = re.compile(r"^(?:(?:module|backbone)\.)+")
+    return {part: {prefixes.sub("", name): one for name, one in weights.items()} for part, weights in parts.items()}
+
+
+def _refused(where: str | Path, found: str) -> InputError:
+    return InputError(where=str(where), found=found, needed=_NEEDED, fix=_FIX)
 
 
 def _foreign(path: Path, error: Exception) -> str:
@@ -131,10 +129,6 @@ def _foreign(path: Path, error: Exception) -> str:
         return kind
     size, reason = path.stat().st_size / 1e9, str(error).splitlines()[0][:120]
     return f"{size:.2f} GB that torch cannot read ({reason}): truncated, or of another kind"
-
-
-def _without_prefixes(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {re.sub(r"^(?:(?:module|backbone)\.)+", "", name): value for name, value in weights.items()}
 
 
 def _shapes(weights: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
@@ -146,7 +140,7 @@ def _sizes(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes, *, w
     try:
         found = _sizes_of_tensors(parts, given)
     except KeyError as missing:
-        raise InputError(where=where, found=f"no tensor {missing} in it", needed=_NEEDED, fix=_FIX) from None
+        raise _refused(where, f"no tensor {missing} in it") from None
     except ValidationError as error:
         raise InputError(
             where=where,
@@ -160,7 +154,7 @@ def _sizes(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes, *, w
 
 def _sizes_of_tensors(parts: dict[str, dict[str, tuple[int, ...]]], given: ModelSizes) -> ModelSizes:
     encoder, predictor = parts["encoder"], parts["predictor"]
-    width, _, _, _, patch_size = encoder["patch_embed.proj.weight"]
+    width, *_, patch_size = encoder["patch_embed.proj.weight"]
     predictor_width, action_width = predictor["action_encoder.weight"]
     if action_width != ACTION_DIM:
         raise KeyError(f"action_encoder.weight of {ACTION_DIM} columns (it has {action_width})")
@@ -207,9 +201,8 @@ def _check(found: dict[str, tuple[int, ...]], ours: dict[str, tuple[int, ...]], 
     for name, shape in ours.items():
         official, third = official_name(name, part)
         needed[official] = shape if third is None else (3 * shape[0], *shape[1:])
-    check_tensors(
-        {name: shape for name, shape in found.items() if name not in IGNORED[part]}, needed, where=f"{where}: {part}"
-    )
+    used = {name: shape for name, shape in found.items() if name not in IGNORED[part]}
+    check_tensors(used, needed, where=f"{where}: {part}")
 
 
 def _take(official: Mapping[str, Tensor], name: str, part: str) -> Tensor:
@@ -218,16 +211,14 @@ def _take(official: Mapping[str, Tensor], name: str, part: str) -> Tensor:
 
 
 def _groups(weights: Mapping[str, Tensor]) -> Iterator[list[str]]:
-    group: list[str] = []
-    size = 0
+    group, size = list[str](), 0
     for name, value in weights.items():
         group.append(name)
         size += value.numel() * 4
         if size >= GROUP_BYTES:
             yield group
             group, size = [], 0
-    if group:
-        yield group
+    yield group
 
 
 def _to_official(weights: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
@@ -235,8 +226,7 @@ def _to_official(weights: Mapping[str, Tensor], part: str) -> dict[str, Tensor]:
     for name, value in weights.items():
         fused, third = official_name(name, part)
         pieces.setdefault(fused, {})[third] = value.detach()
-    return {f"module.{name}": _fuse(thirds) for name, thirds in pieces.items()}
-
-
-def _fuse(thirds: Mapping[int | None, Tensor]) -> Tensor:
-    return thirds[None] if None in thirds else torch.cat([thirds[index] for index in range(3)])
+    return {
+        f"module.{name}": thirds[None] if None in thirds else torch.cat([thirds[index] for index in range(3)])
+        for name, thirds in pieces.items()
+    }

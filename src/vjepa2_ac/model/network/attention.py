@@ -22,7 +22,7 @@ from torch.nn.functional import scaled_dot_product_attention
 from vjepa2_ac.model.network.compilation import compiled, has_triton
 
 AttentionKind = Literal["auto", "dense", "per_step", "flex"]
-ATTENTION_KINDS: tuple[str, ...] = get_args(AttentionKind)
+Attend = Callable[[Tensor, Tensor, Tensor, int], Tensor]  # of queries, keys, values and tokens per step
 
 _FLEX_HEAD_DIM = 16  # minimum of its kernels
 _FLEX_STEPS = 4  # minimum that is worth a compilation
@@ -33,13 +33,13 @@ def block_causal_attention(
     key: Float[Tensor, "batch heads keys head_dim"],
     value: Float[Tensor, "batch heads keys head_dim"],
     tokens_per_step: int,
-    kind: AttentionKind = "auto",
+    kind: AttentionKind | Attend = "auto",
 ) -> Float[Tensor, "batch heads sequence head_dim"]:
     """Return the attention in which a token of step t sees all tokens of steps <= t.
 
     `auto` uses `flex` on CUDA if Triton is installed, with gradients on and at least four steps; `per_step`
     everywhere else. Each length and each number of clips is compiled anew: lengths vary in evaluation and planning, and
-    the short ones at the start of a rollout are not worth it.
+    the short ones at the start of a rollout are not worth it. A function in place of a kind computes it.
 
     Raises:
         ValueError: A sequence is not a whole number of steps, there are fewer keys than queries, or the kind is
@@ -54,9 +54,10 @@ def block_causal_attention(
     if kind == "auto":
         steps = query.shape[2] // tokens_per_step
         kind = best_kind(query.device, query.shape[-1], steps, gradients=torch.is_grad_enabled())
-    if kind not in _IMPLEMENTATIONS:
-        raise ValueError(f"unknown attention {kind!r}; known: {', '.join(ATTENTION_KINDS)}")
-    return _IMPLEMENTATIONS[kind](query, key, value, tokens_per_step)
+    attend = kind if callable(kind) else _IMPLEMENTATIONS.get(kind)
+    if attend is None:
+        raise ValueError(f"unknown attention {kind!r}; known: {', '.join(get_args(AttentionKind))}")
+    return attend(query, key, value, tokens_per_step)
 
 
 def best_kind(device: torch.device, head_dim: int, steps: int, *, gradients: bool) -> AttentionKind:
@@ -105,11 +106,7 @@ def _flex(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Te
     return attend(query, key, value, block_mask=mask)  # type: ignore[no-any-return]  # torch.compile has no types
 
 
-_IMPLEMENTATIONS: dict[str, Callable[[Tensor, Tensor, Tensor, int], Tensor]] = {
-    "dense": _dense,
-    "per_step": _per_step,
-    "flex": _flex,
-}
+_IMPLEMENTATIONS: dict[str, Attend] = {"dense": _dense, "per_step": _per_step, "flex": _flex}
 
 
 @lru_cache(maxsize=8)

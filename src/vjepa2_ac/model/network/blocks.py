@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
-from vjepa2_ac.model.network.attention import AttentionKind, block_causal_attention
+from vjepa2_ac.model.network.attention import Attend, AttentionKind, block_causal_attention
 from vjepa2_ac.model.network.compilation import When, compiled
 from vjepa2_ac.model.network.rotary import RotaryTables, rotate
 
@@ -87,7 +87,7 @@ class Block(nn.Module):
         tokens: Float[Tensor, "batch sequence width"],
         tables: RotaryTables,
         tokens_per_step: int,
-        kind: AttentionKind = "auto",
+        kind: AttentionKind | Attend = "auto",
         keep: int = 0,
         *past: Float[Tensor, "2 batch heads _ head_dim"],
     ) -> tuple[Float[Tensor, "batch sequence width"], Float[Tensor, "2 batch heads keep head_dim"] | None]:

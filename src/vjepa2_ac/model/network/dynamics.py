@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import layer_norm
 
-from vjepa2_ac.model.network.attention import AttentionKind
+from vjepa2_ac.model.network.attention import Attend, AttentionKind
 from vjepa2_ac.model.network.compilation import When
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 
@@ -93,7 +93,7 @@ class LatentDynamics(nn.Module):
         for block in self.base_predictor.blocks:
             block.compiled = when
 
-    def set_attention(self, kind: AttentionKind) -> None:
+    def set_attention(self, kind: AttentionKind | Attend) -> None:
         """Choose how the predictor computes block-causal attention (see `model.network.attention`)."""
         self.base_predictor.attention = kind
 

@@ -16,10 +16,8 @@ from vjepa2_ac.model.network.world_model import FreshHeads, WorldModel
 
 def heads_to_replace(sizes: ModelSizes, widths: Widths) -> tuple[str, ...]:
     """Return the input heads of a model of these sizes that do not fit states and actions of these widths."""
-    fits = {
-        "action_encoder": sizes.predictor.action_dim == widths.action,
-        "state_encoder": sizes.predictor.state_dim == widths.state,
-    }
+    own = widths_of_model(sizes)
+    fits = {"action_encoder": own.action == widths.action, "state_encoder": own.state == widths.state}
     return tuple(name for name, does in fits.items() if not does)
 
 
@@ -64,12 +62,13 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
     for name in heads:
         own, width = getattr(predictor, name), widths.action if name == "action_encoder" else widths.state
         replaced |= {f"{name}.{key}": value.detach().cpu() for key, value in own.state_dict().items()}
-        setattr(predictor, name, _fresh(own, width, _generator(seed, name)))
+        head = nn.Linear(width, own.out_features)
+        initialise(head, _generator(seed, name))
+        setattr(predictor, name, head.to(own.weight.device, own.weight.dtype).requires_grad_(False))
         lines.append(f"{_as_text([name])}: {width} numbers instead of the base's {own.in_features}: initialised anew")
     dims = {"action_dim": widths.action, "state_dim": widths.state}
     predictor.config.update(dims)
-    sizes = model.sizes.predictor.model_copy(update=dims)
-    model.sizes = model.sizes.model_copy(update={"predictor": sizes})
+    model.sizes = model.sizes.model_copy(update={"predictor": model.sizes.predictor.model_copy(update=dims)})
     model.fresh_heads = FreshHeads(replaced, seed)
     return lines
 
@@ -77,12 +76,6 @@ def fit_heads(model: WorldModel, widths: Widths, seed: int) -> list[str]:
 def widths_of_model(sizes: ModelSizes) -> Widths:
     """Return the widths of a model's states and actions."""
     return Widths(state=sizes.predictor.state_dim, action=sizes.predictor.action_dim)
-
-
-def _fresh(own: nn.Linear, width: int, generator: Generator) -> nn.Linear:
-    head = nn.Linear(width, own.out_features)
-    initialise(head, generator)
-    return head.to(own.weight.device, own.weight.dtype).requires_grad_(False)
 
 
 def _generator(seed: int, name: str) -> Generator:

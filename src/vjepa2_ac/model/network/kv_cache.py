@@ -15,8 +15,8 @@ class KeyValueCache:
     concatenates them while it computes, so that with gradient checkpointing no step is stored twice.
     """
 
-    def __init__(self) -> None:
-        self._pieces: tuple[tuple[Tensor, ...], ...] = ()  # of each layer
+    def __init__(self, pieces: tuple[tuple[Tensor, ...], ...] = ()) -> None:
+        self._pieces = pieces  # of each layer
 
     @property
     def tokens(self) -> int:
@@ -34,9 +34,7 @@ class KeyValueCache:
 
     def copy(self) -> KeyValueCache:
         """Return a cache that can grow independently; no tensor is copied."""
-        other = KeyValueCache()
-        other._pieces = self._pieces
-        return other
+        return KeyValueCache(self._pieces)
 
     def expanded(self, samples: int) -> KeyValueCache:
         """Return the cache of one start expanded to many samples; no tensor is copied.
@@ -44,8 +42,4 @@ class KeyValueCache:
         Raises:
             RuntimeError: It holds more than one start.
         """
-        other = KeyValueCache()
-        other._pieces = tuple(
-            tuple(piece.expand(-1, samples, -1, -1, -1) for piece in pieces) for pieces in self._pieces
-        )
-        return other
+        return KeyValueCache(tuple(tuple(one.expand(-1, samples, -1, -1, -1) for one in own) for own in self._pieces))

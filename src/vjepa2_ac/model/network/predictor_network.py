@@ -12,7 +12,7 @@ from torch.utils.checkpoint import checkpoint
 
 from vjepa2_ac.config import ModelSizes
 from vjepa2_ac.episode import EXTRINSICS_DIM
-from vjepa2_ac.model.network.attention import AttentionKind
+from vjepa2_ac.model.network.attention import Attend, AttentionKind
 from vjepa2_ac.model.network.blocks import NORM_EPSILON, Block, hidden_width, normalised
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.model.network.rotary import TokenLayout, rotary_tables
@@ -27,7 +27,7 @@ class PredictorNetwork(nn.Module):
     """
 
     config: Any  # the fields of `predictor_fields`
-    attention: AttentionKind
+    attention: AttentionKind | Attend
     gradient_checkpointing: bool  # the name transformers switches
     has_dropout: bool  # in its blocks: then recomputed blocks draw the same masks
 
@@ -53,6 +53,11 @@ class PredictorNetwork(nn.Module):
     def grid(self) -> int:
         """Patches along one side of a frame."""
         return int(self.config.image_size // self.config.patch_size)
+
+    @property
+    def unused_layers(self) -> tuple[str, ...]:
+        """Layers without input."""
+        return () if self.config.use_extrinsics else ("extrinsics_encoder",)
 
     def forward(
         self,

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import nn
+from torch import Tensor, nn
 
 from vjepa2_ac import storage
 from vjepa2_ac.config import ModelSizes
@@ -53,38 +52,47 @@ def load_safetensors(module: nn.Module, path: Path, dtype: torch.dtype | None) -
     Raises:
         InputError: The file is missing or damaged, its tensors are not those of the module, or one is not finite.
     """
-    needed = {name: tuple(value.shape) for name, value in module.state_dict().items()}
-    with opened_safetensors(path, needed="the weights of a world model") as file:
-        check_tensors(shapes_of(file), needed, where=str(path))
-        weights = {name: _cast(file.get_tensor(name), dtype) for name in needed}
-    require_finite(weights, where=str(path), fix="Copy or write the folder again")
+    fix = "Copy or write the folder again"
+    weights = read_tensors(path, module.state_dict(), needed="the weights of a world model", fix=fix, dtype=dtype)
     frozen = {name: value.requires_grad for name, value in module.named_parameters()}
     module.load_state_dict(weights, strict=True, assign=True)
     for name, value in module.named_parameters():
         value.requires_grad_(frozen[name])
 
 
-@contextmanager
-def opened_safetensors(path: Path, *, needed: str) -> Iterator[Any]:
-    """Open a safetensors file; its header is checked against its size, and its tensors are mapped, not read.
+def read_tensors(
+    path: Path, like: Mapping[str, Tensor], *, needed: str, fix: str, dtype: torch.dtype | None = None
+) -> dict[str, Tensor]:
+    """Read a safetensors file whose tensors must have the names and shapes of given ones.
+
+    Its header is checked against its size first.
+
+    Args:
+        path: The file.
+        like: Tensors of these names and shapes.
+        needed: What the file should be, for messages.
+        fix: What to do if a number in it is not finite, as a sentence.
+        dtype: Type of the result; None: as in the file.
 
     Raises:
-        InputError: The file is missing, truncated, or of another format.
+        InputError: The file is missing or truncated, is of another format, holds other tensors, or NaN or infinity.
     """
     try:
         with safe_open(path, framework="pt") as file:
-            yield file
+            found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
+            check_tensors(found, {name: tuple(value.shape) for name, value in like.items()}, where=str(path))
+            weights = {}
+            for name in like:
+                value = file.get_tensor(name)
+                weights[name] = value.to(dtype or value.dtype, copy=True)  # the file may be replaced while it is in use
     except FileNotFoundError:
-        fix = "Copy or write the folder again"
-        raise InputError(where=str(path), found="no such file", needed=needed, fix=fix) from None
+        again = "Copy or write the folder again"
+        raise InputError(where=str(path), found="no such file", needed=needed, fix=again) from None
     except (SafetensorError, OSError, TypeError) as error:  # the last: of a type that torch does not have
-        found = f"not a whole safetensors file ({error})"
-        raise InputError(where=str(path), found=found, fix="Copy or write it again") from None
-
-
-def shapes_of(file: Any) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the tensors in an open safetensors file."""
-    return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
+        problem = f"not a whole safetensors file ({error})"
+        raise InputError(where=str(path), found=problem, fix="Copy or write it again") from None
+    require_finite(weights, where=str(path), fix=fix)
+    return weights
 
 
 def check_tensors(found: dict[str, tuple[int, ...]], needed: dict[str, tuple[int, ...]], *, where: str) -> None:
@@ -110,10 +118,5 @@ def check_tensors(found: dict[str, tuple[int, ...]], needed: dict[str, tuple[int
         )
 
 
-def _whole(module: nn.Module) -> dict[str, torch.Tensor]:
+def _whole(module: nn.Module) -> dict[str, Tensor]:
     return {name: value.detach().contiguous() for name, value in module.state_dict().items()}
-
-
-def _cast(tensor: torch.Tensor, dtype: torch.dtype | None) -> torch.Tensor:
-    # A copy in memory: the file may be replaced while the model is in use.
-    return tensor.to(dtype or tensor.dtype, copy=True)

@@ -6,6 +6,7 @@ import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 from einops import rearrange
@@ -24,7 +25,7 @@ from vjepa2_ac.model.sizes import read_sizes
 class Adaptation:
     """The adaptation of the predictor by `model.adapter.lora`."""
 
-    kind: str  # as in config.AdapterConfig: lora, or none when every weight is trained
+    kind: Literal["lora", "none"]  # as in config.AdapterConfig; none: every weight is trained
     base: str  # fingerprint of the predictor it started from
     encoder: str  # fingerprint of the encoder whose latents it learns from
     start: dict[str, Tensor] | None = None  # weights it started from: all (kind none), or the adapted ones (PiSSA)
@@ -127,7 +128,7 @@ class WorldModel(LatentDynamics):
     @property
     def num_tokens(self) -> int:
         """Tokens of one frame."""
-        return (self.sizes.image_size // self.sizes.patch_size) ** 2
+        return self.sizes.tokens_per_frame
 
     @property
     def latent_dim(self) -> int:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from jaxtyping import Float
 
 from vjepa2_ac import __version__
 from vjepa2_ac.config import RldsData
@@ -53,7 +55,7 @@ class ClosedLoopBenchmark:
 
     subject: str
     checkpoint: str  # which one, as text; "" of a model
-    asked: BenchmarkOptions
+    options: BenchmarkOptions
     planning: dict[str, Any]  # settings, as plain values
     planning_seed: int
     results: tuple[ClosedLoopResult, ...]
@@ -65,13 +67,13 @@ class ClosedLoopBenchmark:
 
 
 def run_benchmark(
-    session: PlanningSession, asked: BenchmarkOptions, folder: Path, reporter: Reporter = SILENT
+    session: PlanningSession, options: BenchmarkOptions, folder: Path, reporter: Reporter = SILENT
 ) -> tuple[ClosedLoopBenchmark, tuple[Path, ...]]:
     """Let all four solve the same problems; write closed_loop.json and the video. Cheap failures first.
 
     Args:
         session: The model and its planning settings; its `data.stride` is the length of a model step.
-        asked: The options.
+        options: The options.
         folder: The output folder; created if it is missing.
         reporter: Shows the progress of each policy.
 
@@ -79,75 +81,74 @@ def run_benchmark(
         InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, or a folder that is not
             writable.
     """
-    stride = require_stride(session.config.data, to="steer", fix="Say which, as data.stride=4")
-    if session.config.data.pose_frame != "base":
-        raise InputError(
-            where=f"data.pose_frame: {session.config.data.pose_frame}",
-            found="a model of states in another frame",
-            needed="base: the simulated arm is steered in the frame of its base",
-        )
-    _require_measured(session)
-    if asked.films:
+    stride = _require_steerable(session)
+    if options.films:
         video_library()
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    arm = arm_for(asked.task, named_domain(asked.domain), renderer=asked.renderer)
+    arm = arm_for(options.task, named_domain(options.domain), renderer=options.renderer)
     results = []
-    for policy in _policies(session, asked, arm):
-        films = asked.films if isinstance(policy, Planning) else 0
-        spec = RolloutSpec(asked.task, arm.domain, asked.episodes, asked.seed, asked.steps, stride, films)
-        results.append(run_task(spec, policy, arm, reporter.task(f"{asked.task}: {policy.name}")))
-    contest = ClosedLoopBenchmark(
-        session.subject,
-        session.checkpoint,
-        asked,
-        session.config.planning.model_dump(mode="json"),
-        session.config.seed,
-        tuple(results),
+    for policy in _policies(session, options, arm):
+        films = options.films if isinstance(policy, Planning) else 0
+        spec = RolloutSpec(options.task, arm.domain, options.episodes, options.seed, options.steps, stride, films)
+        results.append(run_task(spec, policy, arm, reporter.task(f"{options.task}: {policy.name}")))
+    planning = session.config.planning.model_dump(mode="json")
+    benchmark = ClosedLoopBenchmark(
+        session.subject, session.checkpoint, options, planning, session.config.seed, tuple(results)
     )
-    return contest, _written(contest, folder)
+    path = folder / FILE
+    write_atomically(path, json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
+    return benchmark, (path, write_film(folder / FILM, results[0])) if options.films else (path,)
 
 
-def _require_measured(session: PlanningSession) -> None:
-    """Refuse a model of vectors that are not what the simulated arm measures."""
+def _require_steerable(session: PlanningSession) -> int:
+    """Return the control steps of a model step; refuse a model of what the simulated arm does not measure."""
     data = session.config.data
+    stride = require_stride(data, to="steer", fix="Say which, as data.stride=4")
+    if data.pose_frame != "base":
+        raise InputError(
+            where=f"data.pose_frame: {data.pose_frame}",
+            found="a model of states in another frame",
+            needed="base: the simulated arm is steered in the frame of its base",
+        )
     if data.states == "vector" and not (isinstance(data, RldsData) and data.fields.state == JOINT_FIELDS):
         raise InputError(
             where="data.states: vector",
             found="a model of other numbers than the simulated arm measures",
             needed=f"poses; or seven joint angles and the gripper: data.fields.state: [{', '.join(JOINT_FIELDS)}]",
         )
+    return stride
 
 
-def benchmark_as_dict(contest: ClosedLoopBenchmark) -> dict[str, Any]:
+def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
     """Return all metrics as plain values; see the docs for their meaning."""
     return {
         "format": FORMAT,
         "about": {
-            "subject": contest.subject,
-            "checkpoint": contest.checkpoint,
-            **{key: value for key, value in dataclasses.asdict(contest.asked).items() if key != "films"},
-            "steps": contest.results[0].steps,
-            "stride": contest.results[0].stride,
-            "seconds_per_step": contest.seconds_per_step,
-            "success_below_cm": 100 * SUCCESS_M[contest.asked.task],
-            "planning": contest.planning,
-            "planning_seed": contest.planning_seed,
+            "subject": benchmark.subject,
+            "checkpoint": benchmark.checkpoint,
+            **{key: value for key, value in dataclasses.asdict(benchmark.options).items() if key != "films"},
+            "steps": benchmark.results[0].steps,
+            "stride": benchmark.results[0].stride,
+            "seconds_per_step": benchmark.seconds_per_step,
+            "success_below_cm": 100 * SUCCESS_M[benchmark.options.task],
+            "planning": benchmark.planning,
+            "planning_seed": benchmark.planning_seed,
             "version": __version__,
             "time": utc_now(),
         },
-        "policies": {result.policy: _metrics(result) for result in contest.results},
+        "policies": {result.policy: _metrics(result) for result in benchmark.results},
     }
 
 
-def _policies(session: PlanningSession, asked: BenchmarkOptions, arm: SimulatedArm) -> Sequence[Policy]:
+def _policies(session: PlanningSession, options: BenchmarkOptions, arm: SimulatedArm) -> Sequence[Policy]:
     limits = session.config.planning.limits
     uses_camera = session.world_model.sizes.predictor.use_extrinsics
     controller = session.controller(extrinsics=arm.extrinsics() if uses_camera else None)
     name = Path(session.subject).name or session.subject
     taken = {DoNothing.name, RandomActions.name, Oracle.name}
     model = Planning(controller, name if name not in taken else f"model {name}")
-    return model, DoNothing(), RandomActions(limits, seed=asked.seed), oracle_for(asked.task, limits, arm)
+    return model, DoNothing(), RandomActions(limits, seed=options.seed), oracle_for(options.task, limits, arm)
 
 
 def _metrics(result: ClosedLoopResult) -> dict[str, Any]:
@@ -162,21 +163,14 @@ def _metrics(result: ClosedLoopResult) -> dict[str, Any]:
         "by_episode": {
             "success": result.successes.tolist(),
             "steps_needed": [episode.steps_needed for episode in result.episodes],
-            "distance_cm": [[_rounded(one) for one in row] for row in result.distance_cm.tolist()],
-            "seconds": [[_rounded(one) for one in row] for row in result.seconds.tolist()],
+            "distance_cm": _rounded(result.distance_cm),
+            "seconds": _rounded(result.seconds),
             "unreachable_commands": result.unreachable.tolist(),
         },
     }
 
 
-def _rounded(number: float) -> float:
-    if not math.isfinite(number):
-        raise ValueError(f"{number} among the metrics of episodes")
-    return round(number, 4)
-
-
-def _written(contest: ClosedLoopBenchmark, folder: Path) -> tuple[Path, ...]:
-    path = folder / FILE
-    write_atomically(path, json.dumps(benchmark_as_dict(contest), indent=1, allow_nan=False) + "\n")
-    model = contest.results[0]
-    return (path, write_film(folder / FILM, [model])) if contest.asked.films else (path,)
+def _rounded(numbers: Float[np.ndarray, "episodes _"]) -> list[list[float]]:
+    if not np.isfinite(numbers).all():
+        raise ValueError("a number among the metrics of episodes is not finite")
+    return [[round(one, 4) for one in row] for row in numbers.tolist()]

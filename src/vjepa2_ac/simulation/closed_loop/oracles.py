@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.episode import ACTION_DIM
-from vjepa2_ac.simulation.closed_loop.policies import Moves, Oracle, Policy, shortened
-from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, TaskName, TaskProblem
+from vjepa2_ac.simulation.closed_loop.policies import Oracle, Policy, Reference
+from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, HOLDING, TaskName
 from vjepa2_ac.simulation.world.arm import SimulatedArm
 
 _PUSH_M = 0.035  # per model step: a block that is hit faster slides on
@@ -17,72 +16,52 @@ _OVER_M = 0.012  # closer to the place of the grasp than this, fingers can close
 _CLEAR_M = 0.065  # above the place of the grasp, fingers pass over the block
 
 
-class _Scripted:
-    """Base of the oracles: observes the block.
+class _BlockOracle(Reference):
+    """Base of the oracles with a block, which they observe.
 
     Args:
         limits: The allowed actions.
         arm: The arm whose block is observed.
     """
 
-    name, why, moves = "oracle", "scripted", Moves.FLANGE
-
     def __init__(self, limits: LimitsConfig, arm: SimulatedArm) -> None:
-        self._limits, self._arm = limits, arm
+        super().__init__(limits)
+        self._arm = arm
 
 
-class PushOracle(_Scripted):
-    """Pushes the block along the line to its goal. Does not rotate."""
+class PushOracle(_BlockOracle):
+    """Pushes the block along the line to its goal: forwards, straight behind the block. Does not rotate."""
 
-    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Set the goal."""
-        self._goal, self._end = _block(problem.block_goal)[:2], problem.goal
-        way = self._goal - _block(problem.block_start)[:2]
-        self._ahead = way / np.linalg.norm(way)
-
-    def act(
-        self,
-        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
-        state: Float[np.ndarray, " 7"],
-    ) -> Float[np.ndarray, " 7"]:
-        """Return the next step of the push: forwards, straight behind the block."""
-        block = _block(self._arm.block)[:2]
-        if (self._goal - block) @ self._ahead < _NEAR_M:  # the rest is too short, or it slid past
-            return np.zeros(ACTION_DIM)
+    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+        goal, end = _block(self._problem.block_goal)[:2], self._problem.goal
+        direction = goal - _block(self._problem.block_start)[:2]
+        direction = direction / np.linalg.norm(direction)
+        block, way = _block(self._arm.block)[:2], np.zeros_like(state)
+        if (goal - block) @ direction < _NEAR_M:  # the rest is too short, or it slid past
+            return way
         to_block = block - state[:2]
-        beside = to_block - self._ahead * (to_block @ self._ahead)
-        ahead = self._ahead * ((self._end[:2] - state[:2]) @ self._ahead)
-        way = np.zeros(ACTION_DIM)
-        way[:2], way[2], way[6] = ahead + beside, self._end[2] - state[2], 1.0 - state[6]
+        beside = to_block - direction * (to_block @ direction)
+        ahead = direction * ((end[:2] - state[:2]) @ direction)
+        way[:2], way[2], way[6] = ahead + beside, end[2] - state[2], 1.0 - state[6]
         way[:3] *= min(1.0, _PUSH_M / float(np.linalg.norm(way[:3])))
-        return shortened(way, self._limits)
+        return way
 
 
-class PickOracle(_Scripted):
+class PickOracle(_BlockOracle):
     """Moves over the block, down, closes, and lifts. Does not rotate."""
 
-    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Set the goal."""
-        self._end = problem.goal
-
-    def act(
-        self,
-        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
-        state: Float[np.ndarray, " 7"],
-    ) -> Float[np.ndarray, " 7"]:
-        """Return the next step of the grasp."""
+    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
         place = _block(self._arm.block)[:3] + np.array([0.0, 0.0, GRASP_M])
-        way = np.zeros(ACTION_DIM)
-        to_place = place - state[:3]
+        way, to_place = np.zeros_like(state), place - state[:3]
         if np.linalg.norm(to_place) < _OVER_M * 1.5 and state[6] > HOLDING - 0.1:
-            way[:3], way[6] = self._end[:3] - state[:3], 1.0 - state[6]  # it is held: lift, and keep closing
+            way[:3], way[6] = self._problem.goal[:3] - state[:3], 1.0 - state[6]  # it is held: lift, and keep closing
         elif np.linalg.norm(to_place) < _OVER_M:
             way[6] = 1.0 - state[6]
         else:
             way[:3], way[6] = to_place, -state[6]
             if np.linalg.norm(to_place[:2]) > _OVER_M:
                 way[2] = max(way[2], min(0.0, way[2] + _CLEAR_M))  # not down on the block's edge
-        return shortened(way, self._limits)
+        return way
 
 
 def oracle_for(task: TaskName, limits: LimitsConfig, arm: SimulatedArm) -> Policy:

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config.planning import LimitsConfig
-from vjepa2_ac.episode import ACTION_DIM
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem
 
@@ -40,24 +39,53 @@ class Policy(Protocol):
         """Return the action of the next model step from the camera image and the measured state, in base frame."""
 
 
-class DoNothing:
-    """Does not move the arm."""
+class Reference:
+    """Base of the references, which look at no image: does not move the arm, unless a `_way` does.
 
-    name, why, moves = "do nothing", "nothing", Moves.FLANGE
+    Args:
+        limits: The allowed actions; None: they do not matter.
+    """
 
-    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:
-        """Do nothing."""
+    name, why, moves = "oracle", "scripted", Moves.FLANGE
+
+    def __init__(self, limits: LimitsConfig | None = None) -> None:
+        self._limits = limits or LimitsConfig()
+        self._begun: TaskProblem | None = None
+
+    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
+        """Set the goal."""
+        self._begun = problem
 
     def act(
         self,
         image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
-        state: Float[np.ndarray, " 7"],  # noqa: ARG002
+        state: Float[np.ndarray, " 7"],
     ) -> Float[np.ndarray, " 7"]:
-        """Return no motion."""
-        return np.zeros(ACTION_DIM)
+        """Return the next action, within the limits.
+
+        Raises:
+            ValueError: There is no problem yet.
+        """
+        return shortened(self._way(state), self._limits)
+
+    @property
+    def _problem(self) -> TaskProblem:
+        if self._begun is None:
+            raise ValueError("no problem: call reset first")
+        return self._begun
+
+    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+        """Return the action before it is shortened."""
+        return np.zeros_like(state)
 
 
-class RandomActions:
+class DoNothing(Reference):
+    """Does not move the arm."""
+
+    name, why = "do nothing", "nothing"
+
+
+class RandomActions(Reference):
     """Draws actions uniformly from the allowed ones; the same problem gets the same actions.
 
     Args:
@@ -65,57 +93,27 @@ class RandomActions:
         seed: Of the actions, with the problem's number.
     """
 
-    name, why, moves = "random", "random", Moves.FLANGE
+    name, why = "random", "random"
 
     def __init__(self, limits: LimitsConfig, seed: int = 0) -> None:
-        self._limits, self._seed = limits, seed
-        self._rng = np.random.default_rng(seed)
+        super().__init__(limits)
+        self._seed, self._rng = seed, np.random.default_rng(seed)
 
     def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
         """Seed the generator for this problem."""
         self._rng = np.random.default_rng([self._seed, problem.index])
 
-    def act(
-        self,
-        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
-        state: Float[np.ndarray, " 7"],  # noqa: ARG002
-    ) -> Float[np.ndarray, " 7"]:
-        """Return the next sample."""
-        return shortened(self._rng.uniform(-1.0, 1.0, size=ACTION_DIM) * farthest(self._limits), self._limits)
+    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+        return np.asarray(self._rng.uniform(-1.0, 1.0, size=len(state)) * farthest(self._limits))
 
 
-class Oracle:
-    """Knows the goal state and moves straight to it, as fast as allowed. Does not rotate (`reach` needs no rotation).
+class Oracle(Reference):
+    """Knows the goal state, moves straight to it as fast as allowed. Does not rotate (`reach` needs no rotation)."""
 
-    Args:
-        limits: The allowed actions.
-    """
-
-    name, why, moves = "oracle", "scripted", Moves.FLANGE
-
-    def __init__(self, limits: LimitsConfig) -> None:
-        self._limits = limits
-        self._problem: TaskProblem | None = None
-
-    def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
-        """Set the goal."""
-        self._problem = problem
-
-    def act(
-        self,
-        image: UInt8[np.ndarray, "height width 3"],  # noqa: ARG002 - of the protocol
-        state: Float[np.ndarray, " 7"],
-    ) -> Float[np.ndarray, " 7"]:
-        """Return the next step towards the goal.
-
-        Raises:
-            ValueError: There is no problem yet.
-        """
-        if self._problem is None:
-            raise ValueError("no problem: call reset first")
-        way = np.zeros(ACTION_DIM)
-        way[:3], way[6] = (self._problem.goal - state)[:3], (self._problem.goal - state)[6]
-        return shortened(way, self._limits)
+    def _way(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+        way: np.ndarray = self._problem.goal - state
+        way[3:6] = 0.0
+        return way
 
 
 class Planning:

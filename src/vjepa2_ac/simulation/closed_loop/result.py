@@ -64,11 +64,6 @@ class ClosedLoopResult:
         return np.stack([episode.distances_m for episode in self.episodes]) * 100
 
     @property
-    def final_distances_cm(self) -> Float[np.ndarray, " episodes"]:
-        """Distance to the goal at the end."""
-        return self.distance_cm[:, -1]
-
-    @property
     def successes(self) -> Bool[np.ndarray, " episodes"]:
         """Whether the goal is reached at the end."""
         return np.array([episode.success for episode in self.episodes])
@@ -96,7 +91,7 @@ class ClosedLoopResult:
     @property
     def final_distance_cm(self) -> Estimate:
         """Mean distance to the goal at the end."""
-        return self._mean(self.final_distances_cm)
+        return self._mean(self.distance_cm[:, -1])
 
     @property
     def steps_needed(self) -> Estimate | None:

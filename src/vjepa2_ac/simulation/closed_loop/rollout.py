@@ -6,8 +6,10 @@ as the command for `stride` control steps. Success is judged by the state at the
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,7 +103,7 @@ def run_episode(
     actions, seconds, whys, unreachable = [], [], [], 0
     for _ in range(steps):
         began = time.perf_counter()
-        measured = states[-1] if policy.moves == Moves.FLANGE else arm.joint_state
+        measured = states[-1] if policy.moves == Moves.FLANGE else np.append(arm.joints, arm.closedness)
         action = np.asarray(policy.act(frames[-1], measured), dtype=np.float64)
         seconds.append(time.perf_counter() - began)
         actions.append(_checked(action, policy))
@@ -133,12 +135,10 @@ def put(arm: SimulatedArm, state: Float[np.ndarray, " 7"], block: Float[np.ndarr
     return arm
 
 
-def ways_along(
-    state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"], parts: int = _PARTS
-) -> Sequence[Float[np.ndarray, " 7"]]:
+def ways_along(state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"]) -> Sequence[Float[np.ndarray, " 7"]]:
     """Return equally spaced states on the straight line of an action, the nearest first."""
-    shares = np.arange(1, parts + 1)[:, None] / parts
-    return list(apply_action(np.tile(state, (parts, 1)), shares * action))
+    shares = np.arange(1, _PARTS + 1)[:, None] / _PARTS
+    return list(apply_action(np.tile(state, (_PARTS, 1)), shares * action))
 
 
 def _checked(action: Float[np.ndarray, " dim"], policy: Policy) -> Float[np.ndarray, " dim"]:
@@ -157,24 +157,14 @@ def _send_joints(arm: SimulatedArm, action: Float[np.ndarray, " 8"], stride: int
 
 def _send(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int) -> bool:
     """Command the state after an action, its closedness within 0 .. 1; return whether it can be reached."""
-    target = _with_real_gripper(apply_action(arm.state, action))
-    try:
+    target = apply_action(arm.state, action)
+    target[6] = np.clip(target[6], 0.0, 1.0)
+    with suppress(OutOfReachError):
         arm.command(target, stride)
-    except OutOfReachError:
-        pass
-    else:
         return True
-    reachable = None
-    for way in ways_along(arm.state, action):
-        if not arm.can_reach(way):
-            break
-        reachable = way
-    if reachable is None:
-        arm.command_joints(arm.joints, target[6], stride)
+    reachable = list(itertools.takewhile(arm.can_reach, ways_along(arm.state, action)))
+    if reachable:
+        arm.command(np.append(reachable[-1][:6], target[6]), stride)
     else:
-        arm.command(np.append(reachable[:6], target[6]), stride)
+        arm.command_joints(arm.joints, target[6], stride)
     return False
-
-
-def _with_real_gripper(state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
-    return np.append(state[:6], np.clip(state[6], 0.0, 1.0))

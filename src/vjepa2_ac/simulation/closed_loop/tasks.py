@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
 from vjepa2_ac.simulation.world.block_arm import ContactArm
-from vjepa2_ac.simulation.world.camera import FRAME_HEIGHT, FRAME_WIDTH
+from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.motion import MotionRecipe, downward_poses, poses_in_base
 from vjepa2_ac.simulation.world.scene import (
@@ -43,7 +43,6 @@ GRASP_M = FINGERTIP_M - 0.02
 HOLDING = 1.0 - (BLOCK_M / 2 - FINGER_INSIDE_M) / FINGER_TRAVEL_M
 """Closedness of a gripper that holds the block."""
 
-_NUMBER: dict[TaskName, int] = {"reach": 0, "push": 1, "pick": 2}  # of the random stream
 _FLANGE_AREA = np.array([[0.32, -0.26], [0.62, 0.26]])  # low and high (x, y) in the world
 _BLOCK_AREA = np.array([[0.36, -0.26], [0.64, 0.26]])
 _PUSHING_M = 0.17  # height of the flange while pushing: the fingertips are 2 cm over the table
@@ -95,16 +94,15 @@ def make_problem(task: TaskName, domain: Domain, seed: int, index: int) -> TaskP
     Raises:
         ValueError: No such task, or a negative seed or index.
     """
-    if task not in _NUMBER:
-        raise ValueError(f"no task {task!r}: {', '.join(_NUMBER)}")
-    rng = np.random.default_rng([seed, index, _NUMBER[task]])
-    draw: dict[TaskName, Callable[[np.random.Generator], _Drawn]] = {"reach": _reach, "push": _push, "pick": _pick}
-    drawn = draw[task](rng)
+    if task not in _DRAWN:
+        raise ValueError(f"no task {task!r}: {', '.join(_DRAWN)}")
+    drawn = _DRAWN[task](np.random.default_rng([seed, index, list(_DRAWN).index(task)]))
     first, last = _states(drawn, domain)
     if drawn.blocks is None:
         return TaskProblem(task, index, first, last)
-    block_start, block_goal = _blocks_in_base(drawn.blocks, domain)
-    return TaskProblem(task, index, first, last, block_start, block_goal)
+    turns = drawn.blocks[:, 3:] - np.deg2rad(domain.base_yaw_deg)
+    blocks = np.concatenate([drawn.blocks[:, :3] @ domain.base_pose()[:3, :3], turns], axis=1)
+    return TaskProblem(task, index, first, last, *blocks)
 
 
 @dataclass(frozen=True)
@@ -140,7 +138,7 @@ def _push(rng: np.random.Generator) -> _Drawn:
         blocks = np.stack([block, block + way * ahead])
         flange = blocks - ahead * np.array([[touching + before], [touching]])
         if _inside(blocks, _BLOCK_AREA) and _inside(flange, _FLANGE_AREA):
-            return _Drawn(_at(flange, _PUSHING_M), turn, (1.0, 1.0), _turned(_at(blocks, BLOCK_M / 2), turn))
+            return _Drawn(_with(flange, _PUSHING_M), turn, (1.0, 1.0), _with(_with(blocks, BLOCK_M / 2), turn))
 
 
 def _pick(rng: np.random.Generator) -> _Drawn:
@@ -149,44 +147,34 @@ def _pick(rng: np.random.Generator) -> _Drawn:
     lifted = block + np.append(rng.uniform(-0.03, 0.03, size=2), rng.uniform(*LIFT_M))
     above = block + np.append(rng.uniform(-0.04, 0.04, size=2), GRASP_M + rng.uniform(0.07, 0.12))
     flange = np.stack([above, lifted + np.array([0.0, 0.0, GRASP_M])])
-    return _Drawn(flange, turn, (0.0, HOLDING), _turned(np.stack([block, lifted]), turn))
+    return _Drawn(flange, turn, (0.0, HOLDING), _with(np.stack([block, lifted]), turn))
+
+
+_DRAWN: dict[TaskName, Callable[[np.random.Generator], _Drawn]] = {"reach": _reach, "push": _push, "pick": _pick}
+"""The functions that draw a problem; a task's place among them is the number of its random stream."""
 
 
 def _inside(places: Float[np.ndarray, "places 2"], area: Float[np.ndarray, "2 2"]) -> bool:
     return bool(((places >= area[0]) & (places <= area[1])).all())
 
 
-def _at(places: Float[np.ndarray, "places 2"], height_m: float) -> Float[np.ndarray, "places 3"]:
-    return np.concatenate([places, np.full((len(places), 1), height_m)], axis=1)
-
-
-def _turned(places: Float[np.ndarray, "places 3"], turn: float) -> Float[np.ndarray, "places 4"]:
-    return np.concatenate([places, np.full((len(places), 1), turn)], axis=1)
+def _with(places: Float[np.ndarray, "places dim"], value: float) -> Float[np.ndarray, "places dim+1"]:
+    """Return places with one more coordinate, the same for all."""
+    return np.concatenate([places, np.full((len(places), 1), value)], axis=1)
 
 
 def _states(drawn: _Drawn, domain: Domain) -> Float[np.ndarray, "2 7"]:
     """Return start and goal of the arm in the base frame: pointing down, rotated about z."""
-    poses = poses_in_base(downward_poses(_turned(drawn.flange, drawn.turn)), domain)
+    poses = poses_in_base(downward_poses(_with(drawn.flange, drawn.turn)), domain)
     return np.concatenate([poses, np.array(drawn.closedness)[:, None]], axis=1)
 
 
-def _blocks_in_base(blocks: Float[np.ndarray, "blocks 4"], domain: Domain) -> Float[np.ndarray, "blocks 4"]:
-    turns = blocks[:, 3:] - np.deg2rad(domain.base_yaw_deg)
-    return np.concatenate([blocks[:, :3] @ domain.base_pose()[:3, :3], turns], axis=1)
-
-
 def arm_for(
-    task: TaskName,
-    domain: Domain,
-    *,
-    renderer: Renderer = "rays",
-    height: int = FRAME_HEIGHT,
-    width: int = FRAME_WIDTH,
+    task: TaskName, domain: Domain, *, renderer: Renderer = "rays", size: tuple[int, int] = FRAME_SIZE
 ) -> SimulatedArm:
     """Return an arm for a task: `reach` needs no contacts.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
     """
-    kind = SimulatedArm if task == "reach" else ContactArm
-    return kind(domain, renderer=renderer, height=height, width=width)
+    return (SimulatedArm if task == "reach" else ContactArm)(domain, renderer=renderer, size=size)

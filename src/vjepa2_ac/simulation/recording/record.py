@@ -92,8 +92,13 @@ def record_dataset(
             needed="at least 1 episode, 2 steps, 1 shard, 1 worker, seed 0",
         )
     record = partial(record_episode, spec=replace(spec, domain=spec.worlds))
-    stream = _watched(_recorded(record, episodes, workers), episodes, progress)
-    return write_droid_rlds(folder, stream, shards=shards or -(-episodes // 32))
+
+    def watched() -> Iterator[DroidEpisode]:
+        for done, episode in enumerate(_recorded(record, episodes, workers), start=1):
+            yield episode
+            progress(done, episodes)
+
+    return write_droid_rlds(folder, watched(), shards=shards or -(-episodes // 32))
 
 
 def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
@@ -108,7 +113,10 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
     images: dict[str, list[bytes]] = {}
     if task is None:
         motion = random_reaching(world, spec.steps, motion_rng, spec.recipe)
-        _film(SimulatedArm(world, renderer=spec.renderer), motion, images, spec.cameras)
+        arm = SimulatedArm(world, renderer=spec.renderer)
+        for joints, closedness in zip(motion.joints, motion.gripper, strict=True):
+            arm.set_joints(joints, float(closedness))
+            _take(arm, images, spec.cameras)
     else:
         # They import torch, which random reaching does not need.
         from vjepa2_ac.simulation.closed_loop.tasks import arm_for
@@ -137,12 +145,6 @@ def episode_folder(index: int, seed: int, domain_name: str) -> str:
     minute, hour, day = index % 60, index // 60 % 24, 1 + index // 1440 % 28
     place = f"{domain_name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"
     return f"/simulated/SIM/{'success' if succeeded else 'failure'}/2026-01-{day:02d}/{place}"
-
-
-def _film(arm: SimulatedArm, motion: Motion, films: dict[str, list[bytes]], cameras: int) -> None:
-    for joints, closedness in zip(motion.joints, motion.gripper, strict=True):
-        arm.set_joints(joints, float(closedness))
-        _take(arm, films, cameras)
 
 
 def _take(arm: SimulatedArm, films: dict[str, list[bytes]], cameras: int) -> None:
@@ -185,9 +187,3 @@ def _recorded(record: Callable[[int], DroidEpisode], episodes: int, workers: int
         while waiting:
             yield waiting.pop(0).result()
             waiting += [pool.submit(record, index) for index in itertools.islice(indices, 1)]
-
-
-def _watched(stream: Iterator[DroidEpisode], episodes: int, progress: Progress) -> Iterator[DroidEpisode]:
-    for done, episode in enumerate(stream, start=1):
-        yield episode
-        progress(done, episodes)

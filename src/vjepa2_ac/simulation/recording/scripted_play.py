@@ -6,6 +6,7 @@ Commands are as in the closed loop: one target state per model step, held for th
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Literal
 
 import numpy as np
@@ -19,8 +20,8 @@ from vjepa2_ac.simulation.closed_loop.policies import shortened
 from vjepa2_ac.simulation.closed_loop.rollout import put, ways_along
 from vjepa2_ac.simulation.closed_loop.tasks import GRASP_M, TaskProblem, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
-from vjepa2_ac.simulation.world.kinematics import OutOfReachError, inverse_kinematics
-from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe, rest_joints
+from vjepa2_ac.simulation.world.kinematics import OutOfReachError
+from vjepa2_ac.simulation.world.motion import Motion, MotionRecipe
 
 _NOISE_M = 0.008  # standard deviation of the noise on each axis of an oracle's step
 _LOWEST_M, _HIGHEST_M = 0.155, 0.34  # of the flange while playing
@@ -55,13 +56,16 @@ def play(
     limits = LimitsConfig(xyz=(recipe.reach_m,) * 3)
     oracle = oracle_for(task, limits, arm)
     put(arm, problem.start, problem.block_start)
-    oracle.reset(problem, np.zeros((1, 1, 3), dtype=np.uint8))
+    unseen = np.zeros((1, 1, 3), dtype=np.uint8)
+    oracle.reset(problem, unseen)
     rows: list[tuple[np.ndarray, float, np.ndarray, float]] = []
     joints, grip = arm.joints, float(problem.start[6])
     for step in range(steps):
         if step % recipe.stride == 0:
             if script:
-                action = _with_noise(oracle.act(np.zeros((1, 1, 3), dtype=np.uint8), arm.state), limits, rng)
+                exact = oracle.act(unseen, arm.state)
+                noise = np.append(rng.normal(0.0, _NOISE_M, size=3), np.zeros(4))
+                action = shortened(exact + noise, limits)
             else:
                 action = _play_action(arm, problem, limits, rng)
             joints, grip = _sent(arm, action)
@@ -71,10 +75,6 @@ def play(
         arm.command_joints(joints, grip)
     commanded, commanded_grip, measured, measured_grip = zip(*rows, strict=True)
     return Motion(np.array(commanded), np.array(commanded_grip), np.array(measured), np.array(measured_grip))
-
-
-def _with_noise(action: Float[np.ndarray, " 7"], limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
-    return shortened(action + np.append(rng.normal(0.0, _NOISE_M, size=3), np.zeros(4)), limits)
 
 
 def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:
@@ -101,12 +101,9 @@ def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, 
 
 def _sent(arm: SimulatedArm, action: Float[np.ndarray, " 7"]) -> tuple[np.ndarray, float]:
     """Return the joints and closedness of a step's command, as far along it as joint angles exist."""
-    rest, joints = rest_joints(arm.domain), arm.joints
-    target = apply_action(arm.state, action)
+    joints, target = arm.joints, apply_action(arm.state, action)
     for way in [target, *reversed(ways_along(arm.state, action)[:-1])]:
-        try:
-            joints = inverse_kinematics(way[:6], arm.joints, rest=rest)
-        except OutOfReachError:
-            continue
-        break
+        with suppress(OutOfReachError):
+            joints = arm.joints_for(way)
+            break
     return joints, float(np.clip(target[6], 0.0, 1.0))

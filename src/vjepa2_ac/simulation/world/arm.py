@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from scipy.spatial.transform import Rotation
 
 from vjepa2_ac.geometry import euler_from_matrices
-from vjepa2_ac.simulation.world.camera import FRAME_HEIGHT, FRAME_WIDTH, RayCamera
+from vjepa2_ac.simulation.world.camera import FRAME_SIZE, RayCamera
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.kinematics import OutOfReachError, forward_kinematics, inverse_kinematics
 from vjepa2_ac.simulation.world.motion import GRIPPER_LAG_S, rest_joints, tracking_share
@@ -29,21 +29,18 @@ class SimulatedArm:
     Args:
         domain: Its world.
         renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
-        height, width: Size of the images.
+        size: Height and width of the images.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
     """
 
-    def __init__(
-        self, domain: Domain, *, renderer: Renderer = "rays", height: int = FRAME_HEIGHT, width: int = FRAME_WIDTH
-    ) -> None:
+    def __init__(self, domain: Domain, *, renderer: Renderer = "rays", size: tuple[int, int] = FRAME_SIZE) -> None:
         self.domain = domain
         self._mujoco = load_mujoco()
         self._model = self._compiled(domain)
         self._data = self._mujoco.MjData(self._model)
-        self._size = {"height": height, "width": width}
-        self._renderer = renderer
+        self._renderer, self._size = renderer, size
         self._cameras: dict[str, Any] = {}
         self.set_joints(rest_joints(domain), 0.0)
         if renderer == "opengl":
@@ -58,11 +55,6 @@ class SimulatedArm:
     def state(self) -> Float[np.ndarray, " 7"]:
         """Measured pose of the flange, and closedness of the gripper."""
         return np.append(forward_kinematics(self.joints), self.closedness)
-
-    @property
-    def joint_state(self) -> Float[np.ndarray, " 8"]:
-        """Measured joint angles in radians, and closedness of the gripper: the state as a vector."""
-        return np.append(self.joints, self.closedness)
 
     @property
     def closedness(self) -> float:
@@ -89,19 +81,26 @@ class SimulatedArm:
         self._data.qpos[7:9] = FINGER_TRAVEL_M * (1.0 - closedness)
         self._mujoco.mj_kinematics(self._model, self._data)
 
+    def joints_for(self, state: Float[np.ndarray, " 7"]) -> Float[np.ndarray, " 7"]:
+        """Return joint angles that bring the flange from here to a pose.
+
+        Raises:
+            OutOfReachError: There are none.
+        """
+        return inverse_kinematics(state[:6], self.joints, rest=rest_joints(self.domain))
+
     def set_state(self, state: Float[np.ndarray, " 7"]) -> None:
         """Put the flange at a pose, at once.
 
         Raises:
             OutOfReachError: No joint angles lead there.
         """
-        rest = rest_joints(self.domain)
-        self.set_joints(inverse_kinematics(state[:6], self.joints, rest=rest), float(state[6]))
+        self.set_joints(self.joints_for(state), float(state[6]))
 
     def can_reach(self, state: Float[np.ndarray, " 7"]) -> bool:
         """Return whether a command to move the flange from here to this pose can be followed."""
         try:
-            inverse_kinematics(state[:6], self.joints, rest=rest_joints(self.domain))
+            self.joints_for(state)
         except OutOfReachError:
             return False
         return True
@@ -112,8 +111,7 @@ class SimulatedArm:
         Raises:
             OutOfReachError: No joint angles lead there.
         """
-        goal = inverse_kinematics(target[:6], self.joints, rest=rest_joints(self.domain))
-        return self.command_joints(goal, float(target[6]), control_steps)
+        return self.command_joints(self.joints_for(target), float(target[6]), control_steps)
 
     def command_joints(
         self, goal: Float[np.ndarray, " 7"], closedness: float, control_steps: int = 1
@@ -144,20 +142,16 @@ class SimulatedArm:
         if name not in self._cameras:
             fov = WRIST_FOV_DEG if name == "wrist" else self.domain.camera.vertical_fov_deg
             kind = OpenGlCamera if self._renderer == "opengl" else RayCamera
-            self._cameras[name] = kind(
-                self._model, self.domain, self._camera_pose(name), vertical_fov_deg=fov, **self._size
-            )
+            self._cameras[name] = kind(self._model, self.domain, self._camera_pose(name), fov, self._size)
         return self._cameras[name]
 
     def _camera_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
-        place = self.domain.camera
         if name == "wrist":
             return self._wrist_pose()
-        if name == "exterior_2":
-            return place.turned(SECOND_CAMERA_TURN_DEG).pose()
-        if name == "exterior_1":
-            return place.pose()
-        raise ValueError(f"no camera {name!r}: exterior_1, exterior_2 or wrist")
+        turns = {"exterior_1": 0.0, "exterior_2": SECOND_CAMERA_TURN_DEG}
+        if name not in turns:
+            raise ValueError(f"no camera {name!r}: exterior_1, exterior_2 or wrist")
+        return self.domain.camera.turned(turns[name]).pose()
 
     def _wrist_pose(self) -> Float[np.ndarray, "4 4"]:
         """Return the frame of a camera on the hand that looks past the fingers."""

@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
+from vjepa2_ac.simulation.world.arm import SimulatedArm
 from vjepa2_ac.simulation.world.block_scene import SUBSTEPS, compile_contact_scene
-from vjepa2_ac.simulation.world.camera import FRAME_HEIGHT, FRAME_WIDTH
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.motion import GRIPPER_LAG_S
 from vjepa2_ac.simulation.world.scene import FINGER_TRAVEL_M
@@ -31,21 +30,11 @@ class ContactArm(SimulatedArm):
     Args:
         domain: Its world.
         renderer: `rays` works everywhere; `opengl` needs a working `MUJOCO_GL`.
-        height, width: Size of the images.
+        size: Height and width of the images.
 
     Raises:
         InputError: MuJoCo is not installed, or OpenGL does not work here.
     """
-
-    def __init__(
-        self, domain: Domain, *, renderer: Renderer = "rays", height: int = FRAME_HEIGHT, width: int = FRAME_WIDTH
-    ) -> None:
-        super().__init__(domain, renderer=renderer, height=height, width=width)
-        lags = np.array([domain.lag_s] * 7 + [GRIPPER_LAG_S] * 2)
-        self._share = 1.0 - np.exp(-self._model.opt.timestep / lags)
-        self._ahead = (
-            -self._model.actuator_biasprm[:, 2] / self._model.actuator_gainprm[:, 0] / self._model.opt.timestep
-        )
 
     @property
     def closedness(self) -> float:
@@ -91,4 +80,8 @@ class ContactArm(SimulatedArm):
         return self.state
 
     def _compiled(self, domain: Domain) -> Any:
-        return compile_contact_scene(domain)
+        model = compile_contact_scene(domain)
+        lags = np.array([domain.lag_s] * 7 + [GRIPPER_LAG_S] * 2)
+        self._share = 1.0 - np.exp(-model.opt.timestep / lags)
+        self._ahead = -model.actuator_biasprm[:, 2] / model.actuator_gainprm[:, 0] / model.opt.timestep
+        return model

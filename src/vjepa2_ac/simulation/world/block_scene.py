@@ -5,12 +5,9 @@ from __future__ import annotations
 from typing import Any
 from xml.etree import ElementTree as ET
 
-import numpy as np
-
 from vjepa2_ac.simulation.world.domains import Domain
-from vjepa2_ac.simulation.world.kinematics import JOINTS
 from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ
-from vjepa2_ac.simulation.world.scene import ARM_GROUP, BLOCK_M, as_text, load_mujoco, scene_tree
+from vjepa2_ac.simulation.world.scene import ARM_GROUP, BLOCK_M, add, compile_tree, scene_tree
 
 WORK_AREA_M = ((0.28, 0.74), (-0.38, 0.38))
 """Ranges of x and y in the world that are kept free of other objects, for the block."""
@@ -34,14 +31,9 @@ def compile_contact_scene(domain: Domain) -> Any:
     Raises:
         InputError: MuJoCo is not installed.
     """
-    return load_mujoco().MjModel.from_xml_string(contact_scene_xml(domain))
-
-
-def contact_scene_xml(domain: Domain) -> str:
-    """Return the scene as MJCF."""
     root = scene_tree(domain)
     timestep = 1.0 / CONTROL_RATE_HZ / SUBSTEPS
-    ET.SubElement(root, "option", timestep=repr(timestep), integrator="implicitfast", cone="elliptic", impratio="10")
+    add(root, "option", timestep=timestep, integrator="implicitfast", cone="elliptic", impratio="10")
     world = root.find("worldbody")
     assert world is not None  # noqa: S101 - scene_tree makes it
     _clear_work_area(world)
@@ -50,8 +42,8 @@ def contact_scene_xml(domain: Domain) -> str:
     for body in world.iter("body"):
         _drive(body)
     _add_block(world)
-    _add_servos(ET.SubElement(root, "actuator"))
-    return ET.tostring(root, encoding="unicode")
+    _add_servos(add(root, "actuator"))
+    return compile_tree(root)
 
 
 def _clear_work_area(world: ET.Element) -> None:
@@ -77,30 +69,16 @@ def _drive(body: ET.Element) -> None:
 
 def _add_block(world: ET.Element) -> None:
     half = BLOCK_M / 2
-    body = ET.SubElement(world, "body", name="block", pos=as_text([0.5, 0.0, half]))
-    ET.SubElement(body, "freejoint", name="block")
-    ET.SubElement(
-        body,
-        "geom",
-        name="block",
-        type="box",
-        size=as_text([half] * 3),
-        mass=repr(_BLOCK_KG),
-        rgba=as_text([*_GREEN, 1.0]),
-        group=str(ARM_GROUP),  # moving geoms
-        contype="1",
-        conaffinity="3",
-        condim="4",
-        friction=_SLIDING,
-    )
+    body = add(world, "body", name="block", pos=[0.5, 0.0, half])
+    add(body, "freejoint", name="block")
+    shape = {"type": "box", "size": [half] * 3, "mass": _BLOCK_KG, "rgba": [*_GREEN, 1.0], "group": f"{ARM_GROUP}"}
+    add(body, "geom", name="block", **shape, contype="1", conaffinity="3", condim="4", friction=_SLIDING)
 
 
 def _add_servos(actuators: ET.Element) -> None:
-    for index, stiffness in enumerate(_ARM_STIFFNESS[: len(JOINTS)], start=1):
+    for index, stiffness in enumerate(_ARM_STIFFNESS, start=1):
         name = f"joint{index}"
-        ET.SubElement(actuators, "position", name=name, joint=name, kp=repr(stiffness), dampratio="1")
+        add(actuators, "position", name=name, joint=name, kp=stiffness, dampratio="1")
     for name in ("finger1", "finger2"):
-        force = as_text(np.array([-_FINGER_FORCE, _FINGER_FORCE]))
-        ET.SubElement(
-            actuators, "position", name=name, joint=name, kp=repr(_FINGER_STIFFNESS), dampratio="1", forcerange=force
-        )
+        force = [-_FINGER_FORCE, _FINGER_FORCE]
+        add(actuators, "position", name=name, joint=name, kp=_FINGER_STIFFNESS, dampratio="1", forcerange=force)

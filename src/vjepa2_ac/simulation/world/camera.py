@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.simulation.world.domains import Domain
-from vjepa2_ac.simulation.world.ray_renderer import Caster, Hits, View, lamp_view
-from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, light_position, load_mujoco
+from vjepa2_ac.simulation.world.ray_renderer import Caster, Hits, View, lamp_view, unit
+from vjepa2_ac.simulation.world.scene import ARM_GROUP, STATIC_GROUP, light_position
 
-FRAME_HEIGHT, FRAME_WIDTH = 180, 320
+FRAME_SIZE = FRAME_HEIGHT, FRAME_WIDTH = 180, 320
 """Size of DROID's images in RLDS."""
 
 _SHADOW = 0.35  # share of the lamp's light that remains in the shadow
@@ -43,7 +43,7 @@ class RayCamera:
         domain: Its appearance.
         pose: The camera's frame in the world: x right, y down, z into the image.
         vertical_fov_deg: Angle from the upper to the lower edge of the image.
-        height, width: Size of the image.
+        size: Height and width of the image.
     """
 
     def __init__(
@@ -51,15 +51,13 @@ class RayCamera:
         model: Any,
         domain: Domain,
         pose: Float[np.ndarray, "4 4"],
-        *,
         vertical_fov_deg: float,
-        height: int = FRAME_HEIGHT,
-        width: int = FRAME_WIDTH,
+        size: tuple[int, int] = FRAME_SIZE,
     ) -> None:
         self._caster, self._colours = Caster(model), _Colours(model)
         self._lamp, self._ambient = light_position(domain.look), domain.look.ambient
-        self._size = (width, height)
-        self._half_view = np.tan(np.deg2rad(vertical_fov_deg) / 2) * np.array([width / height, 1.0])
+        self._height, self._width = size
+        self._half_view = np.tan(np.deg2rad(vertical_fov_deg) / 2) * np.array([self._width / self._height, 1.0])
         self._pose = pose
         self._background: _Background | None = None
 
@@ -83,12 +81,12 @@ class RayCamera:
         spots = view.origin + view.rays[near] * hits.distance_m[:, None]
         ambient, direct = self._light(data, spots, hits, ARM_GROUP)
         pixels[near] = _as_bytes(ambient + direct)
-        return pixels.reshape(*self._size[::-1], 3)
+        return pixels.reshape(self._height, self._width, 3)
 
     def _see_background(self, data: Any) -> _Background:
-        view = View(
-            self._pose, _pixel_rays(self._size, self._half_view) @ self._pose[:3, :3].T, self._half_view, self._size
-        )
+        size = (self._width, self._height)
+        rays = _pixel_rays(size, self._half_view) @ self._pose[:3, :3].T
+        view = View(self._pose, rays, self._half_view, size)
         hits = self._caster.cast(data, view.origin, view.rays, STATIC_GROUP)
         distance = np.where(hits.geoms >= 0, hits.distance_m, _FAR_M)
         spots = view.origin + view.rays * distance[:, None]
@@ -99,8 +97,7 @@ class RayCamera:
     def _light(self, data: Any, spots: Any, hits: Hits, group: int) -> tuple[Any, Any]:
         """Return the colour of points in ambient light, and the lamp's part; the group casts shadows on itself."""
         colour = self._colours.at(hits.geoms, spots)
-        to_lamp = self._lamp - spots
-        to_lamp /= np.maximum(np.linalg.norm(to_lamp, axis=1, keepdims=True), 1e-9)
+        to_lamp = unit(self._lamp - spots)
         shine = np.einsum("ij,ij->i", hits.normals, to_lamp).clip(0.0, 1.0)
         facing = np.flatnonzero(shine > 0.0)
         shine[facing[self._caster.shaded(data, self._lamp, spots[facing], group)]] *= _SHADOW
@@ -112,16 +109,16 @@ class _Colours:
     """Colours by geom, and by position for those with a pattern, so that images have texture."""
 
     def __init__(self, model: Any) -> None:
-        mujoco = load_mujoco()
         self._colours = model.geom_rgba[:, :3].astype(np.float32)
-        names = [mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_GEOM, index) or "" for index in range(model.ngeom)]
-        self._table = np.array([name == "table" for name in names])
-        self._floor = np.array([name == "floor" for name in names])
-        self._wall = np.array([name.startswith("wall") for name in names])
+        names = [model.geom(index).name for index in range(model.ngeom)]
+        patterns = {"table": _planks, "floor": _tiles, "wall": _panels}
+        self._patterns = [
+            (np.array([name.startswith(start) for name in names]), pattern) for start, pattern in patterns.items()
+        ]
 
     def at(self, geoms: Any, spots: Any) -> Any:
         colour = self._colours[geoms]
-        for chosen, pattern in ((self._table, _planks), (self._floor, _tiles), (self._wall, _panels)):
+        for chosen, pattern in self._patterns:
             index = np.flatnonzero(chosen[geoms])
             if len(index):
                 colour[index] *= pattern(spots[index])[:, None]
@@ -157,7 +154,7 @@ def _pixel_rays(size: tuple[int, int], half_view: Float[np.ndarray, " 2"]) -> Fl
         ((np.arange(count) + 0.5) / count * 2 - 1) * half for count, half in zip(size, half_view, strict=True)
     )
     rays = np.stack(np.broadcast_arrays(across[None, :], down[:, None], 1.0), axis=-1).reshape(-1, 3)
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    return unit(rays)
 
 
 def _as_bytes(colour: Any) -> UInt8[np.ndarray, "pixels 3"]:

@@ -42,7 +42,7 @@ HIGH = np.array([joint.high_rad for joint in JOINTS])
 HOME = np.array([0.0, -0.4, 0.0, -2.4, 0.0, 2.0, 0.8])
 """The gripper points down in front of the robot; the flange is near (0.42, 0, 0.46)."""
 
-_TOLERANCE_M, _TOLERANCE_RAD = 1e-5, 1e-4
+_TOLERANCE_M, _TOLERANCE_RAD, _ITERATIONS = 1e-5, 1e-4, 200
 
 
 class OutOfReachError(ValueError):
@@ -56,11 +56,7 @@ def forward_kinematics(joints: Float[np.ndarray, "*batch 7"]) -> Float[np.ndarra
 
 
 def inverse_kinematics(
-    pose: Float[np.ndarray, " 6"],
-    start: Float[np.ndarray, " 7"] = HOME,
-    *,
-    rest: Float[np.ndarray, " 7"] = HOME,
-    iterations: int = 200,
+    pose: Float[np.ndarray, " 6"], start: Float[np.ndarray, " 7"] = HOME, *, rest: Float[np.ndarray, " 7"] = HOME
 ) -> Float[np.ndarray, " 7"]:
     """Return joint angles that bring the flange to a pose: to 0.01 mm and 0.006 degrees, within the limits.
 
@@ -73,9 +69,10 @@ def inverse_kinematics(
     rotation = matrices_from_euler(pose[3:])
     for first in (start, rest):
         joints = np.clip(np.asarray(first, dtype=np.float64), LOW, HIGH)
-        for _ in range(iterations):
+        for _ in range(_ITERATIONS):
             frames = _frames(joints)
-            error = _pose_error(pose[:3], rotation, frames[-1])
+            turn = Rotation.from_matrix(rotation @ frames[-1][:3, :3].T).as_rotvec()
+            error = np.concatenate([pose[:3] - frames[-1][:3, 3], turn])
             if np.abs(error[:3]).max() < _TOLERANCE_M and np.abs(error[3:]).max() < _TOLERANCE_RAD:
                 return joints
             joints = _limited_step(_jacobian(frames), error, joints, rest)
@@ -111,13 +108,6 @@ def _step(
     pull = min(0.3, 3.0 * size) * to_rest
     step: np.ndarray = jacobian.T @ np.linalg.solve(damped, error - jacobian @ pull) + pull
     return step * min(1.0, 0.4 / max(float(np.abs(step).max()), 1e-12))
-
-
-def _pose_error(
-    position: Float[np.ndarray, " 3"], rotation: Float[np.ndarray, "3 3"], frame: Float[np.ndarray, "4 4"]
-) -> Float[np.ndarray, " 6"]:
-    turn = Rotation.from_matrix(rotation @ frame[:3, :3].T).as_rotvec()
-    return np.concatenate([position - frame[:3, 3], turn])
 
 
 def _jacobian(frames: list[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "6 7"]:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.simulation.world.camera import FRAME_HEIGHT, FRAME_WIDTH
+from vjepa2_ac.simulation.world.camera import FRAME_SIZE
 from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.scene import load_mujoco
 
@@ -25,17 +25,15 @@ class OpenGlCamera:
         model: Any,
         domain: Domain,
         pose: Float[np.ndarray, "4 4"],
-        *,
         vertical_fov_deg: float,
-        height: int = FRAME_HEIGHT,
-        width: int = FRAME_WIDTH,
+        size: tuple[int, int] = FRAME_SIZE,
     ) -> None:
         del domain  # the light and the colours are in the model
         self._mujoco, self._model = load_mujoco(), model
         self._fov = vertical_fov_deg
         self.move(pose)
         try:
-            self._renderer = self._mujoco.Renderer(model, height, width)
+            self._renderer = self._mujoco.Renderer(model, *size)
         except Exception as error:  # each back end fails in its own way: ImportError, AttributeError, FatalError, ...
             raise InputError(
                 where="renderer: opengl",

@@ -52,9 +52,8 @@ class Caster:
         self, data: Any, lamp: Float[np.ndarray, " 3"], spots: Float[np.ndarray, "spots 3"], group: int
     ) -> Bool[np.ndarray, " spots"]:
         """Return which points are in the shadow of one group of geoms."""
-        ways = spots - lamp
-        reach = np.linalg.norm(ways, axis=1)
-        hits = self.cast(data, lamp, ways / np.maximum(reach, 1e-9)[:, None], group)
+        reach = np.linalg.norm(spots - lamp, axis=1)
+        hits = self.cast(data, lamp, unit(spots - lamp), group)
         return np.asarray((hits.geoms >= 0) & (hits.distance_m < reach - _SKIN_M))
 
 
@@ -110,6 +109,9 @@ def lamp_view(lamp: Float[np.ndarray, " 3"], spots: Float[np.ndarray, "spots 3"]
     azimuth = float(np.rad2deg(np.arctan2(lamp[1], lamp[0])))
     elevation = float(np.rad2deg(np.arcsin(lamp[2] / distance)))
     pose = CameraPlace(azimuth, elevation, distance, look_at_m=(0.0, 0.0, 0.0)).pose()
-    ways = spots - lamp
-    rays = ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9)
-    return View(pose, rays, np.array([_LAMP_HALF_VIEW] * 2), (_LAMP_CELLS, _LAMP_CELLS))
+    return View(pose, unit(spots - lamp), np.array([_LAMP_HALF_VIEW] * 2), (_LAMP_CELLS, _LAMP_CELLS))
+
+
+def unit(ways: Float[np.ndarray, "ways 3"]) -> Float[np.ndarray, "ways 3"]:
+    """Return vectors of length 1 in the same directions."""
+    return np.asarray(ways / np.maximum(np.linalg.norm(ways, axis=1, keepdims=True), 1e-9))

@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from vjepa2_ac.errors import InputError, pip_install
-from vjepa2_ac.simulation.world.domains import Domain, Look
+from vjepa2_ac.simulation.world.domains import Domain, Look, direction
 from vjepa2_ac.simulation.world.kinematics import FLANGE_OFFSET_M, JOINTS
 
 STATIC_GROUP, ARM_GROUP = 0, 1
@@ -112,43 +112,48 @@ def compile_scene(domain: Domain) -> Any:
     Raises:
         InputError: MuJoCo is not installed.
     """
-    return load_mujoco().MjModel.from_xml_string(scene_xml(domain))
+    return compile_tree(scene_tree(domain))
 
 
-def scene_xml(domain: Domain) -> str:
-    """Return the scene as MJCF: seven hinges `joint1`..`joint7`, two slides `finger1`, `finger2`, the site `flange`."""
-    return ET.tostring(scene_tree(domain), encoding="unicode")
+def compile_tree(root: ET.Element) -> Any:
+    """Return the compiled `mujoco.MjModel` of a scene in MJCF.
+
+    Raises:
+        InputError: MuJoCo is not installed.
+    """
+    return load_mujoco().MjModel.from_xml_string(ET.tostring(root, encoding="unicode"))
 
 
 def scene_tree(domain: Domain) -> ET.Element:
-    """Return the scene as the tree of its MJCF, which can be extended."""
-    root = ET.Element("mujoco", model="arm")
-    ET.SubElement(root, "compiler", angle="radian", autolimits="true")
-    visual = ET.SubElement(root, "visual")
-    ET.SubElement(visual, "global", fovy=str(domain.camera.vertical_fov_deg), offwidth="1280", offheight="720")
-    look = domain.look
-    ET.SubElement(visual, "headlight", ambient=as_text([look.ambient] * 3), diffuse="0 0 0", specular="0 0 0")
-    world = ET.SubElement(root, "worldbody")
-    light = light_position(look)
-    ET.SubElement(
-        world,
-        "light",
-        pos=as_text(light),
-        dir=as_text(-light),
-        diffuse=as_text([1 - look.ambient] * 3),
-        castshadow="true",
-    )
+    """Return the scene as the tree of its MJCF, which can be extended.
+
+    It has seven hinges `joint1`..`joint7`, two slides `finger1`, `finger2`, the site `flange`.
+    """
+    look, root = domain.look, ET.Element("mujoco", model="arm")
+    add(root, "compiler", angle="radian", autolimits="true")
+    visual = add(root, "visual")
+    add(visual, "global", fovy=domain.camera.vertical_fov_deg, offwidth="1280", offheight="720")
+    add(visual, "headlight", ambient=[look.ambient] * 3, diffuse="0 0 0", specular="0 0 0")
+    world, light = add(root, "worldbody"), light_position(look)
+    add(world, "light", pos=light, dir=-light, diffuse=[1 - look.ambient] * 3, castshadow="true")
     _add_room(world, look)
     _add_clutter(world, np.random.default_rng(domain.clutter_seed))
     _add_arm(world, domain)
     return root
 
 
+def add(parent: ET.Element, tag: str, **attributes: Any) -> ET.Element:
+    """Add an element to the tree of an MJCF; numbers become text, exactly."""
+    texts = {
+        name: value if isinstance(value, str) else " ".join(repr(float(number)) for number in np.ravel(value))
+        for name, value in attributes.items()
+    }
+    return ET.SubElement(parent, tag, texts)
+
+
 def light_position(look: Look) -> np.ndarray:
     """Return the position of the lamp in the world."""
-    azimuth, elevation = np.deg2rad(look.light_azimuth_deg), np.deg2rad(look.light_elevation_deg)
-    outward = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    return 2.2 * np.array(outward)
+    return 2.2 * direction(look.light_azimuth_deg, look.light_elevation_deg)
 
 
 def _add_room(world: ET.Element, look: Look) -> None:
@@ -172,49 +177,31 @@ def _add_clutter(world: ET.Element, rng: np.random.Generator) -> None:
         x, y = rng.uniform(0.25, 0.8), rng.uniform(-0.5, 0.5)
         size, height = rng.uniform(0.02, 0.04), rng.uniform(0.02, 0.05)
         colour = [float(channel) for channel in rng.uniform(0.15, 0.9, size=3)]
-        ET.SubElement(
-            world,
-            "geom",
-            name=f"thing{index}",
-            type="box" if index % 2 else "cylinder",
-            pos=as_text([x, y, height]),
-            size=as_text([size, size, height] if index % 2 else [size, height]),
-            euler=as_text([0.0, 0.0, rng.uniform(0, np.pi)]),
-            rgba=as_text([*colour, 1.0]),
-            group=str(STATIC_GROUP),
-        )
+        kind, half = ("box", [size, size, height]) if index % 2 else ("cylinder", [size, height])
+        place = {"pos": [x, y, height], "size": half, "euler": [0.0, 0.0, rng.uniform(0, np.pi)]}
+        add(world, "geom", name=f"thing{index}", type=kind, **place, rgba=[*colour, 1.0], group=f"{STATIC_GROUP}")
 
 
 def _add_arm(world: ET.Element, domain: Domain) -> None:
-    body = ET.SubElement(world, "body", name="link0", euler=as_text([0, 0, np.deg2rad(domain.base_yaw_deg)]))
+    body = add(world, "body", name="link0", euler=[0, 0, np.deg2rad(domain.base_yaw_deg)])
     _add_shapes(body, LINK_SHAPES[0], domain.look)
     for index, joint in enumerate(JOINTS, start=1):
         twist = np.deg2rad(joint.twist_deg)
         offset = [joint.length_m, -np.sin(twist) * joint.offset_m, np.cos(twist) * joint.offset_m]
-        body = ET.SubElement(body, "body", name=f"link{index}", pos=as_text(offset), euler=as_text([twist, 0, 0]))
-        ET.SubElement(
-            body,
-            "joint",
-            name=f"joint{index}",
-            type="hinge",
-            axis="0 0 1",
-            range=as_text([joint.low_rad, joint.high_rad]),
-        )
+        body = add(body, "body", name=f"link{index}", pos=offset, euler=[twist, 0, 0])
+        limits = [joint.low_rad, joint.high_rad]
+        add(body, "joint", name=f"joint{index}", type="hinge", axis="0 0 1", range=limits)
         _add_shapes(body, LINK_SHAPES[index], domain.look)
-    ET.SubElement(body, "site", name="flange", pos=as_text([0, 0, FLANGE_OFFSET_M]))
-    hand = ET.SubElement(
-        body, "body", name="hand", pos=as_text([0, 0, FLANGE_OFFSET_M]), euler=as_text([0, 0, -np.pi / 4])
-    )
+    add(body, "site", name="flange", pos=[0, 0, FLANGE_OFFSET_M])
+    hand = add(body, "body", name="hand", pos=[0, 0, FLANGE_OFFSET_M], euler=[0, 0, -np.pi / 4])
     _add_shapes(hand, HAND_SHAPES, domain.look)
     for index, side in enumerate((1, -1), start=1):
         _add_finger(hand, f"finger{index}", side, domain.look)
 
 
 def _add_finger(hand: ET.Element, name: str, side: int, look: Look) -> None:
-    finger = ET.SubElement(hand, "body", name=name)
-    ET.SubElement(
-        finger, "joint", name=name, type="slide", axis=as_text([0, side, 0]), range=as_text([0, FINGER_TRAVEL_M])
-    )
+    finger = add(hand, "body", name=name)
+    add(finger, "joint", name=name, type="slide", axis=[0, side, 0], range=[0, FINGER_TRAVEL_M])
     low, high = sorted((side * FINGER_INSIDE_M, side * FINGER_OUTSIDE_M))
     ends = (-FINGER_HALF_M, low, 0.07), (FINGER_HALF_M, high, FINGERTIP_M)
     _add_shapes(finger, (Shape("box", *ends, 0.0, "hand"),), look)
@@ -224,26 +211,12 @@ def _add_shapes(body: ET.Element, shapes: tuple[Shape, ...], look: Look) -> None
     for shape in shapes:
         start, end = np.array(shape.start, dtype=float), np.array(shape.end, dtype=float)
         if shape.kind == "box":
-            place: dict[str, Any] = {"pos": as_text((start + end) / 2), "size": as_text((end - start) / 2)}
+            place = {"pos": (start + end) / 2, "size": (end - start) / 2}
         else:
-            place = {"fromto": as_text([*start, *end]), "size": as_text([shape.radius_m])}
-        rgba = as_text([*getattr(look, shape.colour), 1.0])
-        ET.SubElement(body, "geom", type=shape.kind, rgba=rgba, group=str(ARM_GROUP), **place)
+            place = {"fromto": np.append(start, end), "size": np.array(shape.radius_m)}
+        rgba = [*getattr(look, shape.colour), 1.0]
+        add(body, "geom", type=shape.kind, rgba=rgba, group=f"{ARM_GROUP}", **place)
 
 
 def _add_box(world: ET.Element, name: str, centre: Point, half: Point, colour: tuple[float, ...]) -> None:
-    ET.SubElement(
-        world,
-        "geom",
-        name=name,
-        type="box",
-        pos=as_text(centre),
-        size=as_text(half),
-        rgba=as_text([*colour, 1.0]),
-        group=str(STATIC_GROUP),
-    )
-
-
-def as_text(numbers: Any) -> str:
-    """Return numbers as an attribute of MJCF, exactly."""
-    return " ".join(repr(float(number)) for number in numbers)
+    add(world, "geom", name=name, type="box", pos=centre, size=half, rgba=[*colour, 1.0], group=f"{STATIC_GROUP}")

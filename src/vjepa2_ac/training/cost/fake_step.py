@@ -3,41 +3,36 @@
 Blocks after the first are alike: models of two and of three tell what each further one needs, and the rest follows
 exactly, phase by phase of the step. Where `adapter.rank_pattern` makes blocks differ, all of them are measured.
 
-Fake tensors are on the CPU, because fake CUDA tensors need a driver or a compiled guard. For CUDA three things are
-taken as they are there: autocast computes norms from a float32 copy where weights have another type than the
-arithmetic, a dropout mask takes one byte, and `auto` attention is one operation (FlexAttention) that keeps no scores.
+Fake tensors are on the CPU, because fake CUDA tensors need a driver or a compiled guard. What CUDA does otherwise is in
+`FakeModel`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import Any, Literal, NamedTuple, TypeVar
-from unittest import mock
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 from torch.autograd.graph import saved_tensors_hooks
-from torch.nn import functional
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.distributed.device import PRECISIONS
 from vjepa2_ac.model.adapter.low_rank import CastMatrices
-from vjepa2_ac.model.network import attention
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
-from vjepa2_ac.training.cost.fake_model import FakeModel, fake_tensors, meta_predictor
+from vjepa2_ac.training.cost.fake_model import FakeModel, Kind, fake_tensors, meta_predictor
 from vjepa2_ac.training.cost.live_storages import LiveStorages
 from vjepa2_ac.training.loss import Objective
 
-Kind = Literal["cpu", "cuda"]
 Measured = TypeVar("Measured")
 
-_KNOBS = {"batch_size", "precision", "rollout_steps", "rollout_weight", "loss", "smooth_l1_beta", "attention"}
 _BLOCKS = (2, 3)  # of the models that are measured
+_WITHOUT_EFFECT = {"training": {"gradient_checkpointing", "optimizer"}, "model": {"encode_chunk"}, "data": {"cache"}}
+
+_measured: dict[str, StepBytes] = {}
 
 
 class PassBytes(NamedTuple):
@@ -69,14 +64,6 @@ class StepBytes(NamedTuple):
     predicting: int  # at most, beside what is cached, in a prediction of this batch
 
 
-@dataclass(frozen=True)
-class _Asked:
-    key: str
-    config: Config = field(compare=False)
-    sizes: ModelSizes = field(compare=False)
-    device: Kind = field(compare=False)
-
-
 def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> StepBytes:
     """Return what a micro-step of a run keeps in memory.
 
@@ -88,9 +75,17 @@ def measure_step(config: Config, sizes: ModelSizes, device: Kind = "cuda") -> St
     Raises:
         InputError: A knob of the adapter does not fit the predictor.
     """
-    training = config.training.model_dump(include=_KNOBS)
-    key = (config.adapter, training, config.data.frames, config.validation.batch_size, config.model.dtype, sizes)
-    return _measured(_Asked(f"{key} {device}", config, sizes, device))
+    key = f"{config.model_dump_json(exclude=_WITHOUT_EFFECT)} {sizes} {device}"
+    if key not in _measured:
+
+        def measure(sizes: ModelSizes) -> StepBytes:
+            predictor = meta_predictor(config, sizes)
+            with fake_tensors(), _Holding() as holding:
+                model = FakeModel(config, sizes, predictor, device)
+                return _Measuring(config, model, holding.storages).step()
+
+        _measured[key] = over_depth(measure, config, sizes)
+    return _measured[key]
 
 
 def over_depth(measure: Callable[[ModelSizes], Measured], config: Config, sizes: ModelSizes) -> Measured:
@@ -118,17 +113,6 @@ def autocast(config: Config) -> AbstractContextManager[object]:
     return nullcontext() if dtype == torch.float32 else torch.autocast("cpu", dtype)
 
 
-@lru_cache(maxsize=32)
-def _measured(asked: _Asked) -> StepBytes:
-    def measure(sizes: ModelSizes) -> StepBytes:
-        predictor = meta_predictor(asked.config, sizes)
-        rules = cuda_rules() if asked.device == "cuda" else nullcontext()
-        with fake_tensors(), rules, _Holding() as holding:
-            return _Measuring(asked.config, FakeModel(asked.config, sizes, predictor), holding.storages).step()
-
-    return over_depth(measure, asked.config, asked.sizes)
-
-
 class _Measuring:
     """Does a step with a model, within `fake_tensors` and `_Holding`."""
 
@@ -153,28 +137,24 @@ class _Measuring:
         batch = self._model.batch(self._config.training.batch_size, self._config.data.frames)
         saved: list[int] = []
         peaks: list[int] = []
-        predict = self._model.predict
 
         def end_phase(_: object = None) -> None:
             peaks.append(storages.peak)
             storages.reset_peak()
 
-        def watched(*given: Any, **named: Any) -> Tensor:
-            predicted = predict(*given, **named)
+        def after_prediction(predicted: Tensor) -> None:
             saved.append(storages.saved)
             end_phase()
             predicted.register_hook(end_phase)  # type: ignore[no-untyped-call]  # comes when the gradients of all later predictions are known
-            return predicted
 
         storages.forget()
-        with (
-            autocast(self._config), saved_tensors_hooks(storages.save, lambda kept: kept),
-            mock.patch.object(self._model, "predict", watched),
-        ):  # fmt: skip
+        self._model.after_prediction = after_prediction
+        with autocast(self._config), saved_tensors_hooks(storages.save, lambda kept: kept):
             forced, rollout = objective(batch)
             loss = forced + rollout
         losses = storages.saved
         end_phase()
+        self._model.after_prediction = None
         loss.backward()
         end_phase()
         return PassBytes(saved[0], saved[-1] - saved[0], losses - saved[-1], tuple(peaks))
@@ -214,28 +194,3 @@ class _Holding(TorchDispatchMode):  # type: ignore[no-untyped-call]  # torch
     @classmethod
     def _should_skip_dynamo(cls) -> bool:
         return False  # nothing is compiled within: it need not be imported
-
-
-@contextmanager
-def cuda_rules() -> Iterator[None]:
-    """Let autograd save on the CPU what it saves on CUDA: functions are replaced, also for blocks computed again."""
-    plain = functional.layer_norm
-
-    def layer_norm(tokens: Any, shape: Any, weight: Any, bias: Any, eps: float) -> Tensor:
-        if torch.is_autocast_enabled("cpu"):
-            tokens, weight, bias = (None if one is None else one.float() for one in (tokens, weight, bias))
-        return plain(tokens, shape, weight, bias, eps)
-
-    def dropout(tokens: Tensor, share: float, training: bool, inplace: bool) -> Tensor:  # noqa: ARG001
-        return torch.native_dropout(tokens, share, training)[0]
-
-    def flash(query: Tensor, key: Tensor, value: Tensor, tokens_per_step: int) -> Tensor:  # noqa: ARG001
-        return functional.scaled_dot_product_attention(query, key, value)
-
-    with (
-        mock.patch.object(functional, "layer_norm", layer_norm),
-        mock.patch.object(functional, "dropout", dropout),
-        mock.patch.dict(attention._IMPLEMENTATIONS, {"flex": flash}),
-        mock.patch.object(attention, "best_kind", return_value="flex"),
-    ):
-        yield

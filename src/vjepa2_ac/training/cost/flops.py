@@ -11,11 +11,13 @@ Not counted: the norms of weights that DoRA needs.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
+from torch import nn
+
 from vjepa2_ac.config import Config, ModelSizes
-from vjepa2_ac.training.cost.parameters import adapter_ranks, linear_layers
+from vjepa2_ac.model.adapter.targets import adapter_ranks
+from vjepa2_ac.training.cost.fake_model import meta_network
 
 
 @dataclass(frozen=True)
@@ -44,11 +46,14 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
         config: What is trained, frames and rollout.
         sizes: Sizes of its model, such as `model.base_model.base_sizes` gives.
     """
-    passes = _Passes.of(config, sizes)
+    passes = _Passes(sizes, config)
     frames, training = config.data.frames, config.training
-    total = passes.over(frames - 1, keys=range(1, frames), fed_back=False)
-    for step in range(2, 1 + (training.rollout_steps if training.rollout_weight else 1)):
-        total += passes.over(1, keys=range(step, step + 1), fed_back=True)  # earlier keys and values are there
+    forced = passes.over(frames - 1, keys=range(1, frames), fed_back=False)
+    fed_back = [  # earlier keys and values are there
+        passes.over(1, keys=range(step, step + 1), fed_back=True)
+        for step in range(2, 1 + (training.rollout_steps if training.rollout_weight else 1))
+    ]
+    total = sum(fed_back, forced)
     return ClipFlops(frames * frame_flops(sizes), total.forward, total.backward)
 
 
@@ -60,17 +65,14 @@ def plan_flops(sizes: ModelSizes, steps: int, before: int = 0) -> int:
         steps: Actions of the sequence.
         before: Frames before the current one, whose keys and values are cached.
     """
-    passes = _Passes(sizes)
-    return sum(
-        passes.over(1, keys=range(seen, seen + 1), fed_back=False).forward
-        for seen in range(before + 1, before + 1 + steps)
-    )
+    passes, seen = _Passes(sizes), range(before + 1, before + 1 + steps)
+    return sum(passes.over(1, keys=range(one, one + 1), fed_back=False).forward for one in seen)
 
 
 def frame_flops(sizes: ModelSizes) -> int:
     """Return the operations of encoding one frame."""
     encoder = sizes.encoder
-    tokens, width, hidden = _patches(sizes), encoder.width, int(encoder.width * encoder.mlp_ratio)
+    tokens, width, hidden = sizes.tokens_per_frame, encoder.width, int(encoder.width * encoder.mlp_ratio)
     embedding = 2 * tokens * 3 * sizes.patch_size**2 * width  # the frames of a tubelet are one
     linear = 2 * tokens * (4 * width**2 + 2 * width * hidden)
     return embedding + encoder.depth * (linear + 4 * tokens**2 * width)
@@ -86,28 +88,23 @@ class _Work:
 
 
 class _Passes:
-    """Counts passes of one clip or plan through the predictor."""
+    """Counts passes of one clip or plan through the predictor.
 
-    def __init__(
-        self, sizes: ModelSizes, ranks: Mapping[str, int] | None = None, whole: Collection[str] = frozenset()
-    ) -> None:
-        """Create a counter for a model.
+    Args:
+        sizes: Of the model.
+        config: What is trained; None: nothing is.
+    """
 
-        Args:
-            sizes: Of the model.
-            ranks: Of the adapter of each layer that has one.
-            whole: Layers whose own weights are trained.
-        """
-        self._sizes, self._layers, self._ranks, self._whole = sizes, linear_layers(sizes), ranks or {}, whole
-        extrinsics = ("extrinsics_encoder",) if sizes.predictor.use_extrinsics else ()
-        self._conditions = ("action_encoder", "state_encoder", *extrinsics)
-
-    @classmethod
-    def of(cls, config: Config, sizes: ModelSizes) -> _Passes:
-        """Create a counter for the model as a run trains it."""
-        everything = config.adapter.kind == "none"
-        whole = linear_layers(sizes) if everything else config.adapter.modules_to_save
-        return cls(sizes, adapter_ranks(config, sizes), whole)
+    def __init__(self, sizes: ModelSizes, config: Config | None = None) -> None:
+        network = meta_network(sizes)
+        self._sizes, self._ranks, self._whole = sizes, dict[str, int](), set[str]()
+        self._layers = {name: layer for name, layer in network.named_modules() if isinstance(layer, nn.Linear)}
+        if config is not None and config.adapter.kind == "none":
+            self._whole = set(self._layers)
+        elif config is not None:
+            self._ranks, self._whole = adapter_ranks(network, config.adapter), set(config.adapter.modules_to_save)
+        conditions = ("action_encoder", "state_encoder", "extrinsics_encoder")
+        self._conditions = [name for name in conditions if name not in network.unused_layers]
 
     def over(self, steps: int, *, keys: range, fed_back: bool) -> _Work:
         """Return the work of a pass.
@@ -117,12 +114,12 @@ class _Passes:
             keys: For each of them, the number of steps that its tokens attend to.
             fed_back: Whether its latents are predictions, through which gradients flow.
         """
-        patches = steps * _patches(self._sizes)
+        patches = steps * self._sizes.tokens_per_frame
         work = self._linear("predictor_embed", patches, into=fed_back)
         for name in self._conditions:
             work += self._linear(name, steps, into=False)
         flowing = fed_back or any(self._changes(name) for name in ("predictor_embed", *self._conditions))
-        per_step = _patches(self._sizes) + len(self._conditions)
+        per_step = self._sizes.tokens_per_frame + len(self._conditions)
         pairs = per_step**2 * sum(keys)
         for index in range(self._sizes.predictor.depth):
             block, flowing = self._block(f"blocks.{index}", steps * per_step, pairs, flowing=flowing)
@@ -155,16 +152,12 @@ class _Passes:
     def _linear(self, name: str, tokens: int, *, into: bool) -> _Work:
         """Return the work of a linear layer with its adapter; `into`: its input needs a gradient."""
         layer = self._layers[name]
-        product = 2 * tokens * layer.weight
+        product = 2 * tokens * layer.in_features * layer.out_features
         work = _Work(product, product * (into + (name in self._whole)))
         if name in self._ranks:
-            first, second = (2 * tokens * self._ranks[name] * side for side in (layer.inputs, layer.outputs))
+            first, second = (2 * tokens * self._ranks[name] * side for side in (layer.in_features, layer.out_features))
             work += _Work(first + second, first * (into + 1) + 2 * second)
         return work
 
     def _changes(self, name: str) -> bool:
         return name in self._whole or name in self._ranks
-
-
-def _patches(sizes: ModelSizes) -> int:
-    return (sizes.image_size // sizes.patch_size) ** 2

@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 from vjepa2_ac.config import Config, ModelSizes
 from vjepa2_ac.encoding.disk_space import FRAMES_AT_ONCE
-from vjepa2_ac.training.cost.fake_step import Kind, StepBytes, measure_step
-from vjepa2_ac.training.cost.parameters import Parameters, count_parameters, trained_tensors
+from vjepa2_ac.training.cost.fake_model import Kind
+from vjepa2_ac.training.cost.fake_step import StepBytes, measure_step
+from vjepa2_ac.training.cost.parameters import Parameters, count_parameters
 
 GIGABYTE = 10**9
 ALLOWANCE = 3 * GIGABYTE // 2  # CUDA context 0.5, cuBLAS workspaces, fragmentation: not computed but assumed
@@ -80,7 +81,7 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
         predictor_weights=parameters.predictor * number if config.adapter.kind == "lora" else 0,
         trained=parameters.trained * FLOAT32,
         gradients=parameters.trained * FLOAT32,
-        moments=sum(_moments(config, elements) for elements in trained_tensors(config, sizes)),
+        moments=sum(_moments(config, elements) for elements in parameters.trained_tensors),
         arriving=_arriving(config, sizes),
         latents=_latents(config, sizes, config.training.batch_size),
         encoding=_encoding(config, sizes, config.training.batch_size),
@@ -93,15 +94,15 @@ def estimate_memory(config: Config, sizes: ModelSizes, device: Kind = "cuda") ->
 
 def ways_to_fit(config: Config, sizes: ModelSizes, available: int) -> list[str] | None:
     """Return the knobs to change, one after the other, until the run fits; None if all of them do not suffice."""
-    turned: list[str] = []
+    turned, total = list[str](), _total(config, sizes)
     for knob, turn in _KNOBS:
-        if _total(config, sizes) <= available:
+        if total <= available:
             break
         lighter = turn(config)
-        if _total(lighter, sizes) < _total(config, sizes):
+        if (less := _total(lighter, sizes)) < total:
             turned.append(knob)
-            config = lighter
-    return turned if _total(config, sizes) <= available else None
+            config, total = lighter, less
+    return turned if total <= available else None
 
 
 def _total(config: Config, sizes: ModelSizes) -> int:
@@ -110,10 +111,6 @@ def _total(config: Config, sizes: ModelSizes) -> int:
 
 def _with(config: Config, section: str, **changes: object) -> Config:
     return config.model_copy(update={section: getattr(config, section).model_copy(update=changes)})
-
-
-def _with_cache(config: Config) -> Config:
-    return config if config.data.takes_latents else _with(config, "data", cache="auto")
 
 
 _KNOBS: tuple[tuple[str, Callable[[Config], Config]], ...] = (
@@ -127,7 +124,10 @@ _KNOBS: tuple[tuple[str, Callable[[Config], Config]], ...] = (
         lambda run: _with(_with(run, "model", dtype="bfloat16"), "training", precision="bf16"),
     ),
     ("model.encode_chunk=4", lambda run: _with(run, "model", encode_chunk=min(4, run.model.encode_chunk))),
-    ("data.cache=auto", lambda run: run if run.data.augment.is_on else _with_cache(run)),
+    (
+        "data.cache=auto",
+        lambda run: run if run.data.augment.is_on or run.data.takes_latents else _with(run, "data", cache="auto"),
+    ),
     (
         "data.frames=8",
         lambda run: _with(run, "data", frames=min(run.data.frames, max(8, run.training.rollout_steps + 1))),
@@ -153,19 +153,11 @@ def _arriving(config: Config, sizes: ModelSizes) -> int:
     frames = config.training.batch_size * config.data.frames
     if not config.data.takes_latents:
         return frames * 3 * sizes.image_size**2
-    return frames * _tokens_per_frame(sizes) * sizes.encoder.width * _BYTES_OF_CACHED[config.data.cache_dtype]
+    return frames * sizes.tokens_per_frame * sizes.encoder.width * _BYTES_OF_CACHED[config.data.cache_dtype]
 
 
 def _latents(config: Config, sizes: ModelSizes, clips: int) -> int:
-    return clips * config.data.frames * _tokens_per_frame(sizes) * sizes.encoder.width * FLOAT32
-
-
-def _tokens_per_frame(sizes: ModelSizes) -> int:
-    return (sizes.image_size // sizes.patch_size) ** 2
-
-
-def _number(config: Config) -> int:
-    return FLOAT32 if config.training.precision == "fp32" else HALF
+    return clips * config.data.frames * sizes.tokens_per_frame * sizes.encoder.width * FLOAT32
 
 
 def _encoding(config: Config, sizes: ModelSizes, clips: int) -> int:
@@ -181,12 +173,12 @@ def _caching(config: Config, sizes: ModelSizes) -> int:
 
 def _at_work(config: Config, sizes: ModelSizes, frames: int) -> int:
     width, hidden = sizes.encoder.width, int(sizes.encoder.width * sizes.encoder.mlp_ratio)
-    number = _number(config)
-    tokens = min(config.model.encode_chunk, frames) * _tokens_per_frame(sizes)
+    number = FLOAT32 if config.training.precision == "fp32" else HALF
+    tokens = min(config.model.encode_chunk, frames) * sizes.tokens_per_frame
     attention = width * (4 * number + 5 * FLOAT32)  # residual, query, key, value; normed, and four while rotating
     mlp = width * (2 * number + 2 * FLOAT32) + 2 * hidden * number  # residual and output; normed, cast; around GELU
     pixels = frames * 3 * sizes.image_size**2 * FLOAT32
-    features = frames * _tokens_per_frame(sizes) * width * 2 * FLOAT32  # as computed, and normalised
+    features = frames * sizes.tokens_per_frame * width * 2 * FLOAT32  # as computed, and normalised
     return tokens * max(attention, mlp) + pixels + features
 
 

@@ -107,16 +107,11 @@ class Watch:
         if low > high:
             better = all(value < self._at_start.get(name, math.nan) for name, value in now.items())
             words = "predicts better and plans worse than the base" if better else "plans worse than the base"
-            yield (
-                "rank",
-                (
-                    f"the model {words}: the mean rank of the true action among others is {rank:.3f} (before training"
-                    f" {before:.3f}; 0 is best, 0.5 chance). `vjepa2-ac data check` says how varied the motion is"
-                ),
-            )
+            text = f"the model {words}: the mean rank of the true action among others is {rank:.3f}"
+            hint = "`vjepa2-ac data check` says how varied the motion of the data is"
+            yield "rank", f"{text} (before training {before:.3f}; 0 is best, 0.5 chance). {hint}"
 
-    def _of_loss(self, step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-        del step
+    def _of_loss(self, _step: int, metrics: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
         loss = _number(metrics.get("loss"))
         if not math.isfinite(loss):  # a step without clips, or one that was refused
             return
@@ -138,7 +133,11 @@ def advice(config: Config) -> str:
     if training.max_grad_norm is None:
         knobs.append("set training.max_grad_norm=1")
     knobs.append(f"raise training.warmup_steps ({training.warmup_steps:,})")
-    best = "; the best checkpoint is kept: --checkpoint best" if config.checkpoint.keep_best != "off" else ""
+    best = (
+        "; the best checkpoint is kept, and used unless another is asked for"
+        if config.checkpoint.keep_best != "off"
+        else ""
+    )
     return f"If it stays so: {', '.join(knobs)}{best}"
 
 

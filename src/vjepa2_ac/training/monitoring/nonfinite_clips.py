@@ -59,25 +59,23 @@ class ClipRecorder:
         """Return micro-batch and index of clips: those with numbers that are not finite, then by their loss."""
         found = []
         for batch, loss in self._kept:
-            sound = bool(torch.isfinite(loss))
             for place in range(len(batch.starts)):
                 own = batch.states[place].isfinite().all() and batch.actions[place].isfinite().all()
-                found.append(((bool(own), sound), (batch, place)))
-        found.sort(key=lambda entry: entry[0])
-        return [clip for _, clip in found[:MOST_CLIPS]]
+                found.append((bool(own), bool(torch.isfinite(loss)), (batch, place)))
+        found.sort(key=lambda entry: entry[:2])
+        return [clip for *_, clip in found[:MOST_CLIPS]]
 
 
 def _write(batch: Batch, place: int, path: Path) -> None:
+    arrays: dict[str, Any] = {
+        **_seen(batch, place),
+        "states": batch.states[place].numpy(),
+        "actions": batch.actions[place].numpy(),
+        "episode_id": np.array(batch.episode_ids[place]),
+        "start": np.array(batch.starts[place]),
+    }
     with atomic_writer(path) as file:
-        arrays: dict[str, Any] = _seen(batch, place)
-        np.savez_compressed(
-            file,
-            **arrays,
-            states=batch.states[place].numpy(),
-            actions=batch.actions[place].numpy(),
-            episode_id=np.array(batch.episode_ids[place]),
-            start=np.array(batch.starts[place]),
-        )
+        np.savez_compressed(file, **arrays)
 
 
 def _seen(batch: Batch, place: int) -> dict[str, np.ndarray]:

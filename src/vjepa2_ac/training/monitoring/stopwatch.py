@@ -5,33 +5,24 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
-from typing import Any, Protocol, runtime_checkable
+from contextlib import contextmanager
+from typing import Any
 
 import torch
 
 from vjepa2_ac.data.clips.streams import Cuda
 
 
-@runtime_checkable
-class Stopwatch(Protocol):
-    """Sums up waiting time."""
+class Stopwatch:
+    """Sums up waiting time: of the host, by its own clock."""
+
+    def __init__(self) -> None:
+        self._seconds = 0.0
 
     @property
     def seconds(self) -> float:
         """Seconds so far."""
-        ...
-
-    def running(self) -> AbstractContextManager[None]:
-        """Measure as long as the context lasts."""
-        ...
-
-
-class HostStopwatch:
-    """Measures the waiting time of the host."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
+        return self._seconds
 
     @contextmanager
     def running(self) -> Iterator[None]:
@@ -40,10 +31,10 @@ class HostStopwatch:
         try:
             yield
         finally:
-            self.seconds += time.perf_counter() - started
+            self._seconds += time.perf_counter() - started
 
 
-class IdleStopwatch:
+class IdleStopwatch(Stopwatch):
     """Measures the idle time of a CUDA device while the host waits: from the end of its queued work to the next work.
 
     Args:
@@ -51,9 +42,9 @@ class IdleStopwatch:
     """
 
     def __init__(self, cuda: Cuda) -> None:
+        super().__init__()
         self._cuda = cuda
         self._spans: deque[tuple[Any, Any]] = deque()  # events that the device may not have reached yet
-        self._seconds = 0.0
 
     @property
     def seconds(self) -> float:
@@ -75,4 +66,4 @@ class IdleStopwatch:
 
 def stopwatch_for(device: torch.device) -> Stopwatch:
     """Return the stopwatch for the device of a run."""
-    return IdleStopwatch(Cuda(device)) if device.type == "cuda" else HostStopwatch()
+    return IdleStopwatch(Cuda(device)) if device.type == "cuda" else Stopwatch()

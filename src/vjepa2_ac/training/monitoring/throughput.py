@@ -28,7 +28,7 @@ from vjepa2_ac.data.clips.prefetch import prefetch_next
 from vjepa2_ac.distributed.device import PRECISIONS
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.training.cost.flops import clip_flops
-from vjepa2_ac.training.monitoring.stopwatch import HostStopwatch, Stopwatch
+from vjepa2_ac.training.monitoring.stopwatch import Stopwatch
 
 MEASURED = frozenset({"data_wait_share", "samples_per_second", "tokens_per_second", "mfu", "memory_gb"})
 """Metrics of the machine: they differ between identical runs."""
@@ -46,7 +46,7 @@ class TimedBatches:
     """
 
     def __init__(self, batches: Iterator[Batch], stopwatch: Stopwatch | None = None) -> None:
-        self._batches, self._stopwatch = batches, stopwatch or HostStopwatch()
+        self._batches, self._stopwatch = batches, stopwatch or Stopwatch()
 
     @property
     def waited_s(self) -> float:
@@ -90,7 +90,7 @@ class Throughput:
             processes: Of the run.
             encodes: Whether the encoder's work counts; cached latents need none.
         """
-        tokens = config.data.frames * (sizes.image_size // sizes.patch_size) ** 2
+        tokens = config.data.frames * sizes.tokens_per_frame
         ceiling = processes * matmul_speed(device, PRECISIONS[config.training.precision])
         flops = clip_flops(config, sizes)
         return cls(flops.total if encodes else flops.predictor, tokens, ceiling, device)
