@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from evaluation_results import ranking_of
 from vjepa2_ac.console.evaluation import evaluation_tables
 from vjepa2_ac.evaluation.metrics import L1, L2, METRICS, Metric
 from vjepa2_ac.evaluation.result import MODES, Evaluation, Example, ModelResult, PredictionErrors
@@ -93,6 +94,30 @@ def test_a_difference_within_the_noise_is_not_called_one() -> None:
     words = verdict(evaluation(model("base", 1.0, noise=0.3), model("adapter", 0.999, noise=0.3)))
     assert words.startswith("The adapter did not clearly help")
     assert "no clear difference." in words
+
+
+def ranked(name: str, level: float, rank: float) -> ModelResult:
+    """Return a model of an error and a mean rank of the true action; the ranks differ a little by clip."""
+    ids = tuple(f"episode {clip % 8}" for clip in range(CLIPS))
+    return replace(model(name, level), ranking=ranking_of(rank + 0.01 * np.sin(np.arange(CLIPS)), ids))
+
+
+def test_a_model_that_predicts_better_and_plans_worse_is_called_so() -> None:
+    words = verdict(evaluation(ranked("base", 1.0, 0.05), ranked("adapter", 0.7, 0.1)))
+    assert "30% better than the base" in words
+    assert "It predicts better, but PLANS WORSE than the base. For moves as large as plans the true action's" in words
+    assert "mean rank is 0.100" in words
+    assert "that of the base 0.050: WORSE to plan with" in words
+
+
+@pytest.mark.parametrize(
+    ("rank", "words"), [(0.02, "better to plan with"), (0.05, "no clear difference"), (0.1, "WORSE")]
+)
+def test_a_ranking_is_compared_with_that_of_the_base(rank: float, words: str) -> None:
+    found = verdict(evaluation(ranked("base", 1.0, 0.05), ranked("adapter", 1.1, rank)))
+    assert f"that of the base 0.050: {words}" in found
+    assert "predicts better, but" not in found
+    assert "that of the base" not in verdict(evaluation(ranked("model", 1.0, rank)))
 
 
 def test_a_model_without_a_base_is_measured_against_doing_nothing_only() -> None:

@@ -15,6 +15,7 @@ from vjepa2_ac.evaluation.result import (
     ACTIONS,
     MODES,
     About,
+    ActionRanking,
     Clips,
     Evaluation,
     Example,
@@ -77,6 +78,12 @@ def _sensitivity(rng: np.random.Generator, ids: tuple[str, ...], skill: float) -
         ranking("box", "uniform actions of up to 7.5 cm an axis"),
     )
     return Sensitivity(mean_of(change, ids), change, rankings)
+
+
+def ranking_of(ranks: np.ndarray, ids: tuple[str, ...]) -> ActionRanking:
+    """Return a ranking of these moves, the same in the box and on the shell."""
+    rank = mean_of(ranks, ids)
+    return ActionRanking(64, 0.075, ids, ranks, rank, rank, rank, mean_of(0.2 - 0.3 * ranks, ids))
 
 
 def _landscape(rng: np.random.Generator, episode_id: str, off: float) -> Landscape:
@@ -142,6 +149,7 @@ def evaluation(
             PredictionErrors(ids, arrays),
             _sensitivity(rng, ids, skill),
             _landscapes(rng, ids, 4 - 3 * skill),
+            ranking=ranking_of(0.3 * (1 - skill) + 0.1 * rng.random(len(ids)), ids),
         )
     size_of_action = rng.gamma(2.0, 2.0, size=(clips, horizon))
     moving = size_of_action > 1.5

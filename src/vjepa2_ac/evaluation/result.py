@@ -208,9 +208,9 @@ class ModelResult:
     role: Role
     errors: PredictionErrors  # those of persistence are the same for all models, which share the encoder
     sensitivity: Sensitivity | None = None
-    ranking: ActionRanking | None = None
     landscapes: Landscapes | None = None
     plans: Plans | None = None
+    ranking: ActionRanking | None = None
 
 
 @dataclass(frozen=True)

@@ -99,6 +99,21 @@ def test_a_loss_that_rises_far_above_its_lowest_is_reported_between_validations(
     assert "the loss is 0.7, and was 0.3 (medians of 10 rows)" in found[step][0]
 
 
+def ranking(rank: float, low: float, high: float) -> dict[str, float]:
+    return {"action_rank": rank, "action_rank_low": low, "action_rank_high": high}
+
+
+def test_a_model_that_predicts_better_and_plans_worse_is_warned_of_once(config: Config) -> None:
+    start = validation(0.9) | ranking(0.03, 0.02, 0.04)
+    unsure, sure = validation(0.7) | ranking(0.05, 0.039, 0.07), validation(0.6) | ranking(0.06, 0.05, 0.07)
+    found = warned(config, (0, start), (3, unsure), (6, sure), (9, sure))
+    assert list(found) == [6]
+    assert "the model predicts better and plans worse than the base" in found[6][0]
+    assert "rank of the true action among others is 0.060 (before training 0.030" in found[6][0]
+    worse = validation(0.95) | ranking(0.06, 0.05, 0.07)
+    assert any("the model plans worse than the base" in text for text in warned(config, (0, start), (3, worse))[3])
+
+
 def test_a_single_loss_that_is_high_or_missing_is_not_reported(config: Config) -> None:
     watch = Watch(config)
     losses = [0.3, 0.5, None, float("nan"), 9.0] * 10
@@ -108,7 +123,11 @@ def test_a_single_loss_that_is_high_or_missing_is_not_reported(config: Config) -
 @pytest.mark.parametrize(
     ("changes", "words", "absent"),
     [
-        ({}, ["learning_rate (0.001)", "adapter.alpha (8) or adapter.rank (4)", "--checkpoint best"], ["grad_norm"]),
+        (
+            {},
+            ["learning_rate (0.001)", "adapter.alpha (8) or adapter.rank (4)", "best checkpoint is kept"],
+            ["grad_norm"],
+        ),
         ({"training__max_grad_norm": None}, ["set training.max_grad_norm=1"], []),
         ({"adapter__kind": "none"}, ["raise training.warmup_steps (1)"], ["adapter"]),
         ({"checkpoint__keep_best": False}, ["learning_rate"], ["best"]),

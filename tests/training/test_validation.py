@@ -1,0 +1,119 @@
+"""Validation ranks the actions of moves, selects by that rank, and may end a run early."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from same_run import assert_same_run
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.loading import config_from
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.checkpoint import checkpoint_name, newest_checkpoint, read_state
+from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.training import loop, validation
+from vjepa2_ac.training.loop import train
+
+EVERY_STEP = {"validation__every": 1, "checkpoint__every": 100, "training__steps": 6}
+
+
+def validations(folder: Path) -> list[dict[str, Any]]:
+    return [row for row in read_metrics_log(folder / "metrics.jsonl") if row["kind"] == "validation"]
+
+
+@pytest.fixture
+def ranks_are(monkeypatch):
+    """Let each validation find these (error, rank) one after the other; the first are the base's."""
+
+    def use(*found: tuple[float, float]) -> None:
+        values = iter(found)
+
+        def metrics(_: object) -> dict[str, float]:
+            error, rank = next(values)
+            return {validation.BEST_BY: error, validation.RANK: rank}
+
+        for module in (loop, validation):
+            monkeypatch.setattr(module, "validation_metrics", metrics)
+
+    return use
+
+
+def test_each_validation_logs_the_ranking_with_intervals(make_config, reporter) -> None:
+    rows = validations(train(make_config(**EVERY_STEP, validation__ranking_samples=8), reporter))
+    assert [row["step"] for row in rows] == list(range(7))
+    for row in rows:
+        assert 0.0 <= row["action_rank"] <= 1.0
+        assert row["action_rank"] == pytest.approx((row["action_rank_box"] + row["action_rank_shell"]) / 2)
+        assert row["energy_spread"] > 0.0
+    assert len({row["action_rank"] for row in rows}) > 1
+
+
+def test_what_is_ranked_does_not_change_the_run(make_config, reporter, tmp_path) -> None:
+    folders = [
+        train(make_config(run_dir=str(tmp_path / name), checkpoint__keep_best="off", **changes), reporter)
+        for name, changes in {"with": {}, "without": {"validation__ranking_clips": 0}}.items()
+    ]
+    weights = [newest_checkpoint(folder / "checkpoints") / "adapter/adapter_model.safetensors" for folder in folders]
+    assert weights[0].read_bytes() == weights[1].read_bytes()
+    assert "action_rank" not in validations(folders[1])[0]
+
+
+def test_the_lowest_rank_is_selected_though_the_error_falls_on(make_config, reporter, ranks_are) -> None:
+    ranks_are((0.9, 0.10), (0.8, 0.05), (0.7, 0.06), (0.6, 0.07), (0.5, 0.08), (0.4, 0.2), (0.3, 0.3))
+    folder = train(make_config(**EVERY_STEP, checkpoint__keep=1), reporter)
+    assert {path.name for path in (folder / "checkpoints").iterdir()} == {checkpoint_name(1), checkpoint_name(6)}
+    assert str(select_checkpoint(folder)) == "step-00000001 (the best by action ranking)"
+
+
+def test_a_base_that_is_never_beaten_is_selected(make_config, reporter, ranks_are) -> None:
+    ranks_are((0.9, 0.01), *[(0.5, 0.02)] * 6)
+    folder = train(make_config(**EVERY_STEP, checkpoint__keep=1), reporter)
+    assert {path.name for path in (folder / "checkpoints").iterdir()} == {checkpoint_name(0), checkpoint_name(6)}
+    assert "the base: none of its checkpoints is better" in str(select_checkpoint(folder))
+
+
+def test_a_run_that_stops_after_its_base_was_saved_goes_on_as_if_it_had_not(
+    make_config, reporter, tmp_path, monkeypatch
+) -> None:
+    whole = train(make_config(run_dir=str(tmp_path / "whole")), reporter)
+    halted = make_config(run_dir=str(tmp_path / "halted"))
+    monkeypatch.setattr(loop, "_loop", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        train(halted, reporter)
+    monkeypatch.undo()
+    assert read_state(newest_checkpoint(tmp_path / "halted/checkpoints")).step == 0
+    assert_same_run(whole, train(halted, reporter))
+
+
+@pytest.mark.parametrize("by", ["ranking", "error"])
+def test_a_run_without_a_better_one_ends_when_patience_does(make_config, reporter, ranks_are, by: str) -> None:
+    ranks_are((0.9, 0.10), (0.8, 0.05), *[(0.85, 0.06)] * 5)
+    config = make_config(**EVERY_STEP, training__patience=2, checkpoint__keep_best=by)
+    folder = train(config, reporter)
+    assert [row["step"] for row in validations(folder)] == [0, 1, 2, 3]
+    assert read_state(newest_checkpoint(folder / "checkpoints")).step == 3
+    assert any(note.startswith("Training ends at step 3: step 1 is the best") for note in reporter.notes)
+    train(config, reporter)
+    assert read_state(newest_checkpoint(folder / "checkpoints")).step == 3, "it has ended"
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["validation.ranking_clips=0"], "keep_best ranking needs validation.ranking_clips"),
+        (["checkpoint.keep_best=off", "training.patience=2"], "training.patience waits"),
+        (["checkpoint.keep_best=sometimes"], "'ranking', 'error' or 'off'"),
+    ],
+)
+def test_what_does_not_fit_together_is_refused(overrides: list[str], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        config_from({"run_dir": "r", "data": {"path": "d"}, "model": {"base": "b"}}, overrides, where="here")
+
+
+@pytest.mark.parametrize(("written", "meant"), [(True, "error"), (False, "off"), ("ranking", "ranking")])
+def test_what_earlier_versions_wrote_means_what_it_meant(make_config, written: object, meant: str) -> None:
+    config: Config = make_config(checkpoint__keep_best=written)
+    assert config.checkpoint.keep_best == meant
+    assert json.loads(config.model_dump_json())["checkpoint"]["keep_best"] == meant
