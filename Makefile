@@ -1,10 +1,10 @@
-# make demo · make evidence · make test · make test-oldest · make lint · make soak · make bench · make base: each creates the environment it needs.
+# make demo · make evidence · make trap · make test · make test-oldest · make lint · make soak · make bench · make base: each creates the environment it needs.
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/installed
 OLDEST := .venv-oldest
 
-.PHONY: demo demo-seeds base evidence test test-oldest soak lint format bench clean
+.PHONY: demo demo-seeds base evidence trap test test-oldest soak lint format bench clean
 
 $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed; set PYTHON=...")'
@@ -29,6 +29,9 @@ base:  $(INSTALLED)  ## make the demo's base model again (about an hour); replac
 
 evidence: $(INSTALLED)  ## does LoRA help? every method side by side; goes on where it stopped; replaces table and plot
 	$(BIN)/python benchmarks/evidence --readme README.md
+
+trap: $(INSTALLED)  ## does a lower error plan better? narrow and varied demonstrations, every checkpoint in closed loop
+	$(BIN)/python benchmarks/trap --picture docs/ranking.png
 
 test: $(INSTALLED)  ## the whole test suite, on all cores (8 at most); a folder in one process: .venv/bin/pytest tests/data
 	$(BIN)/pytest -q -n logical --maxprocesses 8 --dist loadfile --durations 10

@@ -1,0 +1,97 @@
+"""Does a lower error plan better? Narrow and varied demonstrations, and every checkpoint in closed loop.
+
+    python benchmarks/trap                          # all of it (make trap); goes on where it stopped
+    python benchmarks/trap --only narrow --seeds 1  # a part of it
+    python benchmarks/trap --table                  # table and picture again, of what is there
+
+Checkpoints that are measured stand in FOLDER/results as JSON.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+from runs import Cell, Run, all_runs, cells_of
+
+
+def main() -> int:
+    """Do what is not there yet, then write table and picture; return 1 where something failed."""
+    options = _parse()
+    from tables import write_tables
+
+    results = options.folder / "results"
+    results.mkdir(parents=True, exist_ok=True)
+    failed = 0
+    if not options.table:
+        failed = _run_all([run for run in all_runs(options.seeds) if options.only in run.name], results, options)
+    write_tables(options.folder, options.out, options.picture)
+    return 1 if failed else 0
+
+
+def _parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, default=Path("trap"), help="data, runs, results")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="where the tables go")
+    parser.add_argument("--picture", type=Path, help="where the picture goes")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--goals", type=int, default=20, help="of each checkpoint")
+    parser.add_argument("--workers", type=int, default=2, help="at once, one thread each")
+    parser.add_argument("--only", default="", help="runs whose name has this in it")
+    parser.add_argument("--table", action="store_true", help="run nothing")
+    return parser.parse_args()
+
+
+def _run_all(runs: Sequence[Run], results: Path, options: argparse.Namespace) -> int:
+    from runs import measure_alone, prepare, train_alone
+
+    prepare(options.folder)
+    missing = [cell for run in runs for cell in cells_of(run) if not _path(results, cell).exists()]
+    missing.sort(key=lambda cell: [cell.step % part != 0 for part in (800, 400, 200)])  # ends and middles first
+    print(f"{len(runs)} runs; {len(missing)} checkpoints are to be measured", flush=True)
+
+    def keep(cell: Cell, figures: dict[str, Any]) -> None:
+        _path(results, cell).write_text(json.dumps(figures, indent=1))
+        ends = [way[-1] for way in figures["distance_cm"]]
+        rank, error = (figures["validation"][key] for key in ("action_rank", "rollout_over_persistence_last"))
+        print(f"{cell.name}: error {error:.3f}, rank {rank:.3f}, {sum(ends) / len(ends):.1f} cm left", flush=True)
+
+    trained = {cell.run.name: cell.run for cell in missing}
+    failed = _in_processes(train_alone, [(run, options.folder) for run in trained.values()], options.workers)
+    work = [(cell, options.folder, options.goals) for cell in missing]
+    return failed + _in_processes(measure_alone, work, options.workers, keep)
+
+
+def _in_processes(
+    do: Callable[..., Any], work: Sequence[tuple[Any, ...]], workers: int, keep: Callable[..., None] | None = None
+) -> int:
+    """Do work in processes of their own; return how much of it failed."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    context, failed = multiprocessing.get_context("spawn"), 0
+    with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=1) as pool:
+        waiting: dict[Future[Any], Any] = {pool.submit(do, *one): one[0] for one in work}
+        for done in as_completed(waiting):
+            try:
+                found = done.result()
+            except Exception as error:  # one must not cost the others
+                print(f"{waiting[done].name} failed: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+                failed += 1
+                continue
+            if keep is not None:
+                keep(waiting[done], found)
+    return failed
+
+
+def _path(results: Path, cell: Cell) -> Path:
+    return results / f"{cell.name}.json"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

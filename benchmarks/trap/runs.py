@@ -1,0 +1,178 @@
+"""Which runs are there, and how is each of their checkpoints measured?"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+
+from vjepa2_ac.config import AdapterConfig, Config, DataConfig, ModelConfig, TrainingConfig, ValidationConfig
+from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
+from vjepa2_ac.config.training import CheckpointConfig
+from vjepa2_ac.evaluation.evaluate_run import measure_subject
+from vjepa2_ac.evaluation.request import EvaluationOptions, ProbeOptions
+from vjepa2_ac.model.adapter.merging import merge_adapter
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.reports.metrics_json import metrics_as_dict
+from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+from vjepa2_ac.simulation.closed_loop.policies import Planning
+from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset
+from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B
+from vjepa2_ac.simulation.world.motion import MotionRecipe
+from vjepa2_ac.training.loop import train
+
+Motions = Literal["narrow", "varied"]
+
+WORLD = replace(DOMAIN_A, name="near", camera=DOMAIN_A.camera.turned(15.0), look=DOMAIN_B.look, lag_s=DOMAIN_B.lag_s)
+"""A world that the base half knows: other colours and light, the camera turned by 15 degrees, another lag."""
+
+RECIPES: dict[Motions, MotionRecipe] = {
+    "narrow": MotionRecipe(drift_m=(0.01, 0.0, 0.0), turn_rad=0.0, gripper_share=0.0),
+    "varied": MotionRecipe(),
+}
+"""narrow: 1 cm to the front in every model step. varied: random reaching, up to 7.5 cm an axis."""
+
+EPISODES, RECORDED, GOALS = 60, 31, 9_000  # demonstrations, seeds of the recordings and of the problems
+STEPS, EVERY = 800, 100
+PLANNING = PlanningConfig(
+    samples=64,
+    iterations=4,
+    start_std=0.67,
+    limits=LimitsConfig(xyz=(0.075, 0.075, 0.075), gripper_mode="held"),
+)
+"""As in the evidence: horizon 1, 7.5 cm an axis and model step."""
+
+
+OFFLINE: dict[str, Callable[[dict[str, Any]], float]] = {
+    "one-step error / persistence": lambda one: one["one_step_by_actions"]["true"]["value"],
+    "rollout error / persistence, last horizon": lambda one: one["rollout"]["l1"]["over_persistence"][-1]["value"],
+    "gap of zero actions, negated": lambda one: -one["gap_of_zero_actions"]["value"],
+    "gap of shuffled actions, negated": lambda one: -one["gap_of_shuffled_actions"]["value"],
+    "change with the action, negated": lambda one: -one["sensitivity"]["change_over_persistence"]["value"],
+    "own steps: rank among others' actions": lambda one: one["sensitivity"]["rankings"][0]["mean_rank"]["value"],
+    "own steps: rank in a box": lambda one: one["sensitivity"]["rankings"][1]["mean_rank"]["value"],
+    "own steps: distance of the lowest energy": lambda one: one["landscapes"]["distance"]["value"],
+    "moves: rank in a box": lambda one: one["ranking"]["box"]["value"],
+    "moves: rank among other directions": lambda one: one["ranking"]["shell"]["value"],
+    "moves: rank (the one that selects)": lambda one: one["ranking"]["rank"]["value"],
+    "moves: spread of the energy, negated": lambda one: -one["ranking"]["spread"]["value"],
+}
+"""What `evaluate` finds of a model, so that less is meant to be better."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One fine-tuning."""
+
+    motions: Motions
+    method: Literal["LoRA", "full"]
+    seed: int  # decides the order of clips and fresh weights, and the goals
+
+    @property
+    def name(self) -> str:
+        """What its files are called."""
+        return f"{self.motions}-{self.method}-s{self.seed}"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One checkpoint of a run; step 0 is the base."""
+
+    run: Run
+    step: int
+
+    @property
+    def name(self) -> str:
+        """What its file is called."""
+        return f"{self.run.name}-{self.step:04d}"
+
+
+def all_runs(seeds: int) -> Iterator[Run]:
+    """Yield every run, those that matter most first."""
+    for seed in range(seeds):
+        for motions in RECIPES:
+            for method in ("LoRA", "full"):
+                yield Run(motions, method, seed)  # type: ignore[arg-type]
+
+
+def cells_of(run: Run) -> list[Cell]:
+    """Return the checkpoints of a run."""
+    return [Cell(run, step) for step in range(0, STEPS + 1, EVERY)]
+
+
+def prepare(folder: Path) -> None:
+    """Record the demonstrations that are not there yet."""
+    for motions, recipe in RECIPES.items():
+        if not (folder / f"data-{motions}").exists():
+            spec = RecordingSpec(WORLD, seed=RECORDED, recipe=recipe)
+            record_dataset(folder / f"data-{motions}", spec, episodes=EPISODES)
+
+
+def config_of(run: Run, folder: Path) -> Config:
+    """Return the config that anybody would write; every checkpoint is kept."""
+    adapter = AdapterConfig(rank=16, alpha=32.0, dropout=0.0) if run.method == "LoRA" else AdapterConfig(kind="none")
+    return Config(
+        run_dir=str(folder / "runs" / run.name),
+        seed=run.seed,
+        data=DataConfig(
+            path=str(folder / f"data-{run.motions}"),
+            frames=8,
+            stride=4,
+            validation_share=0.2,
+            test_share=0.2,
+            workers=0,
+            cache="auto",
+            cache_dir=str(folder / "latents"),
+        ),
+        model=ModelConfig(base="builtin:sim-tiny", dtype="float32"),
+        adapter=adapter,
+        training=TrainingConfig(
+            steps=STEPS,
+            batch_size=6,
+            accumulation=1,
+            warmup_steps=20,
+            learning_rate=3e-3 if run.method == "LoRA" else 4e-3,
+            device="cpu",
+            log_every=50,
+            allow_weak_base=True,
+        ),
+        validation=ValidationConfig(every=EVERY, clips=40, batch_size=20),
+        checkpoint=CheckpointConfig(every=EVERY, every_minutes=None, keep=STEPS),
+    )
+
+
+def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
+    """Measure a checkpoint in a process of its own, on one thread; its run is trained before, if it is not there."""
+    torch.set_num_threads(1)
+    config = config_of(cell.run, folder)
+    home, step = Path(config.run_dir), str(cell.step)
+    rows = [row for row in read_metrics_log(home / "metrics.jsonl") if row["kind"] == "validation"]
+    (validated,) = (row for row in rows if row["step"] == cell.step)
+    probes = ProbeOptions(sensitivity_clips=24, samples=32, landscape_clips=4, nodes=5, examples=0)
+    found = measure_subject(str(home), EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes))
+    model = load_run(home, step).world_model
+    if model.adaptation is not None:
+        merge_adapter(model)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        spec = RolloutSpec("reach", WORLD, goals, GOALS + cell.run.seed)
+        result = run_task(spec, Planning(Controller(model.eval(), PLANNING)))
+    evaluation = found.evaluation
+    measured = metrics_as_dict(evaluation)["models"][evaluation.trained]
+    return {
+        "cell": asdict(cell.run) | {"step": cell.step, "name": cell.name},
+        "validation": validated,
+        "offline": {name: figure(measured) for name, figure in OFFLINE.items()},
+        "distance_cm": result.distance_cm.round(3).tolist(),
+    }
+
+
+def train_alone(run: Run, folder: Path) -> None:
+    """Train a run in a process of its own, from its newest checkpoint; nothing to do where it is done."""
+    torch.set_num_threads(1)
+    train(config_of(run, folder), SILENT)

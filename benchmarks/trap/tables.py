@@ -1,0 +1,141 @@
+"""Which checkpoint would each rule have taken, how does it plan, and which offline figure tells?"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from runs import OFFLINE
+from scipy.stats import rankdata
+
+from vjepa2_ac.evaluation.intervals import share_of
+
+Figures = dict[str, Any]
+REACHED_CM = 5.0
+_SHOWN = ("rollout_over_persistence_last", "action_rank")
+RULES: dict[str, Callable[[list[Figures]], Figures]] = {
+    "base": lambda cells: cells[0],
+    "last": lambda cells: cells[-1],
+    "best by error": lambda cells: min(cells, key=lambda one: one["validation"]["rollout_over_persistence_last"]),
+    "best by ranking": lambda cells: min(cells, key=lambda one: one["validation"]["action_rank"]),
+}
+
+
+def write_tables(folder: Path, out: Path, picture: Path | None) -> None:
+    """Write the tables, and the picture if a place is given."""
+    cells = [json.loads(path.read_text()) for path in sorted((folder / "results").glob("*.json"))]
+    if not cells:
+        return
+    text = "\n".join([*_rules(cells), "", *_correlations(cells)])
+    (out / "trap.md").write_text(text + "\n")
+    print(text)
+    if picture is not None:
+        draw(cells, picture)
+
+
+def left_cm(one: Figures) -> float:
+    """Return the mean distance to the goal at the end."""
+    return float(np.mean([way[-1] for way in one["distance_cm"]]))
+
+
+def reached(one: Figures) -> int:
+    """Return how many goals were reached."""
+    return sum(way[-1] < REACHED_CM for way in one["distance_cm"])
+
+
+def by_run(cells: Sequence[Figures]) -> Iterator[list[Figures]]:
+    """Yield the checkpoints of each run, by step."""
+
+    def key(one: Figures) -> tuple[Any, ...]:
+        return tuple(one["cell"][name] for name in ("motions", "method", "seed"))
+
+    for _, group in groupby(sorted(cells, key=lambda one: (*key(one), one["cell"]["step"])), key):
+        yield list(group)
+
+
+def _rules(cells: Sequence[Figures]) -> Iterator[str]:
+    yield "| demonstrations | trained | rule | steps | error | rank | goals reached | left at the end, cm |"
+    yield "|---|---|---|---|---|---|---|---|"
+    runs = list(by_run(cells))
+    for kind, group in groupby(runs, lambda run: [run[0]["cell"][name] for name in ("motions", "method")]):
+        of_kind = list(group)
+        for rule, choose in RULES.items():
+            chosen = [choose(run) for run in of_kind]
+            goals = sum(len(one["distance_cm"]) for one in chosen)
+            share = share_of(sum(map(reached, chosen)), goals)
+            row = [
+                *(*kind, rule, _list([one["cell"]["step"] for one in chosen], "d")),
+                *(_list([one["validation"][key] for one in chosen], ".3f") for key in _SHOWN),
+                f"{share.value:.0%} [{share.low:.0%}, {share.high:.0%}] of {goals}",
+                f"{np.mean([left_cm(one) for one in chosen]):.1f} ({_list([left_cm(one) for one in chosen], '.1f')})",
+            ]
+            yield f"| {' | '.join(row)} |"
+
+
+def _list(values: Sequence[float], form: str) -> str:
+    return ", ".join(f"{value:{form}}" for value in values)
+
+
+def _correlations(cells: Sequence[Figures], draws: int = 1000) -> Iterator[str]:
+    """Yield a table of rank correlations with what is left to the goal; intervals are over whole runs."""
+    runs = list(by_run(cells))
+    parts = {name: [run for run in runs if run[0]["cell"]["motions"] == name] for name in ("narrow", "varied")}
+    parts = {"all": runs, **parts}
+    yield f"| offline figure, over {sum(map(len, runs))} checkpoints of {len(runs)} runs | {' | '.join(parts)} |"
+    yield "|---" * (len(parts) + 1) + "|"
+    for name in OFFLINE:
+        found = [_interval(part, name, draws) if len(part) > 1 else "" for part in parts.values()]
+        yield f"| {name} | {' | '.join(found)} |"
+
+
+def _interval(runs: Sequence[list[Figures]], name: str, draws: int) -> str:
+    pairs = [np.array([[one["offline"][name], left_cm(one)] for one in run]) for run in runs]
+    rng = np.random.default_rng(0)
+    drawn = [
+        _spearman(np.concatenate([pairs[place] for place in rng.integers(len(pairs), size=len(pairs))]))
+        for _ in range(draws)
+    ]
+    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    return f"{_spearman(np.concatenate(pairs)):+.2f} [{low:+.2f}, {high:+.2f}]"
+
+
+def _spearman(pairs: np.ndarray) -> float:
+    """Return the correlation of ranks; scipy's own takes a p-value's time, a thousand times."""
+    ranks = rankdata(pairs, axis=0)
+    with np.errstate(invalid="ignore"):
+        return float(np.corrcoef(ranks.T)[0, 1])
+
+
+def draw(cells: Sequence[Figures], path: Path) -> None:
+    """Draw error, ranking and closed loop over steps, a line for each seed: narrow above, varied below."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.0, 6.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(2, 3, sharex=True)
+    shown: dict[str, Callable[[Figures], float]] = {
+        "validation error / persistence": lambda one: one["validation"]["rollout_over_persistence_last"],
+        "mean rank of the true action (moves)": lambda one: one["validation"]["action_rank"],
+        "closed loop: cm left at the end": left_cm,
+    }
+    for row, motions in zip(panels, ("narrow", "varied"), strict=True):
+        for axes, (title, figure_of) in zip(row, shown.items(), strict=True):
+            for run in by_run(cells):
+                about = run[0]["cell"]
+                if about["motions"] != motions:
+                    continue
+                colour = "#1f77b4" if about["method"] == "LoRA" else "#d62728"
+                label = about["method"] if about["seed"] == 0 else None
+                steps = [one["cell"]["step"] for one in run]
+                axes.plot(steps, [figure_of(one) for one in run], color=colour, marker=".", alpha=0.8, label=label)
+            axes.set_ylim(bottom=0)
+            axes.set_title(f"{motions} demonstrations: {title}", fontsize=9)
+    for axes in panels[1]:
+        axes.set_xlabel("optimizer steps (0: the base)")
+    panels[0][0].legend()
+    figure.savefig(path, dpi=110)
