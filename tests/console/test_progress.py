@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 import vjepa2_ac
+from evaluation_results import ranking_of
 from vjepa2_ac.cli import main
 from vjepa2_ac.console import data, training
 from vjepa2_ac.console import progress as console_module
@@ -18,7 +19,7 @@ from vjepa2_ac.console.progress import ConsoleReporter, ProgressBar
 from vjepa2_ac.console.training import TrainingConsole
 from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.evaluation.measure import VALIDATED
-from vjepa2_ac.evaluation.result import PredictionErrors
+from vjepa2_ac.evaluation.result import PredictionErrors, Validation
 
 PACKAGE = Path(vjepa2_ac.__file__).parent
 FIGURES = {"loss": 0.51234, "samples_per_second": 1.5, "data_wait_share": 0.1}
@@ -47,13 +48,14 @@ def test_lines_have_loss_error_speed_and_time_left(monkeypatch: pytest.MonkeyPat
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     reporter = TrainingConsole()
-    reporter.validated(10, errors())
+    reporter.validated(10, Validation(errors(), ranking_of(np.array([0.1, 0.2]), ("a", "b"))))
     reporter.started(10, 100)
     for step in (11, 12, 13):
         now[0] += 6.0
         reporter.stepped(step, FIGURES)
-    validation, *lines = written.getvalue().splitlines()
+    validation, ranked, *lines = written.getvalue().splitlines()
     assert validation.startswith("validation at step 10: one-step error/persistence 0.250")
+    assert ranked.startswith("  mean rank of the true action 0.150 [")
     words = "loss 0.5123  error/persistence 0.250  1.50 clips/s"
     assert lines == [f"training 12/100  {words}  0:08:48 left"], "a line every 10 seconds"
 

@@ -241,6 +241,7 @@ def test_progress_names_each_part_of_the_work() -> None:
     assert {title: seen[-1] for title, seen in reporter.tasks.items()} == {
         "measuring": (12, 12),
         "other actions, model": (6, 6),
+        "action ranking, model": (12, 12),
         "energy landscapes, model": (3, 3),
     }
 
