@@ -38,7 +38,7 @@ def inspection_lines(inspection: Inspection) -> list[str]:
     success = inspection.success_share
     known = int((inspection.success >= 0).sum())
     shortest, low, median, high, longest = inspection.length_percentiles
-    config = inspection.config
+    config, coverage = inspection.config, inspection.coverage
     splits = ", ".join(
         f"{name} {windows:,} clips in {inspection.episodes_of[name]:,} episodes"
         for name, windows in inspection.windows_of.items()
@@ -57,6 +57,7 @@ def inspection_lines(inspection: Inspection) -> list[str]:
         "duplicates": str(inspection.duplicates) + _copies_are_listed(inspection),
         "sample": f"{len(inspection.sample):,} episodes, for what follows",
         **(_pose_rows(inspection) if inspection.has_poses else _vector_rows(inspection)),
+        **({} if coverage is None else coverage.lines | {"coverage": coverage.verdict}),
     }
     return [f"{name:<16}{text}" for name, text in rows.items()]
 

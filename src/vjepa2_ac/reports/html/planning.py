@@ -84,7 +84,7 @@ def _step_table(evaluation: Evaluation, study: PlanningStudy) -> Markup:
     shown = [[label, *(value(of(found), digits) for found in ways.values())] for label, of, digits in rows]
     settings = study.settings
     effort = f"{settings.samples} samples" if settings.planner != "gradient" else f"{settings.gradient.starts} starts"
-    most = ", ".join(f"{100 * one:g}" for one in settings.limits.xyz)
+    most = ", ".join(f"{100 * one:g}" for one in settings.limits.xyz_m)
     caption = (
         f"Plans of one step ({settings.planner}, {effort}, {settings.iterations} iterations,"
         f" {settings.energy.distance.upper()} energy, at most {most} cm along x, y, z;"

@@ -56,6 +56,7 @@ class ClosedLoopBenchmark:
     planning: dict[str, Any]  # settings, as plain values
     planning_seed: int
     results: tuple[ClosedLoopResult, ...]
+    warnings: tuple[str, ...] = ()  # of the session
 
     @property
     def seconds_per_step(self) -> float:
@@ -110,6 +111,7 @@ def run_benchmark(
         session.config.planning.model_dump(mode="json"),
         session.config.seed,
         tuple(results),
+        session.warnings,
     )
     return contest, _written(contest, folder)
 
@@ -138,6 +140,7 @@ def benchmark_as_dict(contest: ClosedLoopBenchmark) -> dict[str, Any]:
             "seconds_per_step": contest.seconds_per_step,
             "success_below_cm": 100 * SUCCESS_M[contest.asked.task],
             "planning": contest.planning,
+            "warnings": list(contest.warnings),
             "planning_seed": contest.planning_seed,
             "version": __version__,
             "time": utc_now(),
