@@ -1,4 +1,4 @@
-"""A run keeps how far its data move in a model step; planning takes its limits from it, or warns where they leave it."""
+"""A run keeps how far its data move in a model step; planning takes its limits from that, or warns beyond it."""
 
 import json
 import logging
