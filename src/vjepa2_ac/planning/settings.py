@@ -96,7 +96,9 @@ def with_taught_limits(config: Config, folder: Path) -> Config:
     limits, poses = config.planning.limits, config.data.states == "pose"
     if (limits.xyz if poses else limits.axes) != "data" or (taught := taught_in(folder, poses=poses)) is None:
         return config
-    numbers = {"xyz": taught.changes[:3]} if poses else {"axes": taught.changes}
+    # Down to tenths of a millimetre: an axis that only measurement moves is held.
+    metres = tuple(math.floor(1e4 * one) / 1e4 for one in taught.changes[:3])
+    numbers = {"xyz": metres} if poses else {"axes": taught.changes}
     planning = config.planning.model_copy(update={"limits": limits.model_copy(update=numbers)})
     return config.model_copy(update={"planning": planning})
 
