@@ -31,7 +31,7 @@ ENOUGH_NEAR = 0.5  # a direction is taught if so many steps go near it, over all
 _SHORT_CM = 0.5  # a shorter step has no direction, and along an axis no sign (as evaluation.action_score.metrics)
 _NEAR_DEG = 30.0
 # Measured: random reaching of the simulated arm 0.99 or more, of 100 random steps 0.90; half of all directions 0.62,
-# a plane 0.50 (0.58 if a fifth as thick as wide), an axis 0.13 (0.43), one way 0.07; starts of BridgeData 0.41.
+# a plane 0.50 (0.58 if a fifth as thick as wide), an axis 0.14 (0.43), one way 0.07; starts of BridgeData 0.41.
 _ENOUGH = 0.7
 _SMALL_CM = 1.0  # an image hardly shows a shorter step
 _FEWEST = 100  # steps that do not overlap
@@ -189,8 +189,8 @@ class PoseCoverage(Coverage):
             for name, far, way in zip(POSE.change_names, self.usual[POSE.position], ways.T, strict=False)
         )
         return {
-            "directions": f"{self.covered:.0%} of all have at least half of an equal share of the steps within"
-            f" {_NEAR_DEG:g} degrees; mean direction {self.one_way:.2f} (0 balanced, 1 one way)",
+            "directions": f"{self.covered:.0%} are taught (at least half of an equal share of the steps goes within"
+            f" {_NEAR_DEG:g} degrees); mean direction {self.one_way:.2f} (0 balanced, 1 one way)",
             "axes": f"{PERCENTILE} % of the steps within {', '.join(axes)}; the gripper changes in"
             f" {self.gripper_share:.0%}",
         }
