@@ -50,7 +50,7 @@ class OfficialPlanner:
     @torch.no_grad()
     def decide(self, scene: Scene, goal: Goal, config: PlanningConfig, dtype: torch.dtype, seed: int) -> Tensor:
         """Return the actions of a plan, [steps, 7]."""
-        cem, most = config.cem, config.limits.xyz[0]
+        cem, most = config.cem, config.limits.xyz_m[0]
         arguments = {
             "rollout": config.horizon, "samples": config.samples, "cem_steps": config.iterations, "topk": cem.elites,
             "momentum_mean": cem.momentum_mean, "momentum_std": cem.momentum_std, "maxnorm": most,

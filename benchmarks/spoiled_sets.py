@@ -128,8 +128,9 @@ def _asked(
 
 
 def _alarms(outcome: Outcome) -> set[tuple[str, str]]:
+    """Return the alarms; narrow data are none: nothing is wrong with them."""
     hints = {(one.about, "hint") for one in outcome.findings if one.text.startswith(_HINT)}
-    return hints | {(one.about, one.level) for one in outcome.findings if one.level != "ok"}
+    return hints | {(one.about, one.level) for one in outcome.findings if one.level != "ok" and one.about != "coverage"}
 
 
 def _print(fault: Fault, outcome: Outcome, usual: set[tuple[str, str]]) -> None:

@@ -147,6 +147,28 @@ def test_a_broken_model_leads_to_no_motion_and_to_status_1(workshop: Path) -> No
     assert not np.any(file["actions"])
 
 
+@pytest.mark.usefixtures("no_figure")
+def test_limits_that_leave_what_the_run_was_taught_are_warned_of(
+    workshop: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noted = workshop / "run" / "changes.json"
+    noted.write_text(json.dumps({"changes": [0.02, 0.05, 0.05, 0.0, 0.0, 0.0, 1.0], "narrow": ""}))
+    try:
+        status, file = plan(workshop, *QUICK, subject="run")
+        (warned,) = [one for one in capsys.readouterr().err.splitlines() if one.startswith("warning")]
+        status_of_data, within = plan(workshop, *QUICK, "planning.limits.xyz=data", subject="run")
+    finally:
+        noted.unlink()
+    assert (status, status_of_data) == (0, 0)
+    assert "planning.limits.xyz leaves what" in warned
+    assert "was taught: dx 5 (2) cm. In brackets" in warned
+    assert [f"warning: {one}" for one in file["warnings"]] == [warned]
+    assert within["warnings"] == []
+    assert within["settings"]["limits"]["xyz"] == [0.02, 0.05, 0.05]
+    assert max(abs(action[0]) for action in within["actions"]) <= 0.02
+    assert "warning" not in capsys.readouterr().err
+
+
 WRONG = {
     "goal of another size": (["--goal", "{here}/other.png"], "48 x 60 pixels (width x height)"),
     "no image": (["--goal", "{here}/notes.png"], ", starting with b'x,y,'"),
@@ -164,6 +186,7 @@ WRONG = {
     "no state": (["--state", ""], "0 numbers"),
     "limits below zero": (["planning.limits.xyz=[-0.05,0.05,0.05]"], "planning.limits.xyz.0"),
     "limits that are not finite": (["planning.limits.xyz=[.inf,0.05,0.05]"], "planning.limits.xyz.0"),
+    "limits of data that nobody knows": (["planning.limits.xyz=data"], "data, of a model or an older run"),
     "limits that hold everything": (["planning.limits={xyz: [0, 0, 0], gripper: 0}"], "nothing is left to plan"),
     "an unknown knob": (["planning.horizn=2"], "did you mean horizon?"),
     "a knob of training": (["training.steps=2"], "a setting that planning does not use"),

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from vjepa2_ac.config.section import OFF, Count, NonNegative, Positive, PositiveInt, Section, Share, ZeroToOne
+from vjepa2_ac.errors import InputError
 
 Metre = ZeroToOne  # no arm moves farther in a model step: more would be millimetres
 
@@ -15,8 +16,9 @@ Metre = ZeroToOne  # no arm moves farther in a model step: more would be millime
 class LimitsConfig(Section):
     """Limits of every action, independent of the model. All per model step; `action_repeat` repeats it."""
 
-    xyz: tuple[Metre, Metre, Metre] = (0.05, 0.05, 0.05)
-    """Largest dx, dy, dz in metres, 1 at most; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075."""
+    xyz: Literal["data"] | tuple[Metre, Metre, Metre] = (0.05, 0.05, 0.05)
+    """Largest dx, dy, dz in metres, 1 at most; 0 holds an axis. Upstream's notebooks use 0.05 to 0.075. data: what the
+    run was taught, the 99th percentile along each axis."""
     ball: Literal["none", "l1", "l2"] = "none"
     """Whether (dx, dy, dz) is also limited to a ball: sum of absolute values (l1) or length (l2)."""
     radius: Positive = 0.05
@@ -35,6 +37,22 @@ class LimitsConfig(Section):
     """Changes below this become zero."""
     gripper_from: Count = 0
     """Model step of the plan at which open or close begins; a multiple of action_repeat."""
+
+    @property
+    def xyz_m(self) -> tuple[float, float, float]:
+        """The largest dx, dy, dz in metres.
+
+        Raises:
+            InputError: They are those of the data, and no run has said which.
+        """
+        if isinstance(self.xyz, tuple):
+            return self.xyz
+        raise InputError(
+            where="planning.limits.xyz",
+            found="data, of a model or an older run, which does not say what it was taught",
+            needed="the largest dx, dy, dz in metres, such as planning.limits.xyz=[0.05,0.05,0.05]",
+            fix="`vjepa2-ac data inspect CONFIG` shows how far 99 % of the steps in your data go (line `axes`)",
+        )
 
     @model_validator(mode="after")
     def _something_is_free(self) -> LimitsConfig:

@@ -42,7 +42,7 @@ def inspection_lines(inspection: Inspection) -> list[str]:
     shortest, low, median, high, longest = inspection.length_percentiles
     hours = inspection.hours
     lasting = f"{hours:,.1f} hours" if hours >= 1 else f"{hours * 60:.1f} minutes"
-    config = inspection.config
+    config, coverage = inspection.config, inspection.coverage
     splits = ", ".join(
         f"{name} {windows:,} clips in {inspection.episodes_of[name]:,} episodes"
         for name, windows in inspection.windows_of.items()
@@ -61,6 +61,7 @@ def inspection_lines(inspection: Inspection) -> list[str]:
         + ("; inspect.json lists the copies" if inspection.duplicates.copies else ""),
         "sample": f"{len(inspection.sample):,} episodes, for what follows",
         **(_pose_rows(inspection) if inspection.has_poses else _vector_rows(inspection)),
+        **({} if coverage is None else coverage.lines | {"coverage": coverage.verdict}),
     }
     return [f"{name:<16}{text}" for name, text in rows.items()]
 

@@ -11,6 +11,7 @@ from vjepa2_ac.config.loading import config_as_dict, config_from
 from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.action_score.protocol import FRAMES
+from vjepa2_ac.planning.settings import require_limits, with_taught_limits
 from vjepa2_ac.runs.checkpoint_selection import SELECTED
 from vjepa2_ac.runs.folder import is_run, read_run_config
 from vjepa2_ac.runs.relative_paths import DATA, with_paths_from_start
@@ -54,7 +55,7 @@ def settle(subject: str, asked: EvaluationOptions) -> tuple[Config, PlanningConf
     """
     config, folder = _config_of(subject, asked)
     _check_long_enough(config, asked.probes)
-    return config, _planning_of(config, asked), folder
+    return config, _planning_of(subject, config, asked), folder
 
 
 def _config_of(subject: str, asked: EvaluationOptions) -> tuple[Config, Path]:
@@ -91,18 +92,23 @@ def _nothing_to_measure(subject: str) -> InputError:
     )
 
 
-def _planning_of(config: Config, asked: EvaluationOptions) -> PlanningConfig:
+def _planning_of(subject: str, config: Config, asked: EvaluationOptions) -> PlanningConfig:
     """Return the settings of one-step plans: the config's, some of them replaced.
 
     Raises:
-        InputError: A setting is wrong, or does not belong to planning.
+        InputError: A setting is wrong, or does not belong to planning, or limits are those of data that nobody knows.
     """
     for setting in asked.planning:
         if not setting.startswith("planning."):
             raise InputError(
                 where="--planning", found=setting, needed="settings of planning, such as planning.samples=200"
             )
-    return config_from(config_as_dict(config), asked.planning, where="--planning").planning
+    config = config_from(config_as_dict(config), asked.planning, where="--planning")
+    if is_run(subject):
+        config = with_taught_limits(config, Path(subject))
+    if asked.probes.planning_clips:
+        require_limits(config)
+    return config.planning
 
 
 def _check_long_enough(config: Config, probes: ProbeOptions) -> None:

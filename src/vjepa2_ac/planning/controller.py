@@ -27,7 +27,7 @@ from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.model_setup import prepare_for_planning
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.search_space import SearchSpace, search_space
-from vjepa2_ac.planning.settings import with_taught_limits
+from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
 from vjepa2_ac.planning.state_integration import states_along
 from vjepa2_ac.runs.loading import TrainedRun
 from vjepa2_ac.spaces import EXTRINSICS, POSES, Spaces
@@ -121,11 +121,14 @@ class Controller:
     ) -> Controller:
         """Return the controller of a trained run: with its crop and, unless others are given, its settings and seed.
 
+        Limits beyond what the run was taught, and narrow data, are logged as warnings.
+
         Raises:
             InputError: As `Controller`.
         """
         its = run.config if config is None else run.config.model_copy(update={"planning": config})
         its = with_taught_limits(its, Path(its.run_dir))
+        warn_beyond_taught(its, Path(its.run_dir))
         return cls.of_config(run.world_model, its, seed=seed, extrinsics=extrinsics)
 
     @classmethod

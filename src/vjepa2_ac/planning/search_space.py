@@ -108,7 +108,7 @@ def pose_space(config: PlanningConfig) -> SearchSpace:
     """Return the allowed actions of an arm: dx, dy, dz, three rotations, gripper (legend: `vjepa2_ac.episode`)."""
     limits, decisions = config.limits, config.horizon // config.action_repeat
     gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
-    reach = _towards_zero([*limits.xyz, *[limits.rotation] * 3, gripper])
+    reach = _towards_zero([*limits.xyz_m, *[limits.rotation] * 3, gripper])
     upper = reach.repeat(decisions, 1)
     lower = -upper
     if limits.gripper_mode in {"open", "close"}:

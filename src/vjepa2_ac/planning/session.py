@@ -21,7 +21,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.planning.controller import Controller
-from vjepa2_ac.planning.settings import planning_settings
+from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint_selection import SELECTED
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
@@ -52,6 +52,7 @@ class PlanningSession:
     config: Config  # of it: planning, seed, data.crop and data.stride are used
     subject: str  # the run or model as given
     checkpoint: str  # which one, as text; "" of a model
+    warnings: tuple[str, ...] = ()  # why its plans may leave what the run was taught
     fingerprints: Fingerprints | None = None  # of a run's weights before they were merged; None: of the world model
 
     def controller(
@@ -90,6 +91,7 @@ class PlanningSession:
                 "device": model.device.type,
                 "image_size": model.image_size,
             },
+            "warnings": list(self.warnings),
             "control_steps_of_a_model_step": self.config.data.stride,
             "frame_of_states": self.config.data.pose_frame,
         }
@@ -102,6 +104,7 @@ def load_to_plan(
 
     The settings of a run are those of its config: planning, seed, crop, stride, type of the weights. Those of a model
     are the given config's; without one the defaults, and float32 weights if the device has no bfloat16, or is a CPU.
+    Limits beyond what a run was taught, and narrow data, are warned of: logged, and in the session's `warnings`.
     Trained weights are merged before the model moves to the device (see `planning.model_setup`): it is there once.
 
     Args:
@@ -120,7 +123,8 @@ def load_to_plan(
         run = load_run(Path(subject), checkpoint, its)
         known = Fingerprints.of(run.world_model)
         merge_adapter(run.world_model)
-        return PlanningSession(run.world_model.to(device).eval(), its, subject, run.chosen, known)
+        warnings = warn_beyond_taught(its, Path(subject))
+        return PlanningSession(run.world_model.to(device).eval(), its, subject, run.chosen, warnings, known)
     if checkpoint != SELECTED:
         raise InputError(
             where=f"--checkpoint {checkpoint}",

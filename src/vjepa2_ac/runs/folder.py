@@ -3,7 +3,7 @@
 RUN/config.yaml         the resolved config, defaults and a chosen stride included
 RUN/environment.json    versions, machine, command and folder of every start
 RUN/calibration.json    metrics of each stride, where data.stride was auto
-RUN/changes.json        how far vector states change in a model step: what planning.limits.axes: data means
+RUN/changes.json        how far states change in a model step (99th percentile): what `data` means in planning.limits
 RUN/run_id              a name that no other run has
 RUN/metrics.jsonl       metrics, a row per line
 RUN/metrics.json        what `evaluate` measured; report.html and evaluation.png show it
@@ -41,7 +41,7 @@ CONFIG = "config.yaml"
 ENVIRONMENT = "environment.json"
 RUN_ID = "run_id"
 CALIBRATION = "calibration.json"  # of an auto stride
-CHANGES = "changes.json"  # of vector states
+CHANGES = "changes.json"  # of states in a model step
 CHECKPOINTS = "checkpoints"
 HELD = ".mirror"
 METRICS = "metrics.jsonl"

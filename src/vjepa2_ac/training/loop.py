@@ -18,7 +18,7 @@ import torch
 
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.loading import config_as_dict
-from vjepa2_ac.data.inspection.statistics import usual_changes
+from vjepa2_ac.data.inspection.statistics import coverage_in
 from vjepa2_ac.distributed.collectives import all_reduce_max, broadcast_object, require_same
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.distributed.preemption import StoppedError, stop_on_signals
@@ -111,13 +111,12 @@ def _train(run: Run, opened: OpenRun, first: Validation | None, reporter: Traini
 
 
 def _write_measured(run: Run) -> None:
-    """Write what the data and the base have shown: the metrics of a chosen stride, and the usual changes of vectors."""
+    """Write what the data and the base have shown: the metrics of a chosen stride, and what the actions teach."""
     folder = run.folder
     if run.calibration is not None:
         write_atomically(folder / CALIBRATION, json.dumps(run.calibration.as_dict(), indent=1).encode())
-    if run.dataset.spaces.state.position is None and not (folder / CHANGES).exists():
-        usual = {"percentile": 99, "changes": usual_changes(run.dataset).tolist()}
-        write_atomically(folder / CHANGES, json.dumps(usual).encode())
+    if not (folder / CHANGES).exists() and (coverage := coverage_in(run.dataset)) is not None:
+        write_atomically(folder / CHANGES, json.dumps(coverage.noted()).encode())
 
 
 def _open_metrics_log(run: Run, reporter: TrainingReporter) -> MetricsLog | NullMetricsLog:

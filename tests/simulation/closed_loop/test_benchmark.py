@@ -129,6 +129,12 @@ def test_the_film_shows_what_the_model_saw_beside_the_goal(model: str, tmp_path:
     assert (frames[0] != frames[-1]).any()
 
 
+def test_the_warnings_of_a_session_are_kept_with_its_results(model: str, tmp_path: Path) -> None:
+    session = replace(load_to_plan(model, overrides=SMALL), warnings=("limits leave what was taught",))
+    run_benchmark(session, BenchmarkOptions(episodes=1, steps=1, films=0), tmp_path)
+    assert metrics(tmp_path)["about"]["warnings"] == ["limits leave what was taught"]
+
+
 def test_what_was_unusual_is_noted(model: str, tmp_path: Path) -> None:
     steering = load_to_plan(model, overrides=[*SMALL, "planning.budget_s=0.000001"])
     benchmark, _ = run_benchmark(steering, BenchmarkOptions(episodes=1, steps=2, films=0), tmp_path)

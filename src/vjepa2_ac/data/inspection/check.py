@@ -20,6 +20,7 @@ from vjepa2_ac.data.inspection.check_excerpts import excerpt_findings
 from vjepa2_ac.data.inspection.check_vectors import has_moved, vector_findings
 from vjepa2_ac.data.inspection.duplicates import find_duplicates
 from vjepa2_ac.data.inspection.finding import Finding, Level
+from vjepa2_ac.data.inspection.statistics import coverage_in
 from vjepa2_ac.episode import Batch, Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.spaces import POSE, POSES, Spaces
@@ -75,7 +76,15 @@ def check_data(
         yield Finding("ok", "stride", f"auto; looked at here at the smallest candidate, {dataset.config.stride}")
     yield from _what_takes_part(dataset)
     yield from _read(dataset, seed=seed, batch_size=batch_size, clips=clips, clock=clock)
+    yield from _coverage(dataset)
     yield from excerpt_findings(dataset)
+
+
+def _coverage(dataset: Dataset) -> Iterator[Finding]:
+    coverage = coverage_in(dataset)
+    if coverage is not None:
+        yield from (Finding("ok", name, text) for name, text in coverage.lines.items())
+        yield Finding("warning" if coverage.narrow else "ok", "coverage", coverage.verdict)
 
 
 def _what_takes_part(dataset: Dataset) -> Iterator[Finding]:

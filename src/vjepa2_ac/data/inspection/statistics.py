@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,14 @@ from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, Removed
 from vjepa2_ac.data.clips.windows import in_split, spread
 from vjepa2_ac.data.filters.idle_rules import idle_by_motion
+from vjepa2_ac.data.inspection.coverage import Coverage, coverage_of
 from vjepa2_ac.data.inspection.duplicates import Duplicates, find_duplicates
 from vjepa2_ac.data.inspection.statistics_vectors import ChangePerStep, change_per_step
 from vjepa2_ac.data.sources.configured_spaces import spaces_of
 from vjepa2_ac.episode import Episode, Progress, Widths
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.spaces import POSE, Spaces
+from vjepa2_ac.geometry import states_in_camera_frame
+from vjepa2_ac.spaces import POSE, Spaces, StateSpace
 
 PERCENTILES = (10, 50, 90, 99)
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
@@ -42,6 +45,14 @@ class ReadEpisode:
     index: int  # index into the data set's table
     states: Float[np.ndarray, "steps state_dim"]
     kept: tuple[tuple[int, int], ...]  # ranges that clips come from
+    extrinsics: Float[np.ndarray, "steps 6"] | None = None  # of the camera that `data.pose_frame` says
+
+    def changes(self, stride: int, space: StateSpace) -> Iterator[Float[np.ndarray, "pairs state_dim"]]:
+        """Yield the changes from each step to the one `stride` later, within kept ranges, in the model's frame."""
+        states = self.states if self.extrinsics is None else states_in_camera_frame(self.states, self.extrinsics)
+        for start, end in self.kept:
+            for first in range(start, min(start + stride, end - stride)):
+                yield space.differences(states[first:end:stride])
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +135,11 @@ class Inspection:
         """The least and the greatest closedness of the sample."""
         return self.range_of(self.spaces.state.gripper or 0)
 
+    @cached_property
+    def coverage(self) -> Coverage | None:
+        """The coverage of actions by the sample at the config's stride; None: no step fits."""
+        return _coverage(self.sample, self.spaces.state, self.config.model_stride)
+
     def as_dict(self) -> dict[str, Any]:
         """Return all statistics as plain values, for `inspect.json`."""
         return {
@@ -146,6 +162,7 @@ class Inspection:
             "state_dim": self.widths.state,
             "action_dim": self.widths.action,
             "percentiles": list(PERCENTILES),
+            "coverage": None if self.coverage is None else self.coverage.as_dict(),
             **(self._poses_as_dict() if self.has_poses else self._vectors_as_dict()),
         }
 
@@ -217,16 +234,19 @@ def inspect_dataset(dataset: Dataset, *, episodes: int = 100, progress: Progress
     return replace(found, still_share=float(idle.mean()), motions=motions)
 
 
-def usual_changes(dataset: Dataset, *, episodes: int = 64) -> Float[np.ndarray, " state_dim"]:
-    """Return the 99th percentile of the size of each number's change per model step, over a sample of the episodes.
+def coverage_in(dataset: Dataset, *, episodes: int = 64) -> Coverage | None:
+    """Return the coverage of actions by a sample of the episodes, read without frames; None: no step fits.
 
     Raises:
         InputError: As `inspect_dataset`.
     """
-    stride, sample = dataset.config.model_stride, _read(dataset, sample_of(dataset, episodes), None)
-    pieces = [one.states[start:end] for one in sample for start, end in one.kept if end - start > stride]
-    changes = [np.abs(piece[stride:] - piece[:-stride]) for piece in pieces]
-    return np.asarray(np.percentile(np.concatenate(changes), 99, axis=0))
+    sample = _read(dataset, sample_of(dataset, episodes), None)
+    return _coverage(sample, dataset.spaces.state, dataset.config.model_stride)
+
+
+def _coverage(sample: Iterable[ReadEpisode], space: StateSpace, stride: int) -> Coverage | None:
+    changes = [piece for one in sample for piece in one.changes(stride, space)]
+    return coverage_of(np.concatenate(changes), space, stride) if changes else None
 
 
 def sample_of(dataset: Dataset, count: int) -> list[int]:
@@ -274,7 +294,8 @@ def _read(dataset: Dataset, episodes: Sequence[int], progress: Progress | None) 
             if isinstance(episode, InputError):
                 dataset.leave_out(index, episode)
             else:
-                yield ReadEpisode(index, np.asarray(episode.states, np.float64), tuple(dataset.kept.of(index)))
+                camera = episode.extrinsics if dataset.config.pose_frame == "camera" else None
+                yield ReadEpisode(index, np.asarray(episode.states, np.float64), tuple(dataset.kept.of(index)), camera)
 
 
 def _episodes(dataset: Dataset, split: Split) -> int:

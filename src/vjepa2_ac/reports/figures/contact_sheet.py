@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, UInt8
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.clips.transforms import CropBox
+from vjepa2_ac.data.inspection.coverage import ENOUGH_NEAR
 from vjepa2_ac.reports.figures.page import BLUE, GREEN, GREY, ORANGE, Page, written_page
 
 _INK, _FAINT, _SPEED, _GRIPPER, _IDLE = "#222222", GREY, BLUE, ORANGE, "#c9c9c9"
@@ -58,6 +59,7 @@ class ContactSheet:
     places_m: Float[np.ndarray, "points 3"] | None  # where the flange was
     shaded_means: str  # what the shaded parts of a strip are; empty: there are none
     ranges: Float[np.ndarray, "state_dim 2"] | None = None  # of vectors: the least and greatest value of each number
+    directions: Float[np.ndarray, "rows columns"] | None = None  # of steps: how frequent, over all being equally so
 
 
 def pictures_per_row(height: int, width: int) -> int:
@@ -86,26 +88,42 @@ def plot_contact_sheet(sheet: ContactSheet, path: Path) -> Path:
 
 
 def _panels(page: Page, sheet: ContactSheet, top: float) -> None:
-    """Draw the three small plots of the whole set: lengths, motion per model step, places."""
-    lengths = page.axes(0.6, top, 3.6, _PANELS)
+    """Draw the small plots of the whole set: lengths, motion per model step, places and directions."""
+    lengths = page.axes(0.6, top, 2.4, _PANELS)
     lengths.hist(sheet.lengths_s, bins=min(40, max(5, len(sheet.lengths_s) // 2)), color=_FAINT)
     lengths.set_title("Length of episodes (s)")
     lengths.locator_params(axis="y", nbins=4, integer=True)
-    _motion(page.axes(5.0, top, 5.2, _PANELS), sheet)
+    _motion(page.axes(3.6, top, 4.6, _PANELS), sheet)
     if sheet.places_m is not None:
         _places(page, sheet.places_m, top)
+    if sheet.directions is not None:
+        _directions(page, sheet.directions, top)
     if sheet.ranges is not None:
-        _ranges(page.axes(11.1, top, 4.3, _PANELS), sheet.ranges)
+        _ranges(page.axes(8.9, top, 6.7, _PANELS), sheet.ranges)
 
 
 def _places(page: Page, places_m: Float[np.ndarray, "points 3"], top: float) -> None:
-    places = page.axes(11.1, top, 4.3, _PANELS)
+    places = page.axes(8.9, top, 3.2, _PANELS)
     shown = places.scatter(-places_m[:, 1], places_m[:, 0], c=places_m[:, 2], s=2, cmap="viridis", linewidths=0)
     places.set_aspect("equal", adjustable="datalim")
     places.set(title="Where the flange was, from above (m; colour: height)")
     places.set(xlabel="-y: to the robot's right", ylabel="x: forward")
     places.locator_params(nbins=5)
     page.figure.colorbar(shown, ax=places, fraction=0.04, pad=0.02)
+
+
+def _directions(page: Page, directions: Float[np.ndarray, "rows columns"], top: float) -> None:
+    """Draw the sphere of directions, each of the same area, as a map: x forward in the middle, z up."""
+    axes = page.axes(12.75, top, 2.85, _PANELS)
+    extent = (-180.0, 180.0, -1.0, 1.0)
+    shown = axes.imshow(directions, extent=extent, origin="lower", aspect="auto", cmap="Blues", vmin=0, vmax=2)
+    if directions.min() < ENOUGH_NEAR < directions.max():
+        axes.contour(directions, [ENOUGH_NEAR], extent=extent, origin="lower", colors=_GRIPPER, linewidths=1.2)
+    share = (directions >= ENOUGH_NEAR).mean()
+    axes.set_title(f"Directions of steps: {share:.0%} are taught")
+    axes.set_xticks([-180, -90, 0, 90, 180], ["-x", "-y", "+x", "+y", "-x"])
+    axes.set_yticks([-1, 0, 1], ["-z", "", "+z"])
+    page.figure.colorbar(shown, ax=axes, fraction=0.04, pad=0.02, ticks=[0, ENOUGH_NEAR, 1, 2])
 
 
 def _ranges(axes: Any, ranges: Float[np.ndarray, "state_dim 2"]) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from vjepa2_ac.config import DataConfig
 from vjepa2_ac.data.clips.dataset import Dataset
 from vjepa2_ac.data.clips.transforms import crop_box
+from vjepa2_ac.data.inspection.coverage import PoseCoverage
 from vjepa2_ac.data.inspection.statistics import RELEASED_STEP_CM, Inspection, ReadEpisode, idle_runs
 from vjepa2_ac.data.inspection.statistics_vectors import largest_change
 from vjepa2_ac.episode import Progress, no_progress
@@ -58,6 +59,7 @@ def sheet_of(inspection: Inspection, strips: Sequence[Strip]) -> ContactSheet:
         places_m=places[:: -(-len(places) // _PLACES)] if has_poses else None,
         shaded_means=_shaded_means(config),
         ranges=None if has_poses else inspection.ranges,
+        directions=inspection.coverage.density if isinstance(inspection.coverage, PoseCoverage) else None,
     )
 
 

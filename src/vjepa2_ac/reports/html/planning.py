@@ -48,7 +48,7 @@ def planning_section(evaluation: Evaluation) -> Markup:
         effort=f"{settings.gradient.starts} starts"
         if settings.planner == "gradient"
         else f"{settings.samples} samples",
-        most=", ".join(f"{100 * one:g}" for one in settings.limits.xyz),
+        most=", ".join(f"{100 * one:g}" for one in settings.limits.xyz_m),
         least=LEAST_CM,
     )
 

@@ -59,6 +59,7 @@ class ClosedLoopBenchmark:
     planning: dict[str, Any]  # settings, as plain values
     planning_seed: int
     results: tuple[ClosedLoopResult, ...]
+    warnings: tuple[str, ...] = ()  # of the session
 
     @property
     def seconds_per_step(self) -> float:
@@ -92,9 +93,14 @@ def run_benchmark(
         films = options.films if isinstance(policy, Planning) else 0
         spec = RolloutSpec(options.task, arm.domain, options.episodes, options.seed, options.steps, stride, films)
         results.append(run_task(spec, policy, arm, reporter.task(f"{options.task}: {policy.name}")))
-    planning = session.config.planning.model_dump(mode="json")
     benchmark = ClosedLoopBenchmark(
-        session.subject, session.checkpoint, options, planning, session.config.seed, tuple(results)
+        session.subject,
+        session.checkpoint,
+        options,
+        session.config.planning.model_dump(mode="json"),
+        session.config.seed,
+        tuple(results),
+        session.warnings,
     )
     path = folder / FILE
     write_atomically(path, json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
@@ -133,6 +139,7 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
             "seconds_per_step": benchmark.seconds_per_step,
             "success_below_cm": 100 * SUCCESS_M[benchmark.options.task],
             "planning": benchmark.planning,
+            "warnings": list(benchmark.warnings),
             "planning_seed": benchmark.planning_seed,
             "version": __version__,
             "time": utc_now(),

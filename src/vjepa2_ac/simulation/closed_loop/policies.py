@@ -144,7 +144,7 @@ class Planning:
 def farthest(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:
     """Return the largest size of each component of an action, without the ball; 0 where it is fixed."""
     gripper = 0.0 if limits.gripper_mode == "held" else limits.gripper
-    return np.array([*limits.xyz, *[limits.rotation] * 3, gripper])
+    return np.array([*limits.xyz_m, *[limits.rotation] * 3, gripper])
 
 
 def shortened(way: Float[np.ndarray, " 7"], limits: LimitsConfig) -> Float[np.ndarray, " 7"]:

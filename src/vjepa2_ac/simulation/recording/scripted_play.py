@@ -89,7 +89,7 @@ def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, 
         way[:3] = block[:3] - state[:3] + np.append(rng.normal(0.0, 0.03, size=2), height)
         way[:2] *= rng.uniform(0.6, 1.8)
     else:
-        way[:3] = rng.uniform(-1.0, 1.0, size=3) * limits.xyz
+        way[:3] = rng.uniform(-1.0, 1.0, size=3) * limits.xyz_m
     if problem.task == "pick" and rng.uniform() < 0.25:
         way[6] = rng.choice([-1.0, 1.0]) * limits.gripper
     way = shortened(way, limits)
