@@ -61,6 +61,7 @@ KINDS = {
     "pissa": {"adapter__init": "pissa"},
     "whole predictor": {"adapter__kind": "none"},
     "8 bit": {"training__optimizer": "adamw_8bit"},
+    "action contrast": {"training__action_contrast": {"weight": 1.0}, "adapter__dropout": 0.2},
 }
 
 

@@ -15,9 +15,16 @@ from vjepa2_ac.config.sources import (
     RldsData,
     RldsFields,
 )
-from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
+from vjepa2_ac.config.training import (
+    ActionContrastConfig,
+    CheckpointConfig,
+    TrackingConfig,
+    TrainingConfig,
+    ValidationConfig,
+)
 
 __all__ = [
+    "ActionContrastConfig",
     "AdapterConfig",
     "AugmentConfig",
     "CheckpointConfig",

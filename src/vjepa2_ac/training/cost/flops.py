@@ -23,7 +23,7 @@ class ClipFlops:
     """Floating-point operations of training on one clip."""
 
     encoder: int  # the frozen encoder, forward, on every frame
-    forward: int  # of the predictor: teacher forcing and the further predictions of the rollout
+    forward: int  # of the predictor: teacher forcing, once more with wrong actions if asked for, rest of the rollout
     backward: int  # of the predictor
 
     @property
@@ -47,6 +47,8 @@ def clip_flops(config: Config, sizes: ModelSizes) -> ClipFlops:
     passes = _Passes.of(config, sizes)
     frames, training = config.data.frames, config.training
     total = passes.over(frames - 1, keys=range(1, frames), fed_back=False)
+    if training.action_contrast.weight:
+        total += total
     for step in range(2, 1 + (training.rollout_steps if training.rollout_weight else 1)):
         total += passes.over(1, keys=range(step, step + 1), fed_back=True)  # earlier keys and values are there
     return ClipFlops(frames * frame_flops(sizes), total.forward, total.backward)
