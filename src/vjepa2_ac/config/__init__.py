@@ -3,6 +3,7 @@
 from vjepa2_ac.config.data import AugmentConfig, DataConfig, DiskCacheConfig, IdleConfig
 from vjepa2_ac.config.model import AdapterConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.replay import ReplayConfig
 from vjepa2_ac.config.run import Config
 from vjepa2_ac.config.section import Section
 from vjepa2_ac.config.sources import (
@@ -45,6 +46,7 @@ __all__ = [
     "PredictorSizes",
     "RawDroidData",
     "RawDroidOptions",
+    "ReplayConfig",
     "RldsData",
     "RldsFields",
     "Section",

@@ -87,7 +87,7 @@ def _check_run(config: Config) -> None:
         )
     if config.training.cuda_graph:
         raise _refusal("FSDP with training.cuda_graph", "false: together they are untried", "Set it to false")
-    if config.data.broken_episodes == "skip":
+    if any(data.broken_episodes == "skip" for data in config.data_sets):
         raise _refusal(
             "FSDP with data.broken_episodes skip",
             "clips for every process: one without would leave the others waiting",

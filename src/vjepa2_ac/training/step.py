@@ -149,11 +149,10 @@ def _finish_gradients(run: Run, factor: float) -> float:
 
 
 def _about_the_data(run: Run, taken: Gradients) -> dict[str, float]:
-    data = run.config.data
     metrics: dict[str, float] = {}
-    if data.broken_episodes == "skip":
+    if any(data.broken_episodes == "skip" for data in run.config.data_sets):
         metrics["clips_left_out"] = float(run.clips_per_step - taken.clips)
-    if is_url(data.path):
+    if any(is_url(data.path) for data in run.config.data_sets):
         metrics["bytes_per_clip"] = taken.bytes_fetched / max(1, taken.clips)
     return metrics
 

@@ -99,7 +99,7 @@ def ways_to_fit(config: Config, sizes: ModelSizes, available: int) -> list[str] 
             break
         lighter = turn(config)
         if _total(lighter, sizes) < _total(config, sizes):
-            turned.append(knob)
+            turned.append(f"{knob} replay.{knob}" if config.replay and knob.startswith("data.") else knob)
             config = lighter
     return turned if _total(config, sizes) <= available else None
 
