@@ -34,7 +34,8 @@ def open_replay(config: Config, dataset: Dataset, reporter: Reporter) -> Dataset
     _require_same_spaces(dataset, replayed)
     _require_same_step(dataset, replayed)
     windows = replayed.windows("train")
-    reporter.note(f"Replay: {config.replay.share:.0%} of the clips are from {replayed.config.path} ({len(windows):,}).")
+    name, share = replayed.config.path, config.replay.share
+    reporter.note(f"Replay: {share:.0%} of the clips are from {name}, which has {len(windows):,}.")
     if held_out := _held_out(dataset, replayed):
         reporter.note(
             f"Warning: {len(held_out):,} episodes that the first data set holds out are replayed in training:"

@@ -185,6 +185,8 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
     fit_to_data(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
     reporter.note(str(trainable_report(world_model)))
+    if unusual := config.adapter.out_of_line:
+        reporter.note(f"Warning: {unusual}.")
     world_model.set_gradient_checkpointing(training.gradient_checkpointing)
     world_model.set_attention(training.attention)
     world_model.set_compiled("with gradients" if training.compile == "blocks" else "never")
