@@ -125,8 +125,16 @@ def _data(config: Config, facts: AdapterFacts) -> str:
             **_states(config, facts),
             "held out": f"{data.validation_share:.0%} of the episodes for validation, {data.test_share:.0%} for test"
             + ("" if data.split_by is None else f", those of one `{data.split_by}` together"),
+            **_replay(config),
         },
     )
+
+
+def _replay(config: Config) -> dict[str, str]:
+    if config.replay is None:
+        return {}
+    share, data = config.replay.share, config.replay.data
+    return {"replay": f"{share:.0%} of the training clips from {data.source}, `{data.path}`"}
 
 
 def _training(config: Config, facts: AdapterFacts) -> str:
@@ -153,6 +161,7 @@ def _loss(config: Config) -> str:
     training = config.training
     parts = {"teacher forcing": training.teacher_forcing_weight}
     parts[f"rollout of {_count(training.rollout_steps, 'step')}"] = training.rollout_weight
+    parts[f"contrast of actions (margin {training.action_contrast.margin:g})"] = training.action_contrast.weight
     words = [name if weight == 1 else f"{weight:g} x {name}" for name, weight in parts.items() if weight]
     return f"{training.loss}, {' + '.join(words)}"
 
