@@ -116,6 +116,7 @@ class Skipped:
 
     episode_id: str
     reason: str
+    replayed: bool = False  # a clip of the second data set
 
 
 @dataclass(frozen=True)

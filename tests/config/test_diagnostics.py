@@ -83,6 +83,7 @@ def test_nothing_is_said_that_may_be_untrue_once_the_mistake_is_gone(wrong: list
         ("data.strid", "stride"),
         ("output_dir", "run_dir"),
         ("training.rank", "adapter.rank"),
+        ("data.mix", "replay"),
     ],
 )
 def test_an_unknown_key_is_told_the_one_that_was_meant(unknown: str, meant: str) -> None:

@@ -107,7 +107,7 @@ def config_of(source: str, path: str | Path, run_dir: Path, **data: Any) -> Conf
 def knobs_of(config: Config) -> set[str]:
     """Return the knobs that a config of its form of data has."""
     foreign = set(DataConfig.kinds.values()) - {type(config.data)}
-    names = tuple(f"data.{name}." for kind in foreign for name in kind.own_sections())
+    names = ("replay.", *(f"data.{name}." for kind in foreign for name in kind.own_sections()))  # see test_replay.py
     return {key for key in marks_of(Config) if not key.startswith(names)}
 
 

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from paths import ROOT
-from vjepa2_ac.config import Config, DataConfig, IdleConfig
+from vjepa2_ac.config import AdapterConfig, CheckpointConfig, Config, DataConfig, IdleConfig
 from vjepa2_ac.config.diagnostics import all_keys
 from vjepa2_ac.config.loading import (
     changed_keys,
@@ -44,6 +44,46 @@ def test_default_config_holds_the_mission() -> None:
     assert (config.training.learning_rate, config.training.precision) == (1e-4, "bf16")
     assert (config.data.frames, config.model.sizes.image_size) == (16, 256)
     assert (config.checkpoint.every, config.checkpoint.keep) == (1_000, 5)
+
+
+@pytest.mark.parametrize(
+    ("knobs", "warned"),
+    [
+        ({"rank": 64, "alpha": 128}, True),
+        ({"rank": 32, "alpha": 64}, True),
+        ({"rank": 64, "alpha": 32}, False),
+        ({"rank": 4, "alpha": 32}, False),
+        ({"rank": 4, "alpha": 8}, False),
+        ({"rank": 64, "alpha": 128, "rslora": False}, False),
+        ({"kind": "none", "alpha": 128}, False),
+    ],
+)
+def test_an_alpha_that_grows_with_the_rank_under_rslora_is_out_of_line(knobs: dict[str, object], warned: bool) -> None:
+    found = AdapterConfig.model_validate(knobs).out_of_line
+    assert (found is not None) == warned
+    if found is not None:
+        assert f"a scale of {knobs['alpha'] / knobs['rank'] ** 0.5:.3g}, alpha 32 one of" in found
+        assert "Take adapter.alpha=32" in found
+
+
+def test_no_config_of_the_project_is_out_of_line() -> None:
+    for path in (ROOT / "configs").glob("*.yaml"):
+        assert load_config(path).adapter.out_of_line is None, path
+
+
+def test_the_config_for_a_few_demonstrations_holds_its_recipe(tmp_path: Path) -> None:
+    config = load_config(ROOT / "configs/own_robot.yaml")
+    adapter, training = config.adapter, config.training
+    assert (adapter.rank, adapter.alpha, adapter.rslora) == (32, 32, True)
+    assert set(adapter.modules_to_save) == {"predictor_embed", "predictor_proj", "action_encoder", "state_encoder"}
+    assert training.steps * training.batch_size * training.accumulation == 16_000
+    assert config.validation.every * 10 == training.steps
+    assert (config.data.cache, config.checkpoint.keep_best) == ("auto", CheckpointConfig().keep_best)
+    text = (ROOT / "configs/own_robot.yaml").read_text()
+    offered = re.sub(r"^( *)# (?=action_contrast|replay:|  share|  data)", r"\1", text, flags=re.MULTILINE)
+    asked = load_config(write(tmp_path, offered))  # with what it offers in comments
+    assert asked.training.action_contrast.weight == 1.0
+    assert asked.replay.share == 0.25
 
 
 def test_a_resolved_config_reads_back_equal(tmp_path: Path) -> None:
@@ -122,7 +162,8 @@ def test_words_that_yaml_takes_for_truth_values_are_words(tmp_path: Path) -> Non
         knob = next((one["properties"][name] for one in sections.values() if name in one.get("properties", {})), {})
         for word in knob.get("enum", ()):
             if section and yaml.safe_load(str(word)) != word:
-                assert attrgetter(key)(load_config(path, [f"{key}={word}"])) == word
+                needed = ["replay.data.path=d"] * key.startswith("replay.")
+                assert attrgetter(key)(load_config(path, [f"{key}={word}", *needed])) == word
                 found.append(key)
     assert {"data.cache", "training.compile", "planning.compile"} <= set(found)
 

@@ -86,11 +86,15 @@ def write_synthetic_droid(
     steps: int | Sequence[int] = 40,
     shards: int = 2,
     size: tuple[int, int] = (180, 320),
+    first: int = 0,
 ) -> Path:
-    """Write drawn demonstrations as a data set in DROID's schema; every third is a failure. Returns the folder."""
+    """Write drawn demonstrations as a data set in DROID's schema; every third is a failure. Returns the folder.
+
+    Those of another data set are counted from another `first`.
+    """
     lengths = [steps] * episodes if isinstance(steps, int) else list(steps)
     drawn = (
         synthetic_episode(number, steps=length, size=size, success=number % 3 != 2)
-        for number, length in enumerate(lengths)
+        for number, length in enumerate(lengths, start=first)
     )
     return write_droid_rlds(folder, drawn, shards=shards)

@@ -61,6 +61,7 @@ KINDS = {
     "pissa": {"adapter__init": "pissa"},
     "whole predictor": {"adapter__kind": "none"},
     "8 bit": {"training__optimizer": "adamw_8bit"},
+    "action contrast": {"training__action_contrast": {"weight": 1.0}, "adapter__dropout": 0.2},
 }
 
 
@@ -122,6 +123,14 @@ def test_the_best_by_validation_is_written_kept_and_remembered(make_config, repo
     assert [path.name for path in sorted(folder.iterdir())] == [checkpoint_name(2), checkpoint_name(6)]
     state = read_state(newest_checkpoint(folder))
     assert (state.best_step, state.best_error) == (2, 0.7)
+
+
+def test_a_run_whose_alpha_was_raised_with_the_rank_is_warned(make_config, reporter) -> None:
+    train(make_config(adapter__rank=16, adapter__alpha=64.0), reporter, check_only=True)
+    assert any("Warning: adapter.alpha 64 gives rank 16 a scale of 16," in note for note in reporter.notes)
+    reporter.notes.clear()
+    train(make_config(), reporter, check_only=True)
+    assert not any("adapter.alpha" in note for note in reporter.notes)
 
 
 def test_another_seed_is_another_run(make_config, reporter, tmp_path) -> None:

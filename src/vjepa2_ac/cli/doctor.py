@@ -63,5 +63,7 @@ def _report(options: argparse.Namespace, config: Config) -> int:
     needed = estimate.total(checkpointing=estimate.checkpointing)
     knobs = ways_to_fit(config, sizes, available)
     console.print(verdict(needed, available, gpu, knobs))
+    if unusual := config.adapter.out_of_line:
+        console.print(f"Warning: {unusual}.")
     console.print(f"The data are looked at by: vjepa2-ac data check {options.config}")
     return 0 if needed <= available else 1

@@ -33,6 +33,8 @@ def _encode(options: argparse.Namespace) -> None:
     is_first = os.environ.get("RANK", "0") == "0"
     with ConsoleReporter() as reporter:
         encoded = encode_config(config, reporter if is_first else SILENT, out=options.out)
+        if config.replay is not None and options.out is None and not config.replay.data.is_cache:
+            encode_config(config.for_replay(), reporter if is_first else SILENT)
     manifest = encoded.manifest
     if manifest is None:
         console.print(f"This process has done its share; others are still at work on {encoded.folder}")

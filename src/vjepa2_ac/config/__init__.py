@@ -3,6 +3,7 @@
 from vjepa2_ac.config.data import AugmentConfig, DataConfig, DiskCacheConfig, IdleConfig
 from vjepa2_ac.config.model import AdapterConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.config.replay import ReplayConfig
 from vjepa2_ac.config.run import Config
 from vjepa2_ac.config.section import Section
 from vjepa2_ac.config.sources import (
@@ -15,11 +16,18 @@ from vjepa2_ac.config.sources import (
     RldsData,
     RldsFields,
 )
-from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
+from vjepa2_ac.config.training import (
+    ActionContrastConfig,
+    CheckpointConfig,
+    TrackingConfig,
+    TrainingConfig,
+    ValidationConfig,
+)
 
 __all__ = [
-    "AdapterConfig", "AugmentConfig", "CheckpointConfig", "Config", "DataConfig", "DiskCacheConfig", "EncoderSizes",
-    "EnergyConfig", "IdleConfig", "LatentsData", "LeRobotData", "LeRobotFields", "LimitsConfig", "ModelConfig",
-    "ModelSizes", "NpzData", "PlanningConfig", "PredictorSizes", "RawDroidData", "RawDroidOptions", "RldsData",
-    "RldsFields", "Section", "TrackingConfig", "TrainingConfig", "ValidationConfig",
+    "ActionContrastConfig", "AdapterConfig", "AugmentConfig", "CheckpointConfig", "Config", "DataConfig",
+    "DiskCacheConfig", "EncoderSizes", "EnergyConfig", "IdleConfig", "LatentsData", "LeRobotData", "LeRobotFields",
+    "LimitsConfig", "ModelConfig", "ModelSizes", "NpzData", "PlanningConfig", "PredictorSizes", "RawDroidData",
+    "RawDroidOptions", "ReplayConfig", "RldsData", "RldsFields", "Section", "TrackingConfig", "TrainingConfig",
+    "ValidationConfig",
 ]  # fmt: skip

@@ -23,6 +23,7 @@ _LONGEST_KEY = 80
 # Names of knobs in other programs, by their key here.
 _ALSO_CALLED = {
     "run_dir": ("output_dir", "out_dir", "save_dir"),
+    "replay": ("mix", "data_mix"),
     "data.path": ("dataset", "data_path", "data_dir", "root"),
     "data.frames": ("num_frames", "clip_frames", "frames_per_clip"),
     "data.stride": ("fps", "frame_stride", "frameskip"),

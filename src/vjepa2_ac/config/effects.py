@@ -1,12 +1,13 @@
 """What each knob affects: said at the knob, as `Annotated[…, Affects.RUN]`, and asked for wherever two things compare.
 
-A mark of a section holds for the knobs in it that have none of their own.
+A mark of a section holds for the knobs in it that have none of their own. `AtMost` limits those that have.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from enum import Flag, auto
 from functools import cache, reduce
 from operator import or_
@@ -31,6 +32,13 @@ class Affects(Flag):
     EPISODES = FORM | CLIPS
 
 
+@dataclass(frozen=True)
+class AtMost:
+    """What the knobs of a section affect at most where it stands, whatever their own marks are."""
+
+    mark: Affects
+
+
 @cache
 def marks_of(knobs: type[BaseModel]) -> Mapping[str, Affects]:
     """Return the mark of each knob of a section and of those in it, by its dotted key.
@@ -38,7 +46,7 @@ def marks_of(knobs: type[BaseModel]) -> Mapping[str, Affects]:
     Raises:
         TypeError: A knob has none: nobody could say what depends on it.
     """
-    return dict(_marks(knobs, None, ""))
+    return dict(_marks(knobs, None, "", ~Affects.NOTHING))
 
 
 def mark_of(key: str, knobs: type[BaseModel]) -> Affects:
@@ -69,42 +77,51 @@ def names_that_affect(what: Affects, knobs: type[BaseModel]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
-def knobs_that_affect(what: Affects, section: BaseModel, outer: Affects | None = None) -> dict[str, Any]:
+def knobs_that_affect(
+    what: Affects, section: BaseModel, outer: Affects | None = None, most: Affects = ~Affects.NOTHING
+) -> dict[str, Any]:
     """Return the knobs of a section, and of those in it, that affect something, as plain values.
 
     Args:
         what: Any of these.
         section: The values.
         outer: The mark of the knobs that have none of their own.
+        most: What they affect at most.
     """
     found: dict[str, Any] = {}
     for name, field in type(section).model_fields.items():
         value, mark = getattr(section, name), _mark_of(field)
         mark = outer if mark is None else mark
         if isinstance(value, BaseModel):
-            if inner := knobs_that_affect(what, value, mark):
+            if inner := knobs_that_affect(what, value, mark, most & _limit_of(field)):
                 found[name] = inner
-        elif mark is not None and what & mark:
+        elif mark is not None and what & mark & most:
             found[name] = section.model_dump(mode="json", include={name})[name]
     return found
 
 
-def _marks(section: type[BaseModel], outer: Affects | None, prefix: str) -> Iterator[tuple[str, Affects]]:
+def _marks(
+    section: type[BaseModel], outer: Affects | None, prefix: str, most: Affects
+) -> Iterator[tuple[str, Affects]]:
     for name, field in section.model_fields.items():
         mark = _mark_of(field)
         mark = outer if mark is None else mark
         inner = sections_in(field.annotation)
         inner = [kind for one in inner for kind in [*getattr(one, "kinds", {}).values()] or [one]]
         for one in inner:
-            yield from _marks(one, mark, f"{prefix}{name}.")
+            yield from _marks(one, mark, f"{prefix}{name}.", most & _limit_of(field))
         if not inner and mark is None:
             raise TypeError(f"{prefix}{name}: say what it affects, as in Annotated[int, Affects.RUN]")
         if not inner and mark is not None:
-            yield prefix + name, mark
+            yield prefix + name, mark & most
 
 
 def _mark_of(field: FieldInfo) -> Affects | None:
     return next((one for one in field.metadata if isinstance(one, Affects)), None)
+
+
+def _limit_of(field: FieldInfo) -> Affects:
+    return next((one.mark for one in field.metadata if isinstance(one, AtMost)), ~Affects.NOTHING)
 
 
 def sections_in(annotation: Any) -> list[type[BaseModel]]:

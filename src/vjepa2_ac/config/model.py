@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -19,6 +20,7 @@ VectorWidth = Annotated[int, Field(ge=1, le=4_096)]
 _MOST_TOKENS = 65_536  # of a frame
 _MOST_WEIGHTS = 10**10  # 40 GB in float32
 _MOST_PATTERNS = 64  # that select layers by name
+_USUAL_ALPHA = 32.0  # of every config here, at any rank
 
 
 class EncoderSizes(Section):
@@ -136,7 +138,8 @@ class AdapterConfig(Section):
     rank: Annotated[int, Field(ge=1, le=1024)] = 16
     """Rank of the update of each target."""
     alpha: Annotated[float, Field(gt=0.0, le=1e6)] = 32.0
-    """Scale of the update: alpha / sqrt(rank) with rsLoRA, alpha / rank without."""
+    """Scale of the update: alpha / sqrt(rank) with rsLoRA, alpha / rank without. With rsLoRA keep it at any rank: as
+    twice the rank it makes the update grow with the rank."""
     rslora: bool = True
     """Rank-stabilised scale (arXiv 2312.03732)."""
     dropout: Share = 0.0
@@ -158,3 +161,15 @@ class AdapterConfig(Section):
     expression for it; the first that matches counts."""
     alpha_pattern: Annotated[dict[str, Annotated[float, Field(gt=0.0, le=1e6)]], Field(max_length=_MOST_PATTERNS)] = {}
     """Other alphas for some targets, in the same way."""
+
+    @property
+    def out_of_line(self) -> str | None:
+        """What a run is warned of: with rsLoRA an alpha that is raised with the rank; None: nothing."""
+        if self.kind != "lora" or not self.rslora or self.alpha < 2 * _USUAL_ALPHA:
+            return None
+        scale, usual = (alpha / math.sqrt(self.rank) for alpha in (self.alpha, _USUAL_ALPHA))
+        return (
+            f"adapter.alpha {self.alpha:g} gives rank {self.rank} a scale of {scale:.3g}, alpha {_USUAL_ALPHA:g} one of"
+            f" {usual:.3g}. With adapter.rslora alpha is meant to stay the same at every rank: raised with the rank, it"
+            f" asks for a lower training.learning_rate. Take adapter.alpha={_USUAL_ALPHA:g}, or compare both"
+        )

@@ -11,6 +11,7 @@ from vjepa2_ac.config.data import DataConfig
 from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.config.replay import ReplayConfig
 from vjepa2_ac.config.section import Section
 from vjepa2_ac.config.sources import RldsData  # noqa: F401 - all forms of data
 from vjepa2_ac.config.training import CheckpointConfig, TrackingConfig, TrainingConfig, ValidationConfig
@@ -34,6 +35,8 @@ class Config(Section):
     """Decides the order of clips, fresh weights and dropout."""
     data: DataConfig
     """The data set, and the clips made of it."""
+    replay: ReplayConfig | None = None
+    """A second data set that a share of the training clips comes from; null: none."""
     model: ModelConfig
     """Which world model to start from."""
     adapter: Annotated[AdapterConfig, Affects.RUN] = AdapterConfig()
@@ -69,8 +72,30 @@ class Config(Section):
         if self.training.patience is not None and self.checkpoint.keep_best == "off":
             raise ValueError("training.patience waits for a better checkpoint, and checkpoint.keep_best is off")
         sizes = self.model.random or self.model.sizes
-        if sizes.predictor.use_extrinsics and not self.data.has_camera_poses:
-            raise ValueError(
-                f"predictor.use_extrinsics needs camera poses, which a data.source of {self.data.source} does not have"
-            )
+        for data in self.data_sets:
+            if sizes.predictor.use_extrinsics and not data.has_camera_poses:
+                raise ValueError(
+                    f"predictor.use_extrinsics needs camera poses, which a data.source of {data.source} does not have"
+                )
         return self
+
+    @model_validator(mode="after")
+    def _replay_fits(self) -> Config:
+        if self.replay is not None and (misfits := self.replay.misfits(self.data)):
+            raise ValueError("; ".join(misfits))
+        return self
+
+    @property
+    def data_sets(self) -> tuple[DataConfig, ...]:
+        """The data set, and that of `replay` where there is one."""
+        return (self.data,) if self.replay is None else (self.data, self.replay.data)
+
+    def for_replay(self) -> Config:
+        """Return the config of a run on the data set of `replay` alone.
+
+        Raises:
+            ValueError: There is none.
+        """
+        if self.replay is None:
+            raise ValueError("a config without replay")
+        return self.model_copy(update={"data": self.replay.data, "replay": None})

@@ -76,12 +76,13 @@ def _check_run(config: Config) -> None:
     training, untried, without = config.training, "together they are untried", "Start without --use_fsdp"
     clips = "clips for every process: one without would leave the others waiting"
     whole = "Set data.broken_episodes=error, or start without --use_fsdp"
+    skips = any(data.broken_episodes == "skip" for data in config.data_sets)
     for knob, is_set, needed, fix in (
         ("adapter.kind lora", config.adapter.kind == "lora", "adapter.kind none: an adapter needs no shards", without),
         ("training.optimizer adamw_8bit", training.optimizer == "adamw_8bit", "adamw", "Set training.optimizer=adamw"),
         ("training.compile blocks", training.compile != "off", f"off: {untried}", "Set training.compile=off"),
         ("training.cuda_graph", training.cuda_graph, f"false: {untried}", "Set it to false"),
-        ("data.broken_episodes skip", config.data.broken_episodes == "skip", clips, whole),
+        ("data.broken_episodes skip", skips, clips, whole),
     ):
         if is_set:
             raise _refusal(f"FSDP with {knob}", needed, fix)

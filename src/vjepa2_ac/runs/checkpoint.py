@@ -61,6 +61,9 @@ class RunState:
     measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.best_checkpoint`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
     data: str | None = None  # the fingerprint of the episodes
+    replayed_broken: Mapping[str, str] = field(default_factory=dict)  # the same of the second data set
+    replayed_windows: Count | None = None
+    replayed_data: str | None = None
 
     @property
     def best_name(self) -> str | None:

@@ -98,7 +98,7 @@ def open_run_folder(config: Config, run_name: str, *, allow_config_change: bool 
     if (changes := config_changes(config)) and allow_config_change:
         start["config_changes"] = changes
     is_new = not (folder / CONFIG).exists()
-    if is_new or allow_config_change or read_run_config(folder).data.path != config.data.path:  # the data were moved
+    if is_new or allow_config_change or _paths(read_run_config(folder)) != _paths(config):  # the data were moved
         # First of all files: it makes the folder a run's.
         write_atomically(folder / CONFIG, config_as_yaml(config).encode())
     path = folder / ENVIRONMENT
@@ -194,6 +194,10 @@ def _earlier_starts(path: Path) -> list[object]:
         return json_list(read_bounded(path, MOST_BYTES), where=str(path))
     except (OSError, InputError):
         return []
+
+
+def _paths(config: Config) -> list[str]:
+    return [data.path for data in config.data_sets]
 
 
 def _refuse_another_config(folder: Path, config: Config) -> None:

@@ -14,7 +14,9 @@ from vjepa2_ac.places import BUILTIN, is_url
 from vjepa2_ac.runs.folder import start_folders
 
 DATA, BASE, RANGES = "data.path", "model.base", "data.idle.ranges"
-_PATHS = (DATA, RANGES, "data.cache_dir", "data.disk_cache.dir", BASE)
+REPLAYED, REPLAYED_RANGES = f"replay.{DATA}", f"replay.{RANGES}"
+_OF_DATA = (DATA, RANGES, "data.cache_dir", "data.disk_cache.dir")
+_PATHS = (*_OF_DATA, BASE, *(f"replay.{key}" for key in _OF_DATA))
 
 
 def with_paths_from_start(config: Config, run: Path, *, needed: Sequence[str]) -> Config:
@@ -55,7 +57,7 @@ def require_start_folder(config: Config, run: Path) -> None:
         InputError: Names the folder.
     """
     for key, path in _seen_from_start(config, run).items():
-        if key in {DATA, BASE}:
+        if key in {DATA, BASE, REPLAYED}:
             found = f"{config_as_flat_dict(config)[key]}: a relative path that leads nowhere from {Path.cwd()}"
             needed = f"the folder in which the run was started: there it is {path}"
             fix = f"Go to that folder: vjepa2-ac train {run.absolute()} --resume"
@@ -67,8 +69,9 @@ def _seen_from_start(config: Config, run: Path) -> dict[str, str]:
     found: dict[str, str] = {}
     flat = config_as_flat_dict(config)
     for key in _PATHS:
-        unread = key == RANGES and config.data.is_cache  # there it is only a name, part of the cache's key
-        if unread or not _leads_nowhere(flat[key]):
+        ranges = dict(zip((RANGES, REPLAYED_RANGES), config.data_sets, strict=False))
+        unread = key in ranges and ranges[key].is_cache  # there it is only a name, part of the cache's key
+        if unread or not _leads_nowhere(flat.get(key)):
             continue
         there = next((start / flat[key] for start in start_folders(run) if (start / flat[key]).exists()), None)
         if there is not None:

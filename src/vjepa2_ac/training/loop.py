@@ -81,7 +81,7 @@ def train(
     with opening as opened, _out_of_memory_explained():
         data = open_data(broadcast_object(accelerator, opened.config), reporter, accelerator)
         if writes and not allow_config_change:
-            require_same_data(data.config, data.dataset)
+            require_same_data(data.config, data.dataset, data.replayed)
         run = restore(open_model(data, reporter, check_only=check_only), reporter)
         first = validate_base(run, reporter)
         for line in opened.changes(run.config):

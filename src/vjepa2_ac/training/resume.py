@@ -43,7 +43,10 @@ def restore(run: Run, reporter: Reporter) -> Run:
     run.optimizer = shard_predictor(run.world_model, run.optimizer, run.config, run.accelerator, reporter)
     restore_loss_scale(run.scaler, state)
     run.dataset.broken.recall(state.broken)
-    _report_data_changes(run.dataset, state, reporter)
+    _report_data_changes(run.dataset, state.windows, reporter)
+    if run.replayed is not None:
+        run.replayed.broken.recall(state.replayed_broken)
+        _report_data_changes(run.replayed, state.replayed_windows, reporter)
     run.state = best_so_far(state, measured_on(run.config, run.dataset), reporter)
     run.micro_batches = micro_batches_of(run.config, state, run.accelerator.num_processes, reporter)
     return run
@@ -114,8 +117,8 @@ def restore_loss_scale(scaler: torch.amp.GradScaler, state: RunState) -> None:
     scaler.load_state_dict(dict(state.loss_scale))
 
 
-def require_same_data(config: Config, dataset: Dataset) -> None:
-    """Refuse to go on with another data set than the one that the run in its folder began with.
+def require_same_data(config: Config, dataset: Dataset, replayed: Dataset | None = None) -> None:
+    """Refuse to go on with other data sets than those that the run in its folder began with.
 
     At the place where it began the data may have changed, which is reported; elsewhere they must be the same.
 
@@ -123,27 +126,30 @@ def require_same_data(config: Config, dataset: Dataset) -> None:
         InputError: They are others, or an earlier version did not note which they were.
     """
     folder = Path(config.run_dir)
-    began_with = read_run_config(folder).data.path if (folder / CONFIG).is_file() else config.data.path
-    if began_with == config.data.path or (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is None:
-        return
-    seen = written_state(checkpoint).data
-    if seen in fingerprints_of(dataset.table):
-        return
-    raise InputError(
-        where=f"data.path: {config.data.path}",
-        found="other episodes or files than the run has seen" if seen else "a run that did not note its data",
-        needed=f"the data set that was at {began_with}",
-        fix="Set data.path to where that is now (its files keep names, sizes and times when they are moved); where the"
-        " change is meant, add --allow-config-change",
-    )
+    before = read_run_config(folder).data_sets if (folder / CONFIG).is_file() else config.data_sets
+    keys, datasets = ("data.path", "replay.data.path"), [one for one in (dataset, replayed) if one is not None]
+    for number, (key, one, began, now) in enumerate(zip(keys, datasets, before, config.data_sets, strict=False)):
+        if began.path == now.path or (checkpoint := newest_checkpoint(folder / CHECKPOINTS)) is None:
+            continue
+        state = written_state(checkpoint)
+        seen = (state.data, state.replayed_data)[number]
+        if seen in fingerprints_of(one.table):
+            continue
+        raise InputError(
+            where=f"{key}: {now.path}",
+            found="other episodes or files than the run has seen" if seen else "a run that did not note its data",
+            needed=f"the data set that was at {began.path}",
+            fix=f"Set {key} to where that is now (its files keep names, sizes and times when they are moved); where the"
+            " change is meant, add --allow-config-change",
+        )
 
 
-def _report_data_changes(dataset: Dataset, state: RunState, reporter: Reporter) -> None:
-    """Report if the data has changed since the checkpoint was written."""
+def _report_data_changes(dataset: Dataset, before: int | None, reporter: Reporter) -> None:
+    """Report if the data has changed since the checkpoint was written, with so many training clips then."""
     windows = len(dataset.windows("train"))
-    if state.windows not in {None, windows}:
+    if before not in {None, windows}:
         reporter.note(
-            f"The data has changed: {windows:,} training clips instead of {state.windows:,}."
+            f"The data has changed: {windows:,} training clips instead of {before:,}."
             " From here on their order is another, and some may be seen twice in this epoch or not at all."
         )
 

@@ -13,7 +13,7 @@ from torch import nn
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.loader import ProcessShare, training_loader, validation_batches
+from vjepa2_ac.data.clips.loader import Mixed, ProcessShare, training_loader, validation_batches
 from vjepa2_ac.data.clips.prefetch import Batches
 from vjepa2_ac.data.clips.streams import Copies, copies_for
 from vjepa2_ac.data.index.index_cache import fingerprints_of
@@ -47,6 +47,7 @@ from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.micro_step import CapturedMicroStep, MicroStep, captured_on_cuda
 from vjepa2_ac.training.new_embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
+from vjepa2_ac.training.replay import open_replay, require_same_form
 from vjepa2_ac.training.stride_choice import choose_stride
 
 _CLIPS_TRIED = 8  # one is read; the others are for clips skipped by data.broken_episodes
@@ -62,6 +63,7 @@ class RunData:
     first_clip: Batch  # of training, as it is read from the data set
     calibration: Calibration | None  # if data.stride was auto and is now chosen
     world_model: WorldModel | None  # the base, if it has chosen the stride
+    replayed: Dataset | None = None  # the second data set, if there is one
 
 
 @dataclass
@@ -78,6 +80,7 @@ class Run:
     state: RunState
     micro_batches: int  # of this process, per optimizer step
     calibration: Calibration | None = None  # if data.stride was auto and is now chosen
+    replayed: Dataset | None = None  # the second data set, if there is one
 
     @property
     def folder(self) -> Path:
@@ -142,6 +145,7 @@ def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelera
         require_learned(config.model)
     with accelerator.local_main_process_first():  # the others find the index of the first one on this machine
         dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+        replayed = open_replay(config, dataset, reporter)
     if (duplicates := find_duplicates(dataset)).episodes:
         reporter.note(f"Warning: {duplicates}.")
     check_heads(config, dataset)
@@ -150,7 +154,10 @@ def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelera
         world_model = load_base(config.model, seed=config.seed).to(accelerator.device)
         calibration = broadcast_object(accelerator, choose_stride(world_model, dataset, config, accelerator, reporter))
         config, dataset = with_stride(config, calibration.best.stride), dataset.with_stride(calibration.best.stride)
-    return RunData(config, accelerator, dataset, _read_one_clip_of_each_split(dataset), calibration, world_model)
+    first_clip = _read_one_clip_of_each_split(dataset)
+    if replayed is not None:
+        _require_fitting_clips(dataset, replayed, first_clip)
+    return RunData(config, accelerator, dataset, first_clip, calibration, world_model, replayed)
 
 
 def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool = False) -> Run:
@@ -168,10 +175,18 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
     world_model = data.world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, data.first_clip)
     dataset = with_latents(config, data.dataset, world_model, accelerator, reporter, check_only=check_only)
+    replayed = data.replayed
+    if replayed is not None:
+        extrinsics_for(world_model, _first_of(replayed, "train"))
+        alone = config.for_replay()
+        replayed = with_latents(alone, replayed, world_model, accelerator, reporter, check_only=check_only)
+        _require_fitting_clips(dataset, replayed, _first_of(dataset, "train"))
     warn_if_shared_memory_is_small(config, dataset, data.first_clip, accelerator, reporter)
     fit_to_data(world_model, config, dataset, reporter)
     add_adapter(world_model, config.adapter, seed=config.seed, started=_started(config))
     reporter.note(str(trainable_report(world_model)))
+    if unusual := config.adapter.out_of_line:
+        reporter.note(f"Warning: {unusual}.")
     world_model.set_gradient_checkpointing(training.gradient_checkpointing)
     world_model.set_attention(training.attention)
     world_model.set_compiled("with gradients" if training.compile == "blocks" else "never")
@@ -189,13 +204,15 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
         state=RunState(step=0),
         micro_batches=training.accumulation,
         calibration=data.calibration,
+        replayed=replayed,
     )
 
 
 def batches_from(run: Run) -> Batches:
     """Yield the micro-batches of this process from the current step on."""
+    replay = run.config.replay
     return training_loader(
-        run.dataset,
+        run.dataset if run.replayed is None or replay is None else Mixed(run.dataset, run.replayed, replay.share),
         seed=run.config.seed,
         batch_size=run.config.training.batch_size,
         start_position=run.state.clips_done,
@@ -223,16 +240,22 @@ def save_checkpoint(run: Run, folder: Path) -> None:
         with (inner / OPTIMIZER).open("wb") as file:
             write_torch(moments, file)
 
-    broken = {
-        name: why
-        for reasons in all_gather_object(run.accelerator, run.dataset.broken.reasons)
-        for name, why in reasons.items()
-    }
+    broken, broken_replayed = (
+        {
+            name: why
+            for reasons in all_gather_object(run.accelerator, one.broken.reasons if one else {})
+            for name, why in reasons.items()
+        }
+        for one in (run.dataset, run.replayed)
+    )
     run.state = replace(
         run.state,
         broken=broken,
         windows=len(run.dataset.windows("train")),
         data=fingerprints_of(run.dataset.table)[0],
+        replayed_broken=broken_replayed,
+        replayed_windows=len(run.replayed.windows("train")) if run.replayed else None,
+        replayed_data=fingerprints_of(run.replayed.table)[0] if run.replayed else None,
         clips_per_step=run.clips_per_step,
         clips_asked=run.config.training.batch_size * run.config.training.accumulation,
         processes=run.accelerator.num_processes,
@@ -255,5 +278,15 @@ def _read_one_clip_of_each_split(dataset: Dataset) -> Batch:
     """Fail early: an empty split, a broken clip. A test split of share 0 is no error."""
     splits: tuple[Split, ...] = ("train", "validation", "test")
     splits = splits if dataset.config.test_share else splits[:2]
-    firsts = [next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1)) for split in splits]
+    firsts = [_first_of(dataset, split) for split in splits]
     return firsts[0]
+
+
+def _first_of(dataset: Dataset, split: Split) -> Batch:
+    return next(validation_batches(dataset, split, clips=_CLIPS_TRIED, batch_size=1))
+
+
+def _require_fitting_clips(dataset: Dataset, replayed: Dataset, first_clip: Batch) -> None:
+    """Refuse a second data set whose clips differ in form; frames that are still to be encoded may."""
+    if all(one.config.is_cache or not one.config.takes_latents for one in (dataset, replayed)):
+        require_same_form(first_clip, _first_of(replayed, "train"))

@@ -7,7 +7,7 @@ import torch
 
 from sized_runs import LORA, built, model_sizes, run_config
 from vjepa2_ac.cli import main
-from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.config import DataConfig, ModelSizes, ReplayConfig
 from vjepa2_ac.console.memory import memory_lines
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.training.cost.memory import USUAL_GPU, estimate_memory, ways_to_fit
@@ -81,6 +81,21 @@ def test_a_run_that_fits_needs_no_knob_and_a_large_one_names_them() -> None:
     checked = run_config(data__frames=16, training__batch_size=8, training__gradient_checkpointing=True)
     assert estimate_memory(checked, sizes).total(checkpointing=True) <= USUAL_GPU
     assert ways_to_fit(large, sizes, 10**9) is None
+
+
+def test_knobs_that_make_it_fit_keep_two_clips_for_a_contrast_of_actions_and_change_both_data_sets() -> None:
+    room = 4 * 10**9
+    alone, contrast = (
+        run_config(data__frames=16, training__batch_size=8, training__action_contrast={"weight": weight})
+        for weight in (0.0, 1.0)
+    )
+    assert any("batch_size=1 " in knob for knob in ways_to_fit(alone, ModelSizes(), room) or ())
+    knobs = ways_to_fit(contrast, ModelSizes(), room) or []
+    assert any("batch_size=2 " in knob for knob in knobs)
+    assert not any("batch_size=1 " in knob for knob in knobs)
+    replay = ReplayConfig(data=DataConfig(path="other", frames=16))
+    knobs = ways_to_fit(alone.model_copy(update={"replay": replay}), ModelSizes(), room) or []
+    assert "data.cache=auto replay.data.cache=auto" in knobs
 
 
 @pytest.mark.parametrize(("batch", "status", "word"), [(2, 0, "It fits on"), (8, 1, "gradient_checkpointing=true")])

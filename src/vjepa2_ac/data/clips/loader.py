@@ -10,7 +10,8 @@ import itertools
 import multiprocessing
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from fractions import Fraction
 from functools import partial
 from typing import Any
 
@@ -48,8 +49,17 @@ class ProcessShare:
 WHOLE = ProcessShare()
 
 
+@dataclass(frozen=True)
+class Mixed:
+    """A data set, and a second one that a share of the training clips comes from."""
+
+    dataset: Dataset
+    replayed: Dataset
+    share: float
+
+
 def training_loader(
-    dataset: Dataset,
+    dataset: Dataset | Mixed,
     *,
     seed: int,
     batch_size: int,
@@ -64,15 +74,22 @@ def training_loader(
     from is start_position + m * processes * batch_size. If `data.broken_episodes` is skip, clips that cannot be
     read are missing from their micro-batch, which may even be empty; no other clip replaces them.
 
+    Of two data sets each has its own sequence. Clip p of the run is the second one's if floor(p * share) grows after
+    it, and that number is its position there: the share is exact in every stretch of the run, up to a clip.
+
     If batches are prefetched to a device (`copies`), they are in pinned memory.
 
     Raises:
         InputError: There is nothing to train on, or a clip cannot be read, also in a worker.
     """
-    clips = _Clips(dataset, partial(_training_clip, dataset.config, ClipOrder(dataset.windows("train"), seed)))
+    if isinstance(dataset, Mixed):
+        replayed, of_clips = _training_clips(dataset.replayed, seed), Fraction(str(dataset.share))
+        clips = replace(_training_clips(dataset.dataset, seed), replayed=replayed, share=of_clips)
+    else:
+        clips = _training_clips(dataset, seed)
     firsts = itertools.count(start_position + share.rank * batch_size, batch_size * share.processes)
     rows = (list(range(first, first + batch_size)) for first in firsts)
-    return _batches(clips, rows, dataset.config.workers, copies)
+    return _batches(clips, rows, clips.dataset.config.workers, copies)
 
 
 def validation_batches(
@@ -158,6 +175,8 @@ class _Clips(TorchDataset[MicroBatch]):
 
     dataset: Dataset
     request_at: Callable[[int], ClipRequest]  # a pure function of the position, the same in every worker
+    replayed: _Clips | None = None  # of the second data set
+    share: Fraction = Fraction(0)  # of these
 
     def __getitems__(self, positions: list[int]) -> MicroBatch | UserError:
         """Return a micro-batch, or its error: DataLoader would change an error that is raised."""
@@ -174,13 +193,19 @@ class _Clips(TorchDataset[MicroBatch]):
             return error
 
     def _read(self, positions: list[int]) -> list[Clip | Skipped]:
-        config = self.dataset.config
-        if not storage.is_url(config.path):
+        configs = [one.dataset.config for one in (self, self.replayed) if one is not None]
+        if not any(storage.is_url(config.path) for config in configs):
             return [self._clip(position) for position in positions]
-        with ThreadPoolExecutor(min(len(positions), config.connections)) as pool:
+        with ThreadPoolExecutor(min(len(positions), *(config.connections for config in configs))) as pool:
             return list(pool.map(self._clip, positions))
 
     def _clip(self, position: int) -> Clip | Skipped:
+        if self.replayed is not None:
+            before, after = (int(number * self.share) for number in (position, position + 1))
+            if after > before:
+                clip = self.replayed._clip(before)
+                return replace(clip, replayed=True) if isinstance(clip, Skipped) else clip
+            position -= before
         request = self.request_at(position)
         try:
             return read_clip(self.dataset, request)
@@ -191,8 +216,14 @@ class _Clips(TorchDataset[MicroBatch]):
             return Skipped(name, str(error))
 
 
+def _training_clips(dataset: Dataset, seed: int) -> _Clips:
+    return _Clips(dataset, partial(_training_clip, dataset.config, ClipOrder(dataset.windows("train"), seed)))
+
+
 def _batches(clips: _Clips, positions: Iterator[list[int]], workers: int, copies: Copies) -> Batches:
-    return Batches(_read(clips, positions, workers, pinned=copies.overlap), clips.dataset.broken, copies)
+    rows, broken = _read(clips, positions, workers, pinned=copies.overlap), clips.dataset.broken
+    replayed = broken if clips.replayed is None else clips.replayed.dataset.broken
+    return Batches(rows, broken, copies, replayed)
 
 
 def _read(

@@ -39,12 +39,18 @@ class Batches(Iterator[Batch]):
         rows: The workers' results: micro-batches, or errors instead.
         broken: Records clips that could not be read.
         copies: How batches are copied to the device; without overlap there are no copies and no prefetching.
+        replayed: Records those of the second data set.
     """
 
     def __init__(
-        self, rows: Generator[MicroBatch | UserError, None, None], broken: BrokenEpisodes, copies: Copies
+        self,
+        rows: Generator[MicroBatch | UserError, None, None],
+        broken: BrokenEpisodes,
+        copies: Copies,
+        replayed: BrokenEpisodes | None = None,
     ) -> None:
         self._rows, self._broken, self._copies = rows, broken, copies
+        self._replayed = broken if replayed is None else replayed
         self._prefetched: Exception | MicroBatch | None = None
 
     def __next__(self) -> Batch:
@@ -58,7 +64,7 @@ class Batches(Iterator[Batch]):
             self.close()
             raise fetched
         for one in fetched.skipped:
-            self._broken.met(one.episode_id, one.reason)
+            (self._replayed if one.replayed else self._broken).met(one.episode_id, one.reason)
         return fetched.batch
 
     def prefetch_next(self) -> None:

@@ -100,7 +100,7 @@ def ways_to_fit(config: Config, sizes: ModelSizes, available: int) -> list[str] 
             break
         lighter = turn(config)
         if (less := _total(lighter, sizes)) < total:
-            turned.append(knob)
+            turned.append(f"{knob} replay.{knob}" if config.replay and knob.startswith("data.") else knob)
             config, total = lighter, less
     return turned if total <= available else None
 
@@ -117,7 +117,11 @@ _KNOBS: tuple[tuple[str, Callable[[Config], Config]], ...] = (
     ("training.gradient_checkpointing=true", lambda run: _with(run, "training", gradient_checkpointing=True)),
     (
         "training.batch_size=1 (and as much more accumulation)",
-        lambda run: _with(run, "training", batch_size=1),
+        lambda run: run if run.training.action_contrast.weight else _with(run, "training", batch_size=1),
+    ),
+    (
+        "training.batch_size=2 (and as much more accumulation)",  # the least that action_contrast takes
+        lambda run: _with(run, "training", batch_size=min(2, run.training.batch_size)),
     ),
     (
         "model.dtype=bfloat16 with training.precision=bf16",

@@ -1,0 +1,121 @@
+"""The second data set of a run (`replay`): opened, and refused where its clips cannot be beside those of the first."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.clips.windows import in_split
+from vjepa2_ac.data.filters.exclusion import named
+from vjepa2_ac.episode import Batch
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.reporter import INDEXING, Reporter
+
+_STEP_TOLERANCE = 0.01  # by which the time of a model step may differ
+
+
+def open_replay(config: Config, dataset: Dataset, reporter: Reporter) -> Dataset | None:
+    """Open the second data set of a run; None if it has none.
+
+    Args:
+        config: The run.
+        dataset: Its first data set, at its stride.
+        reporter: Receives messages, and the progress of indexing.
+
+    Raises:
+        InputError: It cannot be opened; or its spaces or the time of its steps are others than the first one's.
+    """
+    if config.replay is None:
+        return None
+    replayed = open_dataset(config.replay.data, progress=reporter.task(INDEXING))
+    _require_same_spaces(dataset, replayed)
+    _require_same_step(dataset, replayed)
+    windows = replayed.windows("train")
+    name, share = replayed.config.path, config.replay.share
+    reporter.note(f"Replay: {share:.0%} of the clips are from {name}, which has {len(windows):,}.")
+    if held_out := _held_out(dataset, replayed):
+        reporter.note(
+            f"Warning: {len(held_out):,} episodes that the first data set holds out are replayed in training:"
+            f" {named(held_out)}. Add them to replay.data.exclude."
+        )
+    return replayed
+
+
+def require_same_form(first: Batch, replayed: Batch) -> None:
+    """Refuse clips that cannot be in one batch: of other pictures, or latents of another type.
+
+    Args:
+        first: A clip of the first data set.
+        replayed: One of the second.
+
+    Raises:
+        InputError: Says how they differ.
+    """
+    found, needed = (_form(batch) for batch in (replayed, first))
+    if found != needed:
+        raise InputError(
+            where="replay.data",
+            found=f"clips of {found}",
+            needed=f"{needed}, as data has them: clips of both are in one micro-batch",
+            fix="Take latents instead of frames: set data.cache and replay.data.cache to auto, with the same"
+            " cache_dtype",
+        )
+
+
+def _require_same_spaces(dataset: Dataset, replayed: Dataset) -> None:
+    if replayed.widths != dataset.widths or replayed.spaces != dataset.spaces:
+        found, needed = (
+            f"states of {one.widths.state} and actions of {one.widths.action} numbers ({one.config.states})"
+            for one in (replayed, dataset)
+        )
+        raise InputError(
+            where=f"replay.data.path: {replayed.config.path}",
+            found=found,
+            needed=f"{needed}, as data has them",
+            fix="Replay a data set of the same kind of robot",
+        )
+
+
+def _require_same_step(dataset: Dataset, replayed: Dataset) -> None:
+    """Compare strides by the time they take: data sets have different control rates."""
+    found, needed = (one.config.model_stride / one.control_rate_hz for one in (replayed, dataset))
+    if not math.isclose(found, needed, rel_tol=_STEP_TOLERANCE):
+        fitting = needed * replayed.control_rate_hz
+        near = math.isclose(max(1, round(fitting)), fitting, rel_tol=_STEP_TOLERANCE)
+        raise InputError(
+            where="replay.data.stride",
+            found=f"{replayed.config.stride} at {replayed.control_rate_hz:g} control steps a second: model steps of"
+            f" {found:.3g} s",
+            needed=f"{needed:.3g} s, as those of data (stride {dataset.config.stride} at"
+            f" {dataset.control_rate_hz:g} a second)",
+            fix=f"Set replay.data.stride={round(fitting)}"
+            if near
+            else "Choose data.stride and replay.data.stride so that both steps last equally long",
+        )
+
+
+def _held_out(dataset: Dataset, replayed: Dataset) -> list[str]:
+    """Return the replayed training episodes that the first data set, by their identity, validates or tests on."""
+    first, second = (
+        one.table.id_hash[one.kept.taking_part & (in_split(one.split_hash, one.config, "train") == trains)]
+        for one, trains in ((dataset, False), (replayed, True))
+    )
+    return sorted(replayed.table.identity(int(place)) for place in _places(replayed, np.intersect1d(first, second)))
+
+
+def _places(dataset: Dataset, hashes: np.ndarray) -> np.ndarray:
+    return np.flatnonzero(np.isin(dataset.table.id_hash, hashes) & dataset.kept.taking_part)
+
+
+def _form(batch: Batch) -> str:
+    if batch.latents is not None:
+        values = batch.latents.values
+        scaled = " with scales" if batch.latents.scales is not None else ""
+        return f"{values.shape[-2]} latents of {values.shape[-1]} numbers as {str(values.dtype)[6:]}{scaled}"
+    if batch.frames is None:
+        raise ValueError("a batch with neither frames nor latents")
+    height, width = batch.frames.shape[2:4]
+    return f"frames of {height}x{width} after the crop"

@@ -1,0 +1,258 @@
+"""Replay: a share of the clips from a second data set, in an order that resumes exactly; misfits are refused."""
+
+import itertools
+import shutil
+from pathlib import Path
+
+import pytest
+import yaml
+
+from run_fixtures import set_up
+from same_run import assert_same_run
+from synthetic import write_synthetic_droid
+from vjepa2_ac.config import Config, DataConfig, ReplayConfig
+from vjepa2_ac.config.effects import Affects, knobs_that_affect, marks_of, names_that_affect
+from vjepa2_ac.config.loading import config_as_dict, config_as_yaml, parse_config
+from vjepa2_ac.data.clips import loader
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.clips.loader import Mixed, ProcessShare, training_loader
+from vjepa2_ac.episode import Batch
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.runs.checkpoint import newest_checkpoint, read_state
+from vjepa2_ac.runs.folder import check_run_folder, read_run_config
+from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.setup import batches_from
+from vjepa2_ac.training.step import training_step
+
+Names = list[tuple[str, int]]
+
+
+@pytest.fixture(scope="module")
+def second(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The second data set, of other episodes than the first."""
+    folder = tmp_path_factory.mktemp("second") / "set"
+    return write_synthetic_droid(folder, episodes=4, steps=20, size=(36, 64), first=100)
+
+
+@pytest.fixture
+def replaying(make_config, second: Path):
+    """Return a config of a run that replays the second data set."""
+
+    def make(share: float = 0.25, **changes: object) -> Config:
+        values = config_as_dict(make_config())
+        data = {**values["data"], "path": str(second), "validation_share": 0.0, "test_share": 0.0}
+        given = {f"replay__data__{key}": value for key, value in data.items()}
+        return make_config(**{**given, "replay__share": share, **changes})
+
+    return make
+
+
+def names(batches: list[Batch]) -> Names:
+    return [name for batch in batches for name in zip(batch.episode_ids, batch.starts, strict=True)]
+
+
+def clips_of(config: Config, count: int, **knobs: object) -> Names:
+    first, replayed = (open_dataset(one) for one in config.data_sets)
+    chosen = {"seed": 1, "batch_size": 4, **knobs}
+    batches = training_loader(Mixed(first, replayed, config.replay.share), **chosen)
+    return names(list(itertools.islice(batches, count)))
+
+
+def is_replayed(name: tuple[str, int]) -> bool:
+    return int(name[0].split("episode_")[1][:4]) >= 100
+
+
+@pytest.mark.parametrize("share", [0.25, 0.1, 0.6])
+def test_the_share_is_exact_and_each_data_set_keeps_its_own_order(replaying, share: float) -> None:
+    config = replaying(share)
+    found = clips_of(config, 25)
+    assert sum(map(is_replayed, found)) == int(100 * share)
+    for data, replayed in zip(config.data_sets, (False, True), strict=True):
+        own = [name for name in found if is_replayed(name) == replayed]
+        alone = names(list(itertools.islice(training_loader(open_dataset(data), seed=1, batch_size=1), len(own))))
+        assert own == alone
+
+
+def test_every_position_has_its_clip_whoever_asks_and_from_wherever(replaying) -> None:
+    config = replaying(0.3)
+    whole = clips_of(config, 12)
+    assert clips_of(config, 9, start_position=12) == whole[12:]
+    ranks = [clips_of(config, 6, batch_size=2, share=ProcessShare(rank, 2)) for rank in (0, 1)]
+    pairs = [[own[at : at + 2] for at in range(0, len(own), 2)] for own in ranks]
+    assert [name for both in zip(*pairs, strict=True) for pair in both for name in pair] == whole[:24]
+    values = config_as_dict(config)
+    in_workers = parse_config({**values, "data": {**values["data"], "workers": 2}}, where="test")
+    assert clips_of(in_workers, 4) == whole[:16]
+
+
+class KilledError(Exception):
+    """Simulates the end of the process."""
+
+
+@pytest.mark.parametrize("cache", ["off", "auto"])
+def test_a_run_that_replays_died_and_went_on_equals_the_one_that_did_not(
+    replaying, reporter, tmp_path, monkeypatch, cache: str
+) -> None:
+    changes = {
+        "training__steps": 4, "training__action_contrast": {"weight": 0.5}, "data__cache": cache,
+        "replay__data__cache": cache, "data__cache_dir": str(tmp_path / "a"),
+        "replay__data__cache_dir": str(tmp_path / "b"),
+    }  # fmt: skip
+    train(replaying(run_dir=str(tmp_path / "whole"), **changes), reporter)
+    config, stepped = replaying(run_dir=str(tmp_path / "broken"), **changes), reporter.stepped
+
+    def die(step: int, seen: dict) -> None:
+        if step == 3:
+            raise KilledError
+        stepped(step, seen)
+
+    monkeypatch.setattr(reporter, "stepped", die)
+    with pytest.raises(KilledError):
+        train(config, reporter)
+    monkeypatch.setattr(reporter, "stepped", stepped)
+    train(config, reporter)
+    assert_same_run(tmp_path / "whole", tmp_path / "broken")
+    assert any("Replay: 25% of the clips are from" in note for note in reporter.notes)
+    assert (tmp_path / "b").exists() == (cache == "auto")
+    state = read_state(newest_checkpoint(tmp_path / "broken/checkpoints"))
+    assert state.replayed_windows == len(open_dataset(config.replay.data).windows("train"))
+
+
+def test_what_is_replayed_is_learned_from_and_validation_stays_on_the_first_set(replaying, make_config, reporter):
+    plain, mixed = set_up(make_config(), reporter), set_up(replaying(0.5), reporter)
+    rows = [training_step(run, batches_from(run), 1) for run in (plain, mixed)]
+    assert rows[0]["loss"] != rows[1]["loss"]
+    assert plain.dataset.table.identity(0) == mixed.dataset.table.identity(0)
+    assert mixed.dataset.windows("validation")[0] == plain.dataset.windows("validation")[0]
+    replayed = [name for name in names([next(batches_from(mixed)) for _ in range(1)]) if is_replayed(name)]
+    assert len(replayed) == 1
+
+
+def test_check_looks_at_both_and_writes_nothing(replaying, reporter, tmp_path) -> None:
+    config = replaying(data__cache="auto", replay__data__cache="auto", data__cache_dir=str(tmp_path / "latents"))
+    train(config, reporter, check_only=True)
+    assert sum("would first encode" in note for note in reporter.notes) == 2
+    assert not (tmp_path / "latents").exists()
+
+
+def test_a_clip_that_cannot_be_read_counts_for_its_own_data_set(replaying, monkeypatch) -> None:
+    config = replaying(0.5, data__broken_episodes="skip", replay__data__broken_episodes="skip")
+    first, replayed = (open_dataset(one) for one in config.data_sets)
+    for one in (first, replayed):
+        monkeypatch.setattr(one.broken, "_episodes", 1_000)
+    read = loader.read_clip
+
+    def broken(dataset, request):
+        if dataset.config.path == config.replay.data.path:
+            raise InputError(where="here", found="damage")
+        return read(dataset, request)
+
+    monkeypatch.setattr(loader, "read_clip", broken)
+    found = list(itertools.islice(training_loader(Mixed(first, replayed, 0.5), seed=1, batch_size=2), 4))
+    assert [len(batch.starts) for batch in found] == [1, 1, 1, 1]
+    assert not first.broken.names
+    assert replayed.broken.names
+    assert all(is_replayed((name, 0)) for name in replayed.broken.names)
+
+
+# ---- what does not fit ----
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"replay__data__frames": 5}, r"replay.data.frames 5 is not data.frames 4"),
+        ({"replay__data__states": "vector"}, r"replay.data.states vector is not data.states pose"),
+        ({"replay__data__cache": "auto"}, r"replay.data takes latents from a cache and data does not"),
+        ({"data__cache": "auto"}, r"data takes latents from a cache and replay.data does not"),
+        ({"replay__data__stride": "auto"}, r"stride auto: give its number"),
+        ({"data__stride": "auto"}, r"data.stride auto with replay"),
+        ({"replay__share": 1.0}, r"replay.share: .*less than 1"),
+        ({"replay__data__nonsense": 1}, r"replay.data.nonsense: unknown key"),
+    ],
+)
+def test_a_second_data_set_that_cannot_fit_is_refused_when_the_config_is_read(replaying, changes, complaint) -> None:
+    with pytest.raises(InputError, match=complaint):
+        replaying(**changes)
+
+
+def test_poses_in_another_frame_and_commands_joined_otherwise_are_misfits() -> None:
+    in_camera = ReplayConfig(data=DataConfig(source="droid_raw", path="x", pose_frame="camera"))
+    assert in_camera.misfits(DataConfig(path="y")) == ["replay.data.pose_frame camera is not data.pose_frame base"]
+    summed, last = (
+        DataConfig(path="x", states="vector", actions="recorded", join_actions=how) for how in ("sum", "last")
+    )
+    assert ReplayConfig(data=summed).misfits(last) == ["replay.data.join_actions sum is not data.join_actions last"]
+    assert not ReplayConfig(data=last).misfits(last)
+
+
+def test_steps_of_another_length_are_refused_with_the_stride_that_fits(replaying, reporter) -> None:
+    with pytest.raises(InputError, match=r"(?s)replay.data.stride: 3 at 15 .*0.2 s.*0.133 s.*replay.data.stride=2"):
+        train(replaying(replay__data__stride=3), reporter)
+    half = replaying(replay__data__fields={"control_rate_hz": 30.0})
+    with pytest.raises(InputError, match=r"replay.data.stride=4"):
+        train(half, reporter)
+
+
+def test_frames_of_another_size_are_refused_before_the_first_step_and_go_through_caches(
+    replaying, reporter, tmp_path
+) -> None:
+    larger = write_synthetic_droid(tmp_path / "larger", episodes=4, steps=20, size=(48, 80), first=100)
+    with pytest.raises(InputError, match=r"(?s)replay.data: clips of frames of 48x65.*36x49.*data.cache"):
+        train(replaying(replay__data__path=str(larger)), reporter)
+    caches = {"data__cache": "auto", "replay__data__cache": "auto"}
+    places = {"data__cache_dir": str(tmp_path / "latents"), "replay__data__cache_dir": str(tmp_path / "latents")}
+    train(replaying(replay__data__path=str(larger), training__steps=1, **caches, **places), reporter)
+    other = {"replay__data__cache_dtype": "int8", "run_dir": str(tmp_path / "other")}
+    with pytest.raises(InputError, match=r"(?s)as int8 with scales.*as bfloat16"):
+        train(replaying(replay__data__path=str(larger), training__steps=1, **caches, **places, **other), reporter)
+
+
+def test_held_out_episodes_that_would_be_replayed_are_named(replaying, reporter, data_folder) -> None:
+    set_up(replaying(replay__data__path=str(data_folder)), reporter)
+    (warning,) = [note for note in reporter.notes if "holds out are replayed" in note]
+    held_out = open_dataset(replaying().data).windows("validation")
+    assert open_dataset(replaying().data).table.identity(held_out[0][0]) in warning
+    reporter.notes.clear()
+    same = {"replay__data__validation_share": 0.3, "replay__data__test_share": 0.2}
+    set_up(replaying(replay__data__path=str(data_folder), **same), reporter)
+    assert not [note for note in reporter.notes if "holds out" in note]
+
+
+# ---- the run's identity ----
+
+
+def test_a_run_goes_on_with_a_moved_second_set_and_with_no_other(replaying, reporter, tmp_path, second) -> None:
+    folder = train(replaying(training__steps=2), reporter)
+    for name in ("moved", "others"):
+        shutil.copytree(second, tmp_path / name)
+    train(replaying(training__steps=2, replay__data__path=str(tmp_path / "moved")), reporter)
+    assert read_run_config(folder).replay.data.path == str(tmp_path / "moved")
+    next((tmp_path / "others").rglob("*.tfrecord*")).touch()
+    with pytest.raises(InputError, match=r"replay.data.path: .*others: other episodes or files.*moved"):
+        train(replaying(training__steps=2, replay__data__path=str(tmp_path / "others")), reporter)
+
+
+def test_replay_is_part_of_what_decides_a_run_and_of_nothing_else(replaying, make_config, tmp_path) -> None:
+    config = replaying()
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/config.yaml").write_text(config_as_yaml(config))
+    check_run_folder(config)
+    for other in (replaying(0.5), replaying(replay__data__crop="square"), make_config()):
+        with pytest.raises(InputError, match=r"differs in .*replay"):
+            check_run_folder(other)
+    check_run_folder(replaying(replay__data__workers=3, replay__data__exclude=["x"]))
+    marks = {key: mark for key, mark in marks_of(Config).items() if key.startswith("replay.")}
+    assert set(marks.values()) == {Affects.RUN, Affects.NOTHING}
+    for key, mark in marks.items():
+        if key.startswith("replay.data."):
+            assert (mark == Affects.RUN) == (Affects.RUN in marks_of(Config)[key.removeprefix("replay.")]), key
+    for what in (Affects.PLAN, Affects.MEASURED, Affects.LATENTS, Affects.INDEX):
+        assert "replay" not in knobs_that_affect(what, config)
+        assert not [name for name in names_that_affect(what, Config) if name.startswith("replay")]
+    assert knobs_that_affect(Affects.LATENTS, config.for_replay().data)["frames"] == 4
+
+
+def test_a_config_with_replay_is_written_and_read_back(replaying) -> None:
+    config = replaying()
+    assert parse_config(yaml.safe_load(config_as_yaml(config)), where="test") == config
