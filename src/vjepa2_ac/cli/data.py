@@ -25,6 +25,8 @@ from vjepa2_ac.errors import InputError
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
 
+_CLIPS, _PAIRS = 64, 200  # to calibrate by: strides, axes (as the paper)
+
 
 def add_data(commands: Commands[argparse.ArgumentParser]) -> None:
     """Add `data` with its commands to a parser."""
@@ -174,19 +176,29 @@ def _inspect(options: argparse.Namespace) -> None:
 def _add_calibrate(commands: Commands[argparse.ArgumentParser]) -> None:
     parser = _command(
         commands, "calibrate", _calibrate,
-        "Let a model say how many control steps its model step is: its error over persistence at each stride.",
+        "Let a model say how many control steps its model step is: its error over persistence at each stride. Or, with"
+        " --axes: how its axes lie to the robot's; status 1 where that stays unknown.",
     )  # fmt: skip
     parser.add_argument(
-        "--model", metavar="MODEL", type=as_model, help="another than model.base: a .pt, a folder, or a run"
+        "--axes",
+        metavar="RUN_OR_MODEL",
+        type=as_model,
+        help="fit the moves that this model infers from pairs of frames to the executed ones: axes.json, for"
+        " planning.axes",
+    )
+    parser.add_argument(
+        "--model", metavar="MODEL", type=as_model, help="of strides: another than model.base: a .pt, a folder, or a run"
     )
     parser.add_argument("--split", choices=["train", "validation", "test"], default="validation", help="(validation)")
-    parser.add_argument("--limit", metavar="N", type=count, default=64, help="clips at each stride (64)")
+    parser.add_argument("--limit", metavar="N", type=count, help="clips at each stride (64), or pairs of frames (200)")
     parser.add_argument("--frames", metavar="N", type=whole_number(2, 256), help="of a clip (the config's, 8 at most)")
     parser.add_argument("--out", metavar="DIR", type=as_path, default=Path("inspection"), help="where to (inspection)")
 
 
-def _calibrate(options: argparse.Namespace) -> None:
-    config = read_config(options.config, options.overrides)
+def _calibrate(options: argparse.Namespace) -> int:
+    config = read_config(options.config, options.overrides, base=options.axes is None)
+    if options.axes is not None:
+        return _calibrate_axes(options, config)
     if options.model is not None:
         require_subject(options.model)
     _make_folder(options.out)
@@ -198,13 +210,42 @@ def _calibrate(options: argparse.Namespace) -> None:
     from vjepa2_ac.storage import write_atomically
 
     with ConsoleReporter() as reporter:
-        sample = ClipSample(options.split, options.limit, options.frames)
+        sample = ClipSample(options.split, options.limit or _CLIPS, options.frames)
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     console.print(calibration_table(calibration))
     console.print(calibration.verdict())
     path = options.out / "calibration.json"
     write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
     console.print(f"  {path}")
+    return 0
+
+
+def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
+    """Fit the axes of a model; return 1 where nothing can be planned by them."""
+    for name in ("model", "frames"):
+        if getattr(options, name) is not None:
+            raise InputError(
+                where=f"--{name}", found="--axes beside it", needed="one of them: --model and --frames are of strides"
+            )
+    require_subject(options.axes)
+
+    from vjepa2_ac.planning.axes.axes_file import AXES_FILE, require_axes_in
+
+    require_axes_in(config.data)
+    _make_folder(options.out)
+
+    from vjepa2_ac.console.data import axes_table
+    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.evaluation.axis_calibration import calibrate_axes
+    from vjepa2_ac.reports.figures.axes import plot_axes
+
+    with ConsoleReporter() as reporter:
+        pairs = options.limit or _PAIRS
+        found = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
+    console.print(axes_table({options.axes: found.fit}))
+    console.print(found.verdict())
+    console.print(f"  {found.write(options.out / AXES_FILE)}\n  {plot_axes(found.fit, options.out / 'axes.png')}")
+    return int(found.fit.problem is not None)
 
 
 def _make_folder(folder: Path) -> None:

@@ -97,6 +97,9 @@ def _add_probes(parser: argparse.ArgumentParser) -> None:
         help="clips of those with an energy landscape (8)",
     )
     probes.add_argument(
+        "--axes", metavar="N", type=whole_number(0), default=32, help="clips of those to calibrate the axes by (32)"
+    )
+    probes.add_argument(
         "--nodes", metavar="N", type=whole_number(3, 51), default=9, help="of a landscape along each axis (9)"
     )
     probes.add_argument(
@@ -164,6 +167,7 @@ def _asked(options: argparse.Namespace) -> list[tuple[str, EvaluationOptions]]:
         sensitivity_clips=options.sensitivity_clips,
         samples=options.samples,
         landscape_clips=options.landscapes,
+        axis_clips=options.axes,
         nodes=options.nodes,
         reach_cm=options.reach,
         examples=options.examples,

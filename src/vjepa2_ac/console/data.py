@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from rich.table import Table
 from rich.text import Text
 
@@ -10,6 +12,7 @@ from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import Usage
 from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.data.inspection.statistics import PERCENTILES, Inspection
+from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, rows_of
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration
 
@@ -140,4 +143,15 @@ def calibration_table(calibration: Calibration) -> Table:
         table.caption = "\n".join(
             f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()
         )
+    return table
+
+
+def axes_table(fits: Mapping[str, AxisFit]) -> Table:
+    """Return the table of `data calibrate --axes`: a row for each model."""
+    table = MetricsTable("Inferred = matrix x executed moves (95 % interval over episodes)")
+    for name in ("model", "yaw, degrees", "gain", "condition", "off by, cm", "pairs (episodes)"):
+        table.add_column(name, justify="left" if name == "model" else "right")
+    for name, fit in fits.items():
+        numbers = (fit.yaw_degrees, fit.gain, fit.condition, fit.residual_cm)
+        table.add_row(name, *map(str, numbers), f"{fit.pairs} ({fit.episodes})")
     return table

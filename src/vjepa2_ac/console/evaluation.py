@@ -11,6 +11,7 @@ from rich.table import Table
 from vjepa2_ac.console.progress import MetricsTable
 from vjepa2_ac.evaluation.action_score.metrics import AXES, PlanMetrics, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
+from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscapes, PlanningStudy, Sensitivity
@@ -82,6 +83,10 @@ def _use_of_actions(evaluation: Evaluation) -> Table:
     sensitivities = [model.sensitivity for model in evaluation.models.values()]
     if all(sensitivities):
         _sensitivity_rows(table, [one for one in sensitivities if one is not None])
+    axes = [model.axes for model in evaluation.models.values()]
+    if all(axes):
+        table.add_section()
+        _axes_rows(table, [one for one in axes if one is not None])
     landscapes = [model.landscapes for model in evaluation.models.values()]
     if all(landscapes):
         table.add_section()
@@ -99,6 +104,13 @@ def _sensitivity_rows(table: Table, models: list[Sensitivity]) -> None:
             shares = [str(one.rankings[number].top[_TOP]) for one in models]
             label = f"true action in the best {_TOP} of {ranking.samples + 1}"
             table.add_row(label, f"{ranking.chance_of_top(_TOP):.3f}", *shares)
+
+
+def _axes_rows(table: Table, models: list[AxisFit]) -> None:
+    label = f"axes: yaw, degrees ({_clips(models[0].pairs)})"
+    table.add_row(label, "", *(_short(one.yaw_degrees, 0, interval=True) for one in models))
+    table.add_row("  gain", "0.000", *(str(one.gain) for one in models))
+    table.add_row("  condition", "", *(_short(one.condition, 1, interval=True) for one in models))
 
 
 def _landscape_rows(table: Table, models: list[Landscapes]) -> None:

@@ -12,6 +12,7 @@ from vjepa2_ac.config.effects import Affects, mark_of, names_that_affect
 from vjepa2_ac.config.loading import config_from, load_config
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import literal
+from vjepa2_ac.planning.axes.axes_file import require_axes
 from vjepa2_ac.runs.folder import CHANGES, CONFIG, is_run
 from vjepa2_ac.storage.structured import read_json_object, shown
 
@@ -33,9 +34,12 @@ def planning_settings(
         InputError: A setting is wrong or does not matter.
     """
     _require_relevant(overrides)
-    if not is_run(subject):
-        return _of_model(subject, config, overrides, dtype)
-    return with_taught_limits(_of_run(subject, config, overrides), Path(subject))
+    if is_run(subject):
+        its = with_taught_limits(_of_run(subject, config, overrides), Path(subject))
+    else:
+        its = _of_model(subject, config, overrides, dtype)
+    require_axes(its)
+    return its
 
 
 def with_taught_limits(config: Config, folder: Path) -> Config:

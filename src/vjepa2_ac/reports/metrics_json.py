@@ -135,6 +135,7 @@ def _model(evaluation: Evaluation, model: ModelResult) -> dict[str, Any]:
         "sensitivity": None if model.sensitivity is None else _sensitivity(model.sensitivity),
         "landscapes": None if model.landscapes is None else _landscapes(model.landscapes),
         "planning": plans_as_dict(evaluation, model.name),
+        "axes": None if model.axes is None else model.axes.as_dict(),
     }
 
 

@@ -44,8 +44,34 @@ def actions_section(evaluation: Evaluation) -> ReportSection:
         _costs(evaluation),
         _sensitivity(evaluation),
         side_by_side(*drawings),
+        _axes(evaluation),
     ]
     return ReportSection("actions", "Does it use the actions?", joined(*parts))
+
+
+def _axes(evaluation: Evaluation) -> Markup:
+    """Return the table of the axes in which each model infers moves: before and after training."""
+    measured = {name: model.axes for name, model in evaluation.models.items() if model.axes is not None}
+    if not measured:
+        return Markup()
+    rows = [
+        [
+            name,
+            joined(value(one.yaw_degrees, 0), " degrees"),
+            value(one.gain, 2),
+            value(one.condition, 1),
+            joined(value(one.residual_cm, 1), " cm"),
+            "" if one.problem is None else f"not to plan by: {one.problem}",
+        ]
+        for name, one in measured.items()
+    ]
+    pairs = next(iter(measured.values())).pairs
+    caption = (
+        f"Calibrated axes: the moves that a model infers from {pairs} pairs of frames, fitted to the executed ones"
+        " (value [95 % interval]). Yaw 0, gain and condition 1: what it infers is what the robot did. A yaw far from 0"
+        " is a camera or a mounting that it was not trained on: training turns it back, and so does planning.axes."
+    )
+    return table(caption, ["model", "yaw", "gain", "condition", "off by", ""], rows, class_="wordy")
 
 
 def landscape_section(evaluation: Evaluation) -> ReportSection:
