@@ -16,7 +16,7 @@ from vjepa2_ac.evaluation.axis_fit import AxisFit, fit_axes
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.planning.planner import Planner
 
-_ROOM = 1.25  # extent of the search relative to the largest executed move along an axis
+_ROOM = 1.25  # extent of the search along each axis, relative to the longest executed move
 _LEAST_M = 0.01
 _MOVE = slice(0, 3)
 _SEARCH = PlanningConfig(samples=48, iterations=6, start_std=0.67, cem=CemConfig(elites=6))
@@ -34,7 +34,7 @@ def infer_axes(
         progress: Called with the number of finished starts.
     """
     executed = np.stack([_numbers(start.action)[_MOVE] for start in starts])
-    reach = min(1.0, max(_LEAST_M, _ROOM * float(np.abs(executed).max())))
+    reach = min(1.0, max(_LEAST_M, _ROOM * float(np.linalg.norm(executed, axis=1).max())))
     planner = Planner(
         _SEARCH.model_copy(update={"limits": LimitsConfig(xyz=(reach, reach, reach), gripper_mode="held")})
     )
