@@ -160,7 +160,9 @@ def test_axes_are_fitted_written_and_drawn_and_a_model_that_knows_none_is_told(
         (["data.pose_frame=camera"], "base frame"),
     ],
 )
-def test_axes_that_cannot_be_asked_for_are_refused(config: str, capsys: Printed, more: list[str], complaint: str) -> None:
+def test_axes_that_cannot_be_asked_for_are_refused(
+    config: str, capsys: Printed, more: list[str], complaint: str
+) -> None:
     assert main(["data", "calibrate", config, "--axes", "builtin:sim-tiny", *more]) == 2
     assert complaint in " ".join(capsys.readouterr().err.split())
 

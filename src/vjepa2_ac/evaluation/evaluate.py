@@ -134,6 +134,8 @@ def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[s
         notes.append(_NOT_ASKED.format("--landscapes", "energy landscapes"))
     elif action_dim < 3:
         notes.append(_NO_LANDSCAPES.format(action_dim))
+    if probes.sensitivity_clips and not probes.axis_clips and about.space.is_pose:
+        notes.append(_NOT_ASKED.format("--axes", "calibrated axes"))
     if probes.planning_clips and about.space.position is None:
         notes.append(_NO_PLANS)
     if not probes.examples:
@@ -227,7 +229,7 @@ def _axes(
         return None
     chosen = [starts[place] for place in spread(len(starts), probes.axis_clips)]
     progress = reporter.task(f"axes, {contender.name}")
-    return infer_axes(contender.model, chosen, at_once=probes.at_once, progress=progress)
+    return infer_axes(contender.model, chosen, at_once=probes.at_once, rounds=1, progress=progress)
 
 
 def _plans(
