@@ -54,12 +54,12 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
     """
     config = config_of(cell, folder)
     started = time.process_time(), time.perf_counter()
-    planning, axes = PLANNING, None
+    file, axes = None, None
     if method_of(cell.method).kind in {"zero-shot", "calibrated"}:
         model = load_base(config.model, seed=cell.seed)
         trained: dict[str, Any] = {"trained_share": 0.0, "trained_parameters": 0, "adapter_mb": 0.0}
         if method_of(cell.method).kind == "calibrated":
-            planning, axes, trained["axes"] = _calibrated(config, model, folder / "axes" / f"{cell.name}.json")
+            file, axes, trained["axes"] = _calibrated(config, model, folder / "axes" / f"{cell.name}.json")
     else:
         run = train(config, SILENT)
         model, trained = _trained(run)
@@ -78,7 +78,7 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         merge_adapter(model)
     goals_seed = (VALIDATION_GOALS if choosing else TEST_GOALS) + cell.seed
     figures["reach"] = {
-        distance: reach(cell, planner(model, distance, planning), seed=goals_seed, goals=goals)
+        distance: reach(cell, planner(model, distance, axes=file), seed=goals_seed, goals=goals)
         for distance in energies_of(cell)
     }
     return figures
@@ -126,10 +126,10 @@ def baselines(cell: Cell, *, goals: int = GOALS) -> dict[str, Any]:
     return {policy.name: reach(cell, policy, seed=TEST_GOALS + cell.seed, goals=goals) for policy in policies}
 
 
-def planner(model: WorldModel, distance: str, config: PlanningConfig = PLANNING) -> Policy:
-    """Return a policy that plans with a model."""
+def planner(model: WorldModel, distance: str, config: PlanningConfig = PLANNING, axes: str | None = None) -> Policy:
+    """Return a policy that plans with a model, in calibrated axes where a file of them is given."""
     energy = config.energy.model_copy(update={"distance": distance})
-    return Planning(Controller(model, config.model_copy(update={"energy": energy})))
+    return Planning(Controller(model, config.model_copy(update={"energy": energy, "axes": axes})))
 
 
 def reach(cell: Cell, policy: Policy, *, seed: int, goals: int) -> dict[str, Any]:
@@ -161,15 +161,14 @@ def _turned(batch: LatentBatch, axes: Axes) -> LatentBatch:
     return replace(batch, states=axes.poses(batch.states), actions=axes.actions(batch.actions))
 
 
-def _calibrated(config: Config, model: WorldModel, path: Path) -> tuple[PlanningConfig, Axes | None, dict[str, Any]]:
-    """Fit a base's axes to the demonstrations; return how to plan by them, if that can be, and what was found."""
+def _calibrated(config: Config, model: WorldModel, path: Path) -> tuple[str | None, Axes | None, dict[str, Any]]:
+    """Fit a base's axes to the demonstrations; return file and axes if they can be planned by, and what was found."""
     found = calibrate_axes(config, str(config.model.base), pairs=PAIRS, split="train")
     path.parent.mkdir(exist_ok=True)
     found.write(path)
     if found.fit.problem is not None:
-        return PLANNING, None, found.as_dict()
-    planning = PLANNING.model_copy(update={"axes": str(path)})
-    return planning, Axes.read(str(path), Fingerprints.of(model)), found.as_dict()
+        return None, None, found.as_dict()
+    return str(path), Axes.read(str(path), Fingerprints.of(model)), found.as_dict()
 
 
 def _forgetting(model: WorldModel, folder: Path, config: Config) -> dict[str, Any]:

@@ -157,7 +157,7 @@ def test_axes_are_fitted_written_and_drawn_and_a_model_that_knows_none_is_told(
     [
         (["--model", "builtin:sim-tiny"], "--model: --axes beside it"),
         (["data.stride=auto"], "axes are those of a model step"),
-        (["data.pose_frame=camera"], "base frame"),
+        (["data.states=vector"], "base frame"),
     ],
 )
 def test_axes_that_cannot_be_asked_for_are_refused(

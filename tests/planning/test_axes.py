@@ -15,7 +15,7 @@ from tiny_models import actions, goal, scene, tiny_model
 from vjepa2_ac.config import Config
 from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.axis_fit import fit_axes
+from vjepa2_ac.evaluation.axis_fit import TRIED_DEGREES, fit_axes
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.controller import Controller
@@ -163,7 +163,9 @@ def test_a_wrong_file_is_told_before_a_model_is_loaded(tmp_path: Path) -> None:
 def test_what_a_fit_writes_can_be_read(tmp_path: Path) -> None:
     moves = np.random.default_rng(0).normal(size=(40, 3)) * 0.03
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    fit = fit_axes(moves @ turn.T, moves, [f"{place // 4}" for place in range(40)])
+    errors = 1.1 - np.cos(np.deg2rad(np.array(TRIED_DEGREES) - 90.0))
+    fit = fit_axes(moves @ turn.T, moves, np.tile(errors, (40, 1)), [f"{place // 4}" for place in range(40)])
+    assert fit.problem is None
     model = tiny_model()
     path = write(tmp_path / "axes.json", model, **json.loads(json.dumps(fit.as_dict())))
-    assert Axes.read(path, Fingerprints.of(model)).yaw == pytest.approx(math.pi / 2)
+    assert Axes.read(path, Fingerprints.of(model)).yaw == pytest.approx(math.pi / 2, abs=1e-6)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vjepa2_ac.evaluation.axis_fit import AxisFit, fit_axes
+from vjepa2_ac.evaluation.axis_fit import TRIED_DEGREES, AxisFit, fit_axes
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.intervals import mean_of
 from vjepa2_ac.evaluation.metrics import L1, L2
@@ -103,7 +103,9 @@ def _axes(ids: tuple[str, ...], degrees: float) -> AxisFit:
     moves = np.random.default_rng(1).normal(size=(len(ids), 3)) * 0.03
     angle = np.deg2rad(degrees)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
-    return fit_axes(0.9 * moves @ turn.T + 0.005 * np.roll(moves, 1, axis=0), moves, ids)
+    errors = np.tile(1.1 - np.cos(np.deg2rad(np.array(TRIED_DEGREES) - degrees)), (len(ids), 1))
+    errors *= 1 + 0.1 * np.random.default_rng(2).random(errors.shape)
+    return fit_axes(0.9 * moves @ turn.T + 0.005 * np.roll(moves, 1, axis=0), moves, errors, ids)
 
 
 def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, models: list[str], size: int) -> Example:

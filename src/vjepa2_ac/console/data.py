@@ -148,10 +148,12 @@ def calibration_table(calibration: Calibration) -> Table:
 
 def axes_table(fits: Mapping[str, AxisFit]) -> Table:
     """Return the table of `data calibrate --axes`: a row for each model."""
-    table = MetricsTable("Inferred = matrix x executed moves (95 % interval over episodes)")
-    for name in ("model", "yaw, degrees", "gain", "condition", "off by, cm", "pairs (episodes)"):
+    table = MetricsTable("Yaw of least error, and fit of inferred to executed moves (95 % interval over episodes)")
+    names = ("model", "yaw, degrees", "error / unturned", "fitted yaw", "gain", "condition", "off by, cm")
+    for name in (*names, "pairs (episodes)"):
         table.add_column(name, justify="left" if name == "model" else "right")
     for name, fit in fits.items():
-        numbers = (fit.yaw_degrees, fit.gain, fit.condition, fit.residual_cm)
-        table.add_row(name, *map(str, numbers), f"{fit.pairs} ({fit.episodes})")
+        yaws = [f"{yaw.value:.1f} [{yaw.low:.1f}, {yaw.high:.1f}]" for yaw in (fit.yaw_degrees, fit.fitted_yaw_degrees)]
+        numbers = map(str, (fit.gain, fit.condition, fit.residual_cm))
+        table.add_row(name, yaws[0], str(fit.error), yaws[1], *numbers, f"{fit.pairs} ({fit.episodes})")
     return table

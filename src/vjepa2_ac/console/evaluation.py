@@ -109,6 +109,8 @@ def _sensitivity_rows(table: Table, models: list[Sensitivity]) -> None:
 def _axes_rows(table: Table, models: list[AxisFit]) -> None:
     label = f"axes: yaw, degrees ({_clips(models[0].pairs)})"
     table.add_row(label, "", *(_short(one.yaw_degrees, 0, interval=True) for one in models))
+    table.add_row("  error at it / unturned", "1.000", *(str(one.error) for one in models))
+    table.add_row("  fitted yaw", "", *(_short(one.fitted_yaw_degrees, 0, interval=True) for one in models))
     table.add_row("  gain", "0.000", *(str(one.gain) for one in models))
     table.add_row("  condition", "", *(_short(one.condition, 1, interval=True) for one in models))
 

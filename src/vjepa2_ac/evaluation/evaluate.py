@@ -229,7 +229,7 @@ def _axes(
         return None
     chosen = [starts[place] for place in spread(len(starts), probes.axis_clips)]
     progress = reporter.task(f"axes, {contender.name}")
-    return infer_axes(contender.model, chosen, at_once=probes.at_once, rounds=1, progress=progress)
+    return infer_axes(contender.model, chosen, at_once=probes.at_once, progress=progress)
 
 
 def _plans(

@@ -1,5 +1,7 @@
 """The axes of an oracle that is turned by a known angle are found; a model without axes is said to have none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,19 +10,21 @@ from torch import Tensor
 from vjepa2_ac.evaluation.action_use.inferred_moves import infer_axes
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, start_of
 from vjepa2_ac.evaluation.axis_fit import AxisFit
+from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.planning.axes.mapping import Axes
 from worlds import TIME, Copier, Oracle, clips_batch
 
 CLIPS = 30
 
 
 class Turned(Oracle):
-    """Knows the world, but in axes that a matrix leads to: it sees `matrix @ move` where the robot makes a move."""
+    """Knows the world, but in axes of its own: it sees turned, and longer, what the robot does."""
 
-    def __init__(self, matrix: np.ndarray) -> None:
-        self.back = torch.from_numpy(np.linalg.inv(matrix)).float()
+    def __init__(self, degrees: float, gain: float = 1.0, *, mirrored: bool = False) -> None:
+        self.back, self.gain, self.side = Axes(-np.deg2rad(degrees)), gain, -1.0 if mirrored else 1.0
 
     def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-        back = torch.cat([actions[..., :3] @ self.back.T, actions[..., 3:]], dim=-1)
+        back = self.back.actions(actions) / torch.tensor([self.gain, self.side * self.gain, 1, 1, 1, 1, 1])
         return super().predict(latents, back, states, extrinsics)
 
 
@@ -41,9 +45,11 @@ def fitted(model: object, **changes: object) -> AxisFit:
 
 @pytest.mark.parametrize("degrees", [0.0, 43.0, -60.0, 135.0, 179.9])
 def test_the_angle_of_a_turned_oracle_is_recovered_within_half_a_degree(degrees: float) -> None:
-    found = fitted(Turned(turn(degrees)))
-    assert found.yaw_degrees.value == pytest.approx(degrees, abs=0.5)
-    assert found.yaw_degrees.low < found.yaw_degrees.value < found.yaw_degrees.high < found.yaw_degrees.low + 3
+    found = fitted(Turned(degrees))
+    for yaw in (found.yaw_degrees, found.fitted_yaw_degrees):
+        assert yaw.value == pytest.approx(degrees, abs=0.5)
+        assert yaw.low <= yaw.value <= yaw.high < yaw.low + 3
+    assert found.error.value == (1.0 if degrees == 0.0 else pytest.approx(0.0, abs=0.02))
     assert found.gain.value == pytest.approx(1.0, abs=0.02)
     assert found.condition.value == pytest.approx(1.0, abs=0.03)
     assert found.problem is None
@@ -51,7 +57,7 @@ def test_the_angle_of_a_turned_oracle_is_recovered_within_half_a_degree(degrees:
 
 
 def test_gain_and_condition_are_those_of_the_matrix() -> None:
-    found = fitted(Turned(turn(30.0, gain=0.6)))
+    found = fitted(Turned(30.0, gain=0.6))
     np.testing.assert_allclose(found.matrix, turn(30.0, gain=0.6), atol=0.04)
     assert found.gain.value == pytest.approx(0.6, abs=0.02)
     assert found.condition.value == pytest.approx(1 / 0.6, abs=0.1)
@@ -62,6 +68,14 @@ def test_a_model_that_ignores_actions_is_refused_as_ill_conditioned() -> None:
     assert "ill-conditioned" in (fitted(Copier()).problem or "")
 
 
+def test_a_turn_that_predicts_no_better_than_none_and_one_of_a_wide_interval_are_refused() -> None:
+    found = fitted(Turned(60.0))
+    unsure = replace(found, error=Estimate(0.98, 0.95, 1.01))
+    assert (unsure.problem or "").startswith("no better than none")
+    wide = replace(found, yaw_degrees=Estimate(60.0, 30.0, 80.0))
+    assert (wide.problem or "").startswith("uncertain: yaw 60 degrees, 95 % interval 30 to 80")
+
+
 def test_a_direction_in_which_nothing_moved_is_no_axis() -> None:
     actions = clips_batch(CLIPS).actions.clone()
     actions[..., 1] = 0.0
@@ -69,7 +83,7 @@ def test_a_direction_in_which_nothing_moved_is_no_axis() -> None:
 
 
 def test_mirrored_axes_and_one_episode_are_refused_by_name() -> None:
-    assert "mirrored" in (fitted(Turned(np.diag([1.0, -1.0, 1.0]))).problem or "")
+    assert "mirrored" in (fitted(Turned(0.0, mirrored=True)).problem or "")
     batch = clips_batch(2)
     alone = infer_axes(Oracle(), [start_of(batch, clip, step, 0) for clip in (0, 1) for step in range(TIME - 1)],
                        at_once=64)  # fmt: skip

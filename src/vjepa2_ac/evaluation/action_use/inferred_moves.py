@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -14,7 +13,8 @@ from torch import Tensor
 from vjepa2_ac.config.planning import CemConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
-from vjepa2_ac.evaluation.axis_fit import AxisFit, fit_axes
+from vjepa2_ac.evaluation.action_use.turned_errors import turned, turned_errors
+from vjepa2_ac.evaluation.axis_fit import AxisFit, fit_axes, yaw_of_least_error
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.planner import Planner
@@ -26,52 +26,32 @@ _SEARCH = PlanningConfig(samples=48, iterations=6, start_std=0.67, cem=CemConfig
 
 
 def infer_axes(
-    model: Predictor,
-    starts: Sequence[RolloutStart],
-    *,
-    at_once: int,
-    rounds: int = 2,
-    progress: Progress = no_progress,
+    model: Predictor, starts: Sequence[RolloutStart], *, at_once: int, progress: Progress = no_progress
 ) -> AxisFit:
-    """Infer the move of each start and fit them to the executed ones.
+    """Find the angle by which a model's axes are turned, infer the moves of the starts, and fit them to the executed.
 
-    The model is given the robot's states, and a move of the rest of its action, in axes that are not its own: so moves
-    are inferred again with these turned by the angle that was found. In the simulator's world with a robot turned by 60
-    degrees this takes the angle from 66 [57, 73] to 62 [56, 67].
+    A move is inferred from the state turned by the angle: a model that is given the state in axes not its own takes it
+    for another place (docs/planning.md has what this changes).
 
     Args:
         model: The predictor.
         starts: Of poses in the robot's base frame; one or more.
         at_once: Samples per batch.
-        rounds: Times that moves are inferred.
-        progress: Called with the number of finished starts, of all rounds.
+        progress: Called with the number of finished starts.
     """
+    names = [start.episode_id for start in starts]
+    errors = turned_errors(model, starts, at_once=at_once)
+    axes = Axes(math.radians(yaw_of_least_error(errors, names).value))
     executed = np.stack([_numbers(start.action)[_MOVE] for start in starts])
     reach = min(1.0, max(_LEAST_M, _ROOM * float(np.linalg.norm(executed, axis=1).max())))
     planner = Planner(
         _SEARCH.model_copy(update={"limits": LimitsConfig(xyz=(reach, reach, reach), gripper_mode="held")})
     )
-    seen, inferred, names = starts, executed, [start.episode_id for start in starts]
-    for number in range(rounds):
-        if number:
-            axes = Axes(math.radians(fit_axes(inferred, executed, names).yaw_degrees.value))
-            seen = [_turned(start, axes) for start in starts]
-        found = []
-        for start in seen:
-            found.append(_inferred(model, start, planner, at_once))
-            progress(number * len(starts) + len(found), rounds * len(starts))
-        inferred = np.stack(found)
-    return fit_axes(inferred, executed, names)
-
-
-def _turned(start: RolloutStart, axes: Axes) -> RolloutStart:
-    """Return a start as a model of these axes sees it, but for the move, which is searched."""
-    return replace(
-        start,
-        state=axes.poses(start.state),
-        action=torch.cat([start.action[_MOVE], axes.actions(start.action)[_MOVE.stop :]]),
-        extrinsics=None if start.extrinsics is None else axes.poses(start.extrinsics),
-    )
+    inferred = []
+    for done, start in enumerate(starts, start=1):
+        inferred.append(_inferred(model, turned(start, axes), planner, at_once))
+        progress(done, len(starts))
+    return fit_axes(np.stack(inferred), executed, errors, names)
 
 
 def _inferred(model: Predictor, start: RolloutStart, planner: Planner, at_once: int) -> Float[np.ndarray, " 3"]:

@@ -16,7 +16,8 @@ _EXECUTED, _INFERRED, _FITTED = "#8a8a8a", "#1f6fb4", "#d1762a"
 def plot_axes(fit: AxisFit, path: Path) -> Path:
     """Write moves in the horizontal plane, and the robot's x and y as the model takes them, as PNG, atomically."""
     figure = new_figure(9.0, 4.6, layout="constrained")
-    figure.suptitle(f"yaw {fit.yaw_degrees} degrees, gain {fit.gain}, condition {fit.condition}", fontsize=9)
+    found = {"yaw": fit.yaw_degrees, "fitted yaw": fit.fitted_yaw_degrees, "gain": fit.gain, "condition": fit.condition}
+    figure.suptitle(", ".join(f"{name} {number}" for name, number in found.items()), fontsize=9)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     reach = 105 * max(float(np.abs(moves[:, :2]).max()) for moves in (fit.executed, fit.inferred)) or 1.0
     left.scatter(*(100 * fit.executed[:, :2].T), s=9, color=_EXECUTED, label="executed")

@@ -58,6 +58,8 @@ def _axes(evaluation: Evaluation) -> Markup:
         [
             name,
             joined(value(one.yaw_degrees, 0), " degrees"),
+            value(one.error, 2),
+            joined(value(one.fitted_yaw_degrees, 0), " degrees"),
             value(one.gain, 2),
             value(one.condition, 1),
             joined(value(one.residual_cm, 1), " cm"),
@@ -67,11 +69,14 @@ def _axes(evaluation: Evaluation) -> Markup:
     ]
     pairs = next(iter(measured.values())).pairs
     caption = (
-        f"Calibrated axes: the moves that a model infers from {pairs} pairs of frames, fitted to the executed ones"
+        f"Calibrated axes, from {pairs} pairs of frames: the turn about the vertical at which the model predicts best,"
+        " its squared error over that without a turn, and the fit of the moves that it infers to the executed ones"
         " (value [95 % interval]). Yaw 0, gain and condition 1: what it infers is what the robot did. A yaw far from 0"
         " is a camera or a mounting that it was not trained on: training turns it back, and so does planning.axes."
     )
-    return table(caption, ["model", "yaw", "gain", "condition", "off by", ""], rows, class_="wordy")
+    return table(
+        caption, ["model", "yaw", "error there", "fitted yaw", "gain", "condition", "off by", ""], rows, class_="wordy"
+    )
 
 
 def landscape_section(evaluation: Evaluation) -> ReportSection:
