@@ -24,7 +24,7 @@ class Axes:
     Plans are searched among the robot's own actions, so limits hold for what is executed; the model is given each
     action and state turned.
 
-    Source: arXiv 2506.09985, appendix B.4, rotates by the angle of a least-squares fit.
+    Source: arXiv 2506.09985, appendix B.4, which rotates inferred moves by a measured angle.
     """
 
     yaw: float  # radians, counterclockwise from above
