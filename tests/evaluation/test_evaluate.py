@@ -8,7 +8,6 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import torch
 from torch import Tensor
 
 from run_fixtures import SilentReporter
@@ -28,6 +27,7 @@ from vjepa2_ac.evaluation.metrics import L2, METRICS
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import MODES, Evaluation, PredictionErrors, Stratum
 from vjepa2_ac.evaluation.verdict import improvement, uses_actions, verdict
+from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.spaces import vector_actions
 from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, about, again, clips_batch
@@ -242,8 +242,7 @@ def test_the_axes_of_base_and_adapter_are_found_and_those_of_vectors_are_not() -
         """Takes what goes along x for a move along y."""
 
         def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
-            turned = torch.cat([actions[..., 1:2], -actions[..., :1], actions[..., 2:]], dim=-1)
-            return super().predict(latents, turned, states, extrinsics)
+            return super().predict(latents, Axes(-np.pi / 2).actions(actions), states, extrinsics)
 
     found = evaluated(Oracle(), Quarter())
     yaws = {name: model.axes.yaw_degrees.value for name, model in found.models.items() if model.axes is not None}

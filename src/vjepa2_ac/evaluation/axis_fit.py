@@ -93,7 +93,7 @@ def yaw_of_least_error(errors: Float[np.ndarray, "pairs angles"], episode_ids: S
     nearby = _least(errors.sum(axis=0))
 
     def of_sums(sums: Float[np.ndarray, "1 *batch angles"]) -> Float[np.ndarray, "*batch 1"]:
-        return (nearby + _wrapped(_least(sums[0]) - nearby))[..., None]
+        return np.asarray((nearby + _wrapped(_least(sums[0]) - nearby))[..., None])
 
     return bootstrapped(of_sums, errors[None], episode_ids)[0]
 
