@@ -20,10 +20,18 @@ SHIFTS: dict[Shift, Domain] = {
 """look: camera turned by 43 degrees, other colours, light, table and things on it; the arm moves as in A. motion: looks
 like A, but the robot is mounted turned by 60 degrees, so that an action moves the arm elsewhere in the picture."""
 
+TURNS: dict[Shift, float] = {
+    "look": DOMAIN_A.camera.azimuth_deg - SHIFTS["look"].camera.azimuth_deg,
+    "motion": SHIFTS["motion"].base_yaw_deg,
+}
+"""By how many degrees what the robot does seems turned, to a base of domain A."""
+
 BASES: tuple[Base, ...] = ("one camera", "many cameras")
 """one camera: trained on domain A alone. many cameras: on 800 worlds, each seen by another camera (the demo's base)."""
 
 IN_OUT = ("predictor_embed", "predictor_proj", "action_encoder", "state_encoder")
+AXES = "zero-shot, calibrated axes"
+"""No weight changes: the base plans in axes that are fitted to the demonstrations (`data calibrate --axes`)."""
 BEST = "LoRA r32 + in/out"
 """The LoRA that takes part in every comparison; not chosen by test goals (`--choose`)."""
 
@@ -53,7 +61,7 @@ class Method:
     """How the weights change."""
 
     name: str
-    kind: Literal["zero-shot", "LoRA", "full", "scratch"]
+    kind: Literal["zero-shot", "calibrated", "LoRA", "full", "scratch"]
     rank: int = 0
     in_out: bool = False  # whether the layers before and after the blocks are trained whole, beside the adapter
     times: int = 1  # so many times the steps
@@ -83,6 +91,7 @@ METHODS = {
     method.name: method
     for method in (
         Method("zero-shot", "zero-shot"),
+        Method(AXES, "calibrated"),
         *(
             Method(f"LoRA r{rank}{' + in/out' * both}", "LoRA", rank, both, learning_rate=3e-3 if rank > 16 else 5e-3)
             for both in (False, True)
@@ -132,7 +141,7 @@ class Cell:
 
 def all_cells(seeds: int = 3) -> Iterator[Cell]:
     """Yield every cell, those that matter most first."""
-    main = ("zero-shot", BEST, "full", "scratch")
+    main = ("zero-shot", AXES, BEST, "full", "scratch")
     for seed in range(seeds):
         yield from _of("look", main, 20, seed)
     for seed in range(seeds):

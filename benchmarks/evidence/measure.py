@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -21,12 +21,16 @@ from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.data.clips.loader import validation_batches
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.axis_calibration import calibrate_axes
 from vjepa2_ac.evaluation.measure import prediction_errors
 from vjepa2_ac.evaluation.result import PredictionErrors, Way
 from vjepa2_ac.model.adapter.merging import base_only, merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
@@ -35,6 +39,7 @@ from vjepa2_ac.training.cost.parameters import count_parameters
 from vjepa2_ac.training.loop import train
 
 TEST_GOALS, VALIDATION_GOALS = 9_000, 4_000  # seeds of problems, to which a cell adds its own
+PAIRS = 200  # of frames, that axes are fitted to
 GOALS, CLIPS = 20, 128  # of one run; a row of the table pools its seeds, each with other goals
 
 
@@ -49,9 +54,12 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
     """
     config = config_of(cell, folder)
     started = time.process_time(), time.perf_counter()
-    if method_of(cell.method).kind == "zero-shot":
+    file, axes = None, None
+    if method_of(cell.method).kind in {"zero-shot", "calibrated"}:
         model = load_base(config.model, seed=cell.seed)
         trained: dict[str, Any] = {"trained_share": 0.0, "trained_parameters": 0, "adapter_mb": 0.0}
+        if method_of(cell.method).kind == "calibrated":
+            file, axes, trained["axes"] = _calibrated(config, model, folder / "axes" / f"{cell.name}.json")
     else:
         run = train(config, SILENT)
         model, trained = _trained(run)
@@ -62,7 +70,7 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         "cpu_minutes": seconds[0] / 60,
         "minutes": seconds[1] / 60,
         **trained,
-        "shifted": _as_dict(held_out(model, config, split)),
+        "shifted": _as_dict(held_out(model, config, split, axes=axes)),
     }
     if cell.base != "none":
         figures["forgetting"] = _forgetting(model, folder, config)
@@ -70,7 +78,8 @@ def measure(cell: Cell, folder: Path, *, goals: int = GOALS, choosing: bool = Fa
         merge_adapter(model)
     goals_seed = (VALIDATION_GOALS if choosing else TEST_GOALS) + cell.seed
     figures["reach"] = {
-        distance: reach(cell, planner(model, distance), seed=goals_seed, goals=goals) for distance in energies_of(cell)
+        distance: reach(cell, planner(model, distance, axes=file), seed=goals_seed, goals=goals)
+        for distance in energies_of(cell)
     }
     return figures
 
@@ -117,10 +126,10 @@ def baselines(cell: Cell, *, goals: int = GOALS) -> dict[str, Any]:
     return {policy.name: reach(cell, policy, seed=TEST_GOALS + cell.seed, goals=goals) for policy in policies}
 
 
-def planner(model: WorldModel, distance: str, config: PlanningConfig = PLANNING) -> Policy:
-    """Return a policy that plans with a model."""
+def planner(model: WorldModel, distance: str, config: PlanningConfig = PLANNING, axes: str | None = None) -> Policy:
+    """Return a policy that plans with a model, in calibrated axes where a file of them is given."""
     energy = config.energy.model_copy(update={"distance": distance})
-    return Planning(Controller(model, config.model_copy(update={"energy": energy})))
+    return Planning(Controller(model, config.model_copy(update={"energy": energy, "axes": axes})))
 
 
 def reach(cell: Cell, policy: Policy, *, seed: int, goals: int) -> dict[str, Any]:
@@ -136,15 +145,30 @@ def reach(cell: Cell, policy: Policy, *, seed: int, goals: int) -> dict[str, Any
     }
 
 
-def held_out(model: WorldModel, config: Config, split: Split = "test", clips: int = CLIPS) -> PredictionErrors:
-    """Return errors on clips of held-out episodes, from the latents that training used."""
+def held_out(
+    model: WorldModel, config: Config, split: Split = "test", clips: int = CLIPS, axes: Axes | None = None
+) -> PredictionErrors:
+    """Return errors on clips of held-out episodes, from the latents that training used; in the model's own axes."""
     dataset = with_latents_if_there(config, open_dataset(config.data), model)
     batches = validation_batches(dataset, split, clips=clips, batch_size=32)
     model.eval()
     with _bf16():
-        return prediction_errors(
-            model, (encode_batch(model, batch, device=torch.device("cpu"), chunk=64) for batch in batches)
-        )
+        encoded = (encode_batch(model, batch, device=torch.device("cpu"), chunk=64) for batch in batches)
+        return prediction_errors(model, encoded if axes is None else (_turned(batch, axes) for batch in encoded))
+
+
+def _turned(batch: LatentBatch, axes: Axes) -> LatentBatch:
+    return replace(batch, states=axes.poses(batch.states), actions=axes.actions(batch.actions))
+
+
+def _calibrated(config: Config, model: WorldModel, path: Path) -> tuple[str | None, Axes | None, dict[str, Any]]:
+    """Fit a base's axes to the demonstrations; return file and axes if they can be planned by, and what was found."""
+    found = calibrate_axes(config, str(config.model.base), pairs=PAIRS, split="train")
+    path.parent.mkdir(exist_ok=True)
+    found.write(path)
+    if found.fit.problem is not None:
+        return None, None, found.as_dict()
+    return str(path), Axes.read(str(path), Fingerprints.of(model)), found.as_dict()
 
 
 def _forgetting(model: WorldModel, folder: Path, config: Config) -> dict[str, Any]:

@@ -25,7 +25,7 @@ def draw(results: Sequence[Figures], path: Path) -> None:
     figure.savefig(path, dpi=110)
 
 
-_COLOURS = {"zero-shot": "#999999", "LoRA": "#1f77b4", "full": "#2ca02c", "scratch": "#d62728"}
+_COLOURS = {"zero-shot": "#999999", "calibrated": "#9467bd", "LoRA": "#1f77b4", "full": "#2ca02c", "scratch": "#d62728"}
 
 
 def _bars(axes: Any, results: Sequence[Figures]) -> None:

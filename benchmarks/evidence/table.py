@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from cells import BASES, BEST, METHODS
+from cells import AXES, BASES, BEST, METHODS, TURNS
 from plot import draw
 from results import Figures, last, main_cells, of_policy, pick, reached, read_results, share_reached
 
@@ -26,6 +26,8 @@ NOTES = """Read it so:
 - *reach at the end*: of all goals, with Wilson's interval, then how many each seed reached. A seed is a model of its
   own with its own demonstrations and goals, so the interval leaves out part of what chance does: look at the seeds.
   Decision n of every episode draws the same noise.
+- *calibrated axes*: no weight is trained. The base plans in axes fitted to 200 pairs of frames of the demonstrations;
+  where the fit is refused (its angle stays unknown), it plans as zero-shot. Its error is that of turned actions.
 - *L2 energy*: the same when plans are compared by squared error. *error on A, on*: 0.8 s ahead, in the world that the
   base was trained on, adapter on; off: whether switching it off gives the base's figures back to the last bit.
 - *scratch* keeps the frozen encoder of the bases and starts close to copying: a kind start. Learning rates were chosen
@@ -45,7 +47,9 @@ def write_tables(folder: Path, out: Path, readme: Path | None = None) -> None:
         return
     out.mkdir(parents=True, exist_ok=True)
     text = "\n\n".join(
-        part for part in (_main(results), _motion(results), _by_episodes(results), _lora(results)) if part
+        part
+        for part in (_main(results), _motion(results), _axes(results), _by_episodes(results), _lora(results))
+        if part
     )
     text = f"{text}\n\n{NOTES}\n{_made_with(results)}"
     (out / TABLE).write_text(text + "\n")
@@ -130,6 +134,22 @@ def _motion(results: Sequence[Figures]) -> str:
     found = pick(results, shift="motion", base="none")
     rows += [_row("scratch", found)] if found else []
     return "### The robot mounted turned by 60 degrees (20 demonstrations)\n\n" + _table(rows) if rows else ""
+
+
+def _axes(results: Sequence[Figures]) -> str:
+    """Return which turns were fitted to the demonstrations, seed by seed, beside the true ones."""
+    lines = []
+    for shift, true in TURNS.items():
+        for base in BASES:
+            found = pick(results, shift=shift, base=base, method=AXES)
+            fits = [
+                f"{one['axes']['yaw_degrees']['value']:+.0f}"
+                + (" (refused)" if one["axes"]["problem"] else "")
+                + f", condition {one['axes']['condition']['value']:.1f}"
+                for one in found
+            ]
+            lines += [f"- {shift}, {base}: yaw {'; '.join(fits)}; true {true:+.0f} degrees"] if fits else []
+    return "### Calibrated axes\n\n" + "\n".join(lines) if lines else ""
 
 
 def _by_episodes(results: Sequence[Figures]) -> str:

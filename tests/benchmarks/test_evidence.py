@@ -94,6 +94,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         few = cells.PLANNING.model_copy(update={"samples": 12, "iterations": 1})
         patch.setattr(measure, "planner", partial(measure.planner, config=few))
         patch.setattr(measure, "CLIPS", 6)
+        patch.setattr(measure, "PAIRS", 6)
         patch.setattr(measure, "base_model", lambda *_: prepare.BUILTIN)
         patch.setattr(prepare, "RecordingSpec", partial(RecordingSpec, steps=14))
         modules.folder = tmp_path_factory.mktemp("evidence")
@@ -137,9 +138,14 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
         < before["baselines"]["do nothing"]["distance_cm"][0][-1]
     )
 
+    turned = small.measure.measure(replace(cell, method=small.cells.AXES), small.folder, goals=1)
+    assert turned["trained_share"] == 0
+    assert turned["axes"]["pairs"] == 6
+    assert (turned["shifted"] == before["shifted"]) == (turned["axes"]["problem"] is not None)
+
     results = tmp_path / "results"
     results.mkdir()
-    for one in (figures, before):
+    for one in (figures, before, turned):
         one["cell"]["episodes"] = one["cell"]["episodes"] and 20
         (results / f"{one['cell']['name']}.json").write_text(json.dumps(one))
     readme = tmp_path / "README.md"
@@ -148,7 +154,9 @@ def test_a_cell_is_trained_and_measured_and_its_base_comes_back(small: Any, tmp_
     text = (tmp_path / "out" / "evidence.md").read_text()
     assert "LoRA r4 + in/out" in text
     assert "the base's, bit for bit" in text
-    assert "Made with not recorded (2 cells)" in text
+    assert f"| {small.cells.AXES} | " in text
+    assert f"- look, many cameras: yaw {turned['axes']['yaw_degrees']['value']:+.0f}" in text
+    assert "Made with not recorded (3 cells)" in text
     assert "oracle" in text
     assert (tmp_path / "out" / "evidence.png").stat().st_size > 5_000
     new = readme.read_text()

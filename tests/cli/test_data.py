@@ -132,6 +132,41 @@ def test_calibrate_takes_another_model(config: str, tmp_path: Path, capsys: Prin
     assert "model.base: no/such/model" in capsys.readouterr().err
 
 
+def test_axes_are_fitted_written_and_drawn_and_a_model_that_knows_none_is_told(
+    config: str, tmp_path: Path, capsys: Printed
+) -> None:
+    """The synthetic robot is one that the model does not know: whatever is fitted, nothing can be planned by it."""
+    out = tmp_path / "out"
+    arguments = ["data", "calibrate", config, "--axes", "builtin:sim-tiny", "--limit", "12", "--out", str(out)]
+    assert main(arguments) == 1
+    printed = capsys.readouterr().out
+    assert "Not to plan by: " in printed
+    read = json.loads((out / "axes.json").read_text())
+    assert read["pairs"] == 12
+    assert read["problem"] in printed.replace("\n", " ")
+    assert read["model"]["subject"] == "builtin:sim-tiny"
+    assert (out / "axes.png").stat().st_size > 1000
+    capsys.readouterr()
+    assert main(["plan", "builtin:sim-tiny", f"planning.axes={out / 'axes.json'}", "--start", "a.png", "--goal",
+                 "a.png", "--state", "0.4,0,.3,3,0,0,0"]) == 2  # fmt: skip
+    assert read["problem"][:12] in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "complaint"),
+    [
+        (["--model", "builtin:sim-tiny"], "--model: --axes beside it"),
+        (["data.stride=auto"], "axes are those of a model step"),
+        (["data.states=vector"], "base frame"),
+    ],
+)
+def test_axes_that_cannot_be_asked_for_are_refused(
+    config: str, capsys: Printed, more: list[str], complaint: str
+) -> None:
+    assert main(["data", "calibrate", config, "--axes", "builtin:sim-tiny", *more]) == 2
+    assert complaint in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_random_model_cannot_choose(config: str, tmp_path: Path, capsys: Printed) -> None:
     values = yaml.safe_load(Path(config).read_text())
     values["model"] = {"random": {}, "dtype": "float32"}

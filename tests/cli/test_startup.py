@@ -25,6 +25,8 @@ data inspect nope.yaml
 data index nope.yaml
 data calibrate nope.yaml
 data calibrate {demo} data.path=. --model nope
+data calibrate {demo} data.path=. --axes nope
+data calibrate {demo} data.path=. --axes builtin:sim-tiny --model nope
 plan nope --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
 plan builtin:nope --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
 plan builtin:sim-tiny --start a.png --goal b.png --state 0.4,0,.3,3,0,0,0
@@ -34,6 +36,7 @@ config show nope.yaml
 simulate nope
 simulate builtin:sim-tiny --domain Q
 simulate builtin:sim-tiny planning.horizonn=2
+simulate builtin:sim-tiny planning.axes=nope.json
 simulate record /proc/x --episodes 2
 simulate record out --episodes 2 --domain Q
 download --url foo x.pt

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from torch import Tensor
 
 from run_fixtures import SilentReporter
 from vjepa2_ac.evaluation.estimates import (
@@ -26,6 +27,7 @@ from vjepa2_ac.evaluation.metrics import L2, METRICS
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import MODES, Evaluation, PredictionErrors, Stratum
 from vjepa2_ac.evaluation.verdict import improvement, uses_actions, verdict
+from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.spaces import vector_actions
 from worlds import DIM, TIME, TOKENS, Copier, Halfway, Oracle, about, again, clips_batch
@@ -235,6 +237,22 @@ def test_each_model_is_measured_only_while_it_is_switched_on() -> None:
     evaluate(contenders, again(clips_batch()), about(), probes=PROBES)
 
 
+def test_the_axes_of_base_and_adapter_are_found_and_those_of_vectors_are_not() -> None:
+    class Quarter(Oracle):
+        """Takes what goes along x for a move along y."""
+
+        def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+            return super().predict(latents, Axes(-np.pi / 2).actions(actions), states, extrinsics)
+
+    found = evaluated(Oracle(), Quarter())
+    yaws = {name: model.axes.yaw_degrees.value for name, model in found.models.items() if model.axes is not None}
+    assert yaws == {"base": pytest.approx(90.0, abs=3.0), "adapter": pytest.approx(0.0, abs=3.0)}
+    written = metrics_as_dict(found)["models"]
+    assert {name: one["axes"]["yaw_degrees"]["value"] for name, one in written.items()} == yaws
+    vectors = evaluated(Oracle(), space=vector_actions(7, "change"))
+    assert vectors.models["adapter"].axes is None
+
+
 def test_progress_names_each_part_of_the_work() -> None:
     reporter = SilentReporter()
     evaluate([Contender("model", "trained", Oracle())], again(clips_batch()), about(), probes=PROBES, reporter=reporter)
@@ -243,6 +261,7 @@ def test_progress_names_each_part_of_the_work() -> None:
         "other actions, model": (6, 6),
         "action ranking, model": (12, 12),
         "energy landscapes, model": (3, 3),
+        "axes, model": (6, 6),
     }
 
 
@@ -254,6 +273,7 @@ def test_progress_names_each_part_of_the_work() -> None:
             "--sensitivity-clips is 0: no other actions and no energy landscapes were asked for.",
         ),
         ({"landscape_clips": 0}, "--landscapes is 0: no energy landscapes were asked for."),
+        ({"axis_clips": 0}, "--axes is 0: no calibrated axes were asked for."),
         ({"examples": 0}, "--examples is 0: no example clips were asked for."),
         ({}, None),
     ],

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vjepa2_ac.evaluation.axis_fit import TRIED_DEGREES, AxisFit, fit_axes
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.intervals import mean_of
 from vjepa2_ac.evaluation.metrics import L1, L2
@@ -105,6 +106,15 @@ def _landscapes(rng: np.random.Generator, ids: tuple[str, ...], off: float) -> L
     return Landscapes(("dx", "dy", "dz"), "cm", maps, distance, 8.1, signs, (0.5, 0.5, 0.5), (5, 5, 0), 1.25)  # type: ignore[arg-type]
 
 
+def _axes(ids: tuple[str, ...], degrees: float) -> AxisFit:
+    moves = np.random.default_rng(1).normal(size=(len(ids), 3)) * 0.03
+    angle = np.deg2rad(degrees)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    errors = np.tile(1.1 - np.cos(np.deg2rad(np.array(TRIED_DEGREES) - degrees)), (len(ids), 1))
+    errors *= 1 + 0.1 * np.random.default_rng(2).random(errors.shape)
+    return fit_axes(0.9 * moves @ turn.T + 0.005 * np.roll(moves, 1, axis=0), moves, errors, ids)
+
+
 def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, models: list[str], size: int) -> Example:
     grid = max(4, size // 16)
     y, x = np.mgrid[:size, :size] / size
@@ -150,6 +160,7 @@ def evaluation(
             _sensitivity(rng, ids, skill),
             _landscapes(rng, ids, 4 - 3 * skill),
             ranking=ranking_of(0.3 * (1 - skill) + 0.1 * rng.random(len(ids)), ids),
+            axes=_axes(ids, degrees=60 - 60 * skill),
         )
     size_of_action = rng.gamma(2.0, 2.0, size=(clips, horizon))
     moving = size_of_action > 1.5

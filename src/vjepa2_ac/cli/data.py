@@ -20,9 +20,12 @@ from vjepa2_ac.cli.options import (
     require_subject,
     whole_number,
 )
+from vjepa2_ac.errors import InputError
 
 if TYPE_CHECKING:
     from vjepa2_ac.config import Config
+
+_CLIPS, _PAIRS = 64, 200  # to calibrate by: strides, axes (as the paper)
 
 
 def add_to(commands: Commands) -> None:
@@ -57,13 +60,20 @@ def add_to(commands: Commands) -> None:
     argument(parser, "--episodes --limit N", "episodes whose motion is looked at (100)", count, default=100)
     argument(parser, "--rows N", "episodes on the contact sheet (8)", count, default=8)
 
-    text = "Let a model say how many control steps its model step is: its error over persistence at each stride."
+    text = (
+        "Let a model say how many control steps its model step is: its error over persistence at each stride. Or, with"
+        " --axes: how its axes lie to the robot's; status 1 where that stays unknown."
+    )
     parser = command(inner, "calibrate", _calibrate, text)
     add_config(parser, such_as=such_as)
-    argument(parser, "--model MODEL", "another than model.base: a .pt, a folder, or a run", as_model)
+    text = (
+        "fit the moves that this model infers from pairs of frames to the executed ones: axes.json, for planning.axes"
+    )
+    argument(parser, "--axes RUN_OR_MODEL", text, as_model)
+    argument(parser, "--model MODEL", "of strides: another than model.base: a .pt, a folder, or a run", as_model)
     splits = ["train", "validation", "test"]
     argument(parser, "--split", "(validation)", choices=splits, default="validation")
-    argument(parser, "--limit N", "clips at each stride (64)", count, default=64)
+    argument(parser, "--limit N", "clips at each stride (64), or pairs of frames (200)", count)
     argument(parser, "--frames N", "of a clip (the config's, 8 at most)", whole_number(2, 256))
     argument(parser, "--out DIR", "where to (inspection)", as_path, default=out)
 
@@ -157,8 +167,10 @@ def _inspect(options: argparse.Namespace) -> None:
     console.print(f"  {image}\n  {options.out / 'inspect.json'}")
 
 
-def _calibrate(options: argparse.Namespace) -> None:
-    config = read_config(options.config, options.overrides)
+def _calibrate(options: argparse.Namespace) -> int:
+    config = read_config(options.config, options.overrides, base=options.axes is None)
+    if options.axes is not None:
+        return _calibrate_axes(options, config)
     if options.model is not None:
         require_subject(options.model)
     _make_folder(options.out)
@@ -170,13 +182,42 @@ def _calibrate(options: argparse.Namespace) -> None:
     from vjepa2_ac.storage import write_atomically
 
     with ConsoleReporter() as reporter:
-        sample = ClipSample(options.split, options.limit, options.frames)
+        sample = ClipSample(options.split, options.limit or _CLIPS, options.frames)
         calibration = calibrate_config(config, sample, model=options.model, reporter=reporter)
     console.print(calibration_table(calibration))
     console.print(calibration.verdict())
     path = options.out / "calibration.json"
     write_atomically(path, json.dumps(calibration.as_dict(), indent=1).encode())
     console.print(f"  {path}")
+    return 0
+
+
+def _calibrate_axes(options: argparse.Namespace, config: Config) -> int:
+    """Fit the axes of a model; return 1 where nothing can be planned by them."""
+    for name in ("model", "frames"):
+        if getattr(options, name) is not None:
+            raise InputError(
+                where=f"--{name}", found="--axes beside it", needed="one of them: --model and --frames are of strides"
+            )
+    require_subject(options.axes)
+
+    from vjepa2_ac.planning.axes.axes_file import AXES_FILE, require_axes_in
+
+    require_axes_in(config.data)
+    _make_folder(options.out)
+
+    from vjepa2_ac.console.data import axes_table
+    from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.evaluation.axis_calibration import calibrate_axes
+    from vjepa2_ac.reports.figures.axes import plot_axes
+
+    with ConsoleReporter() as reporter:
+        pairs = options.limit or _PAIRS
+        found = calibrate_axes(config, options.axes, pairs=pairs, split=options.split, reporter=reporter)
+    console.print(axes_table({options.axes: found.fit}))
+    console.print(found.verdict())
+    console.print(f"  {found.write(options.out / AXES_FILE)}\n  {plot_axes(found.fit, options.out / 'axes.png')}")
+    return int(found.fit.problem is not None)
 
 
 def _make_folder(folder: Path) -> None:

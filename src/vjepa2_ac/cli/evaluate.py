@@ -61,6 +61,8 @@ def _add_probes(group: argparse._ArgumentGroup) -> None:
     argument(group, "--samples N", "other actions for each of them (64)", count)
     text = "clips of those with an energy landscape (8)"
     argument(group, "--landscapes N", text, whole_number(0), dest="landscape_clips")
+    text = "clips of those to calibrate the axes by (32)"
+    argument(group, "--axes N", text, whole_number(0), dest="axis_clips")
     argument(group, "--nodes N", "of a landscape along each axis (9)", whole_number(3, 51))
     text = "half the width of landscape and box, in cm (7.5)"
     argument(group, "--reach CM", text, number_between(0.0, 1000.0, "cm"), dest="reach_cm")

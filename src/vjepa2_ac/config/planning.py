@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from vjepa2_ac.config.section import OFF, Count, NonNegative, Positive, PositiveInt, Section, Share, ZeroToOne
+from vjepa2_ac.config.section import OFF, Count, Local, NonNegative, Positive, PositiveInt, Section, Share, ZeroToOne
 from vjepa2_ac.errors import InputError
 
 Metre = ZeroToOne  # no arm moves farther in a model step: more would be millimetres
@@ -160,6 +160,9 @@ class PlanningConfig(Section):
     """int8, fp8: the predictor's blocks compute in 8 bits, with the adapter merged in (torchao, extra quantize); the
     rest in bfloat16, which model.dtype must be. fp8 needs compute capability 8.9. Not of planner gradient, nor of
     `evaluate --planning`."""
+    axes: Local | None = None
+    """Calibrated axes of the model (`data calibrate --axes`, its axes.json): it is given what the robot does turned by
+    their angle, as its training camera would have seen it. Of poses in the base frame. Not of `evaluate --planning`."""
     limits: LimitsConfig = LimitsConfig()
     """Limits of every action."""
     energy: EnergyConfig = EnergyConfig()

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from rich.table import Table
 from rich.text import Text
 
-from vjepa2_ac.console.progress import MetricsTable, console
+from vjepa2_ac.console.progress import MetricsTable, console, with_interval
 from vjepa2_ac.data.index.episode_table import EpisodeTable
 from vjepa2_ac.data.index.index_cache import Usage
 from vjepa2_ac.data.inspection.finding import Finding
 from vjepa2_ac.data.inspection.statistics import PERCENTILES, Inspection
+from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, rows_of
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration
 
@@ -126,4 +128,16 @@ def calibration_table(calibration: Calibration) -> Table:
         )  # fmt: skip
     reasons = [f"stride {stride} is not possible: {reason}" for stride, reason in calibration.impossible.items()]
     table.caption = "\n".join(reasons) or None
+    return table
+
+
+def axes_table(fits: Mapping[str, AxisFit]) -> Table:
+    """Return the table of `data calibrate --axes`: a row for each model."""
+    title = "Yaw of least error, and fit of inferred to executed moves (95 % interval over episodes)"
+    names = ["yaw, degrees", "error / unturned", "fitted yaw", "gain", "condition", "off by, cm", "pairs (episodes)"]
+    table = MetricsTable(title, ["model", *names])
+    for name, fit in fits.items():
+        yaws = [with_interval(yaw, ".1f") for yaw in (fit.yaw_degrees, fit.fitted_yaw_degrees)]
+        numbers = map(str, (fit.gain, fit.condition, fit.residual_cm))
+        table.add_row(name, yaws[0], str(fit.error), yaws[1], *numbers, f"{fit.pairs} ({fit.episodes})")
     return table

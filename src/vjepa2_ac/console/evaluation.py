@@ -7,6 +7,7 @@ from rich.table import Table
 from vjepa2_ac.console.progress import MetricsTable, with_interval
 from vjepa2_ac.evaluation.action_score.metrics import AXES, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
+from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.result import ACTIONS, ActionRanking, Evaluation, Landscapes, PlanningStudy, Sensitivity
@@ -72,6 +73,10 @@ def _use_of_actions(evaluation: Evaluation) -> Table:
     if all(rankings):
         table.add_section()
         _ranking_rows(table, [one for one in rankings if one is not None])
+    axes = [model.axes for model in evaluation.models.values()]
+    if all(axes):
+        table.add_section()
+        _axes_rows(table, [one for one in axes if one is not None])
     landscapes = [model.landscapes for model in evaluation.models.values()]
     if all(landscapes):
         table.add_section()
@@ -96,6 +101,15 @@ def _ranking_rows(table: Table, models: list[ActionRanking]) -> None:
     table.add_row("  among actions in a box", "0.500", *(str(one.box) for one in models))
     table.add_row("  among other directions", "0.500", *(str(one.shell) for one in models))
     table.add_row("  spread of the energy / energy now", "0.000", *(str(one.spread) for one in models))
+
+
+def _axes_rows(table: Table, models: list[AxisFit]) -> None:
+    label = f"axes: yaw, degrees ({_clips(models[0].pairs)})"
+    table.add_row(label, "", *(with_interval(one.yaw_degrees, ".0f") for one in models))
+    table.add_row("  error at it / unturned", "1.000", *(str(one.error) for one in models))
+    table.add_row("  fitted yaw", "", *(with_interval(one.fitted_yaw_degrees, ".0f") for one in models))
+    table.add_row("  gain", "0.000", *(str(one.gain) for one in models))
+    table.add_row("  condition", "", *(with_interval(one.condition, ".1f") for one in models))
 
 
 def _landscape_rows(table: Table, models: list[Landscapes]) -> None:

@@ -14,9 +14,11 @@ from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import LatentBatch, Progress
 from vjepa2_ac.evaluation.action_score.measure import PlanningStart, measure_plans, planning_start, study_of
 from vjepa2_ac.evaluation.action_use.energy_landscape import LandscapeGrid, measure_landscapes
+from vjepa2_ac.evaluation.action_use.inferred_moves import infer_axes
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, moves_of, start_of
 from vjepa2_ac.evaluation.action_use.ranking import pool_of, rank_actions
 from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sensitivity
+from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.examples import chosen_clips, make_example, predicted_rollout
 from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, with_other_actions
@@ -108,6 +110,7 @@ def evaluate(
                 ranking=_ranking(contender, seen.moves, about, probes, reporter),
                 landscapes=_landscapes(contender, seen.starts, known, pool, probes, reporter),
                 plans=_plans(contender, seen.planned, probes, reporter),
+                axes=_axes(contender, seen.starts, about, probes, reporter),
             )
     evaluation = Evaluation(
         about=about,
@@ -134,6 +137,8 @@ def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[s
         notes.append(_NOT_ASKED.format("--landscapes", "energy landscapes"))
     elif action_dim < 3:
         notes.append(_NO_LANDSCAPES.format(action_dim))
+    if probes.sensitivity_clips and not probes.axis_clips and about.space.is_pose:
+        notes.append(_NOT_ASKED.format("--axes", "calibrated axes"))
     if probes.planning_clips and about.space.position is None:
         notes.append(_NO_PLANS)
     if not probes.examples:
@@ -230,6 +235,16 @@ def _landscapes(
     grid = LandscapeGrid(pool.space, probes.nodes, reach=0.0 if pool.space.position is None else pool.reach)
     progress = reporter.task(f"energy landscapes, {contender.name}")
     return measure_landscapes(contender.model, chosen, grid, at_once=probes.at_once, progress=progress)
+
+
+def _axes(
+    contender: Contender, starts: Sequence[RolloutStart], about: About, probes: ProbeOptions, reporter: Reporter
+) -> AxisFit | None:
+    if not starts or not probes.axis_clips or not about.space.is_pose:
+        return None
+    chosen = [starts[place] for place in spread(len(starts), probes.axis_clips)]
+    progress = reporter.task(f"axes, {contender.name}")
+    return infer_axes(contender.model, chosen, at_once=probes.at_once, progress=progress)
 
 
 def _plans(

@@ -97,12 +97,13 @@ def measure_subject(subject: str, asked: EvaluationOptions | None = None, *, rep
     encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
     read = partial(batches_of, batch_size=config.validation.batch_size, copies=copies_for(accelerator.device))
     clips = _clips(through_cache, chosen, read, encode, world_model.image_size)
+    has_base_frame = dataset.spaces.state.frame == "base"
     with accelerator.autocast():
         evaluation = evaluate(
             contenders,
             clips,
             _about(subject, run, config, dataset, asked),
-            probes=replace(asked.probes, planning=planning),
+            probes=replace(asked.probes, planning=planning, axis_clips=asked.probes.axis_clips * has_base_frame),
             reporter=reporter,
         )
     evaluation = replace(

@@ -24,6 +24,7 @@ class ProbeOptions:
     sensitivity_clips: int = 32
     samples: int = 64  # other actions per clip, drawn in each of two ways
     landscape_clips: int = 8
+    axis_clips: int = 32  # of the sensitivity's, from which axes are fitted; of poses in the base frame only
     nodes: int = 9  # along each axis of a landscape
     reach_cm: float = 7.5  # of landscapes and of the box, along each axis: as upstream's notebook
     examples: int = 4

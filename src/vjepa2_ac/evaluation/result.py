@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.config.planning import PlanningConfig
+from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
 from vjepa2_ac.spaces import ActionSpace
@@ -211,6 +212,7 @@ class ModelResult:
     landscapes: Landscapes | None = None
     plans: Plans | None = None
     ranking: ActionRanking | None = None
+    axes: AxisFit | None = None
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,13 @@ from vjepa2_ac.episode import Widths
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.network.input_heads import widths_of_model
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.axes.axes_file import no_vertical_axis
+from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.energy import Scene, WorldModelCost, distance
 from vjepa2_ac.planning.goal import Goal, patch_weights
 from vjepa2_ac.planning.input_checks import require_image, require_mask, require_numbers
 from vjepa2_ac.planning.interfaces import Plan
-from vjepa2_ac.planning.model_setup import prepare_for_planning
+from vjepa2_ac.planning.model_setup import Fingerprints, prepare_for_planning
 from vjepa2_ac.planning.planner import Planner
 from vjepa2_ac.planning.search_space import SearchSpace, search_space
 from vjepa2_ac.planning.settings import warn_beyond_taught, with_taught_limits
@@ -88,7 +90,7 @@ class Controller:
         Raises:
             InputError: The model's states and actions are of other spaces, or nobody knows which state follows from an
                 action; or it needs a camera pose and none is given, or the other way round; or its blocks cannot be
-                compiled or quantized to 8 bits; or vectors have no limits.
+                compiled or quantized to 8 bits; or vectors have no limits; or `planning.axes` are not this model's.
         """
         _require_spaces(widths_of_model(world_model.sizes), spaces)
         if extrinsics is not None:
@@ -102,7 +104,7 @@ class Controller:
         self.config = config or PlanningConfig()
         self._model, self.seed, self.crop = prepare_for_planning(world_model, self.config), seed, crop
         self._camera = None if extrinsics is None else torch.from_numpy(extrinsics.astype(np.float32))
-        self.spaces = spaces
+        self.spaces, self._axes = spaces, _axes_of(world_model, self.config, spaces)
         self.planner = Planner(self.config, search_space(self.config, spaces.state))
         self._goal: Goal | None = None
         self._like = np.zeros(0)
@@ -245,6 +247,7 @@ class Controller:
             states=torch.from_numpy(states).float(),
             actions=torch.from_numpy(actions).float(),
             extrinsics=self._camera,
+            axes=self._axes,
         )
 
     def _encoded(self, image: np.ndarray) -> Float[Tensor, "tokens dim"]:
@@ -263,6 +266,15 @@ class Controller:
             return patch_weights(seen > 0, grid).to(self._model.device)
         except ValueError:
             raise InputError(where="mask", found="nothing of what the model sees counts") from None
+
+
+def _axes_of(world_model: WorldModel, config: PlanningConfig, spaces: Spaces) -> Axes | None:
+    """Return the model's axes where they are calibrated."""
+    if config.axes is None:
+        return None
+    if not spaces.state.is_pose or spaces.state.frame != "base":
+        raise no_vertical_axis(f"planning.axes: {config.axes}")
+    return Axes.read(config.axes, Fingerprints.of(world_model))
 
 
 def _require_spaces(widths: Widths, spaces: Spaces) -> None:

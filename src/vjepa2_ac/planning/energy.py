@@ -15,6 +15,7 @@ from vjepa2_ac.config.planning import EnergyConfig
 from vjepa2_ac.distances import absolute_difference, squared_difference
 from vjepa2_ac.model.network.kv_cache import KeyValueCache
 from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.goal import Goal
 from vjepa2_ac.planning.state_integration import states_along
 from vjepa2_ac.spaces import POSES, Spaces
@@ -28,6 +29,18 @@ class Scene:
     states: Float[Tensor, "context state_dim"]
     actions: Float[Tensor, "context-1 action_dim"]
     extrinsics: Float[Tensor, " 6"] | None = None  # of the camera, which does not move
+    axes: Axes | None = None  # the model's, where they are not the robot's
+
+    def seen(
+        self, actions: Float[Tensor, "*batch action_dim"], states: Float[Tensor, "*batch state_dim"]
+    ) -> tuple[Float[Tensor, "*batch action_dim"], Float[Tensor, "*batch state_dim"]]:
+        """Return actions and states of the robot as they are given to the model."""
+        return (actions, states) if self.axes is None else (self.axes.actions(actions), self.axes.poses(states))
+
+    @property
+    def camera(self) -> Float[Tensor, " 6"] | None:
+        """The camera's pose as it is given to the model."""
+        return self.extrinsics if self.axes is None or self.extrinsics is None else self.axes.poses(self.extrinsics)
 
 
 class WorldModelCost:
@@ -69,7 +82,8 @@ class WorldModelCost:
             goal.latents.to(device), goal.durations, None if goal.weights is None else goal.weights.to(device)
         )
         self._frame, self._state = scene.latents[-1].to(device), scene.states[-1].to(device)
-        self._camera = None if scene.extrinsics is None else scene.extrinsics.to(device)
+        self._camera = None if scene.camera is None else scene.camera.to(device)
+        self._seen = scene.seen
         self._cache = self._past(scene)
 
     def __call__(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
@@ -96,7 +110,8 @@ class WorldModelCost:
         camera = None if self._camera is None else self._camera.expand(samples, steps, -1)
         frame = self._frame.expand(samples, 1, -1, -1)
         cache = None if self._cache is None else self._cache.expanded(samples)
-        return self._model.rollout(frame, given, states[:, :-1], camera, cache=cache), states
+        given, before = self._seen(given, states[:, :-1])
+        return self._model.rollout(frame, given, before, camera, cache=cache), states
 
     def _energies(self, actions: Float[Tensor, "samples steps action_dim"]) -> Float[Tensor, " samples"]:
         predicted, _ = self.imagine(actions)
@@ -113,9 +128,8 @@ class WorldModelCost:
             return None
         cache = KeyValueCache()
         device = self._model.device
-        latents, actions, states = (
-            value.to(device)[None] for value in (scene.latents[:-1], scene.actions, scene.states[:-1])
-        )
+        given = self._seen(scene.actions, scene.states[:-1])
+        latents, actions, states = (value.to(device)[None] for value in (scene.latents[:-1], *given))
         camera = None if self._camera is None else self._camera.expand(1, before, -1)
         self._model.predict(latents, actions, states, camera, cache=cache)
         return cache

@@ -2,11 +2,31 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.model.adapter.merging import unadapted_copy
 from vjepa2_ac.model.network.compilation import require_compiler
-from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
 from vjepa2_ac.model.quantization import quantized_copy
+
+
+class Fingerprints(NamedTuple):
+    """Hashes of a model's weights."""
+
+    encoder: str
+    base: str  # of the predictor before it was adapted
+    predictor: str  # with the trained weights
+
+    @classmethod
+    def of(cls, model: WorldModel) -> Fingerprints:
+        """Hash a model, with its adapter separate from its base; of one that was merged, what it was before."""
+        if model.merged_from is not None:
+            return cls(*model.merged_from)
+        known, whole = model.adaptation, fingerprint(model.predictor.state_dict())
+        if known is not None:
+            return cls(known.encoder, known.base, whole)
+        return cls(model.encoder_fingerprint(), model.predictor_fingerprint(), whole)
 
 
 def prepare_for_planning(world_model: WorldModel, config: PlanningConfig) -> WorldModel:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,30 +18,15 @@ from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.adapter.merging import merge_adapter
 from vjepa2_ac.model.checkpoints.loading import load_base
-from vjepa2_ac.model.network.world_model import WorldModel, fingerprint
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.model.quantization import require_8_bits
 from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.planning.settings import planning_settings, warn_beyond_taught
 from vjepa2_ac.runs.checkpoint_selection import SELECTED
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.storage.structured import utc_now
-
-
-class Fingerprints(NamedTuple):
-    """Hashes of a model's weights."""
-
-    encoder: str
-    base: str  # of the predictor before it was adapted
-    predictor: str  # with the trained weights
-
-    @classmethod
-    def of(cls, model: WorldModel) -> Fingerprints:
-        """Hash a model, with its adapter separate from its base."""
-        known, whole = model.adaptation, fingerprint(model.predictor.state_dict())
-        if known is not None:
-            return cls(known.encoder, known.base, whole)
-        return cls(model.encoder_fingerprint(), model.predictor_fingerprint(), whole)
 
 
 @dataclass(frozen=True)
@@ -123,6 +108,7 @@ def load_to_plan(
         run = load_run(Path(subject), checkpoint, its)
         known = Fingerprints.of(run.world_model)
         merge_adapter(run.world_model)
+        run.world_model.merged_from = known
         warnings = warn_beyond_taught(its, Path(subject))
         return PlanningSession(run.world_model.to(device).eval(), its, subject, run.chosen, warnings, known)
     if checkpoint != SELECTED:

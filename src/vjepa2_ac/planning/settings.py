@@ -15,6 +15,7 @@ from vjepa2_ac.config.loading import config_from, load_config
 from vjepa2_ac.config.planning import LimitsConfig
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.places import literal
+from vjepa2_ac.planning.axes.axes_file import require_axes
 from vjepa2_ac.runs.folder import CHANGES, CONFIG, is_run
 from vjepa2_ac.spaces import POSE, REACH_M, vector_states
 from vjepa2_ac.storage.structured import read_json_object, shown
@@ -47,6 +48,7 @@ def planning_settings(
     else:
         its = _of_model(subject, config, overrides, dtype)
     require_limits(its)
+    require_axes(its)
     return its
 
 

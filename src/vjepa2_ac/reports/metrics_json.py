@@ -142,6 +142,7 @@ def _model(evaluation: Evaluation, model: ModelResult) -> dict[str, Any]:
         "ranking": None if model.ranking is None else _ranking(evaluation, model.ranking),
         "landscapes": None if model.landscapes is None else _landscapes(model.landscapes),
         "planning": plans_as_dict(evaluation, model.name),
+        "axes": None if model.axes is None else model.axes.as_dict(),
     }
 
 

@@ -65,6 +65,7 @@ class WorldModel(LatentDynamics):
         self.predictor.requires_grad_(False)
         self.adaptation: Adaptation | None = None
         self.fresh_heads: FreshHeads | None = None
+        self.merged_from: tuple[str, str, str] | None = None  # fingerprints of encoder, base and adapted predictor
 
     @classmethod
     def random(

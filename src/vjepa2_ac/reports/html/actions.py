@@ -41,6 +41,7 @@ def actions_section(evaluation: Evaluation) -> Markup:
         ranks=_ranks(evaluation),
         drawings=drawings,
         moves=_moves(evaluation),
+        axes=_axes(evaluation),
     )
 
 
@@ -104,6 +105,32 @@ def _moves(evaluation: Evaluation) -> Table | None:
     ]
     head = ["model", "mean rank of the true action", "in a box", "among other directions"]
     return [*head, "spread of the energy", "mean rank minus the base's"], rows
+
+
+def _axes(evaluation: Evaluation) -> Table | None:
+    """Return the axes in which each model infers moves: before and after training."""
+    measured = {name: model.axes for name, model in evaluation.models.items() if model.axes is not None}
+    if not measured:
+        return None
+    rows = [
+        [
+            *(name, value(one.yaw_degrees, 0), value(one.error, 2), value(one.fitted_yaw_degrees, 0)),
+            *(value(one.gain, 2), value(one.condition, 1), value(one.residual_cm, 1), str(one.pairs)),
+            "" if one.problem is None else f"not to plan by: {one.problem}",
+        ]
+        for name, one in measured.items()
+    ]
+    head = [
+        "model",
+        "yaw (degrees)",
+        "error there",
+        "fitted yaw (degrees)",
+        "gain",
+        "condition",
+        "off by (cm)",
+        "pairs",
+    ]
+    return [*head, ""], rows
 
 
 def _rank_chart(rankings: Sequence[tuple[Series, Ranking]]) -> Markup:

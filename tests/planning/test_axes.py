@@ -1,0 +1,171 @@
+"""Calibrated axes turn what the model is given, and only that; files that nothing can be planned by are refused."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from adapted_run import write_adapted_run
+from tiny_models import actions, goal, scene, tiny_model
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.planning import CemConfig, EnergyConfig, LimitsConfig, PlanningConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.axis_fit import TRIED_DEGREES, fit_axes
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.axes.mapping import Axes
+from vjepa2_ac.planning.controller import Controller
+from vjepa2_ac.planning.energy import WorldModelCost
+from vjepa2_ac.planning.model_setup import Fingerprints
+from vjepa2_ac.planning.session import load_to_plan
+from vjepa2_ac.planning.state_integration import apply_actions
+from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.spaces import CAMERA_POSE, POSE_CHANGE, Spaces
+
+TURN = Axes(math.radians(43.0))
+QUICK = PlanningConfig(samples=24, iterations=3, horizon=2, cem=CemConfig(elites=4))
+STATE = np.array([0.4, 0.0, 0.3, 3.1, 0.0, 0.1, 0.2])
+
+
+def some(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed)) * 0.8
+
+
+def write(path: Path, model: WorldModel, degrees: float = 43.0, **changes: Any) -> str:
+    values = {
+        "format": 1,
+        **{name: {"value": one, "low": one - 1, "high": one + 1} for name, one in
+           {"yaw_degrees": degrees, "gain": 1.0, "condition": 1.5, "residual_cm": 1.0}.items()},
+        "matrix": np.eye(3).tolist(),
+        "pairs": 200,
+        "episodes": 20,
+        "problem": None,
+        "model": {"subject": "tiny", **Fingerprints.of(model)._asdict()},
+    }  # fmt: skip
+    path.write_text(json.dumps(values | changes))
+    return str(path)
+
+
+def controller(model: WorldModel, **changes: Any) -> Controller:
+    return Controller(model, QUICK.model_copy(update=changes))
+
+
+def image(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (60, 48, 3), dtype=np.uint8)
+
+
+def test_turned_states_follow_from_turned_actions() -> None:
+    """What the model sees is a world like the robot's, only turned: acting and turning can be done in either order."""
+    states, tried = some(50, 7), some(50, 7, seed=1) - 0.4
+    torch.testing.assert_close(
+        apply_actions(TURN.poses(states), TURN.actions(tried)), TURN.poses(apply_actions(states, tried)),
+        atol=1e-5, rtol=0,
+    )  # fmt: skip
+
+
+def test_a_turn_is_counterclockwise_from_above_and_keeps_height_and_gripper() -> None:
+    quarter = Axes(math.pi / 2)
+    turned = quarter.actions(torch.tensor([0.03, 0.0, 0.02, 0.0, 0.0, 0.1, 0.5]))
+    torch.testing.assert_close(turned, torch.tensor([0.0, 0.03, 0.02, 0.0, 0.0, 0.1, 0.5]), atol=1e-6, rtol=0)
+    posed = quarter.poses(torch.tensor([0.4, 0.1, 0.3, 0.0, 0.0, 0.1, 0.5]))
+    expected = torch.tensor([-0.1, 0.4, 0.3, 0.0, 0.0, 0.1 + math.pi / 2, 0.5])
+    torch.testing.assert_close(posed, expected, atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(("context", "extrinsics"), [(1, False), (3, False), (1, True)])
+def test_the_energy_in_turned_axes_is_that_of_turned_actions_from_turned_states(context: int, extrinsics: bool) -> None:
+    model, start, tried = tiny_model(extrinsics=extrinsics), scene(context, extrinsics=extrinsics), actions(6, 2)
+    plain = replace(
+        start,
+        states=TURN.poses(start.states),
+        actions=TURN.actions(start.actions),
+        extrinsics=None if start.extrinsics is None else TURN.poses(start.extrinsics),
+    )
+    with torch.no_grad():
+        turned = WorldModelCost(model, replace(start, axes=TURN), goal(), EnergyConfig())(tried)
+        expected = WorldModelCost(model, plain, goal(), EnergyConfig())(TURN.actions(tried))
+        untouched = WorldModelCost(model, start, goal(), EnergyConfig())(tried)
+    torch.testing.assert_close(turned, expected, atol=1e-5, rtol=0)
+    assert not torch.allclose(turned, untouched, atol=1e-4)
+
+
+def test_limits_hold_for_what_the_robot_executes(tmp_path: Path) -> None:
+    """Limits of a long thin box: turned by 43 degrees they would be exceeded."""
+    model = tiny_model()
+    limits = LimitsConfig(xyz=(0.05, 0.002, 0.05))
+    plans = []
+    for axes in (None, write(tmp_path / "axes.json", model)):
+        run = controller(model, axes=axes, limits=limits)
+        run.reset(image(100))
+        found = np.stack([run.act(image(seed), STATE) for seed in range(3)])
+        assert (np.abs(found[:, :3]) <= limits.xyz).all()
+        plans.append(found)
+    assert not np.allclose(*plans), "the model was given something else"
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"problem": "ill-conditioned: condition 30"}, "ill-conditioned: condition 30"),
+        ({"format": 7}, "format 7"),
+        ({"yaw_degrees": {"value": "north", "low": None, "high": None}}, r"yaw_degrees\.value"),
+        ({"matrix": [[1.0, 0.0]]}, "matrix"),
+    ],
+)
+def test_a_file_that_nothing_can_be_planned_by_is_refused(tmp_path: Path, changes: dict, complaint: str) -> None:
+    model = tiny_model()
+    path = write(tmp_path / "axes.json", model, **changes)
+    with pytest.raises(InputError, match=f"(?s)planning.axes.*{complaint}"):
+        controller(model, axes=path)
+
+
+def test_axes_of_other_weights_and_of_no_file_are_refused(tmp_path: Path) -> None:
+    model, other = tiny_model(), tiny_model()
+    with torch.no_grad():
+        other.base_predictor.predictor_proj.weight.add_(0.1)
+    with pytest.raises(InputError, match="fitted for another model, tiny"):
+        controller(model, axes=write(tmp_path / "axes.json", other))
+    with pytest.raises(InputError, match=r"planning\.axes: no/axes\.json: cannot be read"):
+        controller(model, axes="no/axes.json")
+
+
+def test_states_without_a_vertical_axis_are_refused(tmp_path: Path) -> None:
+    model = tiny_model()
+    config = QUICK.model_copy(update={"axes": write(tmp_path / "axes.json", model)})
+    with pytest.raises(InputError, match=r"poses in the robot's base frame"):
+        Controller(model, config, spaces=Spaces(CAMERA_POSE, POSE_CHANGE))
+
+
+def test_a_run_plans_by_axes_of_its_own_trained_weights_merged_or_not(make_config: Any, tmp_path: Path) -> None:
+    config: Config = make_config(planning={"samples": 12, "iterations": 2})
+    run = write_adapted_run(config)
+    loaded = load_run(run)
+    path = write(tmp_path / "axes.json", loaded.world_model)
+    for_base = write(tmp_path / "base.json", WorldModel.from_pretrained(str(config.model.base)))
+    session = load_to_plan(str(run), overrides=[f"planning.axes={path}"])
+    session.controller()
+    Controller.of_run(loaded, config.planning.model_copy(update={"axes": path}))
+    with pytest.raises(InputError, match="fitted for another model"):
+        load_to_plan(str(run), overrides=[f"planning.axes={for_base}"]).controller()
+
+
+def test_a_wrong_file_is_told_before_a_model_is_loaded(tmp_path: Path) -> None:
+    path = tmp_path / "axes.json"
+    path.write_text("{}")
+    with pytest.raises(InputError, match="format None"):
+        load_to_plan("no/model.pt", overrides=[f"planning.axes={path}"])
+
+
+def test_what_a_fit_writes_can_be_read(tmp_path: Path) -> None:
+    moves = np.random.default_rng(0).normal(size=(40, 3)) * 0.03
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    errors = 1.1 - np.cos(np.deg2rad(np.array(TRIED_DEGREES) - 90.0))
+    fit = fit_axes(moves @ turn.T, moves, np.tile(errors, (40, 1)), [f"{place // 4}" for place in range(40)])
+    assert fit.problem is None
+    model = tiny_model()
+    path = write(tmp_path / "axes.json", model, **json.loads(json.dumps(fit.as_dict())))
+    assert Axes.read(path, Fingerprints.of(model)).yaw == pytest.approx(math.pi / 2, abs=1e-6)
