@@ -4,13 +4,12 @@
     python benchmarks/trap --only narrow --seeds 1  # a part of it
     python benchmarks/trap --table                  # table and picture again, of what is there
 
-Checkpoints that are measured stand in FOLDER/results as JSON.
+Checkpoints that are measured stand in OUT/trap.json.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import sys
@@ -27,19 +26,17 @@ def main() -> int:
     options = _parse()
     from tables import write_tables
 
-    results = options.folder / "results"
-    results.mkdir(parents=True, exist_ok=True)
     failed = 0
     if not options.table:
-        failed = _run_all([run for run in all_runs(options.seeds) if options.only in run.name], results, options)
-    write_tables(options.folder, options.out, options.picture)
+        failed = _run_all([run for run in all_runs(options.seeds) if options.only in run.name], options)
+    write_tables(options.out, options.picture)
     return 1 if failed else 0
 
 
 def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--folder", type=Path, default=Path("trap"), help="data, runs, results")
-    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="where the tables go")
+    parser.add_argument("--folder", type=Path, default=Path("trap"), help="data and runs")
+    parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="where figures and tables go")
     parser.add_argument("--picture", type=Path, help="where the picture goes")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--goals", type=int, default=20, help="of each checkpoint")
@@ -49,24 +46,32 @@ def _parse() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _run_all(runs: Sequence[Run], results: Path, options: argparse.Namespace) -> int:
+def _run_all(runs: Sequence[Run], options: argparse.Namespace) -> int:
     from runs import measure_alone, prepare, train_alone
+    from tables import read_cells, write_cells
 
     prepare(options.folder)
-    missing = [cell for run in runs for cell in cells_of(run) if not _path(results, cell).exists()]
-    missing.sort(key=lambda cell: [cell.step % part != 0 for part in (800, 400, 200)])  # ends and middles first
+    known = read_cells(options.out)
+    missing = [cell for run in runs for cell in cells_of(run) if cell.name not in known]
     print(f"{len(runs)} runs; {len(missing)} checkpoints are to be measured", flush=True)
 
     def keep(cell: Cell, figures: dict[str, Any]) -> None:
-        _path(results, cell).write_text(json.dumps(figures, indent=1))
+        write_cells(options.out, read_cells(options.out) | {cell.name: figures})
         ends = [way[-1] for way in figures["distance_cm"]]
         rank, error = (figures["validation"][key] for key in ("action_rank", "rollout_over_persistence_last"))
         print(f"{cell.name}: error {error:.3f}, rank {rank:.3f}, {sum(ends) / len(ends):.1f} cm left", flush=True)
 
-    trained = {cell.run.name: cell.run for cell in missing}
-    failed = _in_processes(train_alone, [(run, options.folder) for run in trained.values()], options.workers)
-    work = [(cell, options.folder, options.goals) for cell in missing]
-    return failed + _in_processes(measure_alone, work, options.workers, keep)
+    failed = 0
+    for some in _in_turn(list({cell.run.name: cell.run for cell in missing}.values()), options.workers):
+        failed += _in_processes(train_alone, [(run, options.folder) for run in some], options.workers)
+        work = [(cell, options.folder, options.goals) for cell in missing if cell.run in some]
+        failed += _in_processes(measure_alone, work, options.workers, keep)
+    return failed
+
+
+def _in_turn(runs: Sequence[Run], at_once: int) -> list[Sequence[Run]]:
+    """Return the runs in parts, so that what matters most is measured before the rest is trained."""
+    return [runs[first : first + at_once] for first in range(0, len(runs), at_once)]
 
 
 def _in_processes(
@@ -87,10 +92,6 @@ def _in_processes(
             if keep is not None:
                 keep(waiting[done], found)
     return failed
-
-
-def _path(results: Path, cell: Cell) -> Path:
-    return results / f"{cell.name}.json"
 
 
 if __name__ == "__main__":

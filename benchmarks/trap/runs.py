@@ -9,7 +9,16 @@ from typing import Any, Literal
 
 import torch
 
-from vjepa2_ac.config import AdapterConfig, Config, DataConfig, ModelConfig, TrainingConfig, ValidationConfig
+from vjepa2_ac.config import (
+    ActionContrastConfig,
+    AdapterConfig,
+    Config,
+    DataConfig,
+    ModelConfig,
+    ReplayConfig,
+    TrainingConfig,
+    ValidationConfig,
+)
 from vjepa2_ac.config.planning import LimitsConfig, PlanningConfig
 from vjepa2_ac.config.training import CheckpointConfig
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
@@ -66,6 +75,9 @@ OFFLINE: dict[str, Callable[[dict[str, Any]], float]] = {
 """What `evaluate` finds of a model, so that less is meant to be better."""
 
 
+_NO_CONTRAST = ActionContrastConfig()
+
+
 @dataclass(frozen=True)
 class Run:
     """One fine-tuning."""
@@ -73,11 +85,12 @@ class Run:
     motions: Motions
     method: Literal["LoRA", "full"]
     seed: int  # decides the order of clips and fresh weights, and the goals
+    cure: Literal["", "contrast", "replay"] = ""  # action contrast; a quarter of the clips from other worlds
 
     @property
     def name(self) -> str:
         """What its files are called."""
-        return f"{self.motions}-{self.method}-s{self.seed}"
+        return f"{self.motions}-{self.method}{f'-{self.cure}' if self.cure else ''}-s{self.seed}"
 
 
 @dataclass(frozen=True)
@@ -97,39 +110,46 @@ def all_runs(seeds: int) -> Iterator[Run]:
     """Yield every run, those that matter most first."""
     for seed in range(seeds):
         for motions in RECIPES:
-            for method in ("LoRA", "full"):
-                yield Run(motions, method, seed)  # type: ignore[arg-type]
+            yield from (Run(motions, "LoRA", seed), Run(motions, "full", seed))
+    for seed in range(seeds):
+        yield from (Run("narrow", "LoRA", seed, "contrast"), Run("narrow", "LoRA", seed, "replay"))
+        yield from (Run("narrow", "full", seed, "contrast"), Run("narrow", "full", seed, "replay"))
+        yield from (Run("varied", "LoRA", seed, "contrast"), Run("varied", "LoRA", seed, "replay"))
 
 
 def cells_of(run: Run) -> list[Cell]:
-    """Return the checkpoints of a run."""
-    return [Cell(run, step) for step in range(0, STEPS + 1, EVERY)]
+    """Return the checkpoints of a run that are measured: of the cures the base, some, and the last."""
+    steps = (0, 200, 400, STEPS) if run.cure else range(0, STEPS + 1, EVERY)
+    return [Cell(run, step) for step in steps]
 
 
 def prepare(folder: Path) -> None:
-    """Record the demonstrations that are not there yet."""
-    for motions, recipe in RECIPES.items():
-        if not (folder / f"data-{motions}").exists():
-            spec = RecordingSpec(WORLD, seed=RECORDED, recipe=recipe)
-            record_dataset(folder / f"data-{motions}", spec, episodes=EPISODES)
+    """Record what is not there yet: demonstrations, and random worlds as the base was trained on, to replay."""
+    specs = {name: RecordingSpec(WORLD, seed=RECORDED, recipe=recipe) for name, recipe in RECIPES.items()}
+    for name, spec in {**specs, "replay": RecordingSpec("random", seed=RECORDED + 1)}.items():
+        if not (folder / f"data-{name}").exists():
+            record_dataset(folder / f"data-{name}", spec, episodes=EPISODES)
 
 
 def config_of(run: Run, folder: Path) -> Config:
     """Return the config that anybody would write; every checkpoint is kept."""
+    data = DataConfig(
+        path=str(folder / f"data-{run.motions}"),
+        frames=8,
+        stride=4,
+        validation_share=0.2,
+        test_share=0.2,
+        workers=0,
+        cache="auto",
+        cache_dir=str(folder / "latents"),
+    )
+    replayed = data.model_copy(update={"path": str(folder / "data-replay"), "validation_share": 0.0, "test_share": 0.0})
     adapter = AdapterConfig(rank=16, alpha=32.0, dropout=0.0) if run.method == "LoRA" else AdapterConfig(kind="none")
     return Config(
         run_dir=str(folder / "runs" / run.name),
         seed=run.seed,
-        data=DataConfig(
-            path=str(folder / f"data-{run.motions}"),
-            frames=8,
-            stride=4,
-            validation_share=0.2,
-            test_share=0.2,
-            workers=0,
-            cache="auto",
-            cache_dir=str(folder / "latents"),
-        ),
+        data=data,
+        replay=ReplayConfig(share=0.25, data=replayed) if run.cure == "replay" else None,
         model=ModelConfig(base="builtin:sim-tiny", dtype="float32"),
         adapter=adapter,
         training=TrainingConfig(
@@ -141,6 +161,7 @@ def config_of(run: Run, folder: Path) -> Config:
             device="cpu",
             log_every=50,
             allow_weak_base=True,
+            action_contrast=ActionContrastConfig(weight=1.0, margin=0.3) if run.cure == "contrast" else _NO_CONTRAST,
         ),
         validation=ValidationConfig(every=EVERY, clips=40, batch_size=20),
         checkpoint=CheckpointConfig(every=EVERY, every_minutes=None, keep=STEPS),
@@ -154,7 +175,7 @@ def measure_alone(cell: Cell, folder: Path, goals: int) -> dict[str, Any]:
     home, step = Path(config.run_dir), str(cell.step)
     rows = [row for row in read_metrics_log(home / "metrics.jsonl") if row["kind"] == "validation"]
     (validated,) = (row for row in rows if row["step"] == cell.step)
-    probes = ProbeOptions(sensitivity_clips=24, samples=32, landscape_clips=4, nodes=5, examples=0)
+    probes = ProbeOptions(sensitivity_clips=24, samples=32, landscape_clips=4, axis_clips=0, nodes=5, examples=0)
     found = measure_subject(str(home), EvaluationOptions(clips=48, checkpoint=step, against=(), probes=probes))
     model = load_run(home, step).world_model
     if model.adaptation is not None:

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from runs import OFFLINE
+from runs import OFFLINE, Run, cells_of
 from scipy.stats import rankdata
 
 from vjepa2_ac.evaluation.intervals import share_of
+from vjepa2_ac.storage import write_atomically
 
 Figures = dict[str, Any]
 REACHED_CM = 5.0
@@ -25,9 +26,21 @@ RULES: dict[str, Callable[[list[Figures]], Figures]] = {
 }
 
 
-def write_tables(folder: Path, out: Path, picture: Path | None) -> None:
-    """Write the tables, and the picture if a place is given."""
-    cells = [json.loads(path.read_text()) for path in sorted((folder / "results").glob("*.json"))]
+def read_cells(out: Path) -> dict[str, Figures]:
+    """Return the checkpoints that are measured, by name."""
+    path = out / "trap.json"
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def write_cells(out: Path, cells: dict[str, Figures]) -> None:
+    """Write them."""
+    write_atomically(out / "trap.json", json.dumps(dict(sorted(cells.items())), indent=0).encode())
+
+
+def write_tables(out: Path, picture: Path | None) -> None:
+    """Write the tables, and the picture if a place is given; of runs of which all is measured."""
+    found = read_cells(out).values()
+    cells = [one for run in by_run(list(found)) if len(run) == len(cells_of(_run_of(run))) for one in run]
     if not cells:
         return
     text = "\n".join([*_rules(cells), "", *_correlations(cells)])
@@ -35,6 +48,10 @@ def write_tables(folder: Path, out: Path, picture: Path | None) -> None:
     print(text)
     if picture is not None:
         draw(cells, picture)
+
+
+def _run_of(cells: list[Figures]) -> Run:
+    return Run(**{key: value for key, value in cells[0]["cell"].items() if key not in {"step", "name"}})
 
 
 def left_cm(one: Figures) -> float:
@@ -51,17 +68,17 @@ def by_run(cells: Sequence[Figures]) -> Iterator[list[Figures]]:
     """Yield the checkpoints of each run, by step."""
 
     def key(one: Figures) -> tuple[Any, ...]:
-        return tuple(one["cell"][name] for name in ("motions", "method", "seed"))
+        return tuple(one["cell"][name] for name in ("motions", "method", "cure", "seed"))
 
     for _, group in groupby(sorted(cells, key=lambda one: (*key(one), one["cell"]["step"])), key):
         yield list(group)
 
 
 def _rules(cells: Sequence[Figures]) -> Iterator[str]:
-    yield "| demonstrations | trained | rule | steps | error | rank | goals reached | left at the end, cm |"
-    yield "|---|---|---|---|---|---|---|---|"
+    yield "| demonstrations | trained | cure | rule | steps | error | rank | goals reached | left at the end, cm |"
+    yield "|---" * 9 + "|"
     runs = list(by_run(cells))
-    for kind, group in groupby(runs, lambda run: [run[0]["cell"][name] for name in ("motions", "method")]):
+    for kind, group in groupby(runs, lambda run: [run[0]["cell"][name] for name in ("motions", "method", "cure")]):
         of_kind = list(group)
         for rule, choose in RULES.items():
             chosen = [choose(run) for run in of_kind]
@@ -82,7 +99,7 @@ def _list(values: Sequence[float], form: str) -> str:
 
 def _correlations(cells: Sequence[Figures], draws: int = 1000) -> Iterator[str]:
     """Yield a table of rank correlations with what is left to the goal; intervals are over whole runs."""
-    runs = list(by_run(cells))
+    runs = [run for run in by_run(cells) if not run[0]["cell"]["cure"]]
     parts = {name: [run for run in runs if run[0]["cell"]["motions"] == name] for name in ("narrow", "varied")}
     parts = {"all": runs, **parts}
     yield f"| offline figure, over {sum(map(len, runs))} checkpoints of {len(runs)} runs | {' | '.join(parts)} |"
@@ -127,7 +144,7 @@ def draw(cells: Sequence[Figures], path: Path) -> None:
         for axes, (title, figure_of) in zip(row, shown.items(), strict=True):
             for run in by_run(cells):
                 about = run[0]["cell"]
-                if about["motions"] != motions:
+                if about["motions"] != motions or about["cure"]:
                     continue
                 colour = "#1f77b4" if about["method"] == "LoRA" else "#d62728"
                 label = about["method"] if about["seed"] == 0 else None
