@@ -139,8 +139,8 @@ def test_cuda_that_is_not_there_is_told() -> None:
 @torch.no_grad()
 def test_a_run_and_its_exported_adapter_predict_alike(make_config: MakeConfig, tmp_path: Path) -> None:
     folder = write_adapted_run(make_config(run_dir=str(tmp_path / "run")))
-    run = load_run(folder, "best")
-    assert run.checkpoint.name != load_run(folder).checkpoint.name
+    run = load_run(folder)
+    assert run.checkpoint.name != load_run(folder, "newest").checkpoint.name
     assert load_run(folder, 10).checkpoint == run.checkpoint
     hub = export_run(folder, tmp_path / "hub", "hub", "best").path
     exported = load_model(str(run.config.model.base), adapter=hub, dtype="float32")

@@ -32,6 +32,7 @@ from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.planning.model_setup import Fingerprints
 from vjepa2_ac.reporter import SILENT
+from vjepa2_ac.runs.checkpoint_selection import NEWEST
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.simulation.closed_loop.policies import DoNothing, Oracle, Planning, Policy, RandomActions
 from vjepa2_ac.simulation.closed_loop.rollout import RolloutSpec, run_task
@@ -186,7 +187,7 @@ def _forgetting(model: WorldModel, folder: Path, config: Config) -> dict[str, An
 
 
 def _trained(run: Path) -> tuple[WorldModel, dict[str, Any]]:
-    loaded = load_run(run)
+    loaded = load_run(run, NEWEST)  # as it was made: the last
     counts = count_parameters(loaded.config, loaded.world_model.sizes)
     count = counts.trained if loaded.config.adapter.kind == "lora" else counts.predictor
     files = list((loaded.checkpoint / "adapter").rglob("*.safetensors"))

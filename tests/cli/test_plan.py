@@ -85,12 +85,12 @@ def test_a_plan_its_image_a_table_and_words_come_out(workshop: Path, capsys: pyt
 
 @pytest.mark.usefixtures("no_figure")
 def test_a_run_plans_by_its_config_with_the_checkpoint_that_is_named(workshop: Path) -> None:
-    newest = plan(workshop, "--nodes", "0", subject="run")[1]
+    newest = plan(workshop, "--nodes", "0", "--checkpoint", "newest", subject="run")[1]
     assert (newest["seed"], newest["crop"], newest["settings"]["horizon"]) == (4, "square", 2)
     assert newest["control_steps_of_a_model_step"] == 5
     assert newest["model"]["checkpoint"] == "step-00000020 (the newest)"
-    best = plan(workshop, "--nodes", "0", "--checkpoint", "best", "planning.horizon=1", subject="run")[1]
-    assert best["model"]["checkpoint"] == "step-00000010 (the best)"
+    best = plan(workshop, "--nodes", "0", "planning.horizon=1", subject="run")[1]
+    assert best["model"]["checkpoint"] == "step-00000010 (the best by error)"
     assert len(best["actions"]) == 1
     assert best["model"]["base"] == newest["model"]["base"]
     assert best["model"]["predictor"] != newest["model"]["predictor"]

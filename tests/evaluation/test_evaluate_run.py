@@ -89,7 +89,7 @@ def test_a_run_is_measured_against_its_base_with_everything_that_belongs_to_it(m
     assert list(evaluation.models) == ["base", "adapter"]
     assert (evaluation.base, evaluation.trained) == ("base", "adapter")
     assert [path.name for path in measured.files] == ["evaluation.png", "metrics.json", "report.html"]
-    assert evaluation.about.checkpoint == "step-00000002 (the newest)"
+    assert evaluation.about.checkpoint == "step-00000002 (the best by action ranking)"
     assert (evaluation.about.stride, evaluation.about.frames) == (2, 4)
     assert evaluation.about.seconds_per_step == pytest.approx(2 / 15)
     curves = {curve.name: curve for curve in evaluation.training}

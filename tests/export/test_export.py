@@ -139,7 +139,9 @@ def test_it_loads_as_the_base_of_another_run(trained, make_config, reporter, tmp
 
 def test_merged_is_a_folder_that_predicts_as_the_run_does(trained, tmp_path: Path) -> None:
     run = trained()
-    assert export_run(run, tmp_path / "merged") == Exported(tmp_path / "merged", "step-00000002 (the newest)")
+    assert export_run(run, tmp_path / "merged") == Exported(
+        tmp_path / "merged", "step-00000002 (the best by action ranking)"
+    )
     assert_predicts_as(WorldModel.from_pretrained(tmp_path / "merged"), run)
 
 
@@ -312,7 +314,10 @@ def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is
     state = json.loads((newest / "state.json").read_text())
     (newest / "state.json").write_text(json.dumps({**state, "best_step": 2}))
     write_manifest(newest)
-    for asked, step, words in [("best", 2, "step-00000002 (the best)"), ("1", 1, "step-00000001 (as asked for)")]:
+    for asked, step, words in [
+        ("best", 2, "step-00000002 (the best by action ranking)"),
+        ("1", 1, "step-00000001 (as asked for)"),
+    ]:
         assert main(["evaluate", str(run), *QUICK, "--checkpoint", asked]) == 0
         measured = json.loads((run / METRICS_FILE).read_text())
         assert measured["about"]["checkpoint_path"] == str(run / "checkpoints" / f"step-{step:08d}")
@@ -326,7 +331,8 @@ def test_another_checkpoint_than_the_newest_is_measured_and_exported_where_it_is
         assert all(torch.equal(found[name], value) for name, value in weights_of(run, step).items())
         assert any(not torch.equal(found[name], value) for name, value in weights_of(run, 3).items())
     assert main(["export", str(run), str(tmp_path / "x"), "--checkpoint", "7"]) == 2
-    assert "no checkpoint of step 7. needed: newest, best or one of the steps 1, 2, 3, 4" in capsys.readouterr().err
+    needed = "needed: selected, newest, best or one of the steps 0, 1, 2, 3, 4"
+    assert f"no checkpoint of step 7. {needed}" in capsys.readouterr().err
 
 
 def weights_of(run: Path, step: int) -> dict[str, Tensor]:

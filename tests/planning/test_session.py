@@ -41,7 +41,7 @@ def prediction(world_model: WorldModel) -> torch.Tensor:
 
 def test_a_run_is_planned_with_as_its_own_config_says(run: Path) -> None:
     steering = load_to_plan(str(run))
-    assert steering.checkpoint == "step-00000020 (the newest)"
+    assert steering.checkpoint == "step-00000010 (the best by error)"
     assert steering.config.planning.horizon == 2
     controller = steering.controller()
     images = np.random.default_rng(0).integers(0, 256, (2, 40, 64, 3), dtype=np.uint8)
@@ -58,7 +58,7 @@ def test_a_run_is_planned_with_as_its_own_config_says(run: Path) -> None:
 def test_the_checkpoint_that_is_named_is_the_one_that_plans(run: Path, base_folder: Path) -> None:
     newest, best, base = (
         prediction(load_to_plan(*given[:1], checkpoint=given[1]).world_model)
-        for given in ((str(run), "newest"), (str(run), "best"), (str(base_folder), "newest"))
+        for given in ((str(run), "newest"), (str(run), "selected"), (str(base_folder), "selected"))
     )
     torch.testing.assert_close(prediction(load_to_plan(str(run), checkpoint="10").world_model), best)
     assert not torch.allclose(newest, best, atol=1e-4)
@@ -187,7 +187,7 @@ def test_a_run_is_merged_in_its_bases_type_and_its_fingerprints_are_those_of_wha
 ) -> None:
     config = make_config(adapter=adapter, model__dtype="bfloat16", training__precision="bf16")
     run = write_adapted_run(config)
-    steering, trained = load_to_plan(str(run)), load_run(run).world_model
+    steering, trained = load_to_plan(str(run), checkpoint="newest"), load_run(run, "newest").world_model
     assert type(steering.world_model.predictor) is ActionConditionedPredictor
     assert steering.world_model.adaptation is None
     assert {value.dtype for value in steering.world_model.parameters()} == {torch.bfloat16}

@@ -89,7 +89,9 @@ def test_the_number_of_loader_workers_changes_nothing(make_config, reporter, tmp
 
 
 def test_how_often_a_run_is_measured_and_saved_changes_nothing(make_config, reporter, tmp_path, whole_run) -> None:
-    often = make_config(run_dir=str(tmp_path / "often"), validation__every=1, checkpoint__every_minutes=1e-9)
+    often = make_config(
+        run_dir=str(tmp_path / "often"), validation__every=1, checkpoint__every_minutes=1e-9, checkpoint__keep=100
+    )
     train(often, reporter)
     assert len(list((tmp_path / "often/checkpoints").iterdir())) > len(list((whole_run / "checkpoints").iterdir()))
     rows = {(row["kind"], row["step"]): row for row in metrics(tmp_path / "often")}

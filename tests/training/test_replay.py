@@ -150,9 +150,9 @@ def test_a_clip_that_cannot_be_read_counts_for_its_own_data_set(replaying, monke
     monkeypatch.setattr(loader, "read_clip", broken)
     found = list(itertools.islice(training_loader(Mixed(first, replayed, 0.5), seed=1, batch_size=2), 4))
     assert [len(batch.starts) for batch in found] == [1, 1, 1, 1]
-    assert not first.broken.names
-    assert replayed.broken.names
-    assert all(is_replayed((name, 0)) for name in replayed.broken.names)
+    assert not first.broken.reasons
+    assert replayed.broken.reasons
+    assert all(is_replayed((name, 0)) for name in replayed.broken.reasons)
 
 
 # ---- what does not fit ----

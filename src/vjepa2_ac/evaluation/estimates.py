@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from vjepa2_ac.evaluation.intervals import Estimate, bootstrapped, ratio
+from vjepa2_ac.evaluation.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.evaluation.metrics import L1, Metric
-from vjepa2_ac.evaluation.result import Actions, EpisodeScore, Mode, PredictionErrors, Stratum, Way
+from vjepa2_ac.evaluation.result import ActionRanking, Actions, EpisodeScore, Mode, PredictionErrors, Stratum, Way
 
 Curve = tuple[Estimate, ...]  # at horizon 1, 2, ...; index h - 1
 
@@ -65,6 +65,17 @@ def stratum_gain(errors: PredictionErrors, others: PredictionErrors, stratum: St
     """Return the share by which the teacher-forced error is smaller than another model's in a stratum, paired."""
     left = ratio(_of_steps(errors, stratum), _of_steps(others, stratum), errors.episode_ids)
     return Estimate(1 - left.value, 1 - left.high, 1 - left.low)
+
+
+def rank_difference(one: ActionRanking, other: ActionRanking) -> Estimate:
+    """Return the mean rank of one model minus that of another on the same moves, paired: below 0 is better.
+
+    Raises:
+        ValueError: They are of different moves.
+    """
+    if one.episode_ids != other.episode_ids:
+        raise ValueError("rankings of different moves")
+    return mean_of(one.ranks - other.ranks, one.episode_ids)
 
 
 def episode_scores(errors: PredictionErrors, base: PredictionErrors | None) -> tuple[EpisodeScore, ...]:

@@ -8,8 +8,13 @@ import numpy as np
 
 from vjepa2_ac.evaluation.action_score.metrics import differences_of, metrics_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
-from vjepa2_ac.evaluation.action_use.ranking import rank_difference
-from vjepa2_ac.evaluation.estimates import gain_over, gap_of_actions, one_step_over_persistence, over_persistence
+from vjepa2_ac.evaluation.estimates import (
+    gain_over,
+    gap_of_actions,
+    one_step_over_persistence,
+    over_persistence,
+    rank_difference,
+)
 from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import Evaluation, Ranking

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.action_use.ranking import rank_difference
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
     gain_over,
@@ -24,6 +23,7 @@ from vjepa2_ac.evaluation.estimates import (
     mean_error,
     one_step_over_persistence,
     over_persistence,
+    rank_difference,
     stratum_gain,
     stratum_over_persistence,
 )

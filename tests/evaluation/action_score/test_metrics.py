@@ -134,7 +134,7 @@ def test_the_verdict_says_how_plans_end(found: Evaluation) -> None:
     assert away is not None
     far = replace(bad, plans=replace(away, three_steps=away.three_steps + 0.3))
     assert "FARTHER than doing nothing" in verdict(replace(found, models={**found.models, "adapter": far}))
-    assert "plans" not in verdict(evaluation())
+    assert "Its plans" not in verdict(evaluation())
 
 
 def test_the_table_shows_models_beside_what_takes_none(found: Evaluation) -> None:

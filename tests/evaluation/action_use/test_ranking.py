@@ -9,7 +9,8 @@ from torch import Tensor
 
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, moves_of
-from vjepa2_ac.evaluation.action_use.ranking import pool_of, rank_actions, rank_difference
+from vjepa2_ac.evaluation.action_use.ranking import pool_of, rank_actions
+from vjepa2_ac.evaluation.estimates import rank_difference
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import ActionRanking
 from vjepa2_ac.spaces import POSE_CHANGE, ActionSpace, vector_actions

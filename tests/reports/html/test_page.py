@@ -158,7 +158,7 @@ def test_strata_ranks_landscapes_and_episodes_are_those_of_the_result() -> None:
     assert landscape[3] == "8.10 cm"
     axes = table_of(page, "Calibrated axes")
     assert (axes[1][0], axes[-1][0]) == ("base", "adapter")
-    assert axes[1][1] == plain(one.models["base"].axes.yaw_degrees, 0) + " degrees"
+    assert axes[1][1] == plain(one.models["base"].axes.yaw_degrees, 0)
     assert axes[-1][5] == plain(one.models["adapter"].axes.condition, 1)
     assert landscape[6] == "\N{EN DASH}"  # no clip moves along that axis
     episodes = table_of(page, "All 12 episodes")[1:]

@@ -141,7 +141,7 @@ def test_it_says_what_to_turn(make_config, changes: dict, words: list[str], abse
 
 def test_a_run_that_diverges_says_so_and_its_report_does_too(make_diverging, reporter) -> None:
     run = train(make_diverging(), reporter)
-    reported = [note for note in reporter.notes if note.startswith("Warning: ")]
+    reported = [note for note in reporter.notes if note.startswith("Warning: at step")]
     rows = [row for row in read_metrics_log(run / "metrics.jsonl") if row["kind"] == "warning"]
     assert rows, "it did not diverge: this test tests nothing"
     assert [f"Warning: {row['text']}" for row in rows] == reported

@@ -14,7 +14,7 @@ import numpy as np
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, place_of
-from vjepa2_ac.evaluation.intervals import Estimate, mean_of, ratio
+from vjepa2_ac.evaluation.intervals import mean_of, ratio
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import ActionRanking
 from vjepa2_ac.spaces import ActionSpace
@@ -58,17 +58,6 @@ def rank_actions(
         shell=mean_of(on_shell, ids),
         spread=ratio(spread, now, ids),
     )
-
-
-def rank_difference(one: ActionRanking, other: ActionRanking) -> Estimate:
-    """Return the mean rank of one model minus that of another on the same moves, paired: below 0 is better.
-
-    Raises:
-        ValueError: They are of different moves.
-    """
-    if one.episode_ids != other.episode_ids:
-        raise ValueError("rankings of different moves")
-    return mean_of(one.ranks - other.ranks, one.episode_ids)
 
 
 def _rank(true: float, others: np.ndarray) -> float:

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup
 
-from vjepa2_ac.evaluation.action_use.ranking import rank_difference
-from vjepa2_ac.evaluation.estimates import cost_of_actions, one_step_over_persistence
+from vjepa2_ac.evaluation.estimates import cost_of_actions, one_step_over_persistence, rank_difference
 from vjepa2_ac.evaluation.result import ACTIONS, Evaluation, Landscape, Landscapes, Ranking
 from vjepa2_ac.reports.html.charts import Line, line_chart, nice_axis
 from vjepa2_ac.reports.html.formatting import NOT_MEASURED, decimal, percent, share, signed_value, value
