@@ -37,6 +37,7 @@ class AxisFit:
     executed: Float[np.ndarray, "pairs 3"]  # metres
     inferred: Float[np.ndarray, "pairs 3"]
     episodes: int
+    centre_m: tuple[float, float] = (0.0, 0.0)  # x, y about which states are turned by the yaw
 
     @property
     def pairs(self) -> int:
@@ -64,18 +65,24 @@ class AxisFit:
         yaw = self.yaw_degrees
         between = f" (95 % interval {yaw.low:.0f} to {yaw.high:.0f})" if yaw.has_interval else ""
         text = (
-            f"Turned by {yaw.value:+.1f} degrees about the vertical{between}, what the robot does is predicted best:"
+            f"Turned by {yaw.value:+.1f} degrees about {self._place}{between}, what the robot does is predicted best:"
             f" squared error {self.error} of that without a turn. The fit of inferred moves has yaw"
             f" {self.fitted_yaw_degrees.value:+.1f}, gain {self.gain}, condition {self.condition}"
             f" ({self.pairs} pairs of {self.episodes} episodes, off by {self.residual_cm.value:.1f} cm on average)."
         )
         return text if self.problem is None else f"{text} Not to plan by: {self.problem}."
 
+    @property
+    def _place(self) -> str:
+        x, y = self.centre_m
+        return f"the middle of its motion, x {x:.2f} y {y:.2f} m" if any(self.centre_m) else "its base"
+
     def as_dict(self) -> dict[str, Any]:
         """Return all numbers but the pairs as plain values, for JSON."""
         estimates = ("yaw_degrees", "error", "fitted_yaw_degrees", "gain", "condition", "residual_cm")
         return {
             **{name: getattr(self, name).as_dict() for name in estimates},
+            "centre_m": list(self.centre_m),
             "matrix": self.matrix.tolist(),
             "pairs": self.pairs,
             "episodes": self.episodes,
@@ -103,6 +110,7 @@ def fit_axes(
     executed: Float[np.ndarray, "pairs 3"],
     errors: Float[np.ndarray, "pairs angles"],
     episode_ids: Sequence[str],
+    centre_m: tuple[float, float] = (0.0, 0.0),
 ) -> AxisFit:
     """Fit inferred = matrix @ executed, with intervals from resampling whole episodes.
 
@@ -111,6 +119,7 @@ def fit_axes(
         executed: Those that the robot made.
         errors: Squared errors at each of `TRIED_DEGREES`.
         episode_ids: Of each pair.
+        centre_m: x, y about which states were turned.
 
     Raises:
         ValueError: No pairs.
@@ -143,6 +152,7 @@ def fit_axes(
         executed=executed,
         inferred=inferred,
         episodes=len(set(episode_ids)),
+        centre_m=centre_m,
     )
 
 

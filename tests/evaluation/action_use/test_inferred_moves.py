@@ -88,3 +88,36 @@ def test_mirrored_axes_and_one_episode_are_refused_by_name() -> None:
     alone = infer_axes(Oracle(), [start_of(batch, clip, step, 0) for clip in (0, 1) for step in range(TIME - 1)],
                        at_once=64)  # fmt: skip
     assert "1 episode" in (alone.problem or "")
+
+
+class Placed(Turned):
+    """Expects the hand at a place, too: elsewhere its predictions are off."""
+
+    def __init__(self, degrees: float, place: Tensor) -> None:
+        super().__init__(degrees)
+        self.place = place
+
+    def predict(self, latents: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None) -> Tensor:
+        off = (states[..., :3] - self.place).norm(dim=-1)[..., None, None]
+        return super().predict(latents, actions, states, extrinsics) + 5 * off
+
+
+@pytest.mark.parametrize("about", ["base", "middle"])
+def test_the_place_that_is_turned_about_is_found(about: str) -> None:
+    """A mounting is turned about the base; a camera leaves what it looks at where it is."""
+    there = torch.tensor([0.4, 0.1, 0.3, 0.0, 0.0, 0.0, 0.0])
+    expected = there if about == "middle" else Axes(np.deg2rad(45.0)).poses(there)
+    begun = [replace(start, state=there) for start in starts()]
+    found = infer_axes(Placed(45.0, expected[:3]), begun, at_once=64)
+    assert found.yaw_degrees.value == pytest.approx(45.0, abs=0.5)
+    assert found.centre_m == pytest.approx((0.4, 0.1) if about == "middle" else (0.0, 0.0))
+    assert ("about its base" in found.words()) == (about == "base")
+    assert found.as_dict()["centre_m"] == list(found.centre_m)
+
+
+def test_what_is_turned_about_stays_where_it_is() -> None:
+    axes, centre = Axes(np.deg2rad(90.0), (0.4, 0.1)), torch.tensor([0.4, 0.1, 0.3, 0.1, 0.2, 0.3, 0.5])
+    assert torch.allclose(axes.poses(centre)[:3], centre[:3])
+    beside = centre + torch.tensor([0.1, 0, 0, 0, 0, 0, 0])
+    assert torch.allclose(axes.poses(beside)[:3], torch.tensor([0.4, 0.2, 0.3]), atol=1e-6)
+    assert torch.equal(axes.actions(beside), Axes(np.deg2rad(90.0)).actions(beside)), "a move has no place"

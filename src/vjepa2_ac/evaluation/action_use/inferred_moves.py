@@ -40,8 +40,8 @@ def infer_axes(
         progress: Called with the number of finished starts.
     """
     names = [start.episode_id for start in starts]
-    errors = turned_errors(model, starts, at_once=at_once)
-    axes = Axes(math.radians(yaw_of_least_error(errors, names).value))
+    centre_m, errors = _turn_of_least_error(model, starts, at_once)
+    axes = Axes(math.radians(yaw_of_least_error(errors, names).value), centre_m)
     executed = np.stack([_numbers(start.action)[_MOVE] for start in starts])
     reach = min(1.0, max(_LEAST_M, _ROOM * float(np.linalg.norm(executed, axis=1).max())))
     planner = Planner(
@@ -51,7 +51,22 @@ def infer_axes(
     for done, start in enumerate(starts, start=1):
         inferred.append(_inferred(model, turned(start, axes), planner, at_once))
         progress(done, len(starts))
-    return fit_axes(np.stack(inferred), executed, errors, names)
+    return fit_axes(np.stack(inferred), executed, errors, names, centre_m)
+
+
+def _turn_of_least_error(
+    model: Predictor, starts: Sequence[RolloutStart], at_once: int
+) -> tuple[tuple[float, float], Float[np.ndarray, "starts angles"]]:
+    """Return the better of two places to turn about, and the errors there.
+
+    A robot that is mounted turned is turned about its base; a camera, rather about what it looks at: the middle of the
+    motion.
+    """
+    middle = np.mean([_numbers(start.state)[:2] for start in starts], axis=0)
+    places = ((0.0, 0.0), (float(middle[0]), float(middle[1])))
+    tried = {place: turned_errors(model, starts, place, at_once=at_once) for place in places}
+    best = min(places, key=lambda place: tried[place].sum(axis=0).min())
+    return best, tried[best]
 
 
 def _inferred(model: Predictor, start: RolloutStart, planner: Planner, at_once: int) -> Float[np.ndarray, " 3"]:

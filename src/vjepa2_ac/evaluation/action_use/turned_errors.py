@@ -19,16 +19,17 @@ from vjepa2_ac.planning.axes.mapping import Axes
 
 @torch.no_grad()
 def turned_errors(
-    model: Predictor, starts: Sequence[RolloutStart], *, at_once: int
+    model: Predictor, starts: Sequence[RolloutStart], centre_m: tuple[float, float] = (0.0, 0.0), *, at_once: int
 ) -> Float[np.ndarray, "starts angles"]:
     """Return the mean squared error of the next frame at each angle of `TRIED_DEGREES`, with the executed action.
 
     Args:
         model: The predictor.
         starts: Of poses in the robot's base frame.
+        centre_m: x, y about which is turned.
         at_once: Samples per batch.
     """
-    return np.stack([_errors(model, start, at_once) for start in starts])
+    return np.stack([_errors(model, start, centre_m, at_once) for start in starts])
 
 
 def turned(start: RolloutStart, axes: Axes) -> RolloutStart:
@@ -41,8 +42,10 @@ def turned(start: RolloutStart, axes: Axes) -> RolloutStart:
     )
 
 
-def _errors(model: Predictor, start: RolloutStart, at_once: int) -> Float[np.ndarray, " angles"]:
-    seen = [turned(start, Axes(math.radians(angle))) for angle in TRIED_DEGREES]
+def _errors(
+    model: Predictor, start: RolloutStart, centre_m: tuple[float, float], at_once: int
+) -> Float[np.ndarray, " angles"]:
+    seen = [turned(start, Axes(math.radians(angle), centre_m)) for angle in TRIED_DEGREES]
     errors = []
     for first in range(0, len(seen), at_once):
         part = seen[first : first + at_once]

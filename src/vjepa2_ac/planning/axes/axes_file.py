@@ -48,6 +48,7 @@ class AxesFile:
     matrix: tuple[_Row, _Row, _Row]
     model: FittedModel
     problem: str | None  # why nothing can be planned by it
+    centre_m: tuple[_Number, _Number] = (0.0, 0.0)  # x, y about which is turned
 
 
 def read_axes(path: str | Path) -> AxesFile:

@@ -19,7 +19,7 @@ _POSITION, _ROTATION = slice(0, 3), slice(3, 6)
 
 @dataclass(frozen=True)
 class Axes:
-    """A turn about the vertical axis of the robot's base, from its axes into the model's.
+    """A turn about a vertical axis, from the robot's axes into the model's.
 
     Plans are searched among the robot's own actions, so limits hold for what is executed; the model is given each
     action and state turned.
@@ -28,6 +28,7 @@ class Axes:
     """
 
     yaw: float  # radians, counterclockwise from above
+    centre_m: tuple[float, float] = (0.0, 0.0)  # x, y that stay where they are; the robot's base
 
     @classmethod
     def read(cls, path: str, known: Fingerprints) -> Axes:
@@ -44,14 +45,15 @@ class Axes:
                 needed="those of the model that plans, with its trained weights",
                 fix="Fit them anew: `vjepa2-ac data calibrate CONFIG --axes MODEL`",
             )
-        return cls(math.radians(axes.yaw_degrees.value))
+        return cls(math.radians(axes.yaw_degrees.value), axes.centre_m)
 
     def poses(self, poses: Float[Tensor, "*batch numbers"]) -> Float[Tensor, "*batch numbers"]:
         """Return poses as the model sees them: x, y, z, three angles, and what does not turn (a gripper)."""
         with torch.autocast(poses.device.type, enabled=False):
-            turn = self._turn(poses)
+            turn, centre = self._turn(poses), poses.new_tensor([*self.centre_m, 0.0])
             rotation = euler_from_matrices(turn @ matrices_from_euler(poses[..., _ROTATION]))
-            return torch.cat([poses[..., _POSITION] @ turn.T, rotation, poses[..., 6:]], dim=-1)
+            position = (poses[..., _POSITION] - centre) @ turn.T + centre
+            return torch.cat([position, rotation, poses[..., 6:]], dim=-1)
 
     def actions(self, actions: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7"]:
         """Return actions as the model sees them: the move and the axis of the rotation are turned."""
