@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from runs import OFFLINE, Run, cells_of
 from scipy.stats import rankdata
 
 from vjepa2_ac.evaluation.intervals import share_of
+from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.storage import write_atomically
 
 Figures = dict[str, Any]
@@ -22,8 +24,17 @@ RULES: dict[str, Callable[[list[Figures]], Figures]] = {
     "base": lambda cells: cells[0],
     "last": lambda cells: cells[-1],
     "best by error": lambda cells: min(cells, key=lambda one: one["validation"]["rollout_over_persistence_last"]),
-    "best by ranking": lambda cells: min(cells, key=lambda one: one["validation"]["action_rank"]),
+    "best by ranking": lambda cells: _selected(cells),
 }
+
+
+def _selected(cells: list[Figures]) -> Figures:
+    """Return the checkpoint that a run with these validations selects."""
+    state = RunState(0)
+    for one in cells:
+        error, rank = (one["validation"][key] for key in _SHOWN)
+        state = replace(state, step=one["cell"]["step"]).measured(error, rank)
+    return next(one for one in cells if one["cell"]["step"] == state.best_step)
 
 
 def read_cells(out: Path) -> dict[str, Figures]:

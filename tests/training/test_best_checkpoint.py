@@ -67,6 +67,11 @@ def test_a_rank_decides_and_the_error_between_equal_ones() -> None:
     assert state.measured(float("nan"), 0.1) == state
     assert state.measured(0.1, float("nan")) == state
     assert state.measured(0.8, 0.3).best_step == 10
+    assert state.measured(0.8, 0.304).best_step == 10, "as good as equal, and a lower error"
+    near = state.measured(1.0, 0.297)
+    assert (near.best_step, near.lowest_rank) == (0, 0.297), "as good as equal, and a higher error"
+    assert replace(near, step=20).measured(0.8, 0.303).best_step == 0, "not of the lowest of all"
+    assert replace(near, step=20).measured(2.0, 0.294).best_step == 20, "the best is no longer among the lowest"
     assert state.measured(1.5, 0.2).best_error == 1.5
 
 

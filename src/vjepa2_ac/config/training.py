@@ -145,9 +145,9 @@ class CheckpointConfig(Section):
         "ranking"
     )
     """By what the best checkpoint is selected; it is written and kept, and evaluated, exported and planned with unless
-    another is asked for. ranking: the lowest mean rank of the true action (`validation.ranking_clips`), the base being
-    a candidate: a lower error may go with worse plans. error: the rollout error over persistence at the last horizon,
-    as earlier versions did. off: the newest counts."""
+    another is asked for. ranking: the lowest mean rank of the true action (`validation.ranking_clips`), and of ranks
+    within 0.005 of it the lowest error; the base is a candidate, for a lower error may go with worse plans. error: the
+    rollout error over persistence at the last horizon, as earlier versions did. off: the newest counts."""
     remote: Place | None = None
     """Where the run is copied to during training: gs://bucket/folder, another URL of fsspec that can be written, or a
     folder (a mounted disk). A start with an empty run_dir resumes from there; null: nowhere. Same keep and best as

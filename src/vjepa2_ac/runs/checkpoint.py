@@ -40,6 +40,7 @@ _NEEDED = "where a run stood, as this program wrote it"
 _FIX = "Delete this checkpoint, to use an older one"
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
+SAME_RANK = 0.005  # mean ranks this close are equal: on other clips they differ by more
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
@@ -58,6 +59,7 @@ class RunState:
     best_step: Count | None = None  # the best validation by checkpoint.keep_best; 0: the base's
     best_error: Finite | None = None  # its rollout error
     best_rank: Finite | None = None  # its mean rank of the true action, if that selects
+    lowest_rank: Finite | None = None  # of all validations
     measured_on: Mapping[str, str] | None = None  # what validation errors depend on, see `training.best_checkpoint`
     loss_scale: Mapping[str, int | float] | None = None  # of fp16: state of the gradient scaler
     data: str | None = None  # the fingerprint of the episodes
@@ -71,19 +73,22 @@ class RunState:
         return None if self.best_step is None else checkpoint_name(self.best_step)
 
     def measured(self, error: float, rank: float | None = None) -> RunState:
-        """Return the state after a validation at its step: changed only if it was better than all before.
+        """Return the state after a validation at its step, which may be the best one.
 
         Args:
-            error: What decides, if there is no rank; and between equal ranks.
-            rank: What decides.
+            error: What decides, if there is no rank; and between ranks that are as good as equal.
+            rank: Of the best, it is within `SAME_RANK` of the lowest of all.
         """
-        found = (error,) if rank is None else (rank, error)
-        best = (self.best_error,) if rank is None else (self.best_rank, self.best_error)
-        if not all(map(math.isfinite, found)):
+        if not all(map(math.isfinite, (error, rank or 0.0))):
             return self
-        if self.best_step is not None and None not in best and found >= best:
-            return self
-        return replace(self, best_step=self.step, best_error=error, best_rank=rank)
+        lowest = rank if rank is None or self.lowest_rank is None else min(rank, self.lowest_rank)
+        is_lower = self.best_error is None or error < self.best_error
+        if rank is not None and lowest is not None and self.best_step is not None:
+            is_beaten = self.best_rank is None or self.best_rank > lowest + SAME_RANK
+            is_lower = is_beaten or (is_lower and rank <= lowest + SAME_RANK)
+        if not is_lower:
+            return replace(self, lowest_rank=lowest)
+        return replace(self, best_step=self.step, best_error=error, best_rank=rank, lowest_rank=lowest)
 
 
 class CheckpointClock:
@@ -204,7 +209,7 @@ def read_state(checkpoint: Path) -> RunState:
     state = written_state(checkpoint)
     if state.best_step in {None, state.step} or find_damage(checkpoint.parent / str(state.best_name)) is None:
         return state
-    return replace(state, best_step=None, best_error=None, best_rank=None)
+    return replace(state, best_step=None, best_error=None, best_rank=None, lowest_rank=None)
 
 
 def written_state(checkpoint: Path) -> RunState:

@@ -38,7 +38,7 @@ def record(run: Run, metrics: dict[str, Any], metrics_log: MetricsLog | NullMetr
     by, before = run.config.checkpoint.keep_best, run.state
     if by != "off":
         run.state = before.measured(metrics[BEST_BY], metrics[RANK] if by == "ranking" else None)
-    return run.state != before
+    return run.state.best_step != before.best_step
 
 
 def is_out_of_patience(run: Run) -> bool:
