@@ -21,6 +21,7 @@ from vjepa2_ac.model.checkpoints.loading import load_base
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import SILENT
 from vjepa2_ac.reports.write import Evaluated, evaluate_subject
+from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
 from vjepa2_ac.training.loop import train
 
 PROBES = ProbeOptions(sensitivity_clips=3, samples=6, landscape_clips=1, nodes=3, examples=1)
@@ -89,7 +90,7 @@ def test_a_run_is_measured_against_its_base_with_everything_that_belongs_to_it(m
     assert list(evaluation.models) == ["base", "adapter"]
     assert (evaluation.base, evaluation.trained) == ("base", "adapter")
     assert [path.name for path in measured.files] == ["evaluation.png", "metrics.json", "report.html"]
-    assert evaluation.about.checkpoint == "step-00000002 (the best by action ranking)"
+    assert evaluation.about.checkpoint == str(select_checkpoint(Path(evaluation.about.subject)))
     assert (evaluation.about.stride, evaluation.about.frames) == (2, 4)
     assert evaluation.about.seconds_per_step == pytest.approx(2 / 15)
     curves = {curve.name: curve for curve in evaluation.training}

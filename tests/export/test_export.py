@@ -30,6 +30,7 @@ from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reports.metrics_json import METRICS_FILE
 from vjepa2_ac.reports.write import PLOT
 from vjepa2_ac.runs.checkpoint import checkpoint_name
+from vjepa2_ac.runs.checkpoint_selection import select_checkpoint
 from vjepa2_ac.runs.loading import load_run
 from vjepa2_ac.runs.manifest import write_manifest
 from vjepa2_ac.training.loop import train
@@ -134,14 +135,12 @@ def test_it_loads_as_the_base_of_another_run(trained, make_config, reporter, tmp
     config = make_config(run_dir=str(tmp_path / "next"), model__base=str(written), training__steps=1)
     sizes = config.model.model_copy(update={"sizes": sizes_of(run)})
     train(config.model_copy(update={"model": sizes}), reporter)
-    assert load_run(tmp_path / "next").checkpoint.name == "step-00000001"
+    assert load_run(tmp_path / "next", "1").checkpoint.name == "step-00000001"
 
 
 def test_merged_is_a_folder_that_predicts_as_the_run_does(trained, tmp_path: Path) -> None:
     run = trained()
-    assert export_run(run, tmp_path / "merged") == Exported(
-        tmp_path / "merged", "step-00000002 (the best by action ranking)"
-    )
+    assert export_run(run, tmp_path / "merged") == Exported(tmp_path / "merged", str(select_checkpoint(run)))
     assert_predicts_as(WorldModel.from_pretrained(tmp_path / "merged"), run)
 
 
