@@ -10,13 +10,11 @@ Cells that are done stand in FOLDER/results as JSON; table and plot are made of 
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
-import multiprocessing
-import os
 import sys
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+from typing import Any
 
 from cells import Cell, all_cells, candidate_cells
 
@@ -61,36 +59,26 @@ def _parse() -> argparse.Namespace:
 
 def _run(cells: list[Cell], results: Path, options: argparse.Namespace) -> int:
     """Run cells, each in a process of its own; return how many failed."""
-    from measure import measure_alone  # which a process of its own can import
+    sys.path.append(str(Path(__file__).resolve().parents[1]))
+    from cell_processes import in_processes
+    from measure import measure_alone
 
-    os.environ["OMP_NUM_THREADS"] = "1"
-    context = multiprocessing.get_context("spawn")
-    failed = 0
-    with ProcessPoolExecutor(options.workers, mp_context=context, max_tasks_per_child=1) as pool:
-        waiting = {
-            pool.submit(measure_alone, cell, options.folder, options.goals, options.choose): cell for cell in cells
-        }
-        for number, done in enumerate(as_completed(waiting), start=1):
-            cell = waiting[done]
-            try:
-                figures = done.result()
-            except BrokenProcessPool:
-                raise
-            except Exception as error:  # one cell must not cost the others
-                print(f"{cell.name} failed: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-                failed += 1
-                continue
-            path = _result(results, cell)
-            path.with_suffix(".part").write_text(json.dumps(figures, indent=1))
-            path.with_suffix(".part").rename(path)
-            reached = [row[-1] < 5.0 for row in figures["reach"]["l1"]["distance_cm"]]
-            error = figures["shifted"]["rollout_over_persistence"][-1]
-            print(
-                f"{number}/{len(cells)} {cell.name}: error {error:.3f}, reach {sum(reached)}/{len(reached)},"
-                f" {figures['minutes']:.1f} min",
-                flush=True,
-            )
-    return failed
+    numbers = itertools.count(1)
+
+    def keep(cell: Cell, figures: dict[str, Any]) -> None:
+        path = _result(results, cell)
+        path.with_suffix(".part").write_text(json.dumps(figures, indent=1))
+        path.with_suffix(".part").rename(path)
+        reached = [row[-1] < 5.0 for row in figures["reach"]["l1"]["distance_cm"]]
+        error = figures["shifted"]["rollout_over_persistence"][-1]
+        print(
+            f"{next(numbers)}/{len(cells)} {cell.name}: error {error:.3f}, reach {sum(reached)}/{len(reached)},"
+            f" {figures['minutes']:.1f} min",
+            flush=True,
+        )
+
+    work = [(cell, options.folder, options.goals, options.choose) for cell in cells]
+    return in_processes(measure_alone, work, options.workers, keep)
 
 
 def _result(results: Path, cell: Cell) -> Path:

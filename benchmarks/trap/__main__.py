@@ -10,11 +10,8 @@ Checkpoints that are measured stand in OUT/trap.json.
 from __future__ import annotations
 
 import argparse
-import multiprocessing
-import os
 import sys
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +44,8 @@ def _parse() -> argparse.Namespace:
 
 
 def _run_all(runs: Sequence[Run], options: argparse.Namespace) -> int:
+    sys.path.append(str(Path(__file__).resolve().parents[1]))
+    from cell_processes import in_processes
     from runs import measure_alone, prepare, train_alone
     from tables import read_cells, write_cells
 
@@ -63,35 +62,15 @@ def _run_all(runs: Sequence[Run], options: argparse.Namespace) -> int:
 
     failed = 0
     for some in _in_turn(list({cell.run.name: cell.run for cell in missing}.values()), options.workers):
-        failed += _in_processes(train_alone, [(run, options.folder) for run in some], options.workers)
+        failed += in_processes(train_alone, [(run, options.folder) for run in some], options.workers, lambda *_: None)
         work = [(cell, options.folder, options.goals) for cell in missing if cell.run in some]
-        failed += _in_processes(measure_alone, work, options.workers, keep)
+        failed += in_processes(measure_alone, work, options.workers, keep)
     return failed
 
 
 def _in_turn(runs: Sequence[Run], at_once: int) -> list[Sequence[Run]]:
     """Return the runs in parts, so that what matters most is measured before the rest is trained."""
     return [runs[first : first + at_once] for first in range(0, len(runs), at_once)]
-
-
-def _in_processes(
-    do: Callable[..., Any], work: Sequence[tuple[Any, ...]], workers: int, keep: Callable[..., None] | None = None
-) -> int:
-    """Do work in processes of their own; return how much of it failed."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    context, failed = multiprocessing.get_context("spawn"), 0
-    with ProcessPoolExecutor(workers, mp_context=context, max_tasks_per_child=1) as pool:
-        waiting: dict[Future[Any], Any] = {pool.submit(do, *one): one[0] for one in work}
-        for done in as_completed(waiting):
-            try:
-                found = done.result()
-            except Exception as error:  # one must not cost the others
-                print(f"{waiting[done].name} failed: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
-                failed += 1
-                continue
-            if keep is not None:
-                keep(waiting[done], found)
-    return failed
 
 
 if __name__ == "__main__":

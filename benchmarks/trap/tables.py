@@ -20,12 +20,6 @@ from vjepa2_ac.storage import write_atomically
 Figures = dict[str, Any]
 REACHED_CM = 5.0
 _SHOWN = ("rollout_over_persistence_last", "action_rank")
-RULES: dict[str, Callable[[list[Figures]], Figures]] = {
-    "base": lambda cells: cells[0],
-    "last": lambda cells: cells[-1],
-    "best by error": lambda cells: min(cells, key=lambda one: one["validation"]["rollout_over_persistence_last"]),
-    "best by ranking": lambda cells: _selected(cells),
-}
 
 
 def _selected(cells: list[Figures]) -> Figures:
@@ -35,6 +29,14 @@ def _selected(cells: list[Figures]) -> Figures:
         error, rank = (one["validation"][key] for key in _SHOWN)
         state = replace(state, step=one["cell"]["step"]).measured(error, rank)
     return next(one for one in cells if one["cell"]["step"] == state.best_step)
+
+
+RULES: dict[str, Callable[[list[Figures]], Figures]] = {
+    "base": lambda cells: cells[0],
+    "last": lambda cells: cells[-1],
+    "best by error": lambda cells: min(cells, key=lambda one: one["validation"]["rollout_over_persistence_last"]),
+    "best by ranking": _selected,
+}
 
 
 def read_cells(out: Path) -> dict[str, Figures]:

@@ -79,16 +79,16 @@ class RunState:
             error: What decides, if there is no rank; and between ranks that are as good as equal.
             rank: Of the best, it is within `SAME_RANK` of the lowest of all.
         """
-        if not all(map(math.isfinite, (error, rank or 0.0))):
+        if not math.isfinite(error) or (rank is not None and not math.isfinite(rank)):
             return self
-        lowest = rank if rank is None or self.lowest_rank is None else min(rank, self.lowest_rank)
-        is_lower = self.best_error is None or error < self.best_error
-        if rank is not None and lowest is not None and self.best_step is not None:
-            is_beaten = self.best_rank is None or self.best_rank > lowest + SAME_RANK
-            is_lower = is_beaten or (is_lower and rank <= lowest + SAME_RANK)
-        if not is_lower:
-            return replace(self, lowest_rank=lowest)
-        return replace(self, best_step=self.step, best_error=error, best_rank=rank, lowest_rank=lowest)
+        has_lower_error = self.best_error is None or error < self.best_error
+        if rank is None:
+            return replace(self, best_step=self.step, best_error=error) if has_lower_error else self
+        lowest = rank if self.lowest_rank is None else min(rank, self.lowest_rank)
+        is_beaten = self.best_rank is None or self.best_rank > lowest + SAME_RANK
+        if is_beaten or (has_lower_error and rank <= lowest + SAME_RANK):
+            return replace(self, best_step=self.step, best_error=error, best_rank=rank, lowest_rank=lowest)
+        return replace(self, lowest_rank=lowest)
 
 
 class CheckpointClock:

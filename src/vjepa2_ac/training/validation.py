@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from vjepa2_ac.data.clips.loader import validation_batches, validation_windows
+from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.errors import InputError
@@ -70,13 +70,12 @@ def validate(run: Run, reporter: TrainingReporter) -> Validation:
     """Measure the held-out clips, and rank the true actions of moves in some of them."""
     config = run.config
     run.world_model.eval()
-    clips, size = config.validation.clips, config.validation.batch_size
-    batches = validation_batches(run.dataset, "validation", clips=clips, batch_size=size, copies=run.copies)
-    count = len(validation_windows(run.dataset, "validation", clips=clips))
+    windows = validation_windows(run.dataset, "validation", clips=config.validation.clips)
+    batches = batches_of(run.dataset, windows, batch_size=config.validation.batch_size, copies=run.copies)
     moves: list[RolloutStart] = []
     with run.accelerator.autocast():
         encoded = (encode(run, batch) for batch in batches)
-        errors = prediction_errors(run.world_model, _moves_kept(run, encoded, count, moves))
+        errors = prediction_errors(run.world_model, _moves_kept(run, encoded, len(windows), moves))
         found = Validation(errors, _ranking(run, moves) if moves else None)
     reporter.validated(run.state.step, found)
     return found

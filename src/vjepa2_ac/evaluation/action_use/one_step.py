@@ -13,7 +13,7 @@ from torch import Tensor
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.measure import Predictor
-from vjepa2_ac.spaces import POSE, ActionSpace, StateSpace, vector_states
+from vjepa2_ac.spaces import POSE, ActionSpace, vector_states
 
 
 @dataclass(frozen=True)
@@ -55,16 +55,7 @@ def clip_generator(seed: int, episode_id: str, first_step: int) -> np.random.Gen
 
 def start_of(batch: LatentBatch, row: int, step: int, clip: int) -> RolloutStart:
     """Return a step of a clip in a batch as a start."""
-    return RolloutStart(
-        clip=clip,
-        episode_id=batch.episode_ids[row],
-        first_step=batch.starts[row],
-        frame=batch.latents[row, step].clone(),
-        following=batch.latents[row, step + 1].clone(),
-        state=batch.states[row, step],
-        action=batch.actions[row, step],
-        extrinsics=None if batch.extrinsics is None else batch.extrinsics[row, step],
-    )
+    return _start(batch, row, clip, (step, step + 1), batch.actions[row, step])
 
 
 def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach: float) -> tuple[RolloutStart, ...]:
@@ -91,7 +82,11 @@ def moves_of(batch: LatentBatch, row: int, clip: int, space: ActionSpace, reach:
     lengths = np.linalg.norm(changes[:, kind.sized], axis=1)
     within = lengths <= (np.inf if space.position is None else reach)
     ends = pairs[int(np.where(within, lengths, -1.0).argmax() if within.any() else lengths.argmin())]
-    return tuple(_move(batch, row, clip, pair, kind) for pair in (ends, ends[::-1]))
+    found = []
+    for pair in (ends, ends[::-1]):
+        change = kind.differences(states[list(pair)])[0]
+        found.append(_start(batch, row, clip, pair, torch.from_numpy(change).to(batch.actions)))
+    return tuple(found)
 
 
 @torch.no_grad()
@@ -115,9 +110,9 @@ def evaluate_actions(
     return EvaluatedActions(*(torch.cat(parts).cpu().numpy().astype(np.float64) for parts in (energies, changes)))
 
 
-def _move(batch: LatentBatch, row: int, clip: int, ends: tuple[int, int], space: StateSpace) -> RolloutStart:
+def _start(batch: LatentBatch, row: int, clip: int, ends: tuple[int, int], action: Tensor) -> RolloutStart:
+    """Return two frames of a clip, and the action that leads from the first to the second, as a start."""
     first, last = ends
-    change = space.differences(batch.states[row, [first, last]].cpu().numpy().astype(np.float64))[0]
     return RolloutStart(
         clip=clip,
         episode_id=batch.episode_ids[row],
@@ -125,7 +120,7 @@ def _move(batch: LatentBatch, row: int, clip: int, ends: tuple[int, int], space:
         frame=batch.latents[row, first].clone(),
         following=batch.latents[row, last].clone(),
         state=batch.states[row, first],
-        action=torch.from_numpy(change).to(batch.actions),
+        action=action,
         extrinsics=None if batch.extrinsics is None else batch.extrinsics[row, first],
     )
 

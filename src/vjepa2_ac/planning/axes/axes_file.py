@@ -9,6 +9,7 @@ from typing import Annotated
 from pydantic import Field
 
 from vjepa2_ac.config import Config, DataConfig
+from vjepa2_ac.data.clips.windows import require_stride
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.storage.structured import read_json_object, record_of
 
@@ -117,10 +118,4 @@ def require_axes_in(data: DataConfig) -> None:
         InputError: The states are no poses in the base frame, or the stride is still to be chosen.
     """
     require_base_frame(data, "data calibrate --axes")
-    if data.stride == "auto":
-        raise InputError(
-            where="data.stride",
-            found="auto",
-            needed="a number of control steps: axes are those of a model step",
-            fix="`vjepa2-ac data calibrate CONFIG` finds one",
-        )
+    require_stride(data, to="calibrate axes, for axes are those of a model step")
