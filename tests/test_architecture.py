@@ -16,7 +16,7 @@ PACKAGE = Path(vjepa2_ac.__file__).parent
 # A room imports only what stands before it; those in one line do not know each other. A folder has its own order.
 ORDERS: dict[str, list[str]] = {
     "": [
-        "__init__ errors places output episode geometry distances",
+        "__init__ errors places output episode geometry distances intervals",
         "spaces reporter",
         "storage",
         "config",
@@ -26,6 +26,7 @@ ORDERS: dict[str, list[str]] = {
         "runs",
         "encoding",
         "planning",
+        "decoding",
         "evaluation",
         "reports",
         "training export",
@@ -45,7 +46,6 @@ ORDERS: dict[str, list[str]] = {
         "load lora heads",
     ],
     "evaluation": [
-        "intervals",
         "metrics axis_fit",
         "result",
         "estimates measure strata",

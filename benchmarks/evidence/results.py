@@ -9,7 +9,7 @@ from typing import Any
 
 from cells import METHODS
 
-from vjepa2_ac.evaluation.intervals import Estimate, share_of
+from vjepa2_ac.intervals import Estimate, share_of
 
 REACHED_CM = 5.0
 Figures = dict[str, Any]

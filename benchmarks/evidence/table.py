@@ -12,7 +12,7 @@ from cells import AXES, BASES, BEST, METHODS, TURNS
 from plot import draw
 from results import Figures, last, main_cells, of_policy, pick, reached, read_results, share_reached
 
-from vjepa2_ac.evaluation.intervals import mean_of, share_of
+from vjepa2_ac.intervals import mean_of, share_of
 
 TABLE, PLOT = "evidence.md", "evidence.png"
 _BEGIN, _END = "<!-- made by `make evidence`: begin -->", "<!-- made by `make evidence`: end -->"

@@ -13,7 +13,7 @@ import numpy as np
 from runs import OFFLINE, Run, cells_of
 from scipy.stats import rankdata
 
-from vjepa2_ac.evaluation.intervals import share_of
+from vjepa2_ac.intervals import share_of
 from vjepa2_ac.runs.checkpoint import RunState
 from vjepa2_ac.storage import write_atomically
 

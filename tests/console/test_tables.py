@@ -18,9 +18,9 @@ from vjepa2_ac.console.progress import PlainConsole
 from vjepa2_ac.data.inspection.statistics import Inspection
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.stride_calibration.measure import Calibration, StrideResult
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reports.comparison import Comparison
 from vjepa2_ac.simulation.closed_loop.benchmark import ClosedLoopBenchmark

@@ -22,11 +22,11 @@ from vjepa2_ac.evaluation.estimates import (
     stratum_over_persistence,
 )
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L2, METRICS
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import MODES, Evaluation, PredictionErrors, Stratum
 from vjepa2_ac.evaluation.verdict import improvement, uses_actions, verdict
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.axes.mapping import Axes
 from vjepa2_ac.reports.metrics_json import metrics_as_dict
 from vjepa2_ac.spaces import vector_actions

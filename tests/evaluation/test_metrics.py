@@ -9,11 +9,11 @@ from vjepa2_ac.console.evaluation import comparison_table, evaluation_tables
 from vjepa2_ac.console.progress import PlainConsole
 from vjepa2_ac.evaluation import metrics as the_list
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
 from vjepa2_ac.evaluation.request import ProbeOptions
 from vjepa2_ac.evaluation.result import MODES, Evaluation
 from vjepa2_ac.evaluation.verdict import verdict
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.html.page import report_page
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, metrics_as_dict, read_metrics, write_metrics

@@ -3,7 +3,7 @@
 import pytest
 from scipy import stats
 
-from vjepa2_ac.evaluation.intervals import share_of
+from vjepa2_ac.intervals import share_of
 
 
 def test_published_intervals_come_out() -> None:

@@ -8,8 +8,8 @@ import pytest
 
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import Contender, evaluate
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.request import ProbeOptions
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import compare
 from vjepa2_ac.reports.figures.evaluation import plot_comparison
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics, write_metrics

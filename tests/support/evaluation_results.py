@@ -10,7 +10,6 @@ import numpy as np
 
 from vjepa2_ac.evaluation.axis_fit import TRIED_DEGREES, AxisFit, fit_axes
 from vjepa2_ac.evaluation.estimates import episode_scores
-from vjepa2_ac.evaluation.intervals import mean_of
 from vjepa2_ac.evaluation.metrics import L1, L2
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
@@ -31,6 +30,7 @@ from vjepa2_ac.evaluation.result import (
     TrainingCurve,
     Way,
 )
+from vjepa2_ac.intervals import mean_of
 from vjepa2_ac.spaces import POSE_CHANGE
 
 ABOUT = About(

@@ -1,6 +1,7 @@
 """Config knobs: each is defined once, with type, range, default and meaning. `config.loading` reads them."""
 
 from vjepa2_ac.config.data import AugmentConfig, DataConfig, DiskCacheConfig, IdleConfig
+from vjepa2_ac.config.decoder import DecoderConfig
 from vjepa2_ac.config.model import AdapterConfig, EncoderSizes, ModelConfig, ModelSizes, PredictorSizes
 from vjepa2_ac.config.planning import EnergyConfig, LimitsConfig, PlanningConfig
 from vjepa2_ac.config.replay import ReplayConfig
@@ -26,8 +27,8 @@ from vjepa2_ac.config.training import (
 
 __all__ = [
     "ActionContrastConfig", "AdapterConfig", "AugmentConfig", "CheckpointConfig", "Config", "DataConfig",
-    "DiskCacheConfig", "EncoderSizes", "EnergyConfig", "IdleConfig", "LatentsData", "LeRobotData", "LeRobotFields",
-    "LimitsConfig", "ModelConfig", "ModelSizes", "NpzData", "PlanningConfig", "PredictorSizes", "RawDroidData",
+    "DecoderConfig", "DiskCacheConfig", "EncoderSizes", "EnergyConfig", "IdleConfig", "LatentsData", "LeRobotData",
+    "LeRobotFields", "LimitsConfig", "ModelConfig", "ModelSizes", "NpzData", "PlanningConfig", "PredictorSizes", "RawDroidData",
     "RawDroidOptions", "ReplayConfig", "RldsData", "RldsFields", "Section", "TrackingConfig", "TrainingConfig",
     "ValidationConfig",
 ]  # fmt: skip

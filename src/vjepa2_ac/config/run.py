@@ -8,6 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from vjepa2_ac import places
 from vjepa2_ac.config.data import DataConfig
+from vjepa2_ac.config.decoder import DecoderConfig
 from vjepa2_ac.config.effects import Affects
 from vjepa2_ac.config.model import AdapterConfig, ModelConfig
 from vjepa2_ac.config.planning import PlanningConfig
@@ -51,6 +52,8 @@ class Config(Section):
     """Where metrics go."""
     planning: Annotated[PlanningConfig, Affects.PLAN] = PlanningConfig()
     """How a robot is controlled afterwards; training does not use it."""
+    decoder: Annotated[DecoderConfig, Affects.NOTHING] = DecoderConfig()
+    """The decoder of `vjepa2-ac decoder`; training does not use it."""
 
     @model_validator(mode="after")
     def _parts_fit(self) -> Config:

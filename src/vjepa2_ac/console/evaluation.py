@@ -9,8 +9,8 @@ from vjepa2_ac.evaluation.action_score.metrics import AXES, metrics_of, signed_a
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.result import ACTIONS, ActionRanking, Evaluation, Landscapes, PlanningStudy, Sensitivity
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import Comparison
 
 _MOST_HORIZONS = 8  # rows; of longer clips some are left out, but are in metrics.json

@@ -16,7 +16,7 @@ from rich.text import Text
 from vjepa2_ac.errors import printable
 
 if TYPE_CHECKING:
-    from vjepa2_ac.evaluation.intervals import Estimate
+    from vjepa2_ac.intervals import Estimate
 
 _LINE_EVERY_S = 10.0
 _WIDE = 120  # columns that leave room for a long bar

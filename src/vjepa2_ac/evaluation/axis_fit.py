@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from vjepa2_ac.evaluation.intervals import Estimate, bootstrapped, mean_of, ratio
+from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 
 MOST_CONDITION = 10.0  # beyond it, one direction is hardly inferred, or hardly executed
 MOST_YAW_DEGREES = 15.0  # half the width of the interval of an angle that is known

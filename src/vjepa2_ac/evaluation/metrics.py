@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.distances import absolute_difference, squared_difference
-from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.intervals import Estimate
 
 if TYPE_CHECKING:
     from torch import Tensor

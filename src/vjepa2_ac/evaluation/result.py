@@ -16,8 +16,8 @@ from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.evaluation.axis_fit import AxisFit
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import ActionSpace
 
 Mode = Literal["teacher_forced", "rollout"]

@@ -15,9 +15,9 @@ from vjepa2_ac.evaluation.estimates import (
     over_persistence,
     rank_difference,
 )
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import Evaluation, Ranking
+from vjepa2_ac.intervals import Estimate
 
 _SIDES = {1: "better", 0: "no clear difference", -1: "NOT better"}  # of an error over persistence
 _PLANS = {-1: "better to plan with", 0: "no clear difference", 1: "WORSE to plan with"}  # of a difference of ranks

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.intervals import Estimate, bootstrapped
 from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
+from vjepa2_ac.intervals import Estimate, bootstrapped
 from vjepa2_ac.reports.metrics_json import METRICS_FILE, read_metrics
 
 Cell = Estimate | str

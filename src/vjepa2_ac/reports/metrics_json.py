@@ -27,7 +27,6 @@ from vjepa2_ac.evaluation.estimates import (
     stratum_gain,
     stratum_over_persistence,
 )
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import (
     ACTIONS,
@@ -42,6 +41,7 @@ from vjepa2_ac.evaluation.result import (
     Stratum,
 )
 from vjepa2_ac.evaluation.verdict import uses_actions, verdict
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.action_score_json import plans_as_dict, study_as_dict
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import finite_or_none, json_text, read_json_object, shown

@@ -10,7 +10,7 @@ from torch import Tensor
 from vjepa2_ac.evaluation.action_use.inferred_moves import infer_axes
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, start_of
 from vjepa2_ac.evaluation.axis_fit import AxisFit
-from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.planning.axes.mapping import Axes
 from worlds import TIME, Copier, Oracle, clips_batch
 

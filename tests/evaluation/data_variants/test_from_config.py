@@ -14,7 +14,7 @@ from vjepa2_ac.config.loading import config_as_yaml
 from vjepa2_ac.data.clips.dataset import open_dataset
 from vjepa2_ac.evaluation.data_variants.from_config import probe_config
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult
-from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.model.checkpoints.loading import load_base
 
 MakeConfig = Callable[..., Config]

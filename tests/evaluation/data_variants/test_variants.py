@@ -18,9 +18,9 @@ from vjepa2_ac.data.filters.step_ranges import StepSelection
 from vjepa2_ac.episode import Batch, Episode, EpisodeInfo, LatentBatch, StepRanges
 from vjepa2_ac.evaluation.data_variants.measure import VariantProbe, VariantResult, probe_variants, rows_of
 from vjepa2_ac.evaluation.data_variants.variants import mirrored, variants_of
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.geometry import actions_from_states, matrices_from_euler
+from vjepa2_ac.intervals import Estimate
 from worlds import Copier
 
 EPISODES, BEYOND = 8, 8  # episodes; steps before the first and behind the last one, for shifts

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from evaluation_results import evaluation
-from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.comparison import Comparison
 from vjepa2_ac.reports.figures.evaluation import plot_comparison, plot_evaluation
 

@@ -17,9 +17,9 @@ from PIL import Image
 
 from evaluation_results import evaluation
 from vjepa2_ac.evaluation.estimates import difference_to, gain_over, mean_error, over_persistence, stratum_gain
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, L2
 from vjepa2_ac.evaluation.result import Evaluation, TrainingCurve
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.html.charts import Line, line_chart, nice_axis
 from vjepa2_ac.reports.html.examples import MOST_EXAMPLES
 from vjepa2_ac.reports.html.formatting import decimal, percent, signed

@@ -99,6 +99,12 @@ def pixels_to_input(
     return normalised.reshape(batch, time, 3, image_size, image_size)
 
 
+def input_to_pixels(inputs: Float[Tensor, "*batch 3 size size"]) -> UInt8[Tensor, "*batch 3 size size"]:
+    """Return encoder input as the image that it is, rounded to 8 bits: the inverse of the normalisation."""
+    pixels = inputs.float() * per_channel(_STD, inputs.device) + per_channel(_MEAN, inputs.device)
+    return pixels.round().clamp(0, 255).to(torch.uint8)
+
+
 def _augmented(clip: Tensor, image_size: int, augmentation: Augmentation) -> Float[Tensor, "time 3 size size"]:
     top, left, height, width = augmentation.box
     return jittered(_resized(clip[:, top : top + height, left : left + width], image_size), augmentation)

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from vjepa2_ac.evaluation.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.evaluation.result import Evaluation, PlanningStudy, Plans
+from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio
 from vjepa2_ac.spaces import POSE
 
 AXES = ("x", "y", "z")

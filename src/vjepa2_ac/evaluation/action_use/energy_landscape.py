@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
-from vjepa2_ac.evaluation.intervals import Estimate, mean_of
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import Landscape, Landscapes
+from vjepa2_ac.intervals import Estimate, mean_of
 from vjepa2_ac.spaces import ActionSpace
 
 _ROOM = 1.25  # extent of the grid relative to the largest true action

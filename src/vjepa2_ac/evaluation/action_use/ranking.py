@@ -14,9 +14,9 @@ import numpy as np
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
 from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, place_of
-from vjepa2_ac.evaluation.intervals import mean_of, ratio
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import ActionRanking
+from vjepa2_ac.intervals import mean_of, ratio
 from vjepa2_ac.spaces import ActionSpace
 
 

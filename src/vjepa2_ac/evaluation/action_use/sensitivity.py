@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, evaluate_actions
-from vjepa2_ac.evaluation.intervals import mean_of, ratio
 from vjepa2_ac.evaluation.measure import Predictor
 from vjepa2_ac.evaluation.result import Ranking, Sensitivity
+from vjepa2_ac.intervals import mean_of, ratio
 from vjepa2_ac.spaces import ActionSpace
 
 TOP = (1, 5, 10)

@@ -16,8 +16,8 @@ from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.windows import spread
 from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.evaluation.data_variants.variants import ChangedSource, RememberingSource, Variant, variants_of
-from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.evaluation.measure import ClipSample, OneStepErrors, Predictor, one_step_errors
+from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
 
 SHIFTS = (1, 2, 4, 8)  # control steps
 _CANDIDATES_PER_CLIP = 8  # windows checked per clip, since shifts need room on both sides

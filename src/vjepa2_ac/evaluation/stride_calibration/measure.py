@@ -24,8 +24,8 @@ from vjepa2_ac.data.clips.streams import NO_COPIES, Copies, copies_for
 from vjepa2_ac.encoding.batch import encode_batch
 from vjepa2_ac.episode import Batch, LatentBatch, Progress, no_progress
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.evaluation.measure import ClipSample, Predictor, one_step_errors
+from vjepa2_ac.intervals import Estimate, ratio, ratio_difference
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.spaces import ActionSpace
 

@@ -15,9 +15,9 @@ from vjepa2_ac.evaluation.estimates import (
     stratum_gain,
     stratum_over_persistence,
 )
-from vjepa2_ac.evaluation.intervals import Estimate
 from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import MODES, Evaluation, Mode, ModelResult, PredictionErrors, Stratum, Way
+from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.html.charts import Axis, Line, axis_at, line_chart, nice_axis
 from vjepa2_ac.reports.html.formatting import seconds, share, signed_value, value
 from vjepa2_ac.reports.html.series import Series, models_of, persistence, wrong_actions_of

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from markupsafe import Markup
 
-from vjepa2_ac.evaluation.intervals import Estimate
+from vjepa2_ac.intervals import Estimate
 
 NOT_MEASURED = "\N{EN DASH}"  # in a table; the reason is given beside it
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from vjepa2_ac.evaluation.intervals import Estimate, mean_of, share_of
+from vjepa2_ac.intervals import Estimate, mean_of, share_of
 from vjepa2_ac.simulation.closed_loop.tasks import SUCCESS_M, TaskName, TaskProblem
 
 

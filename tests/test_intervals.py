@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from vjepa2_ac.evaluation.intervals import Estimate, bootstrapped, mean_of, ratio, ratio_difference
+from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio, ratio_difference
 
 
 def test_a_ratio_weighs_clips_by_their_motion() -> None:

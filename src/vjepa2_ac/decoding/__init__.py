@@ -1,0 +1,1 @@
+"""Latents to images: the decoder, its training, and imagined rollouts."""

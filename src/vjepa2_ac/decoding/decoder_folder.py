@@ -1,0 +1,141 @@
+"""The folder of a decoder: decoder.json, decoder.safetensors and linear.safetensors. Nothing in it is executed.
+
+A decoder belongs to an encoder. The latents of another one would give images, too, but meaningless ones: they are
+refused.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from vjepa2_ac import __version__
+from vjepa2_ac.decoding.network import Decoder, DecoderShape
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.base_model import ASSETS
+from vjepa2_ac.model.network.pretrained_folder import read_tensors
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.places import BUILTIN
+from vjepa2_ac.storage import folder_writer
+from vjepa2_ac.storage.structured import read_json_object, record_of
+
+CARD, WEIGHTS, LINEAR = "decoder.json", "decoder.safetensors", "linear.safetensors"
+BUILTIN_DECODER = "decoder"  # the folder of a model of the package that holds its decoder
+
+_FORMAT = "vjepa2-ac decoder 1"
+_NEEDED = "the folder of a decoder, as `vjepa2-ac decoder` writes it"
+_FIX = "Copy the folder again, or train the decoder again"
+
+
+@dataclass(frozen=True)
+class DecoderCard:
+    """What is known of a decoder."""
+
+    format: Literal["vjepa2-ac decoder 1"]
+    shape: DecoderShape
+    encoder: str  # WorldModel.encoder_fingerprint
+    crop: str  # data.crop: frames cut otherwise look otherwise to it
+    precision: str  # training.precision, in which the latents were computed
+    data: str  # data.path
+    cameras: tuple[str, ...]
+    episodes: int  # learned from
+    frames: int
+    steps: int
+    held_out: Mapping[str, Any] = field(default_factory=dict)  # by `decoding.held_out`
+    version: str = __version__
+    time: str = ""  # UTC
+
+
+@dataclass(frozen=True, eq=False)
+class TrainedDecoder:
+    """A decoder and the linear one beside it, both in eval mode."""
+
+    card: DecoderCard
+    decoder: Decoder
+    linear: Decoder
+    folder: Path
+
+    def to(self, device: torch.device) -> TrainedDecoder:
+        """Move both to a device."""
+        self.decoder.to(device)
+        self.linear.to(device)
+        return self
+
+    def require_encoder(self, world_model: WorldModel, *, subject: str) -> None:
+        """Refuse a model with another encoder than the decoder's.
+
+        Raises:
+            InputError: It has.
+        """
+        if world_model.encoder_fingerprint() != self.card.encoder:
+            raise InputError(
+                where=f"--decoder {self.folder}",
+                found=f"the decoder of another encoder than that of {subject}",
+                needed="one that was trained on the latents of this encoder: others would be read wrongly",
+                fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
+            )
+
+
+def save_decoder(folder: Path, card: DecoderCard, decoder: Mapping[str, Tensor], linear: Mapping[str, Tensor]) -> None:
+    """Write a decoder into a folder, decoder.json last: a folder that has one is complete.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    with folder_writer(folder, CARD) as fresh:
+        for name, weights in ((WEIGHTS, decoder), (LINEAR, linear)):
+            save_file({key: value.detach().cpu().contiguous() for key, value in weights.items()}, fresh / name)
+        (fresh / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
+
+
+def load_decoder(name: str | Path) -> TrainedDecoder:
+    """Read a decoder, on the CPU.
+
+    Args:
+        name: Its folder; or builtin:sim-tiny, for the one in the package.
+
+    Raises:
+        InputError: There is none, or it is incomplete or damaged.
+    """
+    folder = _folder_of(str(name))
+    card = read_card(folder)
+    linear_shape = DecoderShape("linear", card.shape.dim, card.shape.grid, card.shape.patch_size)
+    decoder = _filled(card.shape, folder / WEIGHTS)
+    return TrainedDecoder(card, decoder, _filled(linear_shape, folder / LINEAR), folder)
+
+
+def read_card(folder: Path) -> DecoderCard:
+    """Return what is known of a decoder.
+
+    Raises:
+        InputError: The folder holds none, or decoder.json is damaged.
+    """
+    path = folder / CARD
+    try:
+        values = read_json_object(path, needed=_NEEDED, fix=_FIX)
+    except (FileNotFoundError, NotADirectoryError):
+        where = f"--decoder {folder}"
+        fix = "Train one with `vjepa2-ac decoder CONFIG`; one that is unfinished goes on with the same command"
+        raise InputError(where=where, found=f"no {CARD} there", needed=_NEEDED, fix=fix) from None
+    except OSError as error:
+        raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED, fix=_FIX) from None
+    return record_of(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)
+
+
+def _folder_of(name: str) -> Path:
+    if name.startswith(BUILTIN):
+        return ASSETS / name.removeprefix(BUILTIN) / BUILTIN_DECODER
+    return Path(name)
+
+
+def _filled(shape: DecoderShape, path: Path) -> Decoder:
+    decoder = Decoder(shape).eval().requires_grad_(False)
+    decoder.load_state_dict(read_tensors(path, decoder.state_dict(), needed=_NEEDED, fix=_FIX))
+    return decoder

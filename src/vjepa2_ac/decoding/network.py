@@ -1,0 +1,199 @@
+"""The decoder: the image of a frame from its latents alone.
+
+It is trained on latents of true frames only, without an adversary, and applied to predictions as it is: where a
+prediction is an average of futures, the image is blurred, and that is what it shows.
+
+Source: the idea is that of Assran et al. (2025), V-JEPA 2, appendix B.3; sizes and losses are our own.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from pydantic import Field
+from torch import Generator, Tensor, nn
+
+from vjepa2_ac.config.section import PositiveInt
+
+Size = Literal["linear", "tiny", "small", "medium"]
+
+_MIDDLE, _RANGE = 0.5, 0.25  # of pixels: the network's numbers are about -2 .. 2
+_FREQUENCIES = 10_000.0
+_STD = 0.02
+
+
+@dataclass(frozen=True)
+class DecoderShape:
+    """What a decoder is: its size, and the sizes of the encoder that it belongs to."""
+
+    size: Size
+    dim: PositiveInt  # of a latent
+    grid: Annotated[int, Field(ge=1, le=256)]  # tokens along each side of a frame
+    patch_size: Annotated[int, Field(ge=4, le=64, multiple_of=4)]  # pixels
+
+    @property
+    def image_size(self) -> int:
+        """Height and width of an image, in pixels."""
+        return self.grid * self.patch_size
+
+
+@dataclass(frozen=True)
+class _Widths:
+    blocks: int
+    width: int
+    heads: int
+    head: tuple[int, int]  # channels after the first and the second doubling of the resolution
+
+
+_SIZES: dict[str, _Widths] = {
+    "tiny": _Widths(blocks=2, width=128, heads=4, head=(64, 32)),
+    "small": _Widths(blocks=6, width=512, heads=8, head=(256, 128)),
+    "medium": _Widths(blocks=12, width=768, heads=12, head=(256, 128)),
+}
+
+
+class Decoder(nn.Module):
+    """Turns the latents of a frame into its image, frame by frame.
+
+    Attention blocks over the tokens of one frame, then convolutions that double the resolution twice and end in
+    patches of a quarter of the patch size. `linear` is one matrix: an image patch from each token.
+    """
+
+    def __init__(self, shape: DecoderShape) -> None:
+        super().__init__()
+        self.shape = shape
+        patch = shape.patch_size
+        if shape.size == "linear":
+            self.layers: nn.Module = nn.Sequential(nn.Linear(shape.dim, 3 * patch**2), _Unfold(shape.grid, patch))
+        else:
+            self.layers = _convolved(shape, _SIZES[shape.size])
+
+    def initialise(self, generator: Generator) -> None:
+        """Draw fresh weights; the generator determines them."""
+        for module in self.modules():
+            if isinstance(module, nn.Linear | nn.Conv2d):
+                fan_in = module.weight[0].numel()
+                std = _STD if isinstance(module, nn.Linear) else 1.0 / math.sqrt(fan_in)
+                nn.init.trunc_normal_(module.weight, std=std, generator=generator)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+
+    def forward(self, latents: Float[Tensor, "*batch tokens dim"]) -> Float[Tensor, "*batch 3 size size"]:
+        """Return images, black 0 to white 1; not clipped.
+
+        Args:
+            latents: Layer-normalised, as the encoder gives them and the predictor predicts them.
+
+        Raises:
+            ValueError: They are of another size.
+        """
+        shape = self.shape
+        if tuple(latents.shape[-2:]) != (shape.grid**2, shape.dim):
+            found = "x".join(map(str, latents.shape[-2:]))
+            raise ValueError(f"latents of {found} numbers; this decoder takes {shape.grid**2}x{shape.dim}")
+        frames = latents.reshape(-1, *latents.shape[-2:])
+        images = self.layers(frames).float() * _RANGE + _MIDDLE
+        return images.reshape(*latents.shape[:-2], *images.shape[-3:])
+
+    @staticmethod
+    def as_numbers(images: Float[Tensor, "*batch 3 size size"]) -> Float[Tensor, "*batch 3 size size"]:
+        """Return what the layers have to give for an image."""
+        return (images - _MIDDLE) / _RANGE
+
+    @torch.no_grad()
+    def decode(
+        self, latents: Float[Tensor, "*batch tokens dim"], *, chunk: int = 64
+    ) -> Float[Tensor, "*batch 3 size size"]:
+        """Return images between 0 and 1, in float32, some frames at a time: bounds the memory."""
+        frames = latents.reshape(-1, *latents.shape[-2:])
+        images = torch.cat([self(part).clamp(0.0, 1.0) for part in torch.split(frames, chunk)])
+        return images.reshape(*latents.shape[:-2], *images.shape[-3:])
+
+
+def _convolved(shape: DecoderShape, widths: _Widths) -> nn.Sequential:
+    first, second = widths.head
+    last = shape.patch_size // 4
+    return nn.Sequential(
+        nn.Linear(shape.dim, widths.width),
+        _Positions(shape.grid, widths.width),
+        *(_Block(widths.width, widths.heads) for _ in range(widths.blocks)),
+        nn.LayerNorm(widths.width),
+        _AsImage(shape.grid),
+        nn.Conv2d(widths.width, 4 * first, 3, padding=1),
+        nn.PixelShuffle(2),
+        nn.GELU(),
+        nn.Conv2d(first, 4 * second, 3, padding=1),
+        nn.PixelShuffle(2),
+        nn.GELU(),
+        nn.Conv2d(second, 3 * last**2, 3, padding=1),
+        nn.PixelShuffle(last),
+    )
+
+
+class _Positions(nn.Module):
+    """Adds sines and cosines of each token's row (first half) and column."""
+
+    table: Tensor
+
+    def __init__(self, grid: int, width: int) -> None:
+        super().__init__()
+        rates = _FREQUENCIES ** -(torch.arange(width // 4) / (width // 4))
+        angles = torch.arange(grid)[:, None] * rates
+        along = torch.cat([angles.sin(), angles.cos()], dim=-1)
+        rows, columns = along[:, None].expand(-1, grid, -1), along[None].expand(grid, -1, -1)
+        self.register_buffer("table", torch.cat([rows, columns], dim=-1).flatten(0, 1), persistent=False)
+
+    def forward(self, tokens: Float[Tensor, "frames tokens width"]) -> Float[Tensor, "frames tokens width"]:
+        return tokens + self.table
+
+
+class _Block(nn.Module):
+    """Attention over the tokens of a frame, then an MLP; both after a norm and added to their input."""
+
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm1, self.norm2 = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.qkv, self.out = nn.Linear(width, 3 * width), nn.Linear(width, width)
+        self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
+
+    def forward(self, tokens: Float[Tensor, "frames tokens width"]) -> Float[Tensor, "frames tokens width"]:
+        query, key, value = rearrange(
+            self.qkv(self.norm1(tokens)),
+            "n tokens (three heads d) -> three n heads tokens d",
+            three=3,
+            heads=self.heads,
+        )
+        attended = nn.functional.scaled_dot_product_attention(query, key, value)
+        tokens = tokens + self.out(rearrange(attended, "n heads tokens d -> n tokens (heads d)"))
+        added: Tensor = tokens + self.mlp(self.norm2(tokens))
+        return added
+
+
+class _AsImage(nn.Module):
+    """Arranges tokens as a grid of channels."""
+
+    def __init__(self, grid: int) -> None:
+        super().__init__()
+        self.grid = grid
+
+    def forward(self, tokens: Float[Tensor, "frames tokens width"]) -> Float[Tensor, "frames width grid grid"]:
+        return rearrange(tokens, "n (rows columns) width -> n width rows columns", rows=self.grid)
+
+
+class _Unfold(nn.Module):
+    """Arranges the pixels of each token's patch as an image."""
+
+    def __init__(self, grid: int, patch_size: int) -> None:
+        super().__init__()
+        self.grid, self.patch_size = grid, patch_size
+
+    def forward(self, patches: Float[Tensor, "frames tokens pixels"]) -> Float[Tensor, "frames 3 size size"]:
+        return rearrange(
+            patches, "n (rows columns) (c p q) -> n c (rows p) (columns q)", rows=self.grid, c=3, p=self.patch_size
+        )

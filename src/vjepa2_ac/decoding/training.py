@@ -1,0 +1,256 @@
+"""Training of a decoder: from the first frame encoded to a folder that `--decoder` takes.
+
+The frames of a step and its noise are functions of (config, step), so a checkpoint holds weights, their average,
+AdamW's moments and the step; a training that was killed goes on as if it had not been.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import shutil
+import signal
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vjepa2_ac.config import Config, DecoderConfig
+from vjepa2_ac.data.clips.permutation import permuted
+from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, save_decoder
+from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, as_images
+from vjepa2_ac.decoding.held_out import mean_image, measure_decoders
+from vjepa2_ac.decoding.linear_fit import fit_linear
+from vjepa2_ac.decoding.loss import decoder_loss
+from vjepa2_ac.decoding.network import Decoder
+from vjepa2_ac.decoding.setup import Setup, prepare, setup
+from vjepa2_ac.distributed.preemption import StoppedError, StopRequest, stop_on_signals
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.finite import first_not_finite
+from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.runs.checkpoint import OPTIMIZER, RunState, newest_checkpoint, read_state, write_checkpoint
+from vjepa2_ac.runs.folder import CHECKPOINTS
+from vjepa2_ac.runs.metrics_log import MetricsLog
+from vjepa2_ac.runs.torch_file import read_torch, write_torch
+from vjepa2_ac.storage.structured import utc_now
+
+_WEIGHTS = "decoder.pt"
+_LOG_EVERY = 50  # steps
+_KEEP = 2  # checkpoints
+_BETAS = (0.9, 0.95)
+
+
+def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bool = False) -> Path:
+    """Train the decoder of a config's encoder and data; go on where a former start stopped.
+
+    Args:
+        config: Data, model and `decoder`.
+        reporter: Receives messages and the progress of each part of the work.
+        check_only: Do what can fail, and write nothing.
+
+    Returns:
+        The folder of the decoder.
+
+    Raises:
+        InputError: An input cannot be used, or the folder holds something else.
+        StoppedError: A signal asked to stop; the same command goes on.
+    """
+    with setup(config, reporter, check_only=check_only) as ready:
+        if ready.is_done or check_only:
+            return ready.folder
+        with _out_of_memory_explained():
+            _try_one_step(ready)
+            with stop_on_signals() as stop:
+                train_pairs, held_out = prepare(ready, reporter, stop)
+                linear = fit_linear(train_pairs, ready.shape, ready.device, reporter.task("fitting the linear decoder"))
+                trained = _Training(ready)
+                _train(trained, train_pairs, reporter, stop)
+            _finish(trained, linear, train_pairs, held_out, reporter)
+    return ready.folder
+
+
+def _try_one_step(ready: Setup) -> None:
+    """Run out of memory now, not after the frames are encoded."""
+    if ready.device.type == "cuda":
+        training = _Training(ready, resume=False)
+        shape, count = ready.shape, ready.knobs.batch_size
+        latents = torch.zeros(count, shape.grid**2, shape.dim)
+        training.step(1, Pairs(latents, torch.zeros(count, 3, shape.image_size, shape.image_size).byte(), ()))
+
+
+class _Training:
+    """Weights, their average, and the optimizer, from the newest checkpoint if there is one."""
+
+    def __init__(self, ready: Setup, *, resume: bool = True) -> None:
+        self.ready, self.knobs = ready, ready.knobs
+        self.decoder = Decoder(ready.shape)
+        self.decoder.initialise(torch.Generator().manual_seed(ready.config.seed))
+        self.decoder.to(ready.device)
+        matrices = [one for one in self.decoder.parameters() if one.ndim > 1]
+        others = [one for one in self.decoder.parameters() if one.ndim <= 1]
+        groups = [
+            {"params": matrices, "weight_decay": self.knobs.weight_decay},
+            {"params": others, "weight_decay": 0.0},
+        ]
+        self.optimizer = torch.optim.AdamW(groups, lr=self.knobs.learning_rate, betas=_BETAS)
+        self.average = {name: one.detach().clone() for name, one in self.decoder.state_dict().items()}
+        self.done = 0
+        newest = newest_checkpoint(ready.folder / CHECKPOINTS) if resume else None
+        if newest is not None:
+            self._restore(newest)
+
+    def step(self, step: int, pairs: Pairs) -> dict[str, float]:
+        """Do one optimizer step and return its metrics."""
+        device = self.ready.device
+        latents, images = pairs.latents.to(device), as_images(pairs.images.to(device))
+        if self.knobs.noise:
+            latents = latents + self._noise(step, latents)
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate_at(step, self.knobs)
+        with self.ready.autocast():
+            shown = self.decoder(latents)
+        loss, parts = decoder_loss(shown, images)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]  # torch
+        norm = torch.nn.utils.clip_grad_norm_(self.decoder.parameters(), self.knobs.max_grad_norm)
+        if not math.isfinite(float(norm)):
+            raise InputError(
+                where="decoder.learning_rate",
+                found=f"{self.knobs.learning_rate:g}: loss or gradients of step {step} are not finite",
+                fix="Lower it, delete the newest checkpoint if it was written by then, and start again",
+            )
+        self.optimizer.step()
+        self._add_to_average(step)
+        return {"loss": float(loss), "learning_rate": learning_rate_at(step, self.knobs)} | {
+            name: float(value) for name, value in parts.items()
+        }
+
+    def save(self, step: int) -> None:
+        """Write a checkpoint."""
+
+        def write(folder: Path) -> None:
+            with (folder / _WEIGHTS).open("wb") as file:
+                write_torch({"decoder": self.decoder.state_dict(), "average": self.average}, file)
+            with (folder / OPTIMIZER).open("wb") as file:
+                write_torch(self.optimizer.state_dict(), file)
+
+        frames = step * self.knobs.batch_size
+        state = RunState(step=step, clips_done=frames)
+        write_checkpoint(self.ready.folder / CHECKPOINTS, state, write, keep=_KEEP)
+        self.done = step
+
+    def _restore(self, checkpoint: Path) -> None:
+        device = self.ready.device
+        weights = read_torch(checkpoint / _WEIGHTS)
+        try:
+            self.decoder.load_state_dict(weights["decoder"])
+            self.average = {name: weights["average"][name].to(device) for name in self.average}
+            self.optimizer.load_state_dict(read_torch(checkpoint / OPTIMIZER))
+        except (KeyError, ValueError, RuntimeError, TypeError) as error:
+            fix = "Delete this checkpoint, to use an older one"
+            raise InputError(where=str(checkpoint), found=f"not this decoder's ({error})", fix=fix) from None
+        self.done = read_state(checkpoint).step
+
+    def _noise(self, step: int, latents: Tensor) -> Tensor:
+        """Return noise of a strength that is drawn for each frame, up to `decoder.noise`."""
+        drawn = torch.Generator().manual_seed(self.ready.config.seed * 2**31 + step)
+        strength = self.knobs.noise * torch.rand(len(latents), 1, 1, generator=drawn)
+        return (strength * torch.randn(latents.shape, generator=drawn)).to(latents.device)
+
+    @torch.no_grad()
+    def _add_to_average(self, step: int) -> None:
+        decay = min(self.knobs.average, step / (step + 9.0))  # the first steps do not count for long
+        for name, one in self.decoder.state_dict().items():
+            self.average[name].lerp_(one, 1.0 - decay)
+
+
+def learning_rate_at(step: int, knobs: DecoderConfig) -> float:
+    """Return the learning rate of step 1 .. steps: a linear warm-up, then half a cosine down to none."""
+    warmup = min(knobs.warmup_steps, knobs.steps - 1)
+    if step <= warmup:
+        return knobs.learning_rate * step / warmup
+    done = (step - warmup) / max(1, knobs.steps - warmup)
+    return knobs.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done))
+
+
+def _train(training: _Training, pairs: FramePairs, reporter: Reporter, stop: StopRequest) -> None:
+    knobs, first = training.knobs, training.done
+    progress = reporter.task("training the decoder", "steps")
+    with (
+        MetricsLog(training.ready.folder, first_step=first) as log,
+        contextlib.closing(_batches(pairs, knobs, training.ready.config.seed, first)) as batches,
+    ):
+        for step, batch in batches:
+            metrics = training.step(step, batch)
+            progress(step, knobs.steps)
+            is_last = step == knobs.steps
+            if step % _LOG_EVERY == 0 or is_last:
+                log.write("train", step, metrics)
+            if step % knobs.checkpoint_every == 0 or is_last or stop.number:
+                with log.before_a_checkpoint():
+                    training.save(step)
+            if stop.number and not is_last:
+                raise StoppedError(training.ready.folder, step, signal.Signals(stop.number).name)
+
+
+def _batches(pairs: FramePairs, knobs: DecoderConfig, seed: int, done: int) -> Iterator[tuple[int, Pairs]]:
+    """Yield the frames of each further step; the next ones are read meanwhile."""
+
+    def read(step: int) -> Pairs:
+        places = range((step - 1) * knobs.batch_size, step * knobs.batch_size)
+        count = len(pairs)
+        return pairs.read([permuted(at % count, size=count, seed=seed, epoch=at // count) for at in places])
+
+    with ThreadPoolExecutor(1, thread_name_prefix="pairs") as pool:
+        ahead = pool.submit(read, done + 1) if done < knobs.steps else None
+        for step in range(done + 1, knobs.steps + 1):
+            batch = ahead.result() if ahead is not None else read(step)
+            ahead = pool.submit(read, step + 1) if step < knobs.steps else None
+            yield step, batch
+
+
+def _finish(
+    training: _Training, linear: Decoder, pairs: FramePairs, held_out: FramePairs | None, reporter: Reporter
+) -> None:
+    """Measure the averaged weights on held-out frames, write the decoder, and remove what only training needs."""
+    ready = training.ready
+    if (name := first_not_finite(training.average)) is not None:
+        raise InputError(where=str(ready.folder), found=f"{name} holds NaN or infinity", fix="Lower the learning rate")
+    decoder = Decoder(ready.shape).to(ready.device).eval()
+    decoder.load_state_dict(training.average)
+    found: dict[str, Any] = {}
+    if held_out is not None:
+        decoders = {"decoder": decoder, "linear": linear.to(ready.device)}
+        found = measure_decoders(held_out, decoders, mean_image(pairs), reporter.task("measuring", "frames"))
+    data = ready.config.data
+    card = DecoderCard(
+        format="vjepa2-ac decoder 1",
+        shape=ready.shape,
+        encoder=ready.encoder,
+        crop=data.crop,
+        precision=ready.config.training.precision,
+        data=data.path,
+        cameras=tuple(data.cameras),
+        episodes=len({file.episode_id for file in pairs.files}),
+        frames=len(pairs),
+        steps=training.knobs.steps,
+        held_out=found,
+        time=utc_now(),
+    )
+    save_decoder(ready.folder, card, decoder.state_dict(), linear.state_dict())
+    for temporary in (ready.pairs, ready.folder / CHECKPOINTS):
+        shutil.rmtree(temporary, ignore_errors=True)
+    reporter.note(f"The decoder is in {ready.folder}: {ready.folder / CARD} says how good it is")
+
+
+@contextlib.contextmanager
+def _out_of_memory_explained() -> Iterator[None]:
+    try:
+        yield
+    except torch.OutOfMemoryError as error:
+        found = f"the GPU's memory is not enough ({str(error).splitlines()[0]})"
+        fix = "Lower decoder.batch_size or model.encode_chunk, or set decoder.size: tiny"
+        raise InputError(where="decoder", found=found, fix=fix) from error
