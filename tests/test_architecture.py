@@ -59,7 +59,7 @@ ORDERS: dict[str, list[str]] = {
         "evaluate_run",
     ],
     "reports": ["action_score_json", "metrics_json", "comparison", "figures html", "write"],
-    "simulation": ["world", "closed_loop", "recording"],
+    "simulation": ["world", "closed_loop", "recording", "counterfactual"],
 }
 
 HOMES = {

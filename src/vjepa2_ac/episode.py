@@ -9,8 +9,9 @@ Axes
     dim      width of a latent (1408 for ViT-g)
 
 State (7 numbers, a pose): x, y, z in metres; roll, pitch, yaw in radians, as extrinsic xyz Euler angles; gripper
-    closedness, 0 open .. 1 closed. All in the robot base frame; the point is the flange, not the finger tip. States are
-    *measured*. With `data.states: vector` a state is whatever numbers the source has, state_dim of them.
+    closedness, 0 open .. 1 closed. All in the robot base frame (x to the robot's front, y to its left, z up); the point
+    is the flange, not the finger tip. States are *measured*. With `data.states: vector` a state is whatever numbers the
+    source has, state_dim of them.
 
 Action (7 numbers, of poses): the change from a state to the state of the next *model* step: metres, extrinsic xyz Euler
     angles of R[t+1] @ R[t].T, and the change of closedness. See `geometry.actions_from_states`. Of vectors:

@@ -108,7 +108,7 @@ def run_episode(
         seconds.append(time.perf_counter() - began)
         actions.append(_checked(action, policy))
         whys.append(policy.why)
-        unreachable += not (_send if policy.moves == Moves.FLANGE else _send_joints)(arm, action, stride)
+        unreachable += not (send_action if policy.moves == Moves.FLANGE else _send_joints)(arm, action, stride)
         states.append(arm.state)
         blocks.append(arm.block)
         frames.append(arm.image())
@@ -135,6 +135,28 @@ def put(arm: SimulatedArm, state: Float[np.ndarray, " 7"], block: Float[np.ndarr
     return arm
 
 
+def send_action(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int) -> bool:
+    """Command the state after an action for `stride` control steps, its closedness within 0 .. 1.
+
+    The target is that action from the *measured* state. If no joint angles reach it, the arm moves along the straight
+    line as far as possible.
+
+    Returns:
+        Whether it can be reached.
+    """
+    target = apply_action(arm.state, action)
+    target[6] = np.clip(target[6], 0.0, 1.0)
+    with suppress(OutOfReachError):
+        arm.command(target, stride)
+        return True
+    reachable = list(itertools.takewhile(arm.can_reach, ways_along(arm.state, action)))
+    if reachable:
+        arm.command(np.append(reachable[-1][:6], target[6]), stride)
+    else:
+        arm.command_joints(arm.joints, target[6], stride)
+    return False
+
+
 def ways_along(state: Float[np.ndarray, " 7"], action: Float[np.ndarray, " 7"]) -> Sequence[Float[np.ndarray, " 7"]]:
     """Return equally spaced states on the straight line of an action, the nearest first."""
     shares = np.arange(1, _PARTS + 1)[:, None] / _PARTS
@@ -153,18 +175,3 @@ def _send_joints(arm: SimulatedArm, action: Float[np.ndarray, " 8"], stride: int
     reachable = np.clip(wanted, LOW, HIGH)
     arm.command_joints(reachable, float(np.clip(arm.closedness + action[-1], 0.0, 1.0)), stride)
     return bool(np.array_equal(wanted, reachable))
-
-
-def _send(arm: SimulatedArm, action: Float[np.ndarray, " 7"], stride: int) -> bool:
-    """Command the state after an action, its closedness within 0 .. 1; return whether it can be reached."""
-    target = apply_action(arm.state, action)
-    target[6] = np.clip(target[6], 0.0, 1.0)
-    with suppress(OutOfReachError):
-        arm.command(target, stride)
-        return True
-    reachable = list(itertools.takewhile(arm.can_reach, ways_along(arm.state, action)))
-    if reachable:
-        arm.command(np.append(reachable[-1][:6], target[6]), stride)
-    else:
-        arm.command_joints(arm.joints, target[6], stride)
-    return False

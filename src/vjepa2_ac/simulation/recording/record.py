@@ -1,4 +1,4 @@
-"""Recording of a simulated data set: random reaching, filmed, written as RLDS in DROID's schema."""
+"""Recording of a simulated data set: demonstrations, filmed, written as RLDS in DROID's schema."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ import itertools
 import multiprocessing
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -24,39 +23,17 @@ from vjepa2_ac.data.sources.rlds.writing.droid_writer import (
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.jpeg import encode_jpeg
-from vjepa2_ac.simulation.world.arm import Renderer, SimulatedArm
-from vjepa2_ac.simulation.world.domains import Domain, DomainRanges, named_domain, sample_domain
-from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion, MotionRecipe, random_reaching
+from vjepa2_ac.simulation.recording.demonstration import RecordingSpec, arm_of, carry_out, episode_folder
+from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE, simulation_text
+from vjepa2_ac.simulation.world.arm import SimulatedArm
+from vjepa2_ac.simulation.world.motion import CONTROL_RATE_HZ, Motion
 from vjepa2_ac.simulation.world.scene import load_mujoco
 
-SUCCESS_SHARE = 0.9
+__all__ = ["RecordingSpec", "episode_folder", "record_dataset", "record_episode"]
+
 JPEG_QUALITY = 85  # some 11 KB an image, as in DROID
 _INSTRUCTIONS = {None: "reach around over the table", "push": "push the block", "pick": "pick up the block"}
 _SIMULATED_CAMERAS = dict(zip(CAMERAS, ("exterior_1", "exterior_2", "wrist"), strict=True))
-
-
-@dataclass(frozen=True)
-class RecordingSpec:
-    """What an episode of a simulated data set is."""
-
-    domain: str | Domain | DomainRanges  # or its name; ranges, or `random`: another world in every episode
-    steps: int = 41  # control steps (15 per second)
-    seed: int = 0  # determines motion, outcome and worlds
-    cameras: Literal[1, 3] = 1  # 1: the three images of a step are the same one; 3: one image per camera
-    renderer: Renderer = "rays"  # it works everywhere; `opengl` needs a working `MUJOCO_GL`
-    recipe: MotionRecipe | None = None  # ranges of the motion, without a task
-    task: Literal["push", "pick"] | None = None  # with a block: half of the episodes by script, half at random
-
-    @property
-    def worlds(self) -> Domain | DomainRanges:
-        """The world of all episodes, or the ranges to draw each one's from.
-
-        Raises:
-            InputError: No domain has this name.
-        """
-        if not isinstance(self.domain, str):
-            return self.domain
-        return DomainRanges() if self.domain == "random" else named_domain(self.domain)
 
 
 def record_dataset(
@@ -98,7 +75,8 @@ def record_dataset(
             yield episode
             progress(done, episodes)
 
-    return write_droid_rlds(folder, watched(), shards=shards or -(-episodes // 32))
+    notes = {SIMULATION_FILE: simulation_text(spec, episodes)}
+    return write_droid_rlds(folder, watched(), shards=shards or -(-episodes // 32), notes=notes)
 
 
 def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
@@ -107,25 +85,10 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
     Raises:
         InputError: MuJoCo or OpenGL is missing, or an unknown domain.
     """
-    motion_rng, world_rng = (np.random.default_rng([spec.seed, index, purpose]) for purpose in range(2))
-    worlds, task = spec.worlds, spec.task
-    world = worlds if isinstance(worlds, Domain) else sample_domain(world_rng, worlds)
+    arm = arm_of(index, spec)
     images: dict[str, list[bytes]] = {}
-    if task is None:
-        motion = random_reaching(world, spec.steps, motion_rng, spec.recipe)
-        arm = SimulatedArm(world, renderer=spec.renderer)
-        for joints, closedness in zip(motion.joints, motion.gripper, strict=True):
-            arm.set_joints(joints, float(closedness))
-            _take(arm, images, spec.cameras)
-    else:
-        # They import torch, which random reaching does not need.
-        from vjepa2_ac.simulation.closed_loop.tasks import arm_for
-        from vjepa2_ac.simulation.recording.scripted_play import play
-
-        arm = arm_for(task, world, renderer=spec.renderer)
-        look = partial(_take, films=images, cameras=spec.cameras)
-        motion = play(arm, task, spec.steps, motion_rng, script=index % 2 == 0, look=look)
-    folder = episode_folder(index, spec.seed, world.name)
+    motion = carry_out(arm, index, spec, look=partial(_take, films=images, cameras=spec.cameras))
+    folder = episode_folder(index, spec.seed, arm.domain.name)
     return DroidEpisode(
         file_path=f"{folder}/trajectory.h5",
         recording_folderpath=f"{folder}/recordings/MP4",
@@ -135,16 +98,8 @@ def record_episode(index: int, spec: RecordingSpec) -> DroidEpisode:
             cartesian_position=motion.poses, gripper_position=motion.gripper[:, None], joint_position=motion.joints
         ),
         images={feature: images.get(feature, images[CAMERAS[0]]) for feature in CAMERAS},
-        language_instruction=_INSTRUCTIONS[task],
+        language_instruction=_INSTRUCTIONS[spec.task],
     )
-
-
-def episode_folder(index: int, seed: int, domain_name: str) -> str:
-    """Return the source folder stored in the episode; as in DROID, the only record of success or failure."""
-    succeeded = np.random.default_rng([seed, index, 2]).uniform() < SUCCESS_SHARE
-    minute, hour, day = index % 60, index // 60 % 24, 1 + index // 1440 % 28
-    place = f"{domain_name}_seed{seed}_{hour:02d}h{minute:02d}_{index:06d}"
-    return f"/simulated/SIM/{'success' if succeeded else 'failure'}/2026-01-{day:02d}/{place}"
 
 
 def _take(arm: SimulatedArm, films: dict[str, list[bytes]], cameras: int) -> None:

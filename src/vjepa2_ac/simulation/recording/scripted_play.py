@@ -40,10 +40,12 @@ def play(
 ) -> Motion:
     """Return a demonstration of `steps` control steps with an arm that touches the block.
 
+    Afterwards arm and block are where control step `steps` would be measured; fewer steps are the beginning of more.
+
     Args:
         arm: From `arm_for` of this task.
         task: The problem at the start, and whether the gripper is used.
-        steps: Control steps.
+        steps: Control steps; 0: only the start is drawn.
         rng: The only source of randomness.
         script: Whether an oracle solves the problem, with noise; otherwise, random play.
         look: Called at every control step, at the time of its measurements.
@@ -73,8 +75,13 @@ def play(
         if look:
             look(arm)
         arm.command_joints(joints, grip)
-    commanded, commanded_grip, measured, measured_grip = zip(*rows, strict=True)
-    return Motion(np.array(commanded), np.array(commanded_grip), np.array(measured), np.array(measured_grip))
+    commanded, commanded_grip, measured, measured_grip = zip(*rows, strict=True) if rows else ((), (), (), ())
+    return Motion(
+        np.reshape(commanded, (-1, 7)),
+        np.array(commanded_grip),
+        np.reshape(measured, (-1, 7)),
+        np.array(measured_grip),
+    )
 
 
 def _play_action(arm: SimulatedArm, problem: TaskProblem, limits: LimitsConfig, rng: np.random.Generator) -> np.ndarray:

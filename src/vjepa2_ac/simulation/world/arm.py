@@ -14,10 +14,10 @@ from vjepa2_ac.simulation.world.domains import Domain
 from vjepa2_ac.simulation.world.kinematics import OutOfReachError, forward_kinematics, inverse_kinematics
 from vjepa2_ac.simulation.world.motion import GRIPPER_LAG_S, rest_joints, tracking_share
 from vjepa2_ac.simulation.world.opengl_renderer import OpenGlCamera
+from vjepa2_ac.simulation.world.projection import exterior_pose
 from vjepa2_ac.simulation.world.scene import FINGER_TRAVEL_M, compile_scene, load_mujoco
 
 Renderer = Literal["rays", "opengl"]
-SECOND_CAMERA_TURN_DEG = -100.0
 WRIST_FOV_DEG = 70.0
 
 
@@ -148,10 +148,7 @@ class SimulatedArm:
     def _camera_pose(self, name: str) -> Float[np.ndarray, "4 4"]:
         if name == "wrist":
             return self._wrist_pose()
-        turns = {"exterior_1": 0.0, "exterior_2": SECOND_CAMERA_TURN_DEG}
-        if name not in turns:
-            raise ValueError(f"no camera {name!r}: exterior_1, exterior_2 or wrist")
-        return self.domain.camera.turned(turns[name]).pose()
+        return exterior_pose(self.domain, name)
 
     def _wrist_pose(self) -> Float[np.ndarray, "4 4"]:
         """Return the frame of a camera on the hand that looks past the fingers."""

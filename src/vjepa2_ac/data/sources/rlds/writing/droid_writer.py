@@ -75,10 +75,19 @@ def write_droid_rlds(
     shards: int,
     name: str = "r2d2_faceblur",
     version: str = "1.0.0",
+    notes: Mapping[str, str] | None = None,
 ) -> Path:
     """Write episodes as a data set in DROID's RLDS schema and return its folder; one episode is in memory at a time.
 
     Episodes are assigned to the shards in turn. An incomplete folder is never a data set.
+
+    Args:
+        folder: New or empty.
+        episodes: What is written.
+        shards: TFRecord files.
+        name: Of the data set.
+        version: Of the data set.
+        notes: Other text files beside the shards, by name; TFDS and our reader use only those that they know.
 
     Raises:
         InputError: The folder exists and is not empty, or cannot be written, or there are fewer episodes than shards.
@@ -91,6 +100,8 @@ def write_droid_rlds(
         if min(counts) == 0:
             found, needed = f"{sum(counts)} episodes", f"at least one for each of {shards} shards"
             raise InputError(where=str(folder), found=found, needed=needed)
+        for file, text in (notes or {}).items():
+            storage.write_atomically(partial / file, text)
         _write_json(partial / "features.json", droid_features(sizes), indent=4)
         _write_json(partial / _INFO, dataset_info(name, version, counts, num_bytes), indent=2)
     return folder

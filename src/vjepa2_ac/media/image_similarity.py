@@ -1,0 +1,174 @@
+"""How alike are two images, pixel by pixel: PSNR, SSIM and MS-SSIM, of whole images or of where something moves.
+
+Images are RGB in 0 .. 1 (data range 1), channels first; every function returns one value per image, in float32 and
+without autocast, and can be differentiated. All three reward blur: an object smeared over every place where it may be
+scores better than a sharp one 12 pixels off. State them beside LPIPS, and inside the moving region.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+MOVES_BY = 8 / 255  # in any channel
+DILATED_BY = 8  # pixels
+_SIGMA, _RADIUS = 1.5, 5  # of the Gaussian window, 11 x 11
+_OF_LUMINANCE, _OF_CONTRAST = 0.01**2, 0.03**2  # the constants C1 and C2 for a data range of 1
+_SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
+_ROUNDING = 1e-5  # so that a difference of exactly 8 levels of 255 does not count, whatever float32 makes of it
+
+
+def psnr(
+    predicted: Float[Tensor, "*batch 3 height width"],
+    true: Float[Tensor, "*batch 3 height width"],
+    where: Bool[Tensor, "*batch height width"] | None = None,
+) -> Float[Tensor, "*batch"]:
+    """Return the peak signal-to-noise ratio of each image in dB: 10 log10(1 / mean squared error).
+
+    Identical images have infinity: leave them out of a mean and say how many there were.
+
+    Args:
+        predicted: Images in 0 .. 1.
+        true: Likewise.
+        where: The pixels that count; None: all. An image without any has NaN.
+    """
+    squared = (predicted.float() - true.float()).square().mean(dim=-3)
+    return -10 * torch.log10(mean_where(squared, where))
+
+
+def ssim(
+    predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"]
+) -> Float[Tensor, "*batch"]:
+    """Return the structural similarity of each image: the mean of `ssim_map`; 1 is identical."""
+    return ssim_map(predicted, true).mean(dim=(-2, -1))
+
+
+def ssim_map(
+    predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"]
+) -> Float[Tensor, "*batch height width"]:
+    """Return the structural similarity at each pixel, as the mean over R, G and B.
+
+    Average it over a region with `mean_where`.
+
+    Raises:
+        ValueError: Images of fewer than 6 pixels a side cannot be reflected at their borders.
+
+    Source: Wang, Bovik, Sheikh, Simoncelli (2004), Image Quality Assessment, equation 13; borders are reflected, as in
+    torchmetrics 1.9.0, whose values it equals to 1e-5.
+    """
+    similarity, _ = _terms(predicted, true)
+    return similarity.mean(dim=-3)
+
+
+def ms_ssim(
+    predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"], scales: int = 5
+) -> Float[Tensor, "*batch"]:
+    """Return the multi-scale structural similarity of each image.
+
+    It is the product over scales of mean contrast (of the coarsest one: of mean similarity) to the power of a weight,
+    each at least 0. The weights are the first `scales` of the paper's five, divided by their sum. torchmetrics takes
+    its `betas` as they are: pass it the same divided weights for the same value. Where a factor is 0, the gradient of
+    the whole is 0: put a pixel loss beside it.
+
+    Args:
+        predicted: Images in 0 .. 1.
+        true: Likewise.
+        scales: Each halves the image; 3 suit images of 96 pixels, 5 those of 256.
+
+    Raises:
+        ValueError: Scales other than 1 to 5, or an image of fewer than 11 pixels at the coarsest one.
+
+    Source: Wang, Simoncelli, Bovik (2003), Multiscale structural similarity, equation 7.
+    """
+    if not 1 <= scales <= len(_SCALE_WEIGHTS):
+        raise ValueError(f"{scales} scales; there are weights for 1 to {len(_SCALE_WEIGHTS)}")
+    if min(predicted.shape[-2:]) >> (scales - 1) < 2 * _RADIUS + 1:
+        size = " x ".join(str(side) for side in predicted.shape[-2:])
+        least = (2 * _RADIUS + 1) << (scales - 1)
+        raise ValueError(f"images of {size} px are too small for {scales} scales, which need {least} px a side")
+    weights = [weight / sum(_SCALE_WEIGHTS[:scales]) for weight in _SCALE_WEIGHTS[:scales]]
+    product = torch.ones(predicted.shape[:-3], device=predicted.device)
+    for scale, weight in enumerate(weights):
+        similarity, contrast = _terms(predicted, true)
+        if scale == scales - 1:
+            factor = similarity.mean(dim=(-3, -2, -1))
+        else:  # without the border, where the window sees reflections
+            inside = contrast[..., _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
+            factor = inside.mean(dim=(-3, -2, -1))
+            predicted, true = _halved(predicted), _halved(true)
+        product = product * _power(factor, weight)
+    return product
+
+
+def moving_region(true: Float[Tensor, "*batch time 3 height width"]) -> Bool[Tensor, "*batch time-1 height width"]:
+    """Return where each later frame differs from frame 0 by more than 8 levels of 255 in any channel.
+
+    Every such pixel is dilated to the square of 8 pixels around it. It depends on the true frames alone; its mean is its
+    share of the pixels.
+    """
+    later, first = true[..., 1:, :, :, :].float(), true[..., :1, :, :, :].float()
+    moved = ((later - first).abs() > MOVES_BY + _ROUNDING).any(dim=-3)
+    flat = moved.reshape(-1, 1, *moved.shape[-2:]).float()
+    dilated = torch.nn.functional.max_pool2d(flat, 2 * DILATED_BY + 1, stride=1, padding=DILATED_BY)
+    return (dilated > 0).reshape(moved.shape)
+
+
+def mean_where(
+    values: Float[Tensor, "*batch height width"], where: Bool[Tensor, "*batch height width"] | None
+) -> Float[Tensor, "*batch"]:
+    """Return the mean over the pixels that count, all of them if `where` is None; NaN where none does."""
+    if where is None:
+        return values.mean(dim=(-2, -1))
+    return torch.where(where, values, 0).sum(dim=(-2, -1)) / where.sum(dim=(-2, -1))
+
+
+def _terms(
+    predicted: Float[Tensor, "*batch channel height width"], true: Float[Tensor, "*batch channel height width"]
+) -> tuple[Float[Tensor, "*batch channel height width"], Float[Tensor, "*batch channel height width"]]:
+    """Return similarity and contrast at each pixel, for each channel."""
+    height, width = predicted.shape[-2:]
+    with torch.autocast(predicted.device.type, enabled=False):
+        one, other = predicted.float(), true.float()
+        down, across = (_window(side, predicted.device) for side in (height, width))
+        parts = torch.stack([one, other, one * one, other * other, one * other])
+        mean, other_mean, square, other_square, product = down @ parts @ across.T
+        variances = (square - mean**2).clamp(min=0) + (other_square - other_mean**2).clamp(min=0)
+        covariance = product - mean * other_mean
+        contrast = (2 * covariance + _OF_CONTRAST) / (variances + _OF_CONTRAST)
+        luminance = (2 * mean * other_mean + _OF_LUMINANCE) / (mean**2 + other_mean**2 + _OF_LUMINANCE)
+        return luminance * contrast, contrast
+
+
+@lru_cache(maxsize=16)
+def _window(side: int, device: torch.device) -> Float[Tensor, "side side"]:
+    """Return the matrix that smooths a line of pixels with the Gaussian window, reflected at both ends.
+
+    A product with it is exact (a convolution may compute in TF32, in which variances are differences of rounded
+    numbers) and on a CPU twenty times faster than a convolution of one channel.
+    """
+    if side <= _RADIUS:
+        raise ValueError(f"an image side of {side} px; the window needs more than {_RADIUS}")
+    weights = [math.exp(-0.5 * (shift / _SIGMA) ** 2) for shift in range(-_RADIUS, _RADIUS + 1)]
+    with torch.inference_mode(False), torch.no_grad():
+        matrix = torch.zeros(side, side, dtype=torch.float64)
+        for place in range(side):
+            for shift, weight in zip(range(-_RADIUS, _RADIUS + 1), weights, strict=True):
+                seen = abs(place + shift)
+                matrix[place, min(seen, 2 * (side - 1) - seen)] += weight / sum(weights)
+        return matrix.to(device, torch.float32)
+
+
+def _halved(images: Float[Tensor, "*batch channel height width"]) -> Float[Tensor, "*batch channel rows columns"]:
+    flat = images.float().reshape(-1, *images.shape[-3:])
+    halved = torch.nn.functional.avg_pool2d(flat, 2)
+    return halved.reshape(*images.shape[:-2], *halved.shape[-2:])
+
+
+def _power(factor: Float[Tensor, "*batch"], weight: float) -> Float[Tensor, "*batch"]:
+    """Return the power of what is above 0, else 0, with a finite gradient in either case."""
+    positive = factor > 0
+    return torch.where(positive, torch.where(positive, factor, 1) ** weight, 0)

@@ -1,0 +1,1 @@
+"""Actions that were not taken: named ones, or those of a file."""

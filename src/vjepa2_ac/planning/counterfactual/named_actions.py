@@ -1,0 +1,102 @@
+"""Named actions that were not taken, and the states to which such actions lead.
+
+They need no simulator: a model can predict under them from any start of recorded robot data.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.episode import ACTION_DIM
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.planning.search_space import GRIPPER
+from vjepa2_ac.planning.state_integration import states_along
+from vjepa2_ac.spaces import POSE, StateSpace
+
+STEP_M, GRIPPER_STEP = 0.05, 0.75
+"""Metres, and change of closedness, of a named step: the largest that upstream plans (`planning.limits`). A run may
+have been taught less; what a model predicts for longer steps than it was taught means nothing."""
+
+_DIRECTIONS: dict[str, tuple[int, float]] = {  # in the robot base frame: x to the front, y to the left, z up
+    "up": (2, 1.0),
+    "down": (2, -1.0),
+    "left": (1, 1.0),
+    "right": (1, -1.0),
+    "forward": (0, 1.0),
+    "back": (0, -1.0),
+    "open": (6, -1.0),
+    "close": (6, 1.0),
+}
+ACTION_NAMES = ("none", *_DIRECTIONS)
+
+
+def named_actions(
+    name: str, steps: int, *, size_m: float = STEP_M, limits: LimitsConfig | None = None
+) -> Float[np.ndarray, "steps 7"]:
+    """Return the same action for every model step (legend: episode.py).
+
+    `open` and `close` go on changing a gripper at its end, as `planning.limits.gripper_mode: close` does: a real one
+    lags behind. Give a model `feasible_actions` of them.
+
+    Args:
+        name: What happens.
+        steps: Model steps.
+        size_m: Length of each step in metres, if the limits allow it.
+        limits: The largest actions, at best those that the data taught (`planning.limits.xyz: data`, resolved). None:
+            `size_m` counts alone, and the gripper changes as upstream's.
+
+    Raises:
+        InputError: No such name, or one that the limits hold still.
+        ValueError: No steps, or no length.
+    """
+    if steps < 1 or not 0 < size_m < np.inf:
+        raise ValueError(f"{steps} steps of {size_m} m")
+    actions = np.zeros((steps, ACTION_DIM))
+    if name == "none":
+        return actions
+    if name not in _DIRECTIONS:
+        raise InputError(where="actions", found=repr(name), needed=f"one of {', '.join(ACTION_NAMES)}, or a file")
+    axis, sign = _DIRECTIONS[name]
+    size = _size_along(axis, size_m, limits)
+    if size == 0:
+        key = "planning.limits.gripper" if axis == GRIPPER else "planning.limits.xyz"
+        raise InputError(where=key, found=f"0, so that nothing can move {name}", needed="a limit above 0")
+    actions[:, axis] = sign * size
+    return actions
+
+
+def counterfactual_states(
+    state: Float[np.ndarray, " state_dim"], actions: Float[np.ndarray, "steps state_dim"], space: StateSpace = POSE
+) -> Float[np.ndarray, "steps+1 state_dim"]:
+    """Return the states before and after actions that were not taken: integrated from the first, in double precision.
+
+    Never take them from a recording: later states of what did happen would give the model the truth. The gripper stays
+    within 0 .. 1. Of poses without the lag of a real arm, which covers some 95 % of a commanded step.
+    """
+    first, changes = (torch.from_numpy(np.array(one, dtype=np.float64)) for one in (state, actions))
+    return states_along(first, changes[None], space)[0].numpy()
+
+
+def feasible_actions(
+    state: Float[np.ndarray, " state_dim"], actions: Float[np.ndarray, "steps state_dim"], space: StateSpace = POSE
+) -> Float[np.ndarray, "steps state_dim"]:
+    """Return actions whose gripper changes only as far as it can: those of `counterfactual_states`, as data would have.
+
+    A measured closedness does not change any more at its end, so a model has never seen further changes there.
+    """
+    feasible = np.array(actions, dtype=np.float64)
+    if space.gripper is not None:
+        feasible[:, space.gripper] = np.diff(counterfactual_states(state, actions, space)[:, space.gripper])
+    return feasible
+
+
+def _size_along(axis: int, size_m: float, limits: LimitsConfig | None) -> float:
+    """Return the size of a step along an axis: metres, or change of closedness."""
+    if limits is None:
+        return GRIPPER_STEP if axis == GRIPPER else size_m
+    if axis == GRIPPER:
+        return limits.gripper
+    return min(size_m, limits.xyz_m[axis], limits.radius if limits.ball != "none" else np.inf)

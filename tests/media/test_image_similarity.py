@@ -1,0 +1,136 @@
+"""Similarity of images equals torchmetrics' (recorded values), can be differentiated and keeps to its region."""
+
+import math
+
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from vjepa2_ac.media.image_similarity import mean_where, moving_region, ms_ssim, psnr, ssim, ssim_map
+
+# size, case, PSNR, SSIM, MS-SSIM by scales: torchmetrics 1.9.0 on torch 2.13.0, data_range 1, `betas` the first scales'
+# default weights divided by their sum; images of `pair`.
+RECORDED = [
+    ((176, 192), 0, 24.952917, 0.9587704539, {1: 0.9587704539, 2: 0.9648514390, 3: 0.9745008349, 5: 0.9764264226}),
+    ((176, 192), 1, 19.958574, 0.7451646328, {1: 0.7451646328, 2: 0.8670520186, 3: 0.9164192677, 5: 0.9396925569}),
+    ((176, 192), 2, 7.416971, 0.0071898736, {1: 0.0071898736, 2: 0.0104463147, 3: 0.0143351527, 5: 0.0151620889}),
+    ((176, 192), 3, 4.948193, -0.4814432263, {1: 0.0, 2: 0.0, 3: 0.0, 5: 0.0}),
+    ((97, 64), 0, 24.929602, 0.9578150511, {1: 0.9578150511, 2: 0.9639894962, 3: 0.9740152955}),
+    ((97, 64), 1, 20.423635, 0.7375175953, {1: 0.7375175953, 2: 0.8657351732, 3: 0.9162175655}),
+    ((97, 64), 2, 7.413724, 0.0073526669, {1: 0.0073526669, 2: 0.0106577622, 3: 0.0150039932}),
+    ((97, 64), 3, 4.941878, -0.4780655801, {1: 0.0, 2: 0.0, 3: 0.0}),
+]
+
+
+def pair(case: int, size: tuple[int, int]) -> tuple[Float[Tensor, "3 height width"], Float[Tensor, "3 height width"]]:
+    """Return an image and another one, by formula: paler and brighter, shifted, unrelated, or its negative."""
+    rows = torch.arange(size[0], dtype=torch.float64)[:, None]
+    columns = torch.arange(size[1], dtype=torch.float64)[None]
+    waves = [rows * (0.11 + 0.03 * c) + columns * (0.07 + 0.02 * case) + c for c in range(3)]
+    true = torch.stack([0.5 + 0.4 * torch.sin(wave) for wave in waves])
+    others = [
+        true * 0.8 + 0.1,
+        torch.roll(true, 3, -1) + 0.05 * torch.cos(rows * columns * 0.37),
+        0.5 + 0.45 * torch.cos(rows * 0.9 + columns * 1.3 + torch.arange(3)[:, None, None]),
+        1 - true,
+    ]
+    return others[case].clamp(0, 1).float(), true.clamp(0, 1).float()
+
+
+@pytest.mark.parametrize(("size", "case", "decibels", "similarity", "by_scales"), RECORDED)
+def test_values_equal_torchmetrics(
+    size: tuple[int, int], case: int, decibels: float, similarity: float, by_scales: dict[int, float]
+) -> None:
+    predicted, true = pair(case, size)
+    assert float(psnr(predicted, true)) == pytest.approx(decibels, abs=1e-5)
+    assert float(ssim(predicted, true)) == pytest.approx(similarity, abs=1e-5)
+    for scales, expected in by_scales.items():
+        assert float(ms_ssim(predicted, true, scales)) == pytest.approx(expected, abs=1e-5)
+
+
+def test_every_image_of_a_batch_has_its_own_value() -> None:
+    pairs = [pair(case, (97, 64)) for case in range(4)]
+    predicted, true = (torch.stack(images).reshape(2, 2, 3, 97, 64) for images in zip(*pairs, strict=True))
+    for measure in (psnr, ssim, ms_ssim_of_3):
+        together = measure(predicted, true)
+        assert together.shape == (2, 2)
+        torch.testing.assert_close(together.flatten(), torch.stack([measure(*each) for each in pairs]))
+
+
+def test_identical_images_have_infinite_psnr_and_similarity_1() -> None:
+    image, _ = pair(2, (97, 64))
+    assert float(psnr(image, image)) == math.inf
+    assert float(ssim(image, image)) == pytest.approx(1, abs=1e-6)
+    assert float(ms_ssim_of_3(image, image)) == pytest.approx(1, abs=1e-6)
+
+
+def ms_ssim_of_3(predicted: Tensor, true: Tensor) -> Tensor:
+    return ms_ssim(predicted, true, 3)
+
+
+def test_gradients_are_those_of_finite_differences() -> None:
+    predicted, true = pair(1, (48, 48))
+    direction = torch.randn(3, 48, 48, generator=torch.Generator().manual_seed(0))
+    for measure in (psnr, ssim, ms_ssim_of_3):
+        given = predicted.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(measure(given, true), given)
+        with torch.no_grad():
+            ends = [float(measure(predicted + step * direction, true)) for step in (-1e-3, 1e-3)]
+        assert float((gradient * direction).sum()) == pytest.approx((ends[1] - ends[0]) / 2e-3, rel=2e-2)
+
+
+def test_gradients_are_finite_where_a_factor_is_zero() -> None:
+    predicted, true = pair(3, (48, 48))
+    given = predicted.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(ms_ssim(given, true, 3), given)
+    assert torch.isfinite(gradient).all()
+
+
+def test_autocast_changes_nothing() -> None:
+    predicted, true = pair(1, (48, 48))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        inside = [measure(predicted, true) for measure in (psnr, ssim, ms_ssim_of_3)]
+    assert inside == [measure(predicted, true) for measure in (psnr, ssim, ms_ssim_of_3)]
+    assert all(value.dtype == torch.float32 for value in inside)
+
+
+def test_within_a_region_only_its_pixels_count() -> None:
+    predicted, true = pair(1, (97, 64))
+    where = torch.zeros(97, 64, dtype=torch.bool)
+    where[30:60, 20:40] = True
+    cut = psnr(predicted[:, 30:60, 20:40], true[:, 30:60, 20:40])
+    torch.testing.assert_close(psnr(predicted, true, where), cut)
+    elsewhere = predicted.clone()
+    elsewhere[:, 75:] = 0
+    similar = [mean_where(ssim_map(image, true), where) for image in (predicted, elsewhere)]
+    torch.testing.assert_close(*similar)
+    assert torch.isnan(psnr(predicted, true, torch.zeros_like(where)))
+
+
+def test_moving_region_is_what_moved_and_eight_pixels_around() -> None:
+    true = torch.full((3, 3, 40, 40), 100 / 255)
+    true[1, 1, 20, 12] += 9 / 255  # one channel suffices
+    true[1, 2, 20, 30] -= 8 / 255  # exactly 8 levels do not
+    expected = torch.zeros(2, 40, 40, dtype=torch.bool)
+    expected[0, 12:29, 4:21] = True
+    assert torch.equal(moving_region(true), expected)
+    assert torch.equal(moving_region(true.expand(2, 3, 3, 40, 40)), expected.expand(2, 2, 40, 40))
+
+
+def test_a_smeared_object_scores_better_than_a_sharp_one_elsewhere() -> None:
+    """The reason why these metrics never stand alone: of two wrong predictions they prefer the vague one."""
+    true, off, smeared = torch.full((3, 3, 64, 64), 0.5)
+    true[:, 20:40, 20:30] = 0.9
+    off[:, 20:40, 32:42] = 0.9
+    for shift in range(-12, 13):
+        smeared[:, 20:40, 20 + shift : 30 + shift] += 0.4 / 25
+    assert psnr(smeared, true) > psnr(off, true) + 2
+    assert ssim(smeared, true) > ssim(off, true)
+
+
+@pytest.mark.parametrize(("size", "scales"), [(43, 3), (64, 6), (64, 0)])
+def test_too_small_images_and_unknown_scales_are_refused(size: int, scales: int) -> None:
+    image = torch.zeros(3, size, size)
+    with pytest.raises(ValueError, match="scales"):
+        ms_ssim(image, image, scales)

@@ -1,0 +1,129 @@
+"""Named actions are opposites, within the limits, and lead where their names say; files of actions are checked."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.planning.counterfactual.actions_file import read_actions
+from vjepa2_ac.planning.counterfactual.named_actions import (
+    ACTION_NAMES,
+    counterfactual_states,
+    feasible_actions,
+    named_actions,
+)
+from vjepa2_ac.spaces import vector_states
+
+START = np.array([0.4, 0.1, 0.3, np.pi - 0.01, 0.02, -0.7, 0.4])
+ROWS = np.array([[0.05, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0], [0.0, -0.02, 0.01, 0.0, 0.0, 0.0, -0.75]])
+
+
+@pytest.mark.parametrize(("one", "other"), [("up", "down"), ("left", "right"), ("forward", "back"), ("close", "open")])
+def test_opposites_sum_to_zero_and_lead_apart_along_one_axis(one: str, other: str) -> None:
+    there, back = named_actions(one, 3), named_actions(other, 3)
+    assert there.any()
+    assert not (there + back).any()
+    ends = [counterfactual_states(START, actions)[-1] for actions in (there, back)]
+    axis = {"up": 2, "left": 1, "forward": 0, "close": 6}[one]
+    assert ends[0][axis] > START[axis] > ends[1][axis]
+    same = np.arange(7) != axis
+    np.testing.assert_allclose(ends[0][same], START[same], atol=1e-9)
+
+
+def test_every_name_has_its_own_actions_and_none_stays() -> None:
+    assert len({named_actions(name, 2).tobytes() for name in ACTION_NAMES}) == len(ACTION_NAMES) == 9
+    np.testing.assert_allclose(
+        counterfactual_states(START, named_actions("none", 4)), np.tile(START, (5, 1)), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("closedness", [0.0, 0.4, 1.0])
+def test_close_ends_closed_open_ends_open_and_a_model_sees_only_what_can_change(closedness: float) -> None:
+    start = np.append(START[:6], closedness)
+    for name, end in (("close", 1.0), ("open", 0.0)):
+        actions = named_actions(name, 3)
+        states = counterfactual_states(start, actions)
+        assert states[-1, 6] == end
+        feasible = feasible_actions(start, actions)
+        np.testing.assert_allclose(feasible, actions_from_states(states), atol=1e-9)
+        assert abs(feasible[:, 6].sum() - (end - closedness)) < 1e-12
+
+
+def test_steps_are_as_long_as_asked_and_never_beyond_the_limits() -> None:
+    taught = LimitsConfig(xyz=(0.03, 0.02, 0.0), gripper=0.5)
+    assert named_actions("forward", 1)[0, 0] == 0.05
+    assert named_actions("forward", 1, limits=taught)[0, 0] == 0.03
+    assert named_actions("right", 1, limits=taught, size_m=0.01)[0, 1] == -0.01
+    assert named_actions("open", 1, limits=taught)[0, 6] == -0.5
+    assert named_actions("up", 1, limits=LimitsConfig(ball="l1", radius=0.02))[0, 2] == 0.02
+    with pytest.raises(InputError, match=r"planning\.limits\.xyz: 0, so that nothing can move up"):
+        named_actions("up", 1, limits=taught)
+    with pytest.raises(InputError, match=r"planning\.limits\.gripper: 0"):
+        named_actions("close", 1, limits=LimitsConfig(gripper=0.0))
+    with pytest.raises(InputError, match="one of none, up, down"):
+        named_actions("sideways", 1)
+    with pytest.raises(ValueError, match="0 steps"):
+        named_actions("up", 0)
+
+
+def test_states_are_integrated_from_the_first_alone() -> None:
+    actions = np.random.default_rng(0).uniform(-0.05, 0.05, (5, 7))
+    states = counterfactual_states(START, actions)
+    np.testing.assert_allclose(states[0], START, atol=0)
+    np.testing.assert_allclose(actions_from_states(states), actions, atol=1e-9)
+    vector = counterfactual_states(np.zeros(3), np.ones((2, 3)), vector_states(3))
+    np.testing.assert_array_equal(vector, [[0] * 3, [1] * 3, [2] * 3])
+
+
+def test_actions_are_read_from_arrays_and_tables(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", ROWS.astype(np.float32))
+    lines = "\n".join(",".join(map(str, row)) for row in ROWS)
+    (tmp_path / "a.csv").write_text(lines + "\n\n")
+    (tmp_path / "named.csv").write_text("dx, dy, dz, droll, dpitch, dyaw, dgripper\n" + lines)
+    for name in ("a.npy", "a.csv", "named.csv"):
+        np.testing.assert_allclose(read_actions(tmp_path / name), ROWS, atol=1e-8)
+    np.testing.assert_array_equal(read_actions(tmp_path / "a.csv", steps=1), ROWS[:1])
+    with pytest.raises(InputError, match=r"a\.csv: 2 actions\. needed: 3"):
+        read_actions(tmp_path / "a.csv", steps=3)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv", "0,0,0,0,0,0\n", "line 1: 6 values"),
+        ("a.csv", "0,0,0,0,0,0,0\n\n0,0,up,0,0,0,0\n", "line 3: could not convert string to float: 'up'"),
+        ("a.csv", "0,0,0,0,0,0,nan\n", "action 0: the numbers"),
+        ("a.csv", "0,0,0,0,0,0,0\n50,0,0,0,0,0,0\n", "action 1: the numbers .* 1 m"),
+        ("a.csv", "", r"shape \(0, 7\)"),
+        ("a.csv", b"\xff\xfe\x00", "not text"),
+        ("a.npy", b"PK\x03\x04", "another kind of file"),
+        ("a.npy", np.zeros((3, 6)), r"shape \(3, 6\)"),
+        ("a.npy", np.full((1, 7), np.inf), "action 0"),
+        ("a.npy", np.array(["a"] * 7)[None], "values of type <U1"),
+        ("a.npy", np.array([[None] * 7]), "not an array of numbers"),
+        ("a.txt", "0", "a file .txt. needed: a .npy or .csv"),
+    ],
+)
+def test_files_of_something_else_are_refused(
+    tmp_path: Path, name: str, content: str | bytes | np.ndarray, message: str
+) -> None:
+    path = tmp_path / name
+    if isinstance(content, np.ndarray):
+        np.save(path, content)
+    else:
+        path.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(InputError, match=message):
+        read_actions(path)
+
+
+def test_a_huge_claim_and_a_missing_file_are_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros((100, 7)))
+    data = (tmp_path / "a.npy").read_bytes()
+    (tmp_path / "a.npy").write_bytes(data.replace(b"(100, 7)", b"(9**9,7)").replace(b"9**9", b"9999"))
+    with pytest.raises(InputError, match="not an array of numbers"):
+        read_actions(tmp_path / "a.npy")
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        read_actions(tmp_path / "b.npy")

@@ -1,0 +1,123 @@
+"""A recorded data set says how it was simulated; what it says gives its episodes again."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.simulation.world.domains import DOMAIN_A, DOMAIN_B, CameraPlace, DomainRanges
+
+pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset, record_episode
+from vjepa2_ac.simulation.recording.simulation_file import (
+    SIMULATION_FILE,
+    other_versions,
+    read_simulation,
+    simulation_text,
+)
+from vjepa2_ac.simulation.world.motion import MotionRecipe
+
+SPECS = [
+    RecordingSpec("A", 5, seed=3),
+    RecordingSpec("random", 5, seed=4, cameras=3),
+    RecordingSpec(replace(DOMAIN_B, lag_s=0.1 + 0.2, camera=CameraPlace(1 / 3, 20.0, 1.2)), 5, task="push"),
+    RecordingSpec(DomainRanges(lag_s=(0.05, 0.06)), 5, recipe=MotionRecipe(drift_m=(0.0, 0.01, 0.0))),
+]
+
+
+def written(folder: Path, spec: RecordingSpec, **changes: Any) -> Path:
+    values = json.loads(simulation_text(spec, 2)) | changes
+    (folder / SIMULATION_FILE).write_text(json.dumps(values))
+    return folder
+
+
+@pytest.mark.parametrize("spec", SPECS, ids=["A", "random", "task", "recipe"])
+def test_the_spec_that_is_read_is_the_one_that_was_recorded(tmp_path: Path, spec: RecordingSpec) -> None:
+    read = read_simulation(written(tmp_path, spec))
+    assert read.spec == replace(spec, domain=spec.worlds, recipe=spec.recipe or MotionRecipe())
+    assert read.episodes == 2
+    assert other_versions(read) == ""
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record_dataset(tmp_path_factory.mktemp("sim") / "data", RecordingSpec("random", 2, 1), episodes=3, shards=2)
+
+
+def test_the_file_gives_the_recorded_episodes_again(recorded: Path) -> None:
+    source, simulation = RldsSource(DataConfig(path=str(recorded))), read_simulation(recorded)
+    numbers = [simulation.number_of(info.id) for info in source.infos()]
+    assert sorted(numbers) == [0, 1, 2]
+    again = record_episode(numbers[1], simulation.spec)
+    assert f"{again.recording_folderpath}--{again.file_path}" == source.infos()[1].id
+    assert simulation.world_of(source.infos()[0].id) != simulation.world_of(source.infos()[1].id)
+
+
+def test_the_index_and_its_key_do_not_depend_on_the_file(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caches = []
+    for name in ("with", "without"):
+        shutil.copytree(recorded, tmp_path / "data")
+        if name == "without":
+            (tmp_path / "data" / SIMULATION_FILE).unlink()
+        monkeypatch.setenv("VJEPA2_AC_CACHE", str(tmp_path / name))
+        infos = RldsSource(DataConfig(path=str(tmp_path / "data"))).infos()
+        caches.append((sorted(path.name for path in (tmp_path / name).rglob("*") if path.is_file()), list(infos)))
+        shutil.rmtree(tmp_path / "data")
+    assert caches[0] == caches[1]
+    assert caches[0][0]
+
+
+def test_a_folder_without_the_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(
+        InputError, match=r"simulation\.json: no such file: .*needed: .*simulate record.*Record it again"
+    ):
+        read_simulation(tmp_path)
+
+
+def test_episodes_of_others_are_refused(tmp_path: Path) -> None:
+    simulation = read_simulation(written(tmp_path, RecordingSpec("A", 5)))
+    ours = record_name(RecordingSpec("A", 5), 1)
+    assert simulation.number_of(ours) == 1
+    others = [record_name(RecordingSpec("A", 5), 2), record_name(RecordingSpec("A", 5, seed=1), 1)]
+    others += [record_name(RecordingSpec("B", 5), 1), "/nfs/AUTOLab/success/2023-07-07/Fri_Jul__7_09:42:23_2023/x.h5"]
+    for other in others:
+        with pytest.raises(InputError, match="not the episode"):
+            simulation.number_of(other)
+
+
+def record_name(spec: RecordingSpec, index: int) -> str:
+    from vjepa2_ac.simulation.recording.record import episode_folder
+
+    return f"{episode_folder(index, spec.seed, str(spec.domain))}/trajectory.h5"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"steps": 0}, "steps: .*greater than or equal to 2"),
+        ({"steps": "5"}, "steps: .*valid integer"),
+        ({"robot": 1}, "robot: unknown"),
+        ({"ranges": {}}, "2 of the keys domain and ranges"),
+        ({"domain": None}, "0 of the keys"),
+        ({"recipe": {"stride": 4, "speed": 2}}, r"recipe\.speed: unknown"),
+        ({"task": "stack"}, "task: "),
+    ],
+)
+def test_a_damaged_file_is_refused(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_simulation(written(tmp_path, RecordingSpec(DOMAIN_A, 5), **changes))
+
+
+def test_what_has_another_version_here_is_named(tmp_path: Path) -> None:
+    folder = written(tmp_path, RecordingSpec("A", 5), version="0.0.1", libraries={"mujoco": "2.0"})
+    assert other_versions(read_simulation(folder)).startswith("vjepa2-ac 0.0.1, here ")
+    assert "mujoco 2.0, here " in other_versions(read_simulation(folder))

@@ -1,0 +1,198 @@
+"""What happens under other actions: the recording itself under its own commands, and plain physics under others."""
+
+import json
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from paths import ROOT
+from vjepa2_ac.config import DataConfig
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.episode import Episode
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.geometry import actions_from_states
+
+pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
+
+from vjepa2_ac.planning.counterfactual.named_actions import named_actions
+from vjepa2_ac.simulation.counterfactual import RECORDED_CAMERAS, Resimulation, resimulate
+from vjepa2_ac.simulation.recording.record import RecordingSpec, record_dataset, record_episode
+from vjepa2_ac.simulation.recording.simulation_file import SIMULATION_FILE
+from vjepa2_ac.simulation.world.projection import exterior_pose, hand_pixels
+
+STEPS, START, STRIDE = 13, 4, 4
+SPECS = {
+    "A": RecordingSpec("A", STEPS, seed=2),
+    "random": RecordingSpec("random", STEPS, seed=2),
+    "push": RecordingSpec("A", STEPS, seed=2, task="push"),
+    "three cameras": RecordingSpec("B", 5, seed=2, cameras=3),
+    "random pick": RecordingSpec("random", STEPS, seed=2, task="pick"),
+}
+NAMES = [name for name, spec in SPECS.items() if spec.cameras == 1]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory):
+    """Return a function that records a data set of two episodes, once."""
+    root = tmp_path_factory.mktemp("sim")
+    return cache(lambda name: record_dataset(root / name.replace(" ", "-"), SPECS[name], episodes=2))
+
+
+def episode_of(folder: Path, index: int = 0) -> Episode:
+    return RldsSource(DataConfig(path=str(folder))).read(index)
+
+
+@pytest.fixture(params=NAMES)
+def start(request: pytest.FixtureRequest, recorded) -> Resimulation:
+    folder = recorded(request.param)
+    return resimulate(folder, episode_of(folder), START)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("index", [0, 1])  # with a task: a script, and play
+def test_under_the_recorded_commands_happens_what_was_recorded(name: str, index: int, recorded) -> None:
+    episode = episode_of(recorded(name), index)
+    outcome = resimulate(recorded(name), episode, START).as_recorded(2, STRIDE)
+    seen = range(START, STEPS, STRIDE)
+    np.testing.assert_allclose(outcome.states, episode.states[seen], atol=1e-6, rtol=0)
+    assert np.abs(outcome.frames.astype(int) - episode.read_frames(seen)).mean() < 0.5
+    assert np.abs(np.diff(outcome.states[:, :3], axis=0)).max() > 0.003  # else persistence would pass
+
+
+def test_the_actions_that_a_script_took_lead_to_what_was_recorded(recorded) -> None:
+    """Its commands are one target per model step, as those of the closed loop."""
+    made, episode = record_episode(0, SPECS["push"]), episode_of(recorded("push"))
+    assert made.recording_folderpath in episode.info.id
+    steps = range(START, STEPS - 1, STRIDE)
+    measured = np.concatenate([made.observation.cartesian_position, made.observation.gripper_position], axis=1)
+    taken = [actions_from_states(np.stack([measured[step], made.action[step]]))[0] for step in steps]
+    outcome = resimulate(recorded("push"), episode, START).under(np.array(taken), STRIDE)
+    np.testing.assert_allclose(outcome.states, measured[[*steps, STEPS - 1]], atol=1e-4)
+    assert outcome.reached.all()
+
+
+def test_the_hand_goes_where_the_name_says_in_states_and_in_images(start: Resimulation) -> None:
+    names = ("none", "up", "down", "left", "right")
+    none, up, down, left, right = (start.under(named_actions(name, 2), STRIDE) for name in names)
+    assert down.states[-1, 2] < none.states[-1, 2] - 0.001  # in `push` it is at the table already
+    assert up.states[-1, 2] - none.states[-1, 2] > 0.08
+    assert left.states[-1, 1] - right.states[-1, 1] > 0.15
+    assert np.abs(left.states[-1, [0, 2]] - right.states[-1, [0, 2]]).max() < 0.01
+    pixels = {
+        name: hand_pixels(outcome.states, start.domain)[-1]
+        for name, outcome in (("none", none), ("up", up), ("left", left), ("right", right))
+    }
+    assert pixels["up"][1] < pixels["none"][1] - 8
+    across = exterior_pose(start.domain)[:3, 0] @ start.domain.base_pose()[:3, 1]  # of the robot's left in the image
+    assert (pixels["left"][0] - pixels["right"][0]) * np.sign(across) > 15
+    for name, outcome in (("up", up), ("left", left)):  # what moved there is the hand
+        x, y = pixels[name].astype(int)
+        changed = np.abs(outcome.frames[-1].astype(int) - none.frames[-1])
+        assert changed[y - 2 : y + 3, x - 2 : x + 3].mean() > changed.mean() + 10
+
+
+def test_the_start_is_the_recorded_one_and_no_outcome_depends_on_another(start: Resimulation) -> None:
+    first = start.under(named_actions("forward", 1), STRIDE)
+    start.under(named_actions("down", 2), STRIDE)
+    again = start.under(named_actions("forward", 1), STRIDE)
+    assert first.frames.shape == (2, 180, 320, 3)
+    np.testing.assert_array_equal(first.frames, again.frames)
+    np.testing.assert_array_equal(first.states, again.states)
+    if first.blocks is not None:
+        np.testing.assert_array_equal(first.blocks, again.blocks)
+
+
+def test_open_and_close_move_the_fingers(recorded) -> None:
+    start = resimulate(recorded("A"), episode_of(recorded("A")), START)
+    closed, opened = (start.under(named_actions(name, 3), STRIDE).states for name in ("close", "open"))
+    assert closed[-1, 6] > 0.9
+    assert opened[-1, 6] < 0.1
+    np.testing.assert_allclose(closed[-1, :3], opened[-1, :3], atol=1e-3)
+
+
+def test_a_pushed_block_moves_only_if_it_is_pushed(recorded) -> None:
+    episode = episode_of(recorded("push"))  # the closed hand is behind the block
+    start = resimulate(recorded("push"), episode, START)
+    none, away = (start.under(named_actions(name, 3), STRIDE) for name in ("none", "up"))
+    assert none.blocks is not None
+    assert away.blocks is not None
+    assert np.linalg.norm(none.blocks[-1, :3] - none.blocks[0, :3]) < 0.02
+    to_block = none.blocks[0, :2] - none.states[0, :2]
+    push = np.zeros((3, 7))
+    push[:, :2] = 0.05 * to_block / np.linalg.norm(to_block)
+    pushed = start.under(push, STRIDE).blocks
+    assert pushed is not None
+    assert np.linalg.norm(pushed[-1, :2] - pushed[0, :2]) > 0.04
+
+
+def test_what_cannot_be_reached_is_said(recorded) -> None:
+    start = resimulate(recorded("A"), episode_of(recorded("A")), START)
+    outcome = start.under(named_actions("forward", 3, size_m=0.5), STRIDE)
+    assert not outcome.reached.all()
+    assert np.isfinite(outcome.states).all()
+
+
+@pytest.mark.parametrize("actions", [np.zeros((2, 6)), np.full((1, 7), np.nan), np.zeros(7)])
+def test_no_actions_are_carried_out_that_are_none(recorded, actions: np.ndarray) -> None:
+    start = resimulate(recorded("A"), episode_of(recorded("A")), START)
+    with pytest.raises(ValueError, match="steps x 7 finite"):
+        start.under(actions, STRIDE)
+    with pytest.raises(ValueError, match="13 were recorded"):
+        start.as_recorded(3, STRIDE)
+
+
+def test_other_data_are_refused(recorded, droid: Path) -> None:
+    real = episode_of(droid)
+    with pytest.raises(InputError, match=r"no such file.*can only be simulated"):
+        resimulate(droid, real, 0)
+    with pytest.raises(InputError, match="not the episode"):
+        resimulate(recorded("A"), real, 0)
+    with pytest.raises(InputError, match="not the episode"):
+        resimulate(recorded("A"), episode_of(recorded("random")), 0)
+    ours = episode_of(recorded("A"))
+    for step, camera, message in (
+        (STEPS, "exterior_1_left", "needed: 0 to 12"),
+        (0, "front", "one of exterior_1_left"),
+    ):
+        with pytest.raises(InputError, match=message):
+            resimulate(recorded("A"), ours, step, camera)
+
+
+def test_each_camera_of_three_shows_its_own_frames(recorded) -> None:
+    folder = recorded("three cameras")
+    source = RldsSource(DataConfig(path=str(folder), camera=tuple(RECORDED_CAMERAS)))
+    frames = []
+    for camera in RECORDED_CAMERAS:
+        episode = source.read(0, camera)
+        frames.append(resimulate(folder, episode, 2, camera).as_recorded(1, 2).frames)
+        assert np.abs(frames[-1].astype(int) - episode.read_frames([2, 4])).mean() < 0.5
+    with pytest.raises(InputError, match="the frame differs by"):
+        resimulate(folder, source.read(0, "exterior_1_left"), 2, "exterior_2_left")
+
+
+def test_the_pages_example_runs(recorded, capsys: pytest.CaptureFixture[str]) -> None:
+    (example,) = re.findall(r"```py\n(.*?)```", (ROOT / "docs/planning.md").read_text(), flags=re.DOTALL)
+    exec(example.replace("data/sim", str(recorded("A"))), {})  # noqa: S102 - our own page
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["none", "up", "left", "close"]
+
+
+def test_a_recording_that_shows_something_else_is_refused(recorded, tmp_path: Path) -> None:
+    episode = episode_of(recorded("A"))
+    moved = replace(episode, states=episode.states + 1e-3)
+    with pytest.raises(InputError, match=r"control step 4: .*the state differs by up to 0\.001"):
+        resimulate(recorded("A"), moved, START)
+    earlier = replace(episode, read_frames=lambda steps: episode.read_frames([0 for _ in steps]))
+    with pytest.raises(InputError, match="the frame differs by"):
+        resimulate(recorded("A"), earlier, START)
+    values = json.loads((recorded("A") / SIMULATION_FILE).read_text())
+    values |= {"domain": values["domain"] | {"lag_s": 0.2}, "version": "0.0.1"}
+    (tmp_path / SIMULATION_FILE).write_text(json.dumps(values))
+    with pytest.raises(InputError, match=r"the state differs.*recorded with vjepa2-ac 0\.0\.1, here"):
+        resimulate(tmp_path, episode, START)
+    small = replace(episode, read_frames=lambda steps: episode.read_frames(steps)[:, ::2, ::2])
+    with pytest.raises(InputError, match="not those of a cache"):
+        resimulate(recorded("A"), small, START)
