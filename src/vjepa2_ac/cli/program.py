@@ -10,7 +10,20 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from vjepa2_ac import __version__, output
-from vjepa2_ac.cli import config, data, decoder, doctor, download, encode, evaluate, export, plan, simulate, train
+from vjepa2_ac.cli import (
+    config,
+    data,
+    decoder,
+    doctor,
+    download,
+    encode,
+    evaluate,
+    export,
+    imagine,
+    plan,
+    simulate,
+    train,
+)
 from vjepa2_ac.cli.ending import tidy_end
 from vjepa2_ac.cli.options import Handler, Parser, parsed
 from vjepa2_ac.errors import InputError, UserError, in_words, is_out_of_memory, printable
@@ -92,6 +105,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=__version__)
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    for one in (train, evaluate, data, encode, decoder, doctor, plan, export, config, download, simulate):
+    for one in (train, evaluate, imagine, data, encode, decoder, doctor, plan, export, config, download, simulate):
         one.add_to(commands)
     return parser

@@ -28,7 +28,7 @@ from vjepa2_ac.config.training import (
 __all__ = [
     "ActionContrastConfig", "AdapterConfig", "AugmentConfig", "CheckpointConfig", "Config", "DataConfig",
     "DecoderConfig", "DiskCacheConfig", "EncoderSizes", "EnergyConfig", "IdleConfig", "LatentsData", "LeRobotData",
-    "LeRobotFields", "LimitsConfig", "ModelConfig", "ModelSizes", "NpzData", "PlanningConfig", "PredictorSizes", "RawDroidData",
-    "RawDroidOptions", "ReplayConfig", "RldsData", "RldsFields", "Section", "TrackingConfig", "TrainingConfig",
-    "ValidationConfig",
+    "LeRobotFields", "LimitsConfig", "ModelConfig", "ModelSizes", "NpzData", "PlanningConfig", "PredictorSizes",
+    "RawDroidData", "RawDroidOptions", "ReplayConfig", "RldsData", "RldsFields", "Section", "TrackingConfig",
+    "TrainingConfig", "ValidationConfig",
 ]  # fmt: skip

@@ -180,7 +180,7 @@ def require_space_for_pairs(
 
 def _file_of(dataset: Dataset, wanted: FramesToEncode, folder: Path) -> PairFile:
     """Return the file of a request: its name says which frames, so that others are never taken for them."""
-    steps = hashlib.sha256(np.ascontiguousarray(wanted.steps)).hexdigest()[:8]
+    steps = hashlib.sha256(np.ascontiguousarray(wanted.steps).tobytes()).hexdigest()[:8]
     camera = dataset.config.cameras.index(wanted.camera)
     name = f"{wanted.episode:07d}-{camera}-{steps}.safetensors"
     return PairFile(folder / name, dataset.table.identity(wanted.episode), len(wanted.steps))

@@ -46,5 +46,5 @@ def fit_linear(pairs: FramePairs, shape: DecoderShape, device: torch.device, pro
     inner.diagonal()[:-1] += ridge
     solved = torch.linalg.solve(inner, outer).float()
     weight, bias = solved[:-1].T.contiguous(), solved[-1].contiguous()
-    decoder.layers[0].load_state_dict({"weight": weight, "bias": bias})  # type: ignore[index]  # a Sequential
-    return decoder
+    decoder.linear.load_state_dict({"weight": weight, "bias": bias})
+    return decoder.eval().requires_grad_(False)

@@ -20,9 +20,10 @@ def decoder_loss(
         images: What the decoder gives, not clipped.
         targets: What the encoder saw, between 0 and 1.
     """
-    scales = sum(images.shape[-1] >= 11 * 2**scale for scale in range(_SCALES))  # a window of 11 pixels has to fit
+    scales = sum(images.shape[-1] >= 11 << scale for scale in range(_SCALES))  # a window of 11 pixels has to fit
     absolute = (images - targets).abs().mean()
     structure = 1.0 - ms_ssim(images, targets, scales=scales).mean()
-    edges = sum((images.diff(dim=axis) - targets.diff(dim=axis)).abs().mean() for axis in (-1, -2))
+    rows, columns = ((images.diff(dim=axis) - targets.diff(dim=axis)).abs().mean() for axis in (-2, -1))
+    edges = rows + columns
     parts = {"l1": absolute, "structure": structure, "edges": edges}
     return absolute + STRUCTURE * structure + EDGES * edges, parts

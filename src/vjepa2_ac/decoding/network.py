@@ -25,6 +25,7 @@ Size = Literal["linear", "tiny", "small", "medium"]
 _MIDDLE, _RANGE = 0.5, 0.25  # of pixels: the network's numbers are about -2 .. 2
 _FREQUENCIES = 10_000.0
 _STD = 0.02
+_LAST = -2  # of the further layers: the last one with weights
 
 
 @dataclass(frozen=True)
@@ -60,18 +61,17 @@ _SIZES: dict[str, _Widths] = {
 class Decoder(nn.Module):
     """Turns the latents of a frame into its image, frame by frame.
 
-    Attention blocks over the tokens of one frame, then convolutions that double the resolution twice and end in
-    patches of a quarter of the patch size. `linear` is one matrix: an image patch from each token.
+    `linear` is one matrix: an image patch from each token. The others add to such a matrix attention blocks over the
+    tokens of the frame, then convolutions that double the resolution twice and end in patches of a quarter of the patch
+    size.
     """
 
     def __init__(self, shape: DecoderShape) -> None:
         super().__init__()
         self.shape = shape
-        patch = shape.patch_size
-        if shape.size == "linear":
-            self.layers: nn.Module = nn.Sequential(nn.Linear(shape.dim, 3 * patch**2), _Unfold(shape.grid, patch))
-        else:
-            self.layers = _convolved(shape, _SIZES[shape.size])
+        self.linear = nn.Linear(shape.dim, 3 * shape.patch_size**2)
+        self.unfold = _Unfold(shape.grid, shape.patch_size)
+        self.further = None if shape.size == "linear" else _convolved(shape, _SIZES[shape.size])
 
     def initialise(self, generator: Generator) -> None:
         """Draw fresh weights; the generator determines them."""
@@ -82,6 +82,14 @@ class Decoder(nn.Module):
                 nn.init.trunc_normal_(module.weight, std=std, generator=generator)
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
+
+    @torch.no_grad()
+    def start_from(self, linear: Decoder) -> None:
+        """Begin as another decoder's matrix: the further layers add nothing yet."""
+        self.linear.load_state_dict(linear.linear.state_dict())
+        if self.further is not None:
+            for one in self.further[_LAST].parameters():
+                one.zero_()
 
     def forward(self, latents: Float[Tensor, "*batch tokens dim"]) -> Float[Tensor, "*batch 3 size size"]:
         """Return images, black 0 to white 1; not clipped.
@@ -97,8 +105,12 @@ class Decoder(nn.Module):
             found = "x".join(map(str, latents.shape[-2:]))
             raise ValueError(f"latents of {found} numbers; this decoder takes {shape.grid**2}x{shape.dim}")
         frames = latents.reshape(-1, *latents.shape[-2:])
-        images = self.layers(frames).float() * _RANGE + _MIDDLE
+        images: Tensor = self._numbers(frames).float() * _RANGE + _MIDDLE
         return images.reshape(*latents.shape[:-2], *images.shape[-3:])
+
+    def _numbers(self, frames: Float[Tensor, "frames tokens dim"]) -> Float[Tensor, "frames 3 size size"]:
+        numbers: Tensor = self.unfold(self.linear(frames))
+        return numbers if self.further is None else numbers + self.further(frames)
 
     @staticmethod
     def as_numbers(images: Float[Tensor, "*batch 3 size size"]) -> Float[Tensor, "*batch 3 size size"]:
@@ -111,7 +123,7 @@ class Decoder(nn.Module):
     ) -> Float[Tensor, "*batch 3 size size"]:
         """Return images between 0 and 1, in float32, some frames at a time: bounds the memory."""
         frames = latents.reshape(-1, *latents.shape[-2:])
-        images = torch.cat([self(part).clamp(0.0, 1.0) for part in torch.split(frames, chunk)])
+        images: Tensor = torch.cat([self(part).clamp(0.0, 1.0) for part in torch.split(frames, chunk)])
         return images.reshape(*latents.shape[:-2], *images.shape[-3:])
 
 
@@ -163,12 +175,8 @@ class _Block(nn.Module):
         self.mlp = nn.Sequential(nn.Linear(width, 4 * width), nn.GELU(), nn.Linear(4 * width, width))
 
     def forward(self, tokens: Float[Tensor, "frames tokens width"]) -> Float[Tensor, "frames tokens width"]:
-        query, key, value = rearrange(
-            self.qkv(self.norm1(tokens)),
-            "n tokens (three heads d) -> three n heads tokens d",
-            three=3,
-            heads=self.heads,
-        )
+        projected = self.qkv(self.norm1(tokens))
+        query, key, value = rearrange(projected, "n tokens (k heads d) -> k n heads tokens d", k=3, heads=self.heads)
         attended = nn.functional.scaled_dot_product_attention(query, key, value)
         tokens = tokens + self.out(rearrange(attended, "n heads tokens d -> n tokens (heads d)"))
         added: Tensor = tokens + self.mlp(self.norm2(tokens))

@@ -10,7 +10,7 @@ import contextlib
 import math
 import shutil
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -66,7 +66,7 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
             with stop_on_signals() as stop:
                 train_pairs, held_out = prepare(ready, reporter, stop)
                 linear = fit_linear(train_pairs, ready.shape, ready.device, reporter.task("fitting the linear decoder"))
-                trained = _Training(ready)
+                trained = _Training(ready, linear)
                 _train(trained, train_pairs, reporter, stop)
             _finish(trained, linear, train_pairs, held_out, reporter)
     return ready.folder
@@ -75,19 +75,26 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
 def _try_one_step(ready: Setup) -> None:
     """Run out of memory now, not after the frames are encoded."""
     if ready.device.type == "cuda":
-        training = _Training(ready, resume=False)
+        training = _Training(ready)
         shape, count = ready.shape, ready.knobs.batch_size
         latents = torch.zeros(count, shape.grid**2, shape.dim)
         training.step(1, Pairs(latents, torch.zeros(count, 3, shape.image_size, shape.image_size).byte(), ()))
 
 
 class _Training:
-    """Weights, their average, and the optimizer, from the newest checkpoint if there is one."""
+    """Weights, their average, and the optimizer: of the newest checkpoint, or beginning as the linear decoder.
 
-    def __init__(self, ready: Setup, *, resume: bool = True) -> None:
+    Args:
+        ready: What is trained.
+        linear: The linear decoder; None: a trial without one, and without a checkpoint.
+    """
+
+    def __init__(self, ready: Setup, linear: Decoder | None = None) -> None:
         self.ready, self.knobs = ready, ready.knobs
         self.decoder = Decoder(ready.shape)
         self.decoder.initialise(torch.Generator().manual_seed(ready.config.seed))
+        if linear is not None:
+            self.decoder.start_from(linear)
         self.decoder.to(ready.device)
         matrices = [one for one in self.decoder.parameters() if one.ndim > 1]
         others = [one for one in self.decoder.parameters() if one.ndim <= 1]
@@ -98,7 +105,7 @@ class _Training:
         self.optimizer = torch.optim.AdamW(groups, lr=self.knobs.learning_rate, betas=_BETAS)
         self.average = {name: one.detach().clone() for name, one in self.decoder.state_dict().items()}
         self.done = 0
-        newest = newest_checkpoint(ready.folder / CHECKPOINTS) if resume else None
+        newest = None if linear is None else newest_checkpoint(ready.folder / CHECKPOINTS)
         if newest is not None:
             self._restore(newest)
 
@@ -124,8 +131,9 @@ class _Training:
             )
         self.optimizer.step()
         self._add_to_average(step)
-        return {"loss": float(loss), "learning_rate": learning_rate_at(step, self.knobs)} | {
-            name: float(value) for name, value in parts.items()
+        parts = {"loss": loss, **parts}
+        return {name: float(value.detach()) for name, value in parts.items()} | {
+            "learning_rate": learning_rate_at(step, self.knobs)
         }
 
     def save(self, step: int) -> None:
@@ -196,7 +204,7 @@ def _train(training: _Training, pairs: FramePairs, reporter: Reporter, stop: Sto
                 raise StoppedError(training.ready.folder, step, signal.Signals(stop.number).name)
 
 
-def _batches(pairs: FramePairs, knobs: DecoderConfig, seed: int, done: int) -> Iterator[tuple[int, Pairs]]:
+def _batches(pairs: FramePairs, knobs: DecoderConfig, seed: int, done: int) -> Generator[tuple[int, Pairs], None, None]:
     """Yield the frames of each further step; the next ones are read meanwhile."""
 
     def read(step: int) -> Pairs:

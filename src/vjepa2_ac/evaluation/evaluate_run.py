@@ -80,10 +80,10 @@ def measure_subject(subject: str, asked: EvaluationOptions | None = None, *, rep
     dataset = open_dataset(config.data, progress=reporter.task("looking through the data"))
     chosen = validation_windows(dataset, asked.split, clips=asked.clips)
     run = load_run(Path(subject), asked.checkpoint) if is_run(subject) else None
-    world_model = run.world_model if run else _load_model(subject, config)
+    world_model = run.world_model if run else load_model(subject, config)
     require_widths(world_model, dataset.widths, where=subject)
     through_cache = with_latents_if_there(config, dataset, world_model)
-    contenders, notes = _contenders(subject, config, run, world_model, asked)
+    contenders, notes = contenders_of(subject, config, run, world_model, asked)
     if through_cache.config.is_cache and not asked.calibrate:
         world_model.set_encoder_aside()
     for each in contenders:  # the encoder of the first one is enough
@@ -133,11 +133,12 @@ def training_curves(folder: Path) -> tuple[TrainingCurve, ...]:
     )
 
 
-def _load_model(name: str, config: Config) -> WorldModel:
+def load_model(name: str, config: Config) -> WorldModel:
+    """Load a model by its name, with the config's other settings of a model."""
     return load_base(config.model.model_copy(update={"base": name, "random": None}), seed=config.seed)
 
 
-def _contenders(
+def contenders_of(
     subject: str, config: Config, run: TrainedRun | None, world_model: WorldModel, asked: EvaluationOptions
 ) -> tuple[list[Contender], tuple[str, ...]]:
     """Return the models to measure, the base first and the subject last; and notes on them."""
@@ -185,7 +186,7 @@ def _like(world_model: WorldModel, other: str, config: Config, subject: str) -> 
             found="no such file or folder",
             needed="base, the folder of a run, or a model: what model.base takes",
         )
-    loaded = load_run(Path(other)).world_model if is_run(other) else _load_model(other, config)
+    loaded = load_run(Path(other)).world_model if is_run(other) else load_model(other, config)
     same = loaded.image_size == world_model.image_size
     if not same or loaded.encoder_fingerprint() != world_model.encoder_fingerprint():
         raise InputError(

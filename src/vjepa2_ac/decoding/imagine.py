@@ -1,0 +1,105 @@
+"""What a model imagines: the images of a rollout from one frame, under actions that were taken or were not.
+
+The first frame and its state are given; nothing after them is. The states along the way are integrated from the first
+one: those of a recording would tell a model what did happen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vjepa2_ac.decoding.frame_pairs import as_pixels
+from vjepa2_ac.decoding.network import Decoder
+from vjepa2_ac.planning.counterfactual.named_actions import counterfactual_states, feasible_actions
+from vjepa2_ac.spaces import StateSpace
+
+AS_RECORDED = "as recorded"
+
+
+class Rolls(Protocol):
+    """What a rollout needs of a model: `WorldModel`, or an oracle in a test."""
+
+    def rollout(
+        self, context: Tensor, actions: Tensor, states: Tensor, extrinsics: Tensor | None = None, /
+    ) -> Float[Tensor, "batch horizon tokens dim"]:
+        """Return the frames after the context, each prediction fed back."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """Where imagination begins: all that a model is given."""
+
+    latents: Float[Tensor, "tokens dim"]
+    state: Float[np.ndarray, " state_dim"]
+    space: StateSpace
+    extrinsics: Float[Tensor, " 6"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Imagined:
+    """A rollout as images, and what really happened, where somebody knows."""
+
+    model: str  # base, adapter, model
+    name: str  # of the actions: as recorded, up, ...
+    actions: Float[np.ndarray, "steps action_dim"]
+    frames: UInt8[np.ndarray, "steps size size 3"]  # after each action
+    truth: UInt8[np.ndarray, "steps size size 3"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Imagination:
+    """One start, and everything that was imagined from it. All frames are as the encoder sees them."""
+
+    subject: str
+    episode_id: str  # "" of an image that is no part of a data set
+    start: int  # control step
+    seconds_per_step: float
+    first: UInt8[np.ndarray, "size size 3"]
+    decoded_first: UInt8[np.ndarray, "size size 3"]
+    rollouts: tuple[Imagined, ...]
+    truth: UInt8[np.ndarray, "steps size size 3"] | None = None  # under the recorded actions
+    decoded_truth: UInt8[np.ndarray, "steps size size 3"] | None = None
+    notes: tuple[str, ...] = field(default=())
+
+
+@torch.no_grad()
+def imagined_latents(
+    model: Rolls, start: Start, actions: Float[np.ndarray, "steps action_dim"]
+) -> Float[Tensor, "steps tokens dim"]:
+    """Return the latents after each action, each prediction fed back.
+
+    A gripper changes as far as it can (`feasible_actions`), since a model has seen nothing else.
+    """
+    if len(actions[0]) == len(start.state):
+        states = counterfactual_states(start.state, actions, start.space)[:-1]
+        actions = feasible_actions(start.state, actions, start.space)
+    else:
+        raise ValueError("states do not follow from these actions: give the recorded ones to `rolled_out`")
+    return rolled_out(model, start, actions, states)
+
+
+@torch.no_grad()
+def rolled_out(
+    model: Rolls,
+    start: Start,
+    actions: Float[np.ndarray, "steps action_dim"],
+    states: Float[np.ndarray, "steps state_dim"],
+) -> Float[Tensor, "steps tokens dim"]:
+    """Return the latents after each action, with states that are known: the recorded ones of recorded actions."""
+    device = start.latents.device
+    taken, known = (torch.as_tensor(one, dtype=torch.float32, device=device)[None] for one in (actions, states))
+    extrinsics = None if start.extrinsics is None else start.extrinsics.expand(1, len(actions), -1)
+    rolled = model.rollout(start.latents[None, None], taken, known, extrinsics)
+    return rolled[0]
+
+
+def shown(decoder: Decoder, latents: Float[Tensor, "steps tokens dim"]) -> UInt8[np.ndarray, "steps size size 3"]:
+    """Return latents as images for people."""
+    return as_pixels(decoder.decode(latents.float()))

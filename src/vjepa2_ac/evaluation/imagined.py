@@ -1,0 +1,243 @@
+"""What a run or a model imagines of a held-out clip, or from an image and a state: load, choose, roll out, decode."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from vjepa2_ac.config import Config
+from vjepa2_ac.config.data import Split
+from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
+from vjepa2_ac.data.clips.loader import batches_of, validation_windows
+from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input, view
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
+from vjepa2_ac.decoding.imagine import (
+    AS_RECORDED,
+    Imagination,
+    Imagined,
+    Start,
+    imagined_latents,
+    rolled_out,
+    shown,
+)
+from vjepa2_ac.distributed.launch import make_accelerator
+from vjepa2_ac.encoding.batch import encode_batch, require_widths
+from vjepa2_ac.episode import Batch, LatentBatch
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.evaluate import Contender
+from vjepa2_ac.evaluation.evaluate_run import contenders_of, load_model
+from vjepa2_ac.evaluation.request import EvaluationOptions, settle
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.planning.counterfactual.actions_file import read_actions
+from vjepa2_ac.planning.counterfactual.named_actions import ACTION_NAMES, STEP_M, named_actions
+from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
+from vjepa2_ac.runs.folder import is_run
+from vjepa2_ac.runs.loading import load_run
+from vjepa2_ac.spaces import StateSpace
+
+_SEARCHED = 64  # clips, among which the one with the most motion is shown
+TRUE = "true"
+"""The word for the recorded actions."""
+
+
+@dataclass(frozen=True)
+class ImagineOptions:
+    """What is to be imagined."""
+
+    decoder: str
+    actions: tuple[str, ...] = (TRUE, "none", "up", "left", "close")  # names, `true`, or files
+    steps: int = 7  # model steps
+    size_m: float = STEP_M  # of a named action, in each step, if the limits allow it
+    split: Split = "test"
+    episode: str | None = None  # None: the held-out clip with the most motion
+    start: int | None = None  # first control step; None: likewise
+    evaluation: EvaluationOptions = field(default_factory=EvaluationOptions)  # checkpoint, data, against
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """An imagination, and where its start comes from: for those who can say what really happens."""
+
+    imagination: Imagination
+    dataset: Dataset
+    episode: int
+    stride: int
+    size: int
+    outcome: Callable[[UInt8[np.ndarray, "time h w 3"]], UInt8[np.ndarray, "time size size 3"]]
+
+
+def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SILENT) -> Film:
+    """Imagine a held-out clip of a run or a model: under the recorded actions, by base and adapter, and under others.
+
+    Args:
+        subject: The folder of a run; or a model, with `evaluation.data`.
+        asked: What is to be imagined.
+        reporter: Shows the progress.
+
+    Raises:
+        InputError: Subject, data, decoder, clip or actions cannot be used.
+    """
+    decoder = load_decoder(asked.decoder)
+    config, planning, _ = settle(subject, asked.evaluation)
+    config = _long_enough(config, asked)
+    accelerator = make_accelerator(config)
+    dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
+    if config.data.is_cache:
+        raise InputError(
+            where="data.source", found="latents, without frames", needed="the data set itself, to show what is true"
+        )
+    window = _window(dataset, asked)
+    run = load_run(Path(subject), asked.evaluation.checkpoint) if is_run(subject) else None
+    world_model = run.world_model if run else load_model(subject, config)
+    require_widths(world_model, dataset.widths, where=subject)
+    decoder.require_encoder(world_model, subject=subject)
+    contenders, _ = contenders_of(subject, config, run, world_model, asked.evaluation)
+    for each in contenders:
+        if isinstance(each.model, WorldModel):
+            each.model.to(accelerator.device).eval()
+    decoder.to(accelerator.device)
+    (batch,) = batches_of(dataset, [window], batch_size=1)
+    encode = partial(encode_batch, world_model, device=accelerator.device, chunk=config.model.encode_chunk)
+    size = world_model.image_size
+    chosen = _actions_of(asked, batch, dataset, limits=planning.limits)
+    with accelerator.autocast():
+        latents = encode(batch)
+        rollouts = _rollouts(contenders, decoder, latents, chosen, dataset.spaces.state)
+        decoded = shown(decoder.decoder, latents.latents[0])
+    frames = _seen(batch, size)
+    imagination = Imagination(
+        subject=subject,
+        episode_id=batch.episode_ids[0],
+        start=batch.starts[0],
+        seconds_per_step=config.data.model_stride / dataset.control_rate_hz,
+        first=frames[0],
+        decoded_first=decoded[0],
+        rollouts=tuple(rollouts),
+        truth=frames[1:],
+        decoded_truth=decoded[1:],
+    )
+    return Film(imagination, dataset, window[0], config.data.model_stride, size, partial(_as_seen, config, size))
+
+
+def with_outcomes(
+    film: Film, outcomes: Callable[[Float[np.ndarray, "steps 7"]], UInt8[np.ndarray, "time h w 3"]]
+) -> Film:
+    """Return the film with what really happens under each sequence of actions, of those that were not recorded."""
+    found = []
+    for one in film.imagination.rollouts:
+        truth = film.imagination.truth if one.name == AS_RECORDED else film.outcome(outcomes(one.actions))[1:]
+        found.append(replace(one, truth=truth))
+    return replace(film, imagination=replace(film.imagination, rollouts=tuple(found)))
+
+
+def _rollouts(
+    contenders: Sequence[Contender],
+    decoder: TrainedDecoder,
+    batch: LatentBatch,
+    chosen: dict[str, Float[np.ndarray, "steps action_dim"]],
+    space: StateSpace,
+) -> list[Imagined]:
+    """Roll out: recorded actions by every model, others by the one that is looked at."""
+    extrinsics = None if batch.extrinsics is None else batch.extrinsics[0, 0]
+    states = batch.states[0].double().cpu().numpy()
+    start = Start(batch.latents[0, 0], states[0], space, extrinsics)
+    found = []
+    for name, actions in chosen.items():
+        for contender in contenders:
+            if name != AS_RECORDED and contender.role != "trained":
+                continue
+            with contender.switched():
+                if name == AS_RECORDED:
+                    latents: Tensor = rolled_out(contender.model, start, actions, states[:-1])
+                else:
+                    latents = imagined_latents(contender.model, start, actions)
+            found.append(Imagined(contender.name, name, actions, shown(decoder.decoder, latents)))
+    return found
+
+
+def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: object) -> dict[str, np.ndarray]:
+    recorded = batch.actions[0].double().numpy()
+    chosen: dict[str, np.ndarray] = {}
+    for word in asked.actions:
+        if word == TRUE:
+            chosen[AS_RECORDED] = recorded
+            continue
+        if not dataset.spaces.state.is_pose or dataset.spaces.state.frame != "base":
+            raise InputError(
+                where=f"--actions {word}",
+                found="states that are no poses in the robot base frame",
+                needed="poses: other actions are directions in that frame",
+                fix="Give --actions true",
+            )
+        if word in ACTION_NAMES:
+            chosen[word] = named_actions(word, len(recorded), size_m=asked.size_m, limits=limits)  # type: ignore[arg-type]
+        elif Path(word).suffix in {".npy", ".csv"}:
+            chosen[Path(word).stem] = read_actions(word, steps=len(recorded))
+        else:
+            raise InputError(
+                where=f"--actions {word}",
+                found="no such actions",
+                needed=f"{TRUE}, {', '.join(ACTION_NAMES)}, or a file",
+            )
+    return chosen
+
+
+def _long_enough(config: Config, asked: ImagineOptions) -> Config:
+    """Return the config with clips of as many model steps as are to be imagined."""
+    return config.model_copy(update={"data": config.data.model_copy(update={"frames": asked.steps + 1})})
+
+
+def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
+    """Return episode and first control step of the clip."""
+    if asked.episode is not None:
+        episode = dataset.table.find(asked.episode)
+        if episode is None:
+            example = dataset.table.identity(int(dataset.episodes[0]))
+            raise InputError(where="--episode", found=f"no episode {asked.episode}", needed=f"one such as {example}")
+        start, last = asked.start or 0, int(dataset.table.num_steps[episode]) - dataset.config.clip_steps
+        if start > last:
+            raise InputError(
+                where="--start",
+                found=f"{start}, in an episode of {dataset.table.num_steps[episode]} steps",
+                needed=f"{last} at most: {asked.steps} model steps take {dataset.config.clip_steps} control steps"
+                if last >= 0
+                else "a longer episode",
+                fix="Lower --steps or --start",
+            )
+        return episode, start
+    windows = validation_windows(dataset, asked.split, clips=_SEARCHED)
+    return max(windows, key=lambda window: _motion(dataset, *window))
+
+
+def _motion(dataset: Dataset, episode: int, start: int) -> float:
+    """Return how far the robot moves in a clip, added up over its model steps."""
+    steps = range(start, start + dataset.config.clip_steps, dataset.config.model_stride)
+    states = dataset.source.read(episode, None, dataset.needed_steps(episode)).states[list(steps)]
+    sized = dataset.spaces.state.sized
+    return float(np.linalg.norm(np.diff(states[:, sized], axis=0), axis=1).sum())
+
+
+def _seen(batch: Batch, size: int) -> UInt8[np.ndarray, "time size size 3"]:
+    """Return the frames of the only clip of a batch as the encoder sees them."""
+    if batch.frames is None:
+        raise ValueError("a batch without frames")
+    return _resized(batch.frames, size)
+
+
+def _as_seen(
+    config: Config, size: int, frames: UInt8[np.ndarray, "time h w 3"]
+) -> UInt8[np.ndarray, "time size size 3"]:
+    """Return camera frames as the encoder sees them."""
+    return _resized(torch.from_numpy(np.ascontiguousarray(view(frames, config.data.crop)))[None], size)
+
+
+def _resized(frames: Tensor, size: int) -> UInt8[np.ndarray, "time size size 3"]:
+    pixels = input_to_pixels(pixels_to_input(frames, size))[0]
+    return np.asarray(pixels.permute(0, 2, 3, 1).contiguous().cpu().numpy())
