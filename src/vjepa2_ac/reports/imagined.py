@@ -1,0 +1,117 @@
+"""The film of what a model imagines: strip, video, GIF, and the actions as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.gif_writer import write_gif
+from vjepa2_ac.media.image_file import encode_png
+from vjepa2_ac.media.video_writer import write_video
+from vjepa2_ac.reporter import SILENT, Reporter
+from vjepa2_ac.reports.figures.film import FilmStrip, Kind, Row, draw_strip, durations, film_frames, held
+from vjepa2_ac.storage import user_can_write, write_atomically
+from vjepa2_ac.storage.structured import json_text
+
+STRIP, VIDEO, GIF, JSON = "imagined.png", "imagined.mp4", "imagined.gif", "imagined.json"
+_SLOWER = 2.0  # than reality, so that an eye can follow
+_RATE_HZ = 15.0
+_LONGEST_NAME = 44  # characters
+_LEAST_CM, _LEAST_GRIP = 0.15, 0.05  # smaller parts of an action are not named
+_POSE = 7  # numbers
+_WAYS = (("forward", "back"), ("left", "right"), ("up", "down"))  # of x, y, z in the robot base frame
+
+
+def strip_of(imagination: Imagination) -> FilmStrip:
+    """Return the rows: truth, decoded truth, recorded actions as each model imagines them, then other actions."""
+    recorded = [one for one in imagination.rollouts if one.name == AS_RECORDED]
+    others = [one for one in imagination.rollouts if one.name != AS_RECORDED]
+    rows = []
+    if imagination.truth is not None:
+        captions = ("", *map(short_action, recorded[0].actions)) if recorded else ()
+        rows.append(_row("what happened", "recorded", imagination.first, imagination.truth, captions))
+    if imagination.decoded_truth is not None:
+        label = "what happened,\nencoded and decoded"
+        rows.append(_row(label, "decoded", imagination.decoded_first, imagination.decoded_truth))
+    for one in recorded:
+        label = f"{one.model} imagines,\nsame actions"
+        rows.append(_row(label, "imagined", imagination.decoded_first, one.frames))
+    for one in others:
+        rows += _rows_of_other(imagination, one)
+    place = f"{imagination.subject}, {_short(imagination.episode_id)} from control step {imagination.start}"
+    times = range(len(rows[0].frames)) if rows else range(0)
+    return FilmStrip(place, tuple(rows), tuple(time * imagination.seconds_per_step for time in times))
+
+
+def short_action(action: Float[np.ndarray, " action_dim"]) -> str:
+    """Return a pose's action in a few words, in the robot's directions; of a vector nothing."""
+    if len(action) != _POSE:
+        return ""
+    words = []
+    for amount, (plus, minus) in zip(100 * action[:3], _WAYS, strict=True):
+        if abs(amount) >= _LEAST_CM:
+            words.append((abs(amount), f"{plus if amount > 0 else minus} {abs(amount):.1f}"))
+    named = [text for _, text in sorted(words, reverse=True)[:2]]
+    if abs(action[6]) >= _LEAST_GRIP:
+        named.append("close" if action[6] > 0 else "open")
+    return ", ".join(named) + " cm" * bool(words) if named else "still"
+
+
+def write_film_of(imagination: Imagination, folder: Path, *, reporter: Reporter = SILENT) -> list[Path]:
+    """Write the film into a folder, and return the files; without PyAV there is no MP4, and a note says so.
+
+    Raises:
+        InputError: The folder cannot be written.
+    """
+    strip = strip_of(imagination)
+    with user_can_write(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(folder / STRIP, encode_png(draw_strip(strip)))
+        frames, seconds = list(film_frames(strip)), durations(strip, slower=_SLOWER)
+        written = [folder / STRIP, write_gif(folder / GIF, frames, seconds=seconds)]
+        try:
+            written.append(write_video(folder / VIDEO, held(frames, seconds, _RATE_HZ), rate_hz=_RATE_HZ))
+        except InputError as error:
+            if error.where != "video":
+                raise
+            reporter.note(f"No {VIDEO}: {error}")
+        write_atomically(folder / JSON, json_text(_as_dict(imagination)))
+    return [*written, folder / JSON]
+
+
+def _short(name: str) -> str:
+    """Return the end of an episode's name; of DROID's, which name several files, that of the first folder."""
+    own = name.split("--", maxsplit=1)[0].removesuffix("/recordings/MP4").rstrip("/")
+    return own if len(own) <= _LONGEST_NAME else f"...{own[-_LONGEST_NAME:]}"
+
+
+def _rows_of_other(imagination: Imagination, one: Imagined) -> list[Row]:
+    length = 100 * float(np.linalg.norm(one.actions[0, :3])) if one.actions.shape[1] == _POSE else 0.0
+    label = f"{one.model} imagines:\n{one.name}" + (f", {length:.1f} cm a step" if length >= _LEAST_CM else "")
+    rows = [_row(label, "imagined", imagination.decoded_first, one.frames)]
+    if one.truth is not None:
+        rows.append(_row(f"what really happens:\n{one.name}", "simulated", imagination.first, one.truth))
+    return rows
+
+
+def _row(label: str, kind: Kind, first: np.ndarray, frames: np.ndarray, captions: Sequence[str] = ()) -> Row:
+    return Row(label, kind, np.concatenate([first[None], frames]), tuple(captions))
+
+
+def _as_dict(imagination: Imagination) -> dict[str, object]:
+    return {
+        "subject": imagination.subject,
+        "episode": imagination.episode_id,
+        "start": imagination.start,
+        "seconds_per_step": imagination.seconds_per_step,
+        "rollouts": [
+            {"model": one.model, "name": one.name, "actions": one.actions.tolist(), "truth": one.truth is not None}
+            for one in imagination.rollouts
+        ],
+        "notes": list(imagination.notes),
+    }
