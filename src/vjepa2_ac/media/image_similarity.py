@@ -107,8 +107,8 @@ def ms_ssim(
 def moving_region(true: Float[Tensor, "*batch time 3 height width"]) -> Bool[Tensor, "*batch time-1 height width"]:
     """Return where each later frame differs from frame 0 by more than 8 levels of 255 in any channel.
 
-    Every such pixel is dilated to the square of 8 pixels around it. It depends on the true frames alone; its mean is its
-    share of the pixels.
+    Every such pixel is dilated to the square of 8 pixels around it. It depends on the true frames alone; its mean is
+    its share of the pixels.
     """
     later, first = true[..., 1:, :, :, :].float(), true[..., :1, :, :, :].float()
     moved = ((later - first).abs() > MOVES_BY + _ROUNDING).any(dim=-3)
