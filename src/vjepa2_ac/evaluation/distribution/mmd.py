@@ -81,7 +81,7 @@ def discrepancy(
     kernel, counts = _without_diagonal(pairs.both), pairs.counts
 
     def of_weights(weights: np.ndarray) -> np.ndarray:
-        return (_SCALE * _quadratic(weights, kernel) / _quadratic(weights, counts))[:, None]
+        return np.asarray(_SCALE * _quadratic(weights, kernel) / _quadratic(weights, counts))[:, None]
 
     (squared,) = bootstrapped_by_weights(of_weights, len(pairs.clips), seed=seed)
     return Discrepancy(squared, p_of_no_difference(pairs, seed=seed))
@@ -149,7 +149,7 @@ def _kernel(
 
 
 def _without_diagonal(matrix: Float[np.ndarray, "side side"]) -> Float[np.ndarray, "side side"]:
-    return matrix - np.diag(np.diag(matrix))
+    return np.asarray(matrix - np.diag(np.diag(matrix)))
 
 
 def _quadratic(
