@@ -46,8 +46,8 @@ ORDERS: dict[str, list[str]] = {
         "load lora heads",
     ],
     "evaluation": [
-        "metrics axis_fit",
-        "result",
+        "metrics axis_fit distribution",
+        "result video",
         "estimates measure strata",
         "action_use",
         "action_score",

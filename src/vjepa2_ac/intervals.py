@@ -72,13 +72,29 @@ def bootstrapped(
             return tuple(Estimate(float(value), math.nan, math.nan) for value in values)
         sums = np.einsum("cnf,ne->cef", columns, np.eye(count)[episode_of], optimize=True)
         drawn = of_sums(np.einsum("re,cef->crf", _draws(count, resamples, seed), sums, optimize=True))
-    from scipy import stats  # takes half a second, which wrong words on a command line do not wait for
+    return _estimates(values, drawn, count)
 
-    tail = stats.norm.cdf(-math.sqrt(count / (count - 1)) * stats.t.ppf((1 + _SHARE) / 2, count - 1))
-    return tuple(
-        _with_interval(float(value), column[np.isfinite(column)], float(tail))
-        for value, column in zip(values, drawn.T, strict=True)
-    )
+
+def bootstrapped_by_weights(
+    of_weights: Callable[[Float[np.ndarray, "draws episodes"]], Float[np.ndarray, "draws metrics"]],
+    episodes: int,
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+) -> tuple[Estimate, ...]:
+    """Return an estimate of each metric that is a function of how often each episode counts, as sums over pairs are.
+
+    Args:
+        of_weights: Turns weights of the episodes into values; all weights 1 give the estimate itself.
+        episodes: Their number; an interval needs two.
+        resamples: As of `bootstrapped`, with the same samples.
+        seed: Likewise.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        values = of_weights(np.ones((1, episodes)))[0]
+        if episodes < 2:
+            return tuple(Estimate(float(value), math.nan, math.nan) for value in values)
+        return _estimates(values, of_weights(_draws(episodes, resamples, seed)), episodes)
 
 
 def mean_of(
@@ -126,6 +142,18 @@ def _draws(episodes: int, resamples: int, seed: int) -> Float[np.ndarray, "resam
     drawn = np.random.default_rng(seed).integers(episodes, size=(resamples, episodes))
     places = drawn + episodes * np.arange(resamples)[:, None]
     return np.bincount(places.ravel(), minlength=resamples * episodes).reshape(resamples, episodes).astype(np.float64)
+
+
+def _estimates(
+    values: Float[np.ndarray, " metrics"], drawn: Float[np.ndarray, "draws metrics"], episodes: int
+) -> tuple[Estimate, ...]:
+    from scipy import stats  # takes half a second, which wrong words on a command line do not wait for
+
+    tail = stats.norm.cdf(-math.sqrt(episodes / (episodes - 1)) * stats.t.ppf((1 + _SHARE) / 2, episodes - 1))
+    return tuple(
+        _with_interval(float(value), column[np.isfinite(column)], float(tail))
+        for value, column in zip(values, drawn.T, strict=True)
+    )
 
 
 def _with_interval(value: float, drawn: np.ndarray, tail: float) -> Estimate:

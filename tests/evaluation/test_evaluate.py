@@ -69,6 +69,25 @@ def test_persistence_scores_exactly_one_relative_to_itself_in_every_metric(oracl
             }
 
 
+def test_spread_and_discrepancy_of_the_rollouts_are_those_of_the_predicted_latents() -> None:
+    found = evaluated(Halfway(), Oracle())
+    batch = clips_batch()
+    predicted = Halfway().rollout(batch.latents[:, :1], batch.actions, batch.states)
+    kinds = predicted, batch.latents[:, 1:], batch.latents[:, :1]
+    traces = [values.double().var(dim=0, correction=0).sum(dim=(1, 2)) for values in kinds]
+    models = {name: model.distribution for name, model in found.models.items()}
+    assert [one.value for one in models["adapter"].spread] == pytest.approx((traces[0] / traces[1]).tolist(), rel=1e-5)
+    assert [one.value for one in models["base"].spread] == pytest.approx([1.0] * (TIME - 1))
+    assert [one.squared.value for one in models["base"].mmd] == pytest.approx([0.0] * (TIME - 1), abs=1e-9)
+    copies = found.persistence_distribution
+    assert [one.value for one in copies.copies.spread] == pytest.approx((traces[2] / traces[1]).tolist(), rel=1e-5)
+    in_file = metrics_as_dict(found)
+    assert in_file["persistence"]["spread"][0]["value"] == copies.copies.spread[0].value
+    assert in_file["models"]["adapter"]["spread"][1]["low"] == models["adapter"].spread[1].low
+    assert set(in_file["models"]["adapter"]["latent_mmd"][0]) == {"value", "low", "high", "p_value"}
+    assert len(in_file["latent_mmd_noise_floor"]) == TIME - 1
+
+
 def test_a_model_that_ignores_actions_has_no_sensitivity_and_the_rank_of_chance() -> None:
     found = evaluated(Copier())
     sensitivity = found.models["adapter"].sensitivity

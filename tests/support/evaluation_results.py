@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac.evaluation.axis_fit import TRIED_DEGREES, AxisFit, fit_axes
+from vjepa2_ac.evaluation.distribution.latent_sums import LatentDistribution
+from vjepa2_ac.evaluation.distribution.mmd import Discrepancy
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.metrics import L1, L2
 from vjepa2_ac.evaluation.result import (
@@ -23,6 +25,7 @@ from vjepa2_ac.evaluation.result import (
     Landscapes,
     Mode,
     ModelResult,
+    PersistenceDistribution,
     PredictionErrors,
     Ranking,
     Sensitivity,
@@ -115,6 +118,12 @@ def _axes(ids: tuple[str, ...], degrees: float) -> AxisFit:
     return fit_axes(0.9 * moves @ turn.T + 0.005 * np.roll(moves, 1, axis=0), moves, errors, ids)
 
 
+def _distribution(rng: np.random.Generator, ids: tuple[str, ...], spread: float, horizon: int) -> LatentDistribution:
+    levels = [spread ** (h / horizon) + 0.1 * rng.standard_normal(len(ids)) for h in range(1, horizon + 1)]
+    spreads = tuple(mean_of(level, ids) for level in levels)
+    return LatentDistribution(spreads, tuple(Discrepancy(mean_of(1 - level, ids), 0.04) for level in levels))
+
+
 def _example(rng: np.random.Generator, why: str, episode_id: str, times: int, models: list[str], size: int) -> Example:
     grid = max(4, size // 16)
     y, x = np.mgrid[:size, :size] / size
@@ -161,6 +170,7 @@ def evaluation(
             _landscapes(rng, ids, 4 - 3 * skill),
             ranking=ranking_of(0.3 * (1 - skill) + 0.1 * rng.random(len(ids)), ids),
             axes=_axes(ids, degrees=60 - 60 * skill),
+            distribution=_distribution(np.random.default_rng(place), ids, 0.5 + 0.4 * skill, horizon),
         )
     size_of_action = rng.gamma(2.0, 2.0, size=(clips, horizon))
     moving = size_of_action > 1.5
@@ -181,5 +191,8 @@ def evaluation(
             TrainingCurve("validation/rollout_over_persistence_last", (0, 400, 800), (0.95, 0.8, 0.78)),
             TrainingCurve("train/data_wait_share", (10, 400, 800), (0.1, 0.02, 0.03)),
             TrainingCurve("train/learning_rate", tuple(range(10, 810, 10)), tuple(np.linspace(3e-3, 0, 80))),
+        ),
+        persistence_distribution=PersistenceDistribution(
+            _distribution(np.random.default_rng(9), ids, 1.0, horizon), (0.031,) * horizon
         ),
     )

@@ -55,6 +55,12 @@ def _errors(evaluation: Evaluation) -> Table:
     for metric in evaluation.metrics[1:]:
         ratios = [over_persistence(errors, "rollout", metric)[-1] for errors in models]
         row(f"{last * seconds:.2f} s, {metric.heading}", ratios)
+    copies = evaluation.persistence_distribution
+    found = [model.distribution for model in evaluation.models.values()]
+    if copies is not None and all(found):
+        spreads = [which.spread[-1] for which in found if which is not None]
+        label = f"{last * seconds:.2f} s, spread / that of the truth"
+        table.add_row(label, f"{copies.copies.spread[-1].value:.3f}", *map(str, spreads))
     table.add_section()
     for actions in ACTIONS:
         row(f"one step, {actions} actions", [one_step_over_persistence(errors, actions) for errors in models])

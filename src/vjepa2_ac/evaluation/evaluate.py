@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from vjepa2_ac.evaluation.action_use.one_step import RolloutStart, moves_of, sta
 from vjepa2_ac.evaluation.action_use.ranking import pool_of, rank_actions
 from vjepa2_ac.evaluation.action_use.sensitivity import ActionPool, measure_sensitivity
 from vjepa2_ac.evaluation.axis_fit import AxisFit
+from vjepa2_ac.evaluation.distribution.latent_sums import LatentSums, distribution_of, latent_noise_floor
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.examples import chosen_clips, make_example, predicted_rollout
 from vjepa2_ac.evaluation.measure import ALL, Predictor, joined, measured, with_other_actions
@@ -31,11 +33,14 @@ from vjepa2_ac.evaluation.result import (
     Evaluation,
     Example,
     Landscapes,
+    Mode,
     ModelResult,
+    PersistenceDistribution,
     Plans,
     PredictionErrors,
     Role,
     Sensitivity,
+    Way,
 )
 from vjepa2_ac.evaluation.strata import clips_of, strata_of
 from vjepa2_ac.reporter import SILENT, Reporter
@@ -102,7 +107,12 @@ def evaluate(
     )
     models: dict[str, ModelResult] = {}
     for contender in contenders:
-        result = ModelResult(contender.name, contender.role, joined(seen.errors[contender.name]))
+        result = ModelResult(
+            contender.name,
+            contender.role,
+            joined(seen.errors[contender.name]),
+            distribution=distribution_of(seen.latents.predicted[contender.name], seen.latents.true),
+        )
         with contender.switched():
             models[contender.name] = replace(
                 result,
@@ -121,6 +131,9 @@ def evaluate(
         examples=(),
         planning=study_of(seen.planned, probes.planning) if seen.planned else None,
         metrics=metrics,
+        persistence_distribution=PersistenceDistribution(
+            distribution_of(seen.latents.copies, seen.latents.true), latent_noise_floor(seen.latents.true)
+        ),
     )
     scores = episode_scores(evaluation.errors, evaluation.base_errors)
     examples = _examples(contenders, clips, evaluation, probes)
@@ -146,6 +159,23 @@ def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[s
     return tuple(notes)
 
 
+class _Latents:
+    """Sums of the rollouts of every model with the true actions, of copies of frame 0, and of the true latents."""
+
+    def __init__(self, models: Sequence[str]) -> None:
+        self.predicted = {name: LatentSums() for name in models}
+        self.copies = LatentSums()
+        self.true = LatentSums()
+        self._first = models[0]
+
+    def add(self, model: str, ids: Sequence[str], way: Way, mode: Mode, predicted: torch.Tensor) -> None:
+        """Add one model's prediction of a batch; copies are the same for all models."""
+        if (way, mode) == ("true", "rollout"):
+            self.predicted[model].add(predicted, ids)
+        elif (way, mode, model) == ("persistence", "rollout", self._first):
+            self.copies.add(predicted, ids)
+
+
 @dataclass
 class _Seen:
     """Data of all clips: errors and actions, and one frame and the next of some."""
@@ -155,6 +185,7 @@ class _Seen:
     actions: Float[np.ndarray, "clips horizon action_dim"]
     errors: dict[str, list[PredictionErrors]]  # by model
     starts: list[RolloutStart]
+    latents: _Latents
     moves: list[RolloutStart] = field(default_factory=list)
     planned: list[PlanningStart] = field(default_factory=list)
 
@@ -167,7 +198,8 @@ def _collect(
     metrics: Sequence[Metric],
     progress: Progress,
 ) -> _Seen:
-    seen = _Seen([], [], np.zeros((0, 0, 0)), {contender.name: [] for contender in contenders}, [])
+    names = [contender.name for contender in contenders]
+    seen = _Seen([], [], np.zeros((0, 0, 0)), {name: [] for name in names}, [], _Latents(names))
     actions = []
     probed = set(spread(clips.count, probes.sensitivity_clips)) if probes.sensitivity_clips else set()
     planned = (
@@ -176,9 +208,11 @@ def _collect(
         else set()
     )
     for batch, others in with_other_actions(batch for batch, _ in clips.read(None)):
+        seen.latents.true.add(batch.latents[:, 1:], batch.episode_ids)
         for contender in contenders:
+            watch = partial(seen.latents.add, contender.name, batch.episode_ids)
             with contender.switched():
-                seen.errors[contender.name].append(measured(contender.model, batch, ALL, metrics, others))
+                seen.errors[contender.name].append(measured(contender.model, batch, ALL, metrics, others, watch))
         first = len(seen.ids)
         for row in range(len(batch.starts)):
             if first + row in probed:

@@ -6,7 +6,7 @@ was seen. A ratio of 1 means: as good as doing nothing; 0: perfect.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
 from typing import NamedTuple, Protocol, get_args, runtime_checkable
@@ -71,6 +71,7 @@ def measured(
     wanted: Sequence[tuple[Way, Mode]],
     metrics: Sequence[Metric],
     others: Float[Tensor, "batch time action_dim"] | None = None,
+    watch: Callable[[Way, Mode, Float[Tensor, "batch horizon tokens dim"]], None] | None = None,
 ) -> PredictionErrors:
     """Return the errors of a model on a batch of clips.
 
@@ -80,10 +81,13 @@ def measured(
         wanted: The predictions to make.
         metrics: By what they are measured.
         others: The actions of other clips, if predictions with shuffled actions are wanted.
+        watch: Receives each prediction, which is not stored.
     """
     arrays: dict[tuple[Way, Mode, str], Float[np.ndarray, "clips horizon"]] = {}
     for way, mode in wanted:
         predicted = _prediction(model, batch, way, mode, others)
+        if watch is not None:
+            watch(way, mode, predicted)
         for metric in metrics:
             found = metric.of(predicted, batch.latents[:, 1:])
             arrays[way, mode, metric.name] = np.asarray(found.cpu().numpy(), dtype=np.float64)

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.evaluation.axis_fit import AxisFit
+from vjepa2_ac.evaluation.distribution.latent_sums import LatentDistribution
 from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import ActionSpace
@@ -213,6 +214,15 @@ class ModelResult:
     plans: Plans | None = None
     ranking: ActionRanking | None = None
     axes: AxisFit | None = None
+    distribution: LatentDistribution | None = None  # of the rollout with the true actions
+
+
+@dataclass(frozen=True)
+class PersistenceDistribution:
+    """The neighbours of the models' distributions: that of copies of frame 0, and what chance makes of the truth."""
+
+    copies: LatentDistribution
+    noise_floor: tuple[float, ...]  # of the discrepancy, by horizon
 
 
 @dataclass(frozen=True)
@@ -271,6 +281,7 @@ class Evaluation:
     notes: tuple[str, ...] = ()  # for the reader: why there is no base, no landscape ...
     planning: PlanningStudy | None = None
     metrics: tuple[Metric, ...] = METRICS  # of the errors
+    persistence_distribution: PersistenceDistribution | None = None
 
     @property
     def trained(self) -> str:

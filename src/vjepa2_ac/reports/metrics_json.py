@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.distribution.latent_sums import LatentDistribution
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
     gain_over,
@@ -85,6 +86,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
     """Return all metrics as plain values; see docs/evaluation.md for the meaning of each."""
     about = {field.name: getattr(evaluation.about, field.name) for field in fields(evaluation.about)}
     del about["space"]
+    copies = evaluation.persistence_distribution
     metrics = {
         "format": FORMAT,
         "verdict": verdict(evaluation),
@@ -93,9 +95,11 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         "base": evaluation.base,
         "about": {**about, "is_pose": evaluation.about.space.position is not None},
         "clips": _clips(evaluation.clips),
-        "persistence": _by_mode(
-            evaluation, lambda mode, metric: mean_error(evaluation.errors, mode, metric, "persistence")
-        ),
+        "persistence": {
+            **_by_mode(evaluation, lambda mode, metric: mean_error(evaluation.errors, mode, metric, "persistence")),
+            **_distribution(None if copies is None else copies.copies),
+        },
+        "latent_mmd_noise_floor": None if copies is None else copies.noise_floor,
         "models": {name: _model(evaluation, model) for name, model in evaluation.models.items()},
         "strata": {
             "moving_means": evaluation.clips.moving_means,
@@ -135,6 +139,7 @@ def _model(evaluation: Evaluation, model: ModelResult) -> dict[str, Any]:
     return {
         "role": model.role,
         **_by_mode(evaluation, partial(_errors, evaluation, model)),
+        **_distribution(model.distribution),
         "one_step_by_actions": {actions: one_step_over_persistence(model.errors, actions) for actions in ACTIONS},
         "gap_of_zero_actions": gap_of_actions(model.errors, "zero"),
         "gap_of_shuffled_actions": gap_of_actions(model.errors, "shuffled"),
@@ -144,6 +149,12 @@ def _model(evaluation: Evaluation, model: ModelResult) -> dict[str, Any]:
         "planning": plans_as_dict(evaluation, model.name),
         "axes": None if model.axes is None else model.axes.as_dict(),
     }
+
+
+def _distribution(found: LatentDistribution | None) -> dict[str, Any]:
+    if found is None:
+        return {"spread": None, "latent_mmd": None}
+    return {"spread": found.spread, "latent_mmd": [one.as_dict() for one in found.mmd]}
 
 
 def _by_mode(evaluation: Evaluation, of: Callable[[Mode, Metric], Any]) -> dict[str, dict[str, Any]]:

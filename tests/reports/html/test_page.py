@@ -142,6 +142,17 @@ def test_differences_to_the_base_are_those_of_the_pairs() -> None:
     assert difference.value < 0
 
 
+def test_spread_and_discrepancy_stand_beside_those_of_persistence() -> None:
+    one, _, page = usual()
+    head, *rows = table_of(page, "Spread over that of the truth")
+    kinds = [one.persistence_distribution.copies, *(model.distribution for model in one.models.values())]
+    assert head[1:] == ["persistence", "base", "runs/other", "adapter"]
+    assert [row[1:] for row in rows] == [[plain(kind.spread[h]) for kind in kinds] for h in range(one.horizon)]
+    head, *rows = table_of(page, "Squared MMD of predicted and true latents")
+    assert rows[1][1:5] == [f"{plain(kind.mmd[1].squared)}; p 0.040" for kind in kinds]
+    assert rows[1][5] == "0.031"
+
+
 def test_strata_ranks_landscapes_and_episodes_are_those_of_the_result() -> None:
     one, _, page = usual()
     _, moving, _idle = table_of(page, "One-step L1 error over persistence by motion")
@@ -253,12 +264,13 @@ def test_the_page_stays_small_whatever_was_measured() -> None:
 
 def test_what_was_not_measured_is_named_with_the_reason() -> None:
     one = evaluation(with_base=False)
-    adapter = replace(one.models["adapter"], sensitivity=None, landscapes=None)
+    adapter = replace(one.models["adapter"], sensitivity=None, landscapes=None, distribution=None)
     bare = replace(one, models={"adapter": adapter}, examples=(), training=(), strata=(), episodes=())
+    bare = replace(bare, persistence_distribution=None)
     page = Page(page_of(bare))
     for what in (
         "Differences to the base", "Strata", "Action sensitivity and ranks", "Energy landscapes", "Episodes",
-        "Example clips", "Training curves", "Other strides",
+        "Example clips", "Training curves", "Other strides", "Spread of the predictions",
     ):  # fmt: skip
         assert f"{what}: not measured." in page.shown
     assert "data calibrate" in page.shown

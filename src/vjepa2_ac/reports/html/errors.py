@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from markupsafe import Markup
 
+from vjepa2_ac.evaluation.distribution.mmd import Discrepancy
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
     gain_over,
@@ -19,7 +21,7 @@ from vjepa2_ac.evaluation.metrics import L1, Metric
 from vjepa2_ac.evaluation.result import MODES, Evaluation, Mode, ModelResult, PredictionErrors, Stratum, Way
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.html.charts import Axis, Line, axis_at, line_chart, nice_axis
-from vjepa2_ac.reports.html.formatting import seconds, share, signed_value, value
+from vjepa2_ac.reports.html.formatting import decimal, seconds, share, signed_value, value
 from vjepa2_ac.reports.html.series import Series, models_of, persistence, wrong_actions_of
 from vjepa2_ac.reports.html.templates import render
 
@@ -55,6 +57,31 @@ def base_section(evaluation: Evaluation) -> Markup:
     chart = line_chart(description, lines, _time_axis(evaluation), y_axis, level=0.0, key=lines)
     tables = [_compared_table(evaluation, one.model, base) for one in compared]
     return render("base", evaluation=evaluation, chart=chart, tables=tables)
+
+
+def spread_section(evaluation: Evaluation) -> Markup:
+    """Return the section on whether predictions are as varied as the truth, and distributed alike."""
+    found = [(one, one.model.distribution) for one in models_of(evaluation)]
+    if evaluation.persistence_distribution is not None:
+        found.insert(0, (persistence(evaluation), evaluation.persistence_distribution.copies))
+    measured = [(one, which) for one, which in found if which is not None]
+    if not any(math.isfinite(each.value) for _, which in measured for each in which.spread):
+        return render("spread", chart=None)
+    lines = [_line(evaluation, one, which.spread) for one, which in measured]
+    y_axis = nice_axis("spread / that of the truth", [*_reached(lines), 1.0], from_zero=True)
+    description = f"Spread over that of the truth by horizon: {_as_text(lines)}."
+    chart = line_chart(description, lines, _time_axis(evaluation), y_axis, level=1.0, key=lines)
+    names = [horizon_name(evaluation, h + 1) for h in range(evaluation.horizon)]
+    head = ["model steps ahead", *(one.label for one, _ in measured)]
+    spreads = [[name, *(value(which.spread[h]) for _, which in measured)] for h, name in enumerate(names)]
+    mmds = [[name, *(_discrepancy(which.mmd[h]) for _, which in measured)] for h, name in enumerate(names)]
+    floors = evaluation.persistence_distribution.noise_floor if evaluation.persistence_distribution else ()
+    if floors:
+        head_of_mmds = [*head, "two halves of the truth stay below"]
+        mmds = [[*row, decimal(floor)] for row, floor in zip(mmds, floors, strict=True)]
+    else:
+        head_of_mmds = head
+    return render("spread", chart=chart, spread_head=head, spread_rows=spreads, mmd_head=head_of_mmds, mmd_rows=mmds)
 
 
 def strata_section(evaluation: Evaluation) -> Markup:
@@ -99,6 +126,11 @@ def _tables(evaluation: Evaluation, metric: Metric, curve_of: CurveOf, over: str
         caption = f"{' '.join(name.split())} by horizon, {_MODES[mode]}"
         tables.append((caption, ["model steps ahead", *(one.label for one in shown)], rows))
     return tables
+
+
+def _discrepancy(found: Discrepancy) -> Markup:
+    p_value = f"; p {decimal(found.p_value)}" if math.isfinite(found.p_value) else ""
+    return value(found.squared) + p_value
 
 
 def _compared_table(evaluation: Evaluation, one: ModelResult, base: ModelResult) -> Table:

@@ -11,7 +11,7 @@ from vjepa2_ac.evaluation.estimates import cost_of_actions, gain_over, over_pers
 from vjepa2_ac.evaluation.metrics import L1
 from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.reports.html.actions import actions_section, landscape_section
-from vjepa2_ac.reports.html.errors import base_section, error_section, strata_section
+from vjepa2_ac.reports.html.errors import base_section, error_section, spread_section, strata_section
 from vjepa2_ac.reports.html.examples import animation_style, examples_section
 from vjepa2_ac.reports.html.formatting import seconds, share, value
 from vjepa2_ac.reports.html.planning import planning_section
@@ -43,6 +43,7 @@ def report_page(evaluation: Evaluation, verdict: str) -> str:
     sections = (  # id, title, body
         ("errors", "Error by horizon", error_section(evaluation)),
         ("base", "Compared with the base", base_section(evaluation)),
+        ("spread", "Is it as varied as the truth?", spread_section(evaluation)),
         ("strata", "Where it helps: moving and idle, small and large actions", strata_section(evaluation)),
         ("actions", "Does it use the actions?", actions_section(evaluation)),
         ("landscapes", "Energy landscapes", landscape_section(evaluation)),
