@@ -57,9 +57,10 @@ ORDERS: dict[str, list[str]] = {
         "verdict examples",
         "evaluate",
         "evaluate_run",
+        "imagined",
     ],
-    "reports": ["action_score_json", "metrics_json", "comparison", "figures html", "write"],
-    "simulation": ["world", "closed_loop", "recording", "counterfactual"],
+    "reports": ["action_score_json", "metrics_json", "comparison", "figures html", "write imagined"],
+    "simulation": ["world", "closed_loop", "recording", "counterfactual", "imagined_truth"],
 }
 
 HOMES = {

@@ -17,7 +17,7 @@ WRITING = """
 import sys, time
 from pathlib import Path
 from vjepa2_ac import storage
-from vjepa2_ac.cli.ending import tidy_end
+from vjepa2_ac.distributed.ending import tidy_end
 target = Path(sys.argv[1])
 with tidy_end():
     if sys.argv[2] == "file":

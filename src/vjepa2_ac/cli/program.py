@@ -24,8 +24,8 @@ from vjepa2_ac.cli import (
     simulate,
     train,
 )
-from vjepa2_ac.cli.ending import tidy_end
 from vjepa2_ac.cli.options import Handler, Parser, parsed
+from vjepa2_ac.distributed.ending import tidy_end
 from vjepa2_ac.errors import InputError, UserError, in_words, is_out_of_memory, printable
 
 
