@@ -57,6 +57,7 @@ ORDERS: dict[str, list[str]] = {
         "verdict examples",
         "evaluate",
         "evaluate_run",
+        "imagined_image",
         "imagined",
     ],
     "reports": ["action_score_json", "metrics_json", "comparison", "figures html", "write imagined"],

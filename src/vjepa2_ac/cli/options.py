@@ -15,12 +15,15 @@ from vjepa2_ac import places
 from vjepa2_ac.errors import InputError, printable
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from vjepa2_ac.config import Config
     from vjepa2_ac.planning.session import PlanningSession
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Handler = Callable[[argparse.Namespace], int | None]
 
+NEGATIVE_NUMBERS = re.compile(r"^-[\d.]")  # for a parser that takes several in one word
 _MOST = 10**9
 _OPTION = re.compile(r"-(?![\d.])")  # but a negative number is a value
 _OVERRIDE = re.compile(r"[a-z_]+(\.\w+)+=")
@@ -245,3 +248,34 @@ def _meant(read: Callable[[str], str], text: str) -> str:
         return read(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(f"{text!r} {error}") from None
+
+
+def as_numbers(text: str, where: str) -> np.ndarray:
+    """Read the numbers of one word, with commas between them.
+
+    Raises:
+        InputError: A part is none.
+    """
+    import numpy as np
+
+    try:
+        return np.array([float(word) for word in text.replace(",", " ").split()])
+    except ValueError as error:
+        found, needed = f"{text!r} ({error})", "numbers with commas between them, in one word"
+        raise InputError(where=where, found=found, needed=needed) from None
+
+
+def camera_pose(text: str | None) -> np.ndarray | None:
+    """Read the value of --extrinsics.
+
+    Raises:
+        InputError: It is no pose.
+    """
+    from vjepa2_ac.planning.input_checks import require_numbers
+    from vjepa2_ac.spaces import EXTRINSICS
+
+    if text is None:
+        return None
+    extrinsics = as_numbers(text, "--extrinsics")
+    require_numbers(extrinsics, EXTRINSICS, where="--extrinsics")
+    return extrinsics

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vjepa2_ac.cli.options import (
+    NEGATIVE_NUMBERS,
     Commands,
     add_checkpoint,
     argument,
     as_local,
     as_model,
+    as_numbers,
     as_path,
+    camera_pose,
     command,
     load_planning_session,
     require_overrides,
@@ -36,7 +38,7 @@ def add_to(commands: Commands) -> None:
         " Status 1 where the model gives no finite energy."
     )
     parser = command(commands, "plan", _plan, text)
-    parser._negative_number_matcher = re.compile(r"^-[\d.]")  # "-0.3,0.1,..." is a value, not an option
+    parser._negative_number_matcher = NEGATIVE_NUMBERS  # "-0.3,0.1,..." is a value, not an option
     argument(parser, "subject RUN_OR_MODEL", "folder of a run, or what model.base takes", as_model)
     argument(parser, "overrides key=value", "such as planning.horizon=2", nargs="*")
     argument(parser, "--start IMAGE", "what the camera sees: PNG or JPEG", as_local, required=True)
@@ -67,7 +69,7 @@ def _plan(options: argparse.Namespace) -> int:
 
     # Wrong words are told before what takes seconds is imported.
     require_overrides(options.overrides, fix="Numbers of --state or --extrinsics go in one word: --state 0.4,0,0.3,...")
-    state, extrinsics = _numbers(options.state, "--state"), _extrinsics(options)
+    state, extrinsics = as_numbers(options.state, "--state"), camera_pose(options.extrinsics)
     durations = _durations(options.durations, len(options.goal)) if options.durations else ()
     _require_state(state, require_to_plan(options))
     with user_can_write(options.out):
@@ -125,27 +127,6 @@ def _images(options: argparse.Namespace) -> tuple[np.ndarray, tuple[np.ndarray, 
     if mask is not None:
         require_mask(mask, where=f"--mask {options.mask}", like=goals[0])
     return start, goals, mask
-
-
-def _extrinsics(options: argparse.Namespace) -> np.ndarray | None:
-    from vjepa2_ac.planning.input_checks import require_numbers
-    from vjepa2_ac.spaces import EXTRINSICS
-
-    if options.extrinsics is None:
-        return None
-    extrinsics = _numbers(options.extrinsics, "--extrinsics")
-    require_numbers(extrinsics, EXTRINSICS, where="--extrinsics")
-    return extrinsics
-
-
-def _numbers(text: str, where: str) -> np.ndarray:
-    import numpy as np
-
-    try:
-        return np.array([float(word) for word in text.replace(",", " ").split()])
-    except ValueError as error:
-        found, needed = f"{text!r} ({error})", "numbers with commas between them, in one word"
-        raise InputError(where=where, found=found, needed=needed) from None
 
 
 def _durations(text: str, goals: int) -> tuple[int, ...]:

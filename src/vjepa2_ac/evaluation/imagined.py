@@ -12,11 +12,12 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.config import Config
+from vjepa2_ac.config import Config, LimitsConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input, view
+from vjepa2_ac.data.clips.windows import in_split
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import (
     AS_RECORDED,
@@ -33,10 +34,10 @@ from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.evaluation.evaluate import Contender
 from vjepa2_ac.evaluation.evaluate_run import contenders_of, load_model
+from vjepa2_ac.evaluation.imagined_image import actions_by_name
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.counterfactual.actions_file import read_actions
-from vjepa2_ac.planning.counterfactual.named_actions import ACTION_NAMES, STEP_M, named_actions
+from vjepa2_ac.planning.counterfactual.named_actions import STEP_M
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
@@ -162,7 +163,7 @@ def _rollouts(
     return found
 
 
-def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: object) -> dict[str, np.ndarray]:
+def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig) -> dict[str, np.ndarray]:
     recorded = batch.actions[0].double().numpy()
     chosen: dict[str, np.ndarray] = {}
     for word in asked.actions:
@@ -176,16 +177,7 @@ def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: o
                 needed="poses: other actions are directions in that frame",
                 fix="Give --actions true",
             )
-        if word in ACTION_NAMES:
-            chosen[word] = named_actions(word, len(recorded), size_m=asked.size_m, limits=limits)  # type: ignore[arg-type]
-        elif Path(word).suffix in {".npy", ".csv"}:
-            chosen[Path(word).stem] = read_actions(word, steps=len(recorded))
-        else:
-            raise InputError(
-                where=f"--actions {word}",
-                found="no such actions",
-                needed=f"{TRUE}, {', '.join(ACTION_NAMES)}, or a file",
-            )
+        chosen[Path(word).stem] = actions_by_name(word, len(recorded), asked.size_m, limits)
     return chosen
 
 
@@ -212,6 +204,12 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
                 fix="Lower --steps or --start",
             )
         return episode, start
+    members = in_split(dataset.split_hash, dataset.config, asked.split)[dataset.episodes]
+    longest = int(dataset.table.num_steps[dataset.episodes[members]].max(initial=0))
+    if 0 < longest < dataset.config.clip_steps:
+        most = (longest - 1) // dataset.config.model_stride
+        found = f"{asked.steps} model steps, and the longest {asked.split} episode has {most}"
+        raise InputError(where="--steps", found=found, needed=f"{most} at most")
     windows = validation_windows(dataset, asked.split, clips=_SEARCHED)
     return max(windows, key=lambda window: _motion(dataset, *window))
 
