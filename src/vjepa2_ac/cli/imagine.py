@@ -45,8 +45,9 @@ def add_to(commands: Commands) -> None:
     text = "what draws the images: the folder that `vjepa2-ac decoder` made, or builtin:sim-tiny"
     argument(parser, "--decoder FOLDER", text, as_model, required=True)
     text = (
-        "with commas between them: true (the recorded ones of a clip), none, up, down, left, right, forward, back, open,"
-        " close, in the robot's frame; or files, .npy or .csv, a row of 7 numbers for each step (true,none,up,left,close)"
+        "with commas between them: true (the recorded ones of a clip), none, up, down, left, right, forward, back,"
+        " open, close, in the robot's frame; or files, .npy or .csv: a row of 7 numbers for each step"
+        " (true,none,up,left,close)"
     )
     argument(parser, "--actions NAMES", text)
     argument(parser, "--steps N", "model steps to imagine (7)", count, default=7)
