@@ -57,9 +57,17 @@ ORDERS: dict[str, list[str]] = {
         "verdict examples",
         "evaluate",
         "evaluate_run",
+        "imagined",
+    ],
+    "decoding": [
+        "network loss",
+        "decoder_folder frame_pairs",
+        "linear_fit held_out imagine",
+        "setup",
+        "training",
     ],
     "reports": ["action_score_json", "metrics_json", "comparison", "figures html", "write"],
-    "simulation": ["world", "closed_loop", "recording", "counterfactual"],
+    "simulation": ["world", "closed_loop", "recording", "counterfactual", "imagined_truth"],
 }
 
 HOMES = {

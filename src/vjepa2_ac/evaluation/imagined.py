@@ -77,7 +77,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     """Imagine a held-out clip of a run or a model: under the recorded actions, by base and adapter, and under others.
 
     Args:
-        subject: The folder of a run; or a model, with `evaluation.data`.
+        subject: The folder of a run; or a model, with data in `evaluation`.
         asked: What is to be imagined.
         reporter: Shows the progress.
 
@@ -163,6 +163,9 @@ def _rollouts(
 
 
 def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: object) -> dict[str, np.ndarray]:
+    if not asked.actions or not 0 < asked.size_m < np.inf:
+        found = f"{len(asked.actions)} sequences of actions, named ones of {asked.size_m:g} m a step"
+        raise InputError(where="--actions, --size", found=found, needed="one or more, of more than 0")
     recorded = batch.actions[0].double().numpy()
     chosen: dict[str, np.ndarray] = {}
     for word in asked.actions:
@@ -178,8 +181,9 @@ def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: o
             )
         if word in ACTION_NAMES:
             chosen[word] = named_actions(word, len(recorded), size_m=asked.size_m, limits=limits)  # type: ignore[arg-type]
-        elif Path(word).suffix in {".npy", ".csv"}:
-            chosen[Path(word).stem] = read_actions(word, steps=len(recorded))
+        elif Path(word).suffix.lower() in {".npy", ".csv"}:
+            name = Path(word).name  # with its ending: never one of the other names
+            chosen[word if name in chosen else name] = read_actions(word, steps=len(recorded))
         else:
             raise InputError(
                 where=f"--actions {word}",
@@ -202,11 +206,11 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
             example = dataset.table.identity(int(dataset.episodes[0]))
             raise InputError(where="--episode", found=f"no episode {asked.episode}", needed=f"one such as {example}")
         start, last = asked.start or 0, int(dataset.table.num_steps[episode]) - dataset.config.clip_steps
-        if start > last:
+        if not 0 <= start <= last:
             raise InputError(
                 where="--start",
                 found=f"{start}, in an episode of {dataset.table.num_steps[episode]} steps",
-                needed=f"{last} at most: {asked.steps} model steps take {dataset.config.clip_steps} control steps"
+                needed=f"0 to {last}: {asked.steps} model steps take {dataset.config.clip_steps} control steps"
                 if last >= 0
                 else "a longer episode",
                 fix="Lower --steps or --start",
