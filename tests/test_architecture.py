@@ -60,6 +60,13 @@ ORDERS: dict[str, list[str]] = {
         "imagined_image",
         "imagined",
     ],
+    "decoding": [
+        "network loss",
+        "decoder_folder frame_pairs",
+        "linear_fit held_out imagine",
+        "setup",
+        "training",
+    ],
     "reports": ["action_score_json", "metrics_json", "comparison", "figures html", "write imagined"],
     "simulation": ["world", "closed_loop", "recording", "counterfactual", "imagined_truth"],
 }

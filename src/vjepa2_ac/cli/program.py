@@ -13,17 +13,16 @@ from vjepa2_ac import __version__, output
 from vjepa2_ac.cli import (
     config,
     data,
-    decoder,
     doctor,
     download,
     encode,
     evaluate,
     export,
-    imagine,
     plan,
     simulate,
     train,
 )
+from vjepa2_ac.cli.decoding import decoder, imagine
 from vjepa2_ac.cli.options import Handler, Parser, parsed
 from vjepa2_ac.distributed.ending import tidy_end
 from vjepa2_ac.errors import InputError, UserError, in_words, is_out_of_memory, printable

@@ -74,6 +74,15 @@ class TrainedDecoder:
         Raises:
             InputError: It has.
         """
+        shape = self.card.shape
+        sizes = (world_model.num_tokens, world_model.latent_dim, world_model.image_size)
+        if sizes != (shape.grid**2, shape.dim, shape.image_size):
+            raise InputError(
+                where=f"--decoder {self.folder}",
+                found=f"a decoder of {shape.grid**2}x{shape.dim} latents to images of {shape.image_size} px",
+                needed=f"{sizes[0]}x{sizes[1]} latents of images of {sizes[2]} px, as those of {subject}",
+                fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
+            )
         if world_model.encoder_fingerprint() != self.card.encoder:
             raise InputError(
                 where=f"--decoder {self.folder}",

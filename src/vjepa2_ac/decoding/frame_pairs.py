@@ -6,9 +6,10 @@ loses one episode at most.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
@@ -102,22 +103,12 @@ def _stacked(tensors: Sequence[Tensor | None]) -> Tensor:
 def wanted_frames(dataset: Dataset, split: Split, *, frames: int) -> list[FramesToEncode]:
     """Return at most about this many frames of a split, spread over its episodes and cameras.
 
-    They are among those that clips use: the decoder is to show clips.
-
-    Raises:
-        InputError: The split has none.
+    They are among those that clips use: the decoder is to show clips. None, if the split has no clips.
     """
     members = in_split(dataset.split_hash, dataset.config, split)
     needed = [one for one in needed_frames(dataset) if members[one.episode]]
     cameras = dataset.config.cameras
     total = sum(len(one.steps) for one in needed) * len(cameras)
-    if not total:
-        raise InputError(
-            where=f"data.path: {dataset.config.path}",
-            found=f"no frames of {split} episodes",
-            needed="one episode or more",
-            fix=f"Raise data.{split}_share" if split != "train" else "Lower data.validation_share or data.test_share",
-        )
     places, counted = np.linspace(0, total, min(frames, total), endpoint=False).astype(int), 0
     wanted = []
     for one in needed:
@@ -146,10 +137,11 @@ def encode_pairs(
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
     total, done = sum(len(one.steps) for one in left), 0
-    for one, frames in _whole_episodes(dataset, left):
-        _write(_file_of(dataset, one, folder).path, frames, encoder, dataset.config.cache_dtype)
-        done += len(frames)
-        progress(done, total)
+    with contextlib.closing(_whole_episodes(dataset, left)) as episodes:
+        for one, frames in episodes:
+            _write(_file_of(dataset, one, folder).path, frames, encoder, dataset.config.cache_dtype)
+            done += len(frames)
+            progress(done, total)
     there = [file for file in files if file.path.is_file()]
     if not there:
         raise InputError(where=dataset.config.path, found="no frame that can be read", needed="one or more")
@@ -188,19 +180,20 @@ def _file_of(dataset: Dataset, wanted: FramesToEncode, folder: Path) -> PairFile
 
 def _whole_episodes(
     dataset: Dataset, wanted: Sequence[FramesToEncode]
-) -> Iterator[tuple[FramesToEncode, list[UInt8[np.ndarray, "height width 3"]]]]:
+) -> Generator[tuple[FramesToEncode, list[UInt8[np.ndarray, "height width 3"]]], None, None]:
     """Yield the frames of each request that can be read."""
     frames: list[np.ndarray] = []
     threads = max(1, dataset.config.workers)
-    for part in prefetched(dataset, wanted, threads=threads, side=_NO_SMALL_FRAMES):
-        if isinstance(part, Unreadable):
-            dataset.leave_out(part.wanted.episode, part.error)
-            frames = []
-            continue
-        frames += list(part.frames)
-        if len(frames) == len(part.wanted.steps):
-            yield part.wanted, frames
-            frames = []
+    with contextlib.closing(prefetched(dataset, wanted, threads=threads, side=_NO_SMALL_FRAMES)) as parts:
+        for part in parts:
+            if isinstance(part, Unreadable):
+                dataset.leave_out(part.wanted.episode, part.error)
+                frames = []
+                continue
+            frames += list(part.frames)
+            if len(frames) == len(part.wanted.steps):
+                yield part.wanted, frames
+                frames = []
 
 
 def _write(path: Path, frames: Sequence[np.ndarray], encoder: EncoderOnDevice, kind: CacheType) -> None:

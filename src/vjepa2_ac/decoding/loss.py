@@ -8,6 +8,7 @@ from torch import Tensor
 from vjepa2_ac.media.image_similarity import ms_ssim
 
 STRUCTURE, EDGES = 0.2, 0.1  # weights of the second and the third part
+SMALLEST = 11  # pixels of an image's side: a window has to fit
 _SCALES = 3
 
 
@@ -20,7 +21,7 @@ def decoder_loss(
         images: What the decoder gives, not clipped.
         targets: What the encoder saw, between 0 and 1.
     """
-    scales = sum(images.shape[-1] >= 11 << scale for scale in range(_SCALES))  # a window of 11 pixels has to fit
+    scales = sum(images.shape[-1] >= SMALLEST << scale for scale in range(_SCALES))
     absolute = (images - targets).abs().mean()
     structure = 1.0 - ms_ssim(images, targets, scales=scales).mean()
     rows, columns = ((images.diff(dim=axis) - targets.diff(dim=axis)).abs().mean() for axis in (-2, -1))

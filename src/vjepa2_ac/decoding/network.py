@@ -18,13 +18,12 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Generator, Tensor, nn
 
-from vjepa2_ac.config.section import PositiveInt
-
 Size = Literal["linear", "tiny", "small", "medium"]
 
 _MIDDLE, _RANGE = 0.5, 0.25  # of pixels: the network's numbers are about -2 .. 2
 _FREQUENCIES = 10_000.0
 _STD = 0.02
+UPSAMPLED = 4  # the resolution of tokens is doubled twice
 _LAST = -2  # of the further layers: the last one with weights
 
 
@@ -33,9 +32,9 @@ class DecoderShape:
     """What a decoder is: its size, and the sizes of the encoder that it belongs to."""
 
     size: Size
-    dim: PositiveInt  # of a latent
+    dim: Annotated[int, Field(ge=1, le=1 << 14)]  # of a latent
     grid: Annotated[int, Field(ge=1, le=256)]  # tokens along each side of a frame
-    patch_size: Annotated[int, Field(ge=4, le=64, multiple_of=4)]  # pixels
+    patch_size: Annotated[int, Field(ge=UPSAMPLED, le=64, multiple_of=UPSAMPLED)]  # pixels
 
     @property
     def image_size(self) -> int:
@@ -129,7 +128,7 @@ class Decoder(nn.Module):
 
 def _convolved(shape: DecoderShape, widths: _Widths) -> nn.Sequential:
     first, second = widths.head
-    last = shape.patch_size // 4
+    last = shape.patch_size // UPSAMPLED
     return nn.Sequential(
         nn.Linear(shape.dim, widths.width),
         _Positions(shape.grid, widths.width),

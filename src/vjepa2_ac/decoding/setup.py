@@ -16,10 +16,11 @@ import torch
 from vjepa2_ac.config import Config, DecoderConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
-from vjepa2_ac.data.clips.windows import in_split, require_stride
-from vjepa2_ac.decoding.decoder_folder import CARD, read_card
+from vjepa2_ac.data.clips.windows import require_stride
+from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, read_card
 from vjepa2_ac.decoding.frame_pairs import FramePairs, encode_pairs, require_space_for_pairs, wanted_frames
-from vjepa2_ac.decoding.network import DecoderShape
+from vjepa2_ac.decoding.loss import SMALLEST
+from vjepa2_ac.decoding.network import UPSAMPLED, DecoderShape
 from vjepa2_ac.distributed.device import autocast, computing_device
 from vjepa2_ac.distributed.preemption import StoppedError, StopRequest
 from vjepa2_ac.encoding.batch import encoding_of
@@ -30,6 +31,7 @@ from vjepa2_ac.encoding.prefetch import FramesToEncode
 from vjepa2_ac.episode import Progress
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.reporter import INDEXING, Reporter
 from vjepa2_ac.runs.folder import CHECKPOINTS, METRICS
 from vjepa2_ac.runs.lock import LOCK, RunLock
@@ -37,7 +39,15 @@ from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import read_json_object
 
 KEY, PAIRS = "key.json", "pairs"
-_OWN = {KEY, PAIRS, LOCK, CHECKPOINTS, METRICS}
+_OWN = {
+    KEY,
+    PAIRS,
+    LOCK,
+    CHECKPOINTS,
+    METRICS,
+    WEIGHTS,
+    LINEAR,
+}  # the last two: of a start that was killed while it wrote
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,18 +98,17 @@ def setup(config: Config, reporter: Reporter, *, check_only: bool) -> Iterator[S
     dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
     wanted = _wanted(dataset, config.decoder)
     model = load_base(config.model, seed=config.seed)
+    shape = _shape_for(model, config.decoder)
     on_device = encoder_on_device(config, model, device)
     if config.training.precision == "fp16":
         precision: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext  # no loss scale here
     else:
         precision = partial(autocast, config.training, device)
-    grid = model.image_size // model.sizes.patch_size
-    shape = DecoderShape(config.decoder.size, model.latent_dim, grid, model.sizes.patch_size)
     key = {
         "decoder": config.decoder.model_dump(mode="json", exclude={"folder", "checkpoint_every"}),
         "seed": config.seed,
         "latents": dict(key_for(dataset, encoding_of(model, config)).parts),
-        "shares": [config.data.validation_share, config.data.test_share, config.data.split_by],
+        "data": config.data.model_dump(mode="json", include={"validation_share", "test_share", "split_by"}),
     }
     is_done = _compare_key(folder, key)
     if not is_done:
@@ -149,8 +158,15 @@ def _interruptible(progress: Progress, folder: Path, stop: StopRequest) -> Progr
 def _wanted(dataset: Dataset, knobs: DecoderConfig) -> dict[Split, list[FramesToEncode]]:
     """Return the frames of each split; the test split may be empty."""
     found: dict[Split, list[FramesToEncode]] = {"train": wanted_frames(dataset, "train", frames=knobs.frames)}
-    if in_split(dataset.split_hash, dataset.config, "test")[dataset.episodes].any():
-        found["test"] = wanted_frames(dataset, "test", frames=knobs.held_out_frames)
+    if held_out := wanted_frames(dataset, "test", frames=knobs.held_out_frames):
+        found["test"] = held_out
+    if not found["train"]:
+        raise InputError(
+            where=f"data.path: {dataset.config.path}",
+            found="no frames of train episodes",
+            needed="one episode or more that is as long as a clip",
+            fix="Lower data.validation_share or data.test_share",
+        )
     return found
 
 
@@ -163,6 +179,17 @@ def _require_frames(config: Config) -> None:
             fix="Use the config of the data set; data.cache does not matter here",
         )
     require_stride(config.data, to="know which frames clips use")
+
+
+def _shape_for(model: WorldModel, knobs: DecoderConfig) -> DecoderShape:
+    patch = model.sizes.patch_size
+    if patch % UPSAMPLED or model.image_size < SMALLEST:
+        raise InputError(
+            where="model",
+            found=f"images of {model.image_size} px in patches of {patch} px",
+            needed=f"{SMALLEST} px or more, and patches of a multiple of {UPSAMPLED} px",
+        )
+    return DecoderShape(knobs.size, model.latent_dim, model.image_size // patch, patch)
 
 
 def _require_own(folder: Path) -> None:
@@ -186,17 +213,24 @@ def _compare_key(folder: Path, key: dict[str, Any]) -> bool:
     """
     path = folder / KEY
     if not path.is_file():
-        if (folder / CARD).is_file():
+        if any((folder / name).exists() for name in (CARD, PAIRS, CHECKPOINTS)):
             raise _another(folder, "of unknown origin")
         return False
     there = read_json_object(path, fix="Delete this folder")
-    if there != json.loads(json.dumps(key)):
-        parts = sorted(name for name in key if there.get(name) != json.loads(json.dumps(key[name])))
-        raise _another(folder, f"made otherwise: {', '.join(parts)}")
+    if differing := _differing(there, json.loads(json.dumps(key))):
+        raise _another(folder, f"made otherwise: {'; '.join(differing)}")
     if (folder / CARD).is_file():
         read_card(folder)
         return True
     return False
+
+
+def _differing(there: Any, key: Any, name: str = "") -> list[str]:
+    """Return what differs, by dotted names."""
+    if isinstance(there, dict) and isinstance(key, dict):
+        names = sorted(there.keys() | key.keys())
+        return [one for each in names for one in _differing(there.get(each), key.get(each), f"{name}.{each}")]
+    return [] if there == key else [f"{name[1:]}: {there}, not {key}"]
 
 
 def _another(folder: Path, how: str) -> InputError:

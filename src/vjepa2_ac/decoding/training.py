@@ -59,7 +59,10 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
         StoppedError: A signal asked to stop; the same command goes on.
     """
     with setup(config, reporter, check_only=check_only) as ready:
-        if ready.is_done or check_only:
+        if check_only:
+            return ready.folder
+        if ready.is_done:
+            _remove_temporary(ready)  # of a start that was killed by then
             return ready.folder
         with _out_of_memory_explained():
             _try_one_step(ready)
@@ -223,7 +226,7 @@ def _batches(pairs: FramePairs, knobs: DecoderConfig, seed: int, done: int) -> G
 def _finish(
     training: _Training, linear: Decoder, pairs: FramePairs, held_out: FramePairs | None, reporter: Reporter
 ) -> None:
-    """Measure the averaged weights on held-out frames, write the decoder, and remove what only training needs."""
+    """Measure the averaged weights on held-out frames, write the decoder, and remove all else."""
     ready = training.ready
     if (name := first_not_finite(training.average)) is not None:
         raise InputError(where=str(ready.folder), found=f"{name} holds NaN or infinity", fix="Lower the learning rate")
@@ -249,9 +252,14 @@ def _finish(
         time=utc_now(),
     )
     save_decoder(ready.folder, card, decoder.state_dict(), linear.state_dict())
+    _remove_temporary(ready)
+    reporter.note(f"The decoder is in {ready.folder}: {ready.folder / CARD} says how good it is")
+
+
+def _remove_temporary(ready: Setup) -> None:
+    """Remove what only training needs."""
     for temporary in (ready.pairs, ready.folder / CHECKPOINTS):
         shutil.rmtree(temporary, ignore_errors=True)
-    reporter.note(f"The decoder is in {ready.folder}: {ready.folder / CARD} says how good it is")
 
 
 @contextlib.contextmanager

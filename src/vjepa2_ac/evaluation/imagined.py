@@ -37,7 +37,7 @@ from vjepa2_ac.evaluation.evaluate_run import contenders_of, load_model
 from vjepa2_ac.evaluation.imagined_image import actions_by_name
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.model.network.world_model import WorldModel
-from vjepa2_ac.planning.counterfactual.named_actions import STEP_M
+from vjepa2_ac.planning.counterfactual.named_actions import ACTION_NAMES, STEP_M
 from vjepa2_ac.reporter import INDEXING, SILENT, Reporter
 from vjepa2_ac.runs.folder import is_run
 from vjepa2_ac.runs.loading import load_run
@@ -78,7 +78,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
     """Imagine a held-out clip of a run or a model: under the recorded actions, by base and adapter, and under others.
 
     Args:
-        subject: The folder of a run; or a model, with `evaluation.data`.
+        subject: The folder of a run; or a model, with data in `evaluation`.
         asked: What is to be imagined.
         reporter: Shows the progress.
 
@@ -164,6 +164,9 @@ def _rollouts(
 
 
 def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: LimitsConfig) -> dict[str, np.ndarray]:
+    if not asked.actions or not 0 < asked.size_m < np.inf:
+        found = f"{len(asked.actions)} sequences of actions, named ones of {asked.size_m:g} m a step"
+        raise InputError(where="--actions, --size", found=found, needed="one or more, of more than 0")
     recorded = batch.actions[0].double().numpy()
     chosen: dict[str, np.ndarray] = {}
     for word in asked.actions:
@@ -177,7 +180,8 @@ def _actions_of(asked: ImagineOptions, batch: Batch, dataset: Dataset, limits: L
                 needed="poses: other actions are directions in that frame",
                 fix="Give --actions true",
             )
-        chosen[Path(word).stem] = actions_by_name(word, len(recorded), asked.size_m, limits)
+        name = word if word in ACTION_NAMES else Path(word).name  # with its ending: never one of the other names
+        chosen[word if name in chosen else name] = actions_by_name(word, len(recorded), asked.size_m, limits)
     return chosen
 
 
@@ -194,11 +198,11 @@ def _window(dataset: Dataset, asked: ImagineOptions) -> tuple[int, int]:
             example = dataset.table.identity(int(dataset.episodes[0]))
             raise InputError(where="--episode", found=f"no episode {asked.episode}", needed=f"one such as {example}")
         start, last = asked.start or 0, int(dataset.table.num_steps[episode]) - dataset.config.clip_steps
-        if start > last:
+        if not 0 <= start <= last:
             raise InputError(
                 where="--start",
                 found=f"{start}, in an episode of {dataset.table.num_steps[episode]} steps",
-                needed=f"{last} at most: {asked.steps} model steps take {dataset.config.clip_steps} control steps"
+                needed=f"0 to {last}: {asked.steps} model steps take {dataset.config.clip_steps} control steps"
                 if last >= 0
                 else "a longer episode",
                 fix="Lower --steps or --start",

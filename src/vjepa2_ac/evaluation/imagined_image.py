@@ -99,7 +99,7 @@ def actions_by_name(word: str, steps: int, size_m: float, limits: LimitsConfig) 
     """
     if word in ACTION_NAMES:
         return named_actions(word, steps, size_m=size_m, limits=limits)
-    if word.endswith((".npy", ".csv")):
+    if word.lower().endswith((".npy", ".csv")):
         return read_actions(word, steps=steps)
     needed = f"true (of a recorded clip), {', '.join(ACTION_NAMES)}, or a file"
     raise InputError(where=f"--actions {word}", found="no such actions", needed=needed)

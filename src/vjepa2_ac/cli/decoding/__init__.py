@@ -1,0 +1,1 @@
+"""The commands that show what latents hold, and what a model imagines."""
