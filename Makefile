@@ -15,7 +15,9 @@ $(INSTALLED): pyproject.toml constraints.txt
 demo: $(INSTALLED)  ## a simulated arm, a tiny world model, a LoRA adapter, and whether it helped
 	test -e demo/data || $(BIN)/vjepa2-ac simulate record demo/data --domain B --episodes 60 --seed 5
 	$(BIN)/vjepa2-ac train configs/demo.yaml
+	$(BIN)/vjepa2-ac decoder configs/demo.yaml
 	$(BIN)/vjepa2-ac evaluate demo/run
+	$(BIN)/vjepa2-ac imagine demo/run --decoder demo/decoder --actions true,left,close
 
 demo-seeds: demo  ## the spread of the demo's result over three seeds
 	for seed in 1 2; do $(BIN)/vjepa2-ac train configs/demo.yaml seed=$$seed run_dir=demo/run-$$seed || exit 1; done
@@ -25,7 +27,10 @@ base:  $(INSTALLED)  ## make the demo's base model again (about an hour); replac
 	test -e base/data || $(BIN)/vjepa2-ac simulate record base/data --domain random --episodes 800 --seed 3 --workers 2
 	$(BIN)/vjepa2-ac train configs/demo_base.yaml
 	rm -rf base/model && $(BIN)/vjepa2-ac export base/run base/model
+	$(BIN)/vjepa2-ac decoder configs/demo_base.yaml model.random=null model.base=base/model
 	rm -rf src/vjepa2_ac/assets/sim-tiny && cp -r base/model src/vjepa2_ac/assets/sim-tiny
+	mkdir src/vjepa2_ac/assets/sim-tiny/decoder
+	cp base/decoder/decoder.json base/decoder/decoder.safetensors base/decoder/linear.safetensors src/vjepa2_ac/assets/sim-tiny/decoder
 
 evidence: $(INSTALLED)  ## does LoRA help? every method side by side; goes on where it stopped; replaces table and plot
 	$(BIN)/python benchmarks/evidence --readme README.md

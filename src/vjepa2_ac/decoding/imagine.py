@@ -14,12 +14,14 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from vjepa2_ac.decoding.decoder_folder import DecoderCard
 from vjepa2_ac.decoding.frame_pairs import as_pixels
 from vjepa2_ac.decoding.network import Decoder
 from vjepa2_ac.planning.counterfactual.named_actions import counterfactual_states, feasible_actions
 from vjepa2_ac.spaces import StateSpace
 
 AS_RECORDED = "as recorded"
+_MUCH_WORSE_DB = 5.0
 
 
 class Rolls(Protocol):
@@ -98,6 +100,21 @@ def rolled_out(
     extrinsics = None if start.extrinsics is None else start.extrinsics.expand(1, len(actions), -1)
     rolled = model.rollout(start.latents[None, None], taken, known, extrinsics)
     return rolled[0]
+
+
+def worth_knowing(
+    card: DecoderCard, first: UInt8[np.ndarray, "size size 3"], decoded_first: UInt8[np.ndarray, "size size 3"]
+) -> tuple[str, ...]:
+    """Return a note where the decoder shows the start much worse than it showed its own held-out frames."""
+    usual = card.held_out.get("decoder", {}).get("psnr_db", {}).get("value")
+    error = np.square(first.astype(np.float64) - decoded_first).mean() / 255**2
+    decibels = -10 * np.log10(max(error, 1e-10))
+    if usual is None or decibels > usual - _MUCH_WORSE_DB:
+        return ()
+    return (
+        f"The decoder does not know this scene: it shows the start with {decibels:.1f} dB, its own held-out frames with"
+        f" {usual:.1f} dB. What the images lack, the model need not lack; train a decoder on frames of this scene.",
+    )
 
 
 def shown(decoder: Decoder, latents: Float[Tensor, "steps tokens dim"]) -> UInt8[np.ndarray, "steps size size 3"]:

@@ -27,6 +27,7 @@ from vjepa2_ac.decoding.imagine import (
     imagined_latents,
     rolled_out,
     shown,
+    worth_knowing,
 )
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
@@ -123,6 +124,7 @@ def imagine_clip(subject: str, asked: ImagineOptions, *, reporter: Reporter = SI
         rollouts=tuple(rollouts),
         truth=frames[1:],
         decoded_truth=decoded[1:],
+        notes=worth_knowing(decoder.card, frames[0], decoded[0]),
     )
     return Film(imagination, dataset, window[0], config.data.model_stride, size, partial(_as_seen, config, size))
 

@@ -13,7 +13,7 @@ from vjepa2_ac.config import LimitsConfig
 from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input, view
 from vjepa2_ac.data.sources.configured_spaces import measured_space
 from vjepa2_ac.decoding.decoder_folder import load_decoder
-from vjepa2_ac.decoding.imagine import Imagination, Imagined, Start, imagined_latents, shown
+from vjepa2_ac.decoding.imagine import Imagination, Imagined, Start, imagined_latents, shown, worth_knowing
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.planning.counterfactual.actions_file import read_actions
 from vjepa2_ac.planning.counterfactual.named_actions import ACTION_NAMES, STEP_M, named_actions
@@ -76,18 +76,22 @@ def imagine_image(
         extrinsics=None if camera is None else camera.to(model.device),
     )
     first = np.asarray(input_to_pixels(inputs)[0, 0].permute(1, 2, 0).contiguous().cpu().numpy())
+    decoded_first = shown(decoder.decoder, start.latents[None])[0]
     return Imagination(
         subject=session.subject,
         episode_id="",
         start=0,
         seconds_per_step=(config.data.model_stride if config.data.stride != "auto" else 1) / _RATE_HZ,
         first=first,
-        decoded_first=shown(decoder.decoder, start.latents[None])[0],
+        decoded_first=decoded_first,
         rollouts=tuple(
             Imagined("model", word, taken, shown(decoder.decoder, imagined_latents(model, start, taken)))
             for word, taken in chosen.items()
         ),
-        notes=(f"Times in the film suppose {_RATE_HZ:g} control steps in a second.",),
+        notes=(
+            f"Times in the film suppose {_RATE_HZ:g} control steps in a second.",
+            *worth_knowing(decoder.card, first, decoded_first),
+        ),
     )
 
 

@@ -43,7 +43,8 @@ def strip_of(imagination: Imagination) -> FilmStrip:
         rows.append(_row(label, "imagined", imagination.decoded_first, one.frames))
     for one in others:
         rows += _rows_of_other(imagination, one)
-    place = f"{imagination.subject}, {_short(imagination.episode_id)} from control step {imagination.start}"
+    clip = f"{_short(imagination.episode_id)} from control step {imagination.start}"
+    place = f"{imagination.subject}, {clip if imagination.episode_id else 'from an image'}"
     times = range(len(rows[0].frames)) if rows else range(0)
     return FilmStrip(place, tuple(rows), tuple(time * imagination.seconds_per_step for time in times))
 
