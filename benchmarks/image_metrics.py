@@ -3,8 +3,8 @@
     python benchmarks/image_metrics.py
     python benchmarks/image_metrics.py --starts 40 --futures 8
 
-First table: from each start the arm goes in a random direction; that is the truth. A *wrong future* is sharp and goes in
-another direction; the *mean of futures* is the average image of all others: what a model gives that cannot tell them
+First table: from each start the arm goes in a random direction; that is the truth. A *wrong future* is sharp and goes
+in another direction; the *mean of futures* is the average image of all others: what a model gives that cannot tell them
 apart. Second table: the squared MMD between features of predictions and of truth, of predictions that are as varied as
 the truth but wrong, and of predictions that are smoothed; once by the estimate that is unbiased over episodes, once by
 that of JEDi (every pair counts, a clip with itself and with its own truth, too).

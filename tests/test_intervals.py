@@ -5,7 +5,18 @@ import math
 import numpy as np
 import pytest
 
+<<<<<<< HEAD:tests/test_intervals.py
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio, ratio_difference
+=======
+from vjepa2_ac.evaluation.intervals import (
+    Estimate,
+    bootstrapped,
+    bootstrapped_by_weights,
+    mean_of,
+    ratio,
+    ratio_difference,
+)
+>>>>>>> help-a:tests/evaluation/test_intervals.py
 
 
 def test_a_ratio_weighs_clips_by_their_motion() -> None:
@@ -79,3 +90,15 @@ def test_the_same_seed_gives_the_same_interval() -> None:
     ids = tuple(map(str, range(20)))
     assert mean_of(values, ids, seed=3) == mean_of(values, ids, seed=3)
     assert mean_of(values, ids, seed=3) != mean_of(values, ids, seed=4)
+
+
+def test_weights_of_episodes_give_the_interval_of_their_sums() -> None:
+    rng = np.random.default_rng(3)
+    values, ids = rng.random(12), [f"episode {clip % 4}" for clip in range(12)]
+    sums = values.reshape(3, 4).sum(axis=0)
+    (found,) = bootstrapped_by_weights(lambda weights: (weights @ sums / (3 * weights.sum(axis=1)))[:, None], 4)
+    expected = mean_of(values, ids)
+    assert (found.value, found.low, found.high) == pytest.approx((expected.value, expected.low, expected.high))
+    (alone,) = bootstrapped_by_weights(lambda weights: weights, 1)
+    assert alone.value == 1
+    assert not alone.has_interval

@@ -111,10 +111,11 @@ def worth_knowing(
     decibels = -10 * np.log10(max(error, 1e-10))
     if usual is None or decibels > usual - _MUCH_WORSE_DB:
         return ()
-    return (
+    note = (
         f"The decoder does not know this scene: it shows the start with {decibels:.1f} dB, its own held-out frames with"
-        f" {usual:.1f} dB. What the images lack, the model need not lack; train a decoder on frames of this scene.",
+        f" {usual:.1f} dB. What the images lack, the model need not lack; train a decoder on frames of this scene."
     )
+    return (note,)
 
 
 def shown(decoder: Decoder, latents: Float[Tensor, "steps tokens dim"]) -> UInt8[np.ndarray, "steps size size 3"]:

@@ -1,0 +1,174 @@
+"""How alike do two images look to a network trained on photographs: LPIPS, from files that the user names.
+
+No weights are shipped or downloaded. Without the files the metric is absent (`NO_LPIPS`), never computed with random
+weights. `alex` is the metric that people compare, `vgg` the usual loss; do not report the one that was trained on.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.video.weights_file import checked_file
+
+Backbone = Literal["alex", "vgg"]
+NO_LPIPS = "No LPIPS: it needs the weights of a backbone and of its heads, which are not shipped; name their files."
+LEAST_SIDE = 32  # pixels: of fewer the pooled images have none
+_MEAN, _DEVIATION = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of images in -1 .. 1
+_EPSILON = 1e-10
+
+
+@dataclass(frozen=True)
+class LpipsFiles:
+    """The two files, and what their SHA-256 must begin with; None: the published file's digits."""
+
+    backbone: Path  # torchvision's weights: alexnet-owt-7be5be79.pth or vgg16-397923af.pth
+    heads: Path  # of lpips 0.1.4: weights/v0.1/alex.pth or vgg.pth
+    backbone_sha256: str | None = None
+    heads_sha256: str | None = None
+
+
+class _Layer(NamedTuple):
+    """A convolution followed by a ReLU."""
+
+    place: int  # features.{place} in the file
+    inputs: int
+    outputs: int
+    kernel: int = 3
+    stride: int = 1
+    pool: int = 0  # window of the maximum before it, at stride 2; 0: none
+    seen: bool = True  # whether its output is compared
+
+
+_LAYERS: dict[Backbone, tuple[_Layer, ...]] = {
+    "alex": (
+        _Layer(0, 3, 64, kernel=11, stride=4),
+        _Layer(3, 64, 192, kernel=5, pool=3),
+        _Layer(6, 192, 384, pool=3),
+        _Layer(8, 384, 256),
+        _Layer(10, 256, 256),
+    ),
+    "vgg": (
+        _Layer(0, 3, 64, seen=False),
+        _Layer(2, 64, 64),
+        _Layer(5, 64, 128, pool=2, seen=False),
+        _Layer(7, 128, 128),
+        _Layer(10, 128, 256, pool=2, seen=False),
+        _Layer(12, 256, 256, seen=False),
+        _Layer(14, 256, 256),
+        _Layer(17, 256, 512, pool=2, seen=False),
+        _Layer(19, 512, 512, seen=False),
+        _Layer(21, 512, 512),
+        _Layer(24, 512, 512, pool=2, seen=False),
+        _Layer(26, 512, 512, seen=False),
+        _Layer(28, 512, 512),
+    ),
+}
+_PADDING = {11: 2, 5: 2, 3: 1}  # by kernel
+_BACKBONES = {"alex": "7be5be79", "vgg": "397923af"}  # the digits in the names of torchvision's files
+_HEADS = {
+    "alex": "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
+    "vgg": "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
+}
+
+
+class Lpips(nn.Module):
+    """The distance of two images: squared differences of normalised features, weighted by channel, mean over places.
+
+    Frozen; gradients pass to the images, in float32 and without autocast. It equals lpips 0.1.4 (version 0.1).
+
+    Source: Zhang et al. (2018), The Unreasonable Effectiveness of Deep Features as a Perceptual Metric, equation 1;
+    constants of richzhang/PerceptualSimilarity @ 082bb24, lpips/lpips.py.
+    """
+
+    def __init__(self, backbone: Backbone) -> None:
+        super().__init__()
+        self.layers = _LAYERS[backbone]
+        self.convolutions = nn.ModuleDict({
+            str(one.place): nn.Conv2d(one.inputs, one.outputs, one.kernel, one.stride, _PADDING[one.kernel])
+            for one in self.layers
+        })  # fmt: skip
+        widths = [one.outputs for one in self.layers if one.seen]
+        self.heads = nn.ParameterList([nn.Parameter(torch.zeros(width)) for width in widths])
+        self.requires_grad_(False)
+        self.eval()
+
+    def forward(
+        self, predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"]
+    ) -> Float[Tensor, "*batch"]:
+        """Return the distance of each pair of images in 0 .. 1; 0 is identical.
+
+        Raises:
+            ValueError: Images of fewer than 32 pixels a side, or true ones outside 0 .. 1.
+        """
+        if min(predicted.shape[-2:]) < LEAST_SIDE:
+            size = " x ".join(map(str, predicted.shape[-2:]))
+            raise ValueError(f"images of {size} px; LPIPS needs {LEAST_SIDE} px a side")
+        if float(true.detach().amin()) < 0 or float(true.detach().amax()) > 1:  # a prediction may be outside
+            raise ValueError("true images outside 0 .. 1; LPIPS scales them to -1 .. 1 itself")
+        with torch.autocast(predicted.device.type, enabled=False):
+            pairs = zip(self._features(predicted), self._features(true), self.heads, strict=True)
+            total = torch.zeros(math.prod(predicted.shape[:-3]), device=predicted.device)
+            for one, other, head in pairs:
+                total = total + torch.einsum("nchw,c->nhw", (one - other).square(), head).mean(dim=(1, 2))
+        return total.reshape(predicted.shape[:-3])
+
+    def _features(self, images: Float[Tensor, "*batch 3 height width"]) -> list[Tensor]:
+        """Return the compared features [images channel rows columns], each place of length 1 over channels."""
+        mean, deviation = (torch.tensor(one, device=images.device)[:, None, None] for one in (_MEAN, _DEVIATION))
+        features = (2 * images.float().reshape(-1, *images.shape[-3:]) - 1 - mean) / deviation
+        found = []
+        for layer in self.layers:
+            if layer.pool:
+                features = nn.functional.max_pool2d(features, layer.pool, stride=2)
+            features = self.convolutions[str(layer.place)](features).relu()
+            if layer.seen:
+                length = torch.linalg.vector_norm(features, dim=1, keepdim=True)  # has a gradient at 0, a root has none
+                found.append(features / (length + _EPSILON))
+        return found
+
+
+def load_lpips(backbone: Backbone, files: LpipsFiles) -> Lpips:
+    """Return LPIPS with the weights of two files, of which nothing is unpickled but tensors.
+
+    Raises:
+        InputError: A file is missing, another one than was published, or lacks weights.
+    """
+    network = Lpips(backbone)
+    expected = files.backbone_sha256 or _BACKBONES[backbone], files.heads_sha256 or _HEADS[backbone]
+    weights = _tensors(files.backbone, expected[0], f"torchvision's backbone of LPIPS ({backbone})")
+    heads = _tensors(files.heads, expected[1], f"the heads of LPIPS ({backbone}, version 0.1)")
+    with torch.no_grad():
+        for index, convolution in network.convolutions.items():
+            for name, value in convolution.named_parameters():
+                _copy(value, weights, f"features.{index}.{name}", files.backbone)
+        for number, head in enumerate(network.heads):
+            _copy(head.view(1, -1, 1, 1), heads, f"lin{number}.model.1.weight", files.heads)
+    return network
+
+
+def _tensors(path: Path, sha256: str, what: str) -> dict[str, Tensor]:
+    content = checked_file(path, sha256, what)
+    try:
+        found = torch.load(content, map_location="cpu", weights_only=True)
+    except (RuntimeError, pickle.UnpicklingError, EOFError, ValueError):
+        found = None
+    if not isinstance(found, dict):
+        raise InputError(where=str(path), found="no PyTorch weights", needed=what)
+    return found
+
+
+def _copy(into: Tensor, weights: dict[str, Tensor], name: str, path: Path) -> None:
+    value = weights.get(name)
+    if not isinstance(value, Tensor) or value.shape != into.shape:
+        found = f"{name} of shape {list(value.shape)}" if isinstance(value, Tensor) else f"no {name}"
+        raise InputError(where=str(path), found=found, needed=f"{name} of shape {list(into.shape)}")
+    into.copy_(value)
