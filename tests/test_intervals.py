@@ -5,10 +5,7 @@ import math
 import numpy as np
 import pytest
 
-<<<<<<< HEAD:tests/test_intervals.py
-from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of, ratio, ratio_difference
-=======
-from vjepa2_ac.evaluation.intervals import (
+from vjepa2_ac.intervals import (
     Estimate,
     bootstrapped,
     bootstrapped_by_weights,
@@ -16,7 +13,6 @@ from vjepa2_ac.evaluation.intervals import (
     ratio,
     ratio_difference,
 )
->>>>>>> help-a:tests/evaluation/test_intervals.py
 
 
 def test_a_ratio_weighs_clips_by_their_motion() -> None:
