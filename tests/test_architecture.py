@@ -63,7 +63,7 @@ ORDERS: dict[str, list[str]] = {
     "decoding": [
         "network loss",
         "decoder_folder frame_pairs",
-        "linear_fit held_out imagine",
+        "linear_fit held_out imagine optimizer_steps",
         "setup",
         "training",
     ],

@@ -5,6 +5,7 @@
     python benchmarks/fake_gpu train --largest 24 --checkpointing on       # GB: what batch fits
     python benchmarks/fake_gpu train --source pixels --checkpointing on --official ../vjepa2   # beside its step
     python benchmarks/fake_gpu encode --batch 8 16 --top 10
+    python benchmarks/fake_gpu decoder --batch 64 --size small medium      # a training step of a decoder
     python benchmarks/fake_gpu plan --horizon 1 2 --at-once 32 64 --samples 800 --iterations 10 --adapter
 
 Needs a C++ compiler and a PyTorch without CUDA; no GPU. A row takes 10 to 30 seconds. Tensors are fake: they have a
@@ -88,8 +89,8 @@ def rows(options: argparse.Namespace, machine: Machine) -> Iterator[tuple[dict[s
 
     gc.freeze()  # no look for garbage goes through what was imported
     if options.work != "train":
-        works = work.encoding(options) if options.work == "encode" else work.planning(options)
-        for one in works:
+        works = {"encode": work.encoding, "plan": work.planning, "decoder": work.decoding}
+        for one in works[options.work](options):
             yield measured(one, machine, with_places=bool(options.top))
         return
     for step_of in work.training(options):
@@ -160,7 +161,7 @@ def print_more(options: argparse.Namespace, count: Count) -> None:
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("work", choices=("train", "encode", "plan"))
+    parser.add_argument("work", choices=("train", "encode", "decoder", "plan"))
     parser.add_argument("--quick", action="store_true", help="tiny sizes: whether it works")
     parser.add_argument("--layers", type=int, default=24, help="of the predictor")
     parser.add_argument("--width", type=int, default=1024, help="of the predictor, 64 a head")
@@ -178,6 +179,7 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     train.add_argument("--augment", action="store_true", help="clips of pixels are cropped and jittered")
     train.add_argument("--rollout-steps", type=int, default=2)
     train.add_argument("--official", type=Path, help="a checkout of facebookresearch/vjepa2: its step, too")
+    train.add_argument("--size", nargs="+", choices=("tiny", "small", "medium"), default=["small"], help="of a decoder")
     plan = parser.add_argument_group("plan")
     plan.add_argument("--horizon", type=int, nargs="+", default=[1, 2])
     plan.add_argument("--at-once", type=int, nargs="+", default=[64])

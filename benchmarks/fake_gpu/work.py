@@ -21,9 +21,12 @@ from stand_ins import FAKE, no_fake_gpu
 from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
-from vjepa2_ac.config import AdapterConfig, AugmentConfig, Config, ModelSizes
+from vjepa2_ac.config import AdapterConfig, AugmentConfig, Config, DecoderConfig, ModelSizes
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.clips.augmentation import draw
+from vjepa2_ac.decoding.frame_pairs import Pairs
+from vjepa2_ac.decoding.network import DecoderShape
+from vjepa2_ac.decoding.optimizer_steps import DecoderSteps
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.model.adapter.lora import add_adapter
 from vjepa2_ac.model.network.world_model import WorldModel
@@ -34,6 +37,7 @@ from vjepa2_ac.training.cost.memory import ALLOWANCE, estimate_memory
 
 OFFICIALS = (train_step_variants.OFFICIAL_FULL, train_step_variants.OFFICIAL)
 _AUGMENT = AugmentConfig(crop_scale=(0.3, 1.0), brightness=0.4, contrast=0.4, saturation=0.4)
+_PATCH = 16  # pixels
 _ITERATIONS = 2  # of a decision that are computed: all after the first are alike
 Doing = Callable[[Count], object]
 
@@ -137,6 +141,22 @@ def encoding(options: argparse.Namespace) -> Iterator[Work]:
     bench = _Steps(argparse.Namespace(**vars(options) | {"source": ["pixels"], "layers": 1}), options.dtype)
     for frames in options.batch:
         yield _encoding(bench, frames)
+
+
+def decoding(options: argparse.Namespace) -> Iterator[Work]:
+    """Yield a training step of a decoder for each size and number of frames."""
+    grid = options.image_size // _PATCH
+    for size, frames in itertools.product(options.size, options.batch):
+        shape = DecoderShape(size, options.latent_dim, grid, _PATCH)
+        knobs = DecoderConfig(size=size, batch_size=frames)
+        kind = getattr(torch, options.dtype)
+        arithmetic = partial(torch.autocast, "cuda", dtype=kind, enabled=kind != torch.float32)
+        steps = DecoderSteps(shape, knobs, 0, torch.device("cuda"), arithmetic, None)
+        latents = torch.empty(frames, grid**2, options.latent_dim, device="cuda")
+        images = torch.empty(frames, 3, shape.image_size, shape.image_size, dtype=torch.uint8, device="cuda")
+        pairs = Pairs(latents, images, ())
+        name = f"{size} decoder, {frames} frames"
+        yield Work(name, {"size": size, "batch": frames}, 0, lambda _, steps=steps, pairs=pairs: steps.do(1, pairs))
 
 
 def planning(options: argparse.Namespace) -> Iterator[Work]:

@@ -7,7 +7,6 @@ AdamW's moments and the step; a training that was killed goes on as if it had no
 from __future__ import annotations
 
 import contextlib
-import math
 import shutil
 import signal
 from collections.abc import Generator, Iterator
@@ -16,16 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from vjepa2_ac.config import Config, DecoderConfig
 from vjepa2_ac.data.clips.permutation import permuted
 from vjepa2_ac.decoding.decoder_folder import CARD, DecoderCard, save_decoder
-from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, as_images
+from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs
 from vjepa2_ac.decoding.held_out import mean_image, measure_decoders
 from vjepa2_ac.decoding.linear_fit import fit_linear
-from vjepa2_ac.decoding.loss import decoder_loss
 from vjepa2_ac.decoding.network import Decoder
+from vjepa2_ac.decoding.optimizer_steps import DecoderSteps
 from vjepa2_ac.decoding.setup import Setup, prepare, setup
 from vjepa2_ac.distributed.preemption import StoppedError, StopRequest, stop_on_signals
 from vjepa2_ac.errors import InputError
@@ -40,7 +38,6 @@ from vjepa2_ac.storage.structured import utc_now
 _WEIGHTS = "decoder.pt"
 _LOG_EVERY = 50  # steps
 _KEEP = 2  # checkpoints
-_BETAS = (0.9, 0.95)
 
 
 def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bool = False) -> Path:
@@ -78,124 +75,55 @@ def train_decoder(config: Config, reporter: Reporter = SILENT, *, check_only: bo
 def _try_one_step(ready: Setup) -> None:
     """Run out of memory now, not after the frames are encoded."""
     if ready.device.type == "cuda":
-        training = _Training(ready)
+        steps = _steps_of(ready, None)
         shape, count = ready.shape, ready.knobs.batch_size
         latents = torch.zeros(count, shape.grid**2, shape.dim)
-        training.step(1, Pairs(latents, torch.zeros(count, 3, shape.image_size, shape.image_size).byte(), ()))
+        steps.do(1, Pairs(latents, torch.zeros(count, 3, shape.image_size, shape.image_size).byte(), ()))
 
 
 class _Training:
-    """Weights, their average, and the optimizer: of the newest checkpoint, or beginning as the linear decoder.
+    """The steps of a decoder, from its newest checkpoint if there is one."""
 
-    Args:
-        ready: What is trained.
-        linear: The linear decoder; None: a trial without one, and without a checkpoint.
-    """
-
-    def __init__(self, ready: Setup, linear: Decoder | None = None) -> None:
-        self.ready, self.knobs = ready, ready.knobs
-        self.decoder = Decoder(ready.shape)
-        self.decoder.initialise(torch.Generator().manual_seed(ready.config.seed))
-        if linear is not None:
-            self.decoder.start_from(linear)
-        self.decoder.to(ready.device)
-        matrices = [one for one in self.decoder.parameters() if one.ndim > 1]
-        others = [one for one in self.decoder.parameters() if one.ndim <= 1]
-        groups = [
-            {"params": matrices, "weight_decay": self.knobs.weight_decay},
-            {"params": others, "weight_decay": 0.0},
-        ]
-        self.optimizer = torch.optim.AdamW(groups, lr=self.knobs.learning_rate, betas=_BETAS)
-        self.average = {name: one.detach().clone() for name, one in self.decoder.state_dict().items()}
-        self.done = 0
-        newest = None if linear is None else newest_checkpoint(ready.folder / CHECKPOINTS)
+    def __init__(self, ready: Setup, linear: Decoder) -> None:
+        self.ready, self.done = ready, 0
+        self.steps = _steps_of(ready, linear)
+        newest = newest_checkpoint(ready.folder / CHECKPOINTS)
         if newest is not None:
             self._restore(newest)
-
-    def step(self, step: int, pairs: Pairs) -> dict[str, float]:
-        """Do one optimizer step and return its metrics."""
-        device = self.ready.device
-        latents, images = pairs.latents.to(device), as_images(pairs.images.to(device))
-        if self.knobs.noise:
-            latents = latents + self._noise(step, latents)
-        for group in self.optimizer.param_groups:
-            group["lr"] = learning_rate_at(step, self.knobs)
-        with self.ready.autocast():
-            shown = self.decoder(latents)
-        loss, parts = decoder_loss(shown, images)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]  # torch
-        norm = torch.nn.utils.clip_grad_norm_(self.decoder.parameters(), self.knobs.max_grad_norm)
-        if not math.isfinite(float(norm)):
-            raise InputError(
-                where="decoder.learning_rate",
-                found=f"{self.knobs.learning_rate:g}: loss or gradients of step {step} are not finite",
-                fix="Lower it, delete the newest checkpoint if it was written by then, and start again",
-            )
-        self.optimizer.step()
-        self._add_to_average(step)
-        parts = {"loss": loss, **parts}
-        return {name: float(value.detach()) for name, value in parts.items()} | {
-            "learning_rate": learning_rate_at(step, self.knobs)
-        }
 
     def save(self, step: int) -> None:
         """Write a checkpoint."""
 
         def write(folder: Path) -> None:
-            with (folder / _WEIGHTS).open("wb") as file:
-                write_torch({"decoder": self.decoder.state_dict(), "average": self.average}, file)
-            with (folder / OPTIMIZER).open("wb") as file:
-                write_torch(self.optimizer.state_dict(), file)
+            for name, value in ((_WEIGHTS, self.steps.weights()), (OPTIMIZER, self.steps.optimizer.state_dict())):
+                with (folder / name).open("wb") as file:
+                    write_torch(value, file)
 
-        frames = step * self.knobs.batch_size
-        state = RunState(step=step, clips_done=frames)
+        state = RunState(step=step, clips_done=step * self.ready.knobs.batch_size)
         write_checkpoint(self.ready.folder / CHECKPOINTS, state, write, keep=_KEEP)
-        self.done = step
 
     def _restore(self, checkpoint: Path) -> None:
-        device = self.ready.device
-        weights = read_torch(checkpoint / _WEIGHTS)
         try:
-            self.decoder.load_state_dict(weights["decoder"])
-            self.average = {name: weights["average"][name].to(device) for name in self.average}
-            self.optimizer.load_state_dict(read_torch(checkpoint / OPTIMIZER))
+            self.steps.restore(read_torch(checkpoint / _WEIGHTS), read_torch(checkpoint / OPTIMIZER))
         except (KeyError, ValueError, RuntimeError, TypeError) as error:
             fix = "Delete this checkpoint, to use an older one"
             raise InputError(where=str(checkpoint), found=f"not this decoder's ({error})", fix=fix) from None
         self.done = read_state(checkpoint).step
 
-    def _noise(self, step: int, latents: Tensor) -> Tensor:
-        """Return noise of a strength that is drawn for each frame, up to `decoder.noise`."""
-        drawn = torch.Generator().manual_seed(self.ready.config.seed * 2**31 + step)
-        strength = self.knobs.noise * torch.rand(len(latents), 1, 1, generator=drawn)
-        return (strength * torch.randn(latents.shape, generator=drawn)).to(latents.device)
 
-    @torch.no_grad()
-    def _add_to_average(self, step: int) -> None:
-        decay = min(self.knobs.average, step / (step + 9.0))  # the first steps do not count for long
-        for name, one in self.decoder.state_dict().items():
-            self.average[name].lerp_(one, 1.0 - decay)
-
-
-def learning_rate_at(step: int, knobs: DecoderConfig) -> float:
-    """Return the learning rate of step 1 .. steps: a linear warm-up, then half a cosine down to none."""
-    warmup = min(knobs.warmup_steps, knobs.steps - 1)
-    if step <= warmup:
-        return knobs.learning_rate * step / warmup
-    done = (step - warmup) / max(1, knobs.steps - warmup)
-    return knobs.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done))
+def _steps_of(ready: Setup, linear: Decoder | None) -> DecoderSteps:
+    return DecoderSteps(ready.shape, ready.knobs, ready.config.seed, ready.device, ready.autocast, linear)
 
 
 def _train(training: _Training, pairs: FramePairs, reporter: Reporter, stop: StopRequest) -> None:
-    knobs, first = training.knobs, training.done
+    knobs, first = training.ready.knobs, training.done
     progress = reporter.task("training the decoder", "steps")
     with (
         MetricsLog(training.ready.folder, first_step=first) as log,
         contextlib.closing(_batches(pairs, knobs, training.ready.config.seed, first)) as batches,
     ):
         for step, batch in batches:
-            metrics = training.step(step, batch)
+            metrics = training.steps.do(step, batch)
             progress(step, knobs.steps)
             is_last = step == knobs.steps
             if step % _LOG_EVERY == 0 or is_last:
@@ -228,10 +156,10 @@ def _finish(
 ) -> None:
     """Measure the averaged weights on held-out frames, write the decoder, and remove all else."""
     ready = training.ready
-    if (name := first_not_finite(training.average)) is not None:
+    if (name := first_not_finite(training.steps.average)) is not None:
         raise InputError(where=str(ready.folder), found=f"{name} holds NaN or infinity", fix="Lower the learning rate")
     decoder = Decoder(ready.shape).to(ready.device).eval()
-    decoder.load_state_dict(training.average)
+    decoder.load_state_dict(training.steps.average)
     found: dict[str, Any] = {}
     if held_out is not None:
         decoders = {"decoder": decoder, "linear": linear.to(ready.device)}
@@ -247,7 +175,7 @@ def _finish(
         cameras=tuple(data.cameras),
         episodes=len({file.episode_id for file in pairs.files}),
         frames=len(pairs),
-        steps=training.knobs.steps,
+        steps=training.ready.knobs.steps,
         held_out=found,
         time=utc_now(),
     )

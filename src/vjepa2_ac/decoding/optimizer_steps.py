@@ -1,0 +1,119 @@
+"""Optimizer steps of a decoder: its weights, their moving average, and AdamW."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vjepa2_ac.config import DecoderConfig
+from vjepa2_ac.decoding.frame_pairs import Pairs, as_images
+from vjepa2_ac.decoding.loss import decoder_loss
+from vjepa2_ac.decoding.network import Decoder, DecoderShape
+from vjepa2_ac.errors import InputError
+
+_BETAS = (0.9, 0.95)
+_YOUNG = 9.0  # steps: the average of fewer forgets the first ones faster
+Autocast = Callable[[], AbstractContextManager[object]]
+
+
+class DecoderSteps:
+    """A decoder in training.
+
+    Args:
+        shape: Of the decoder.
+        knobs: How it is trained.
+        seed: Of fresh weights and of noise.
+        device: Where.
+        autocast: The arithmetic of the network.
+        linear: What the decoder begins as; None: fresh weights.
+    """
+
+    def __init__(
+        self,
+        shape: DecoderShape,
+        knobs: DecoderConfig,
+        seed: int,
+        device: torch.device,
+        autocast: Autocast,
+        linear: Decoder | None,
+    ) -> None:
+        self._knobs, self._seed, self._device, self._autocast = knobs, seed, device, autocast
+        self.decoder = Decoder(shape)
+        self.decoder.initialise(torch.Generator().manual_seed(seed))
+        if linear is not None:
+            self.decoder.start_from(linear)
+        self.decoder.to(device)
+        matrices = [one for one in self.decoder.parameters() if one.ndim > 1]
+        others = [one for one in self.decoder.parameters() if one.ndim <= 1]
+        groups = [{"params": matrices, "weight_decay": knobs.weight_decay}, {"params": others, "weight_decay": 0.0}]
+        self.optimizer = torch.optim.AdamW(groups, lr=knobs.learning_rate, betas=_BETAS)
+        self.average = {name: one.detach().clone() for name, one in self.decoder.state_dict().items()}
+
+    def do(self, step: int, pairs: Pairs) -> dict[str, float]:
+        """Do one optimizer step, counted from 1, and return its metrics.
+
+        Raises:
+            InputError: Loss or gradients are not finite; nothing was changed.
+        """
+        latents, images = pairs.latents.to(self._device), as_images(pairs.images.to(self._device))
+        if self._knobs.noise:
+            latents = latents + self._noise(step, latents)
+        learning_rate = learning_rate_at(step, self._knobs)
+        for group in self.optimizer.param_groups:
+            group["lr"] = learning_rate
+        with self._autocast():
+            shown = self.decoder(latents)
+        loss, parts = decoder_loss(shown, images)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]  # torch
+        norm = torch.nn.utils.clip_grad_norm_(self.decoder.parameters(), self._knobs.max_grad_norm)
+        if not math.isfinite(float(norm)):
+            raise InputError(
+                where="decoder.learning_rate",
+                found=f"{self._knobs.learning_rate:g}: loss or gradients of step {step} are not finite",
+                fix="Lower it, delete the newest checkpoint if it was written by then, and start again",
+            )
+        self.optimizer.step()
+        self._add_to_average(step)
+        metrics = {name: float(value.detach()) for name, value in {"loss": loss, **parts}.items()}
+        return metrics | {"learning_rate": learning_rate}
+
+    def weights(self) -> dict[str, Any]:
+        """Return the weights and their average, for a checkpoint."""
+        return {"decoder": self.decoder.state_dict(), "average": self.average}
+
+    def restore(self, weights: Mapping[str, Any], optimizer: dict[str, Any]) -> None:
+        """Continue from a checkpoint.
+
+        Raises:
+            KeyError, ValueError, RuntimeError, TypeError: It is of another decoder.
+        """
+        self.decoder.load_state_dict(weights["decoder"])
+        self.average = {name: weights["average"][name].to(self._device) for name in self.average}
+        self.optimizer.load_state_dict(optimizer)
+
+    def _noise(self, step: int, latents: Tensor) -> Tensor:
+        """Return noise of a strength that is drawn for each frame, up to `decoder.noise`."""
+        drawn = torch.Generator().manual_seed(self._seed * 2**31 + step)
+        strength = self._knobs.noise * torch.rand(len(latents), 1, 1, generator=drawn)
+        return (strength * torch.randn(latents.shape, generator=drawn)).to(latents.device)
+
+    @torch.no_grad()
+    def _add_to_average(self, step: int) -> None:
+        decay = min(self._knobs.average, step / (step + _YOUNG))
+        for name, one in self.decoder.state_dict().items():
+            self.average[name].lerp_(one, 1.0 - decay)
+
+
+def learning_rate_at(step: int, knobs: DecoderConfig) -> float:
+    """Return the learning rate of step 1 .. steps: a linear warm-up, then half a cosine down to none."""
+    warmup = min(knobs.warmup_steps, knobs.steps - 1)
+    if step <= warmup:
+        return knobs.learning_rate * step / warmup
+    done = (step - warmup) / max(1, knobs.steps - warmup)
+    return knobs.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done))
