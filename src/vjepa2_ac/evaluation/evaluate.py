@@ -97,22 +97,10 @@ def evaluate(
     seen = _collect(contenders, clips, probes, about, metrics, reporter.task("measuring"))
     ids, seconds = tuple(seen.ids), about.seconds_per_step
     known = clips_of(seen.actions, ids, tuple(seen.firsts), space=about.space, seconds_per_step=seconds)
-    pool = ActionPool(
-        actions=seen.actions.reshape(-1, seen.actions.shape[-1]),
-        episode_ids=tuple(np.repeat(np.array(ids), seen.actions.shape[1]).tolist()),
-        space=about.space,
-        reach=probes.reach_cm / 100,
-        samples=probes.samples,
-        seed=about.seed,
-    )
+    pool = _pool(seen, about, probes)
     models: dict[str, ModelResult] = {}
     for contender in contenders:
-        result = ModelResult(
-            contender.name,
-            contender.role,
-            joined(seen.errors[contender.name]),
-            distribution=distribution_of(seen.latents.predicted[contender.name], seen.latents.true),
-        )
+        result = _predictions(contender, seen)
         with contender.switched():
             models[contender.name] = replace(
                 result,
@@ -131,14 +119,29 @@ def evaluate(
         examples=(),
         planning=study_of(seen.planned, probes.planning) if seen.planned else None,
         metrics=metrics,
-        persistence_distribution=PersistenceDistribution(
-            distribution_of(seen.latents.copies, seen.latents.true), latent_noise_floor(seen.latents.true)
-        ),
+        persistence_distribution=seen.latents.of_persistence(),
     )
     scores = episode_scores(evaluation.errors, evaluation.base_errors)
     examples = _examples(contenders, clips, evaluation, probes)
     notes = _left_out(probes, about, action_dim=seen.actions.shape[-1])
     return replace(evaluation, episodes=scores, examples=examples, notes=notes)
+
+
+def _pool(seen: _Seen, about: About, probes: ProbeOptions) -> ActionPool:
+    return ActionPool(
+        actions=seen.actions.reshape(-1, seen.actions.shape[-1]),
+        episode_ids=tuple(np.repeat(np.array(seen.ids), seen.actions.shape[1]).tolist()),
+        space=about.space,
+        reach=probes.reach_cm / 100,
+        samples=probes.samples,
+        seed=about.seed,
+    )
+
+
+def _predictions(contender: Contender, seen: _Seen) -> ModelResult:
+    """Return what the predictions of all clips gave: their errors, and how they are distributed."""
+    distribution = distribution_of(seen.latents.predicted[contender.name], seen.latents.true)
+    return ModelResult(contender.name, contender.role, joined(seen.errors[contender.name]), distribution=distribution)
 
 
 def _left_out(probes: ProbeOptions, about: About, *, action_dim: int) -> tuple[str, ...]:
@@ -174,6 +177,10 @@ class _Latents:
             self.predicted[model].add(predicted, ids)
         elif (way, mode, model) == ("persistence", "rollout", self._first):
             self.copies.add(predicted, ids)
+
+    def of_persistence(self) -> PersistenceDistribution:
+        """Return how copies of frame 0 are distributed, and the noise floor."""
+        return PersistenceDistribution(distribution_of(self.copies, self.true), latent_noise_floor(self.true))
 
 
 @dataclass
