@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import planning_variants
 import torch
@@ -25,7 +26,7 @@ from vjepa2_ac.config import AdapterConfig, AugmentConfig, Config, DecoderConfig
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.data.clips.augmentation import draw
 from vjepa2_ac.decoding.frame_pairs import Pairs
-from vjepa2_ac.decoding.network import DecoderShape
+from vjepa2_ac.decoding.network import Decoder, DecoderShape
 from vjepa2_ac.decoding.optimizer_steps import DecoderSteps
 from vjepa2_ac.episode import Batch
 from vjepa2_ac.model.adapter.lora import add_adapter
@@ -151,7 +152,8 @@ def decoding(options: argparse.Namespace) -> Iterator[Work]:
         knobs = DecoderConfig(size=size, batch_size=frames)
         kind = getattr(torch, options.dtype)
         arithmetic = partial(torch.autocast, "cuda", dtype=kind, enabled=kind != torch.float32)
-        steps = DecoderSteps(shape, knobs, 0, torch.device("cuda"), arithmetic, None)
+        with patch.object(Decoder, "initialise"):  # numbers are not drawn on fake tensors
+            steps = DecoderSteps(shape, knobs, 0, torch.device("cuda"), arithmetic, None)
         latents = torch.empty(frames, grid**2, options.latent_dim, device="cuda")
         images = torch.empty(frames, 3, shape.image_size, shape.image_size, dtype=torch.uint8, device="cuda")
         pairs = Pairs(latents, images, ())

@@ -72,7 +72,10 @@ class DecoderSteps:
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch
         norm = torch.nn.utils.clip_grad_norm_(self.decoder.parameters(), self._knobs.max_grad_norm)
-        if not math.isfinite(float(norm)):
+        numbers = {"loss": loss, **parts, "gradient_norm": norm}
+        read = torch.stack([value.detach().float() for value in numbers.values()]).tolist()  # waits for the device once
+        metrics = dict(zip(numbers, read, strict=True))
+        if not math.isfinite(metrics["gradient_norm"]):
             raise InputError(
                 where="decoder.learning_rate",
                 found=f"{self._knobs.learning_rate:g}: loss or gradients of step {step} are not finite",
@@ -80,7 +83,6 @@ class DecoderSteps:
             )
         self.optimizer.step()
         self._add_to_average(step)
-        metrics = {name: float(value.detach()) for name, value in {"loss": loss, **parts}.items()}
         return metrics | {"learning_rate": learning_rate}
 
     def weights(self) -> dict[str, Any]:
