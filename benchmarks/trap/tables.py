@@ -56,7 +56,7 @@ def write_tables(out: Path, picture: Path | None) -> None:
     cells = [one for run in by_run(list(found)) if len(run) == len(cells_of(_run_of(run))) for one in run]
     if not cells:
         return
-    text = "\n".join([*_rules(cells), "", *_correlations(cells)])
+    text = "\n".join([*_rules(cells), "", *_correlations(cells), "", *_of_evidence(out)])
     (out / "trap.md").write_text(text + "\n")
     print(text)
     if picture is not None:
@@ -122,8 +122,30 @@ def _correlations(cells: Sequence[Figures], draws: int = 1000) -> Iterator[str]:
         yield f"| {name} | {' | '.join(found)} |"
 
 
+def _of_evidence(out: Path) -> Iterator[str]:
+    """Yield the same of the errors of the evidence, each cell being a run; nothing if it is not there."""
+    path = out / "evidence.json"
+    if not path.exists():
+        return
+    cells = [one for one in json.loads(path.read_text()) if "shifted" in one and "reach" in one]
+    by_world: dict[str, list[np.ndarray]] = {}
+    for one in cells:
+        pair = [one["shifted"]["rollout_over_persistence"][-1], np.mean(one["reach"]["l1"]["distance_cm"])]
+        world = f"{one['cell']['shift']}, base of {one['cell']['base']}"
+        by_world.setdefault(world, []).append(np.array([pair]))
+    parts = {"all": [pair for some in by_world.values() for pair in some], **by_world}
+    yield "| rollout error / persistence, in the evidence (varied demonstrations) | cells | correlation |"
+    yield "|---|---|---|"
+    for name, pairs in parts.items():
+        yield f"| {name} | {len(pairs)} | {_with_interval(pairs, 1000)} |"
+
+
 def _interval(runs: Sequence[list[Figures]], name: str, draws: int) -> str:
-    pairs = [np.array([[one["offline"][name], left_cm(one)] for one in run]) for run in runs]
+    return _with_interval([np.array([[one["offline"][name], left_cm(one)] for one in run]) for run in runs], draws)
+
+
+def _with_interval(pairs: Sequence[np.ndarray], draws: int) -> str:
+    """Return the rank correlation of pairs of numbers, in groups that are drawn as a whole for the interval."""
     rng = np.random.default_rng(0)
     drawn = [
         _spearman(np.concatenate([pairs[place] for place in rng.integers(len(pairs), size=len(pairs))]))
