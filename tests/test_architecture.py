@@ -69,7 +69,14 @@ ORDERS: dict[str, list[str]] = {
         "html",
         "write imagined",
     ],
-    "simulation": ["world", "closed_loop", "recording", "counterfactual", "imagined_truth hand_in_images"],
+    "simulation": [
+        "world",
+        "closed_loop",
+        "recording",
+        "counterfactual",
+        "imagined_truth hand_in_images",
+        "counterfactual_sides",
+    ],
 }
 
 HOMES = {

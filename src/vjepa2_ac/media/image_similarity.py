@@ -106,7 +106,7 @@ def ms_ssim(
             counted = None if where is None else where[..., _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
             factor = mean_where(inside.mean(dim=-3), counted)
             predicted, true = _halved(predicted), _halved(true)
-            where = None if where is None else _halved(where[..., None, :, :])[..., 0, :, :] > 0
+            where = None if where is None else _halved(where[..., None, :, :].float())[..., 0, :, :] > 0
         product = product * _power(factor, weight)
     return product
 
