@@ -46,8 +46,9 @@ ORDERS: dict[str, list[str]] = {
         "load lora heads",
     ],
     "evaluation": [
-        "metrics axis_fit distribution",
-        "result video",
+        "metrics axis_fit distribution video",
+        "decoded",
+        "result",
         "estimates measure strata",
         "action_use",
         "action_score",
@@ -56,6 +57,7 @@ ORDERS: dict[str, list[str]] = {
         "data_variants axis_calibration",
         "verdict examples",
         "evaluate",
+        "decoded_rollouts",
         "evaluate_run",
         "imagined_image",
         "imagined",
@@ -67,8 +69,22 @@ ORDERS: dict[str, list[str]] = {
         "setup",
         "training",
     ],
-    "reports": ["action_score_json", "metrics_json", "comparison", "figures html", "write imagined"],
-    "simulation": ["world", "closed_loop", "recording", "counterfactual", "imagined_truth"],
+    "reports": [
+        "action_score_json decoded_json",
+        "metrics_json",
+        "comparison",
+        "figures",
+        "html",
+        "write imagined",
+    ],
+    "simulation": [
+        "world",
+        "closed_loop",
+        "recording",
+        "counterfactual",
+        "imagined_truth hand_in_images",
+        "counterfactual_sides",
+    ],
 }
 
 HOMES = {

@@ -134,3 +134,20 @@ def test_too_small_images_and_unknown_scales_are_refused(size: int, scales: int)
     image = torch.zeros(3, size, size)
     with pytest.raises(ValueError, match="scales"):
         ms_ssim(image, image, scales)
+
+
+def test_ms_ssim_of_a_region_is_that_of_the_whole_if_all_pixels_count_and_of_none_nan() -> None:
+    predicted, true = pair(1, (97, 64))
+    every, nothing = torch.ones(97, 64, dtype=torch.bool), torch.zeros(97, 64, dtype=torch.bool)
+    torch.testing.assert_close(ms_ssim(predicted, true, 3, every), ms_ssim(predicted, true, 3))
+    assert math.isnan(ms_ssim(predicted, true, 3, nothing))
+
+
+def test_ms_ssim_of_a_region_does_not_see_what_is_far_from_it() -> None:
+    predicted, true = pair(1, (176, 176))
+    where = torch.zeros(176, 176, dtype=torch.bool)
+    where[20:40, 20:40] = True
+    changed = predicted.clone()
+    changed[:, 120:, 120:] = 0.0
+    torch.testing.assert_close(ms_ssim(changed, true, 3, where), ms_ssim(predicted, true, 3, where))
+    assert ms_ssim(changed, true, 3) < ms_ssim(predicted, true, 3) - 0.01

@@ -45,6 +45,8 @@ def add_to(commands: Commands) -> None:
     argument(parser, "--split", "which held-out episodes (test)", choices=["test", "validation"])
     argument(parser, "--clips N", "at most this many clips, spread over the episodes (256)", count)
     add_checkpoint(parser)
+    text = "decode the rollouts and measure the images, too: what `vjepa2-ac decoder` made, or builtin:sim-tiny"
+    argument(parser, "--decoder FOLDER", text, as_model)
     argument(parser, "--calibrate", "measure the one-step error at other strides, too", action="store_true")
     _add_probes(parser.add_argument_group("use of the actions"))
     _add_planning(parser.add_argument_group("plans (they take long: see docs/evaluation.md)"))
@@ -87,21 +89,24 @@ def _evaluate(options: argparse.Namespace) -> None:
         settle(subject, how)
         require_subject(subject, how.checkpoint)
 
-    from vjepa2_ac.console.evaluation import evaluation_tables
+    from vjepa2_ac.console.evaluation import decoded_lines, evaluation_tables
     from vjepa2_ac.console.progress import ConsoleReporter, console
     from vjepa2_ac.evaluation.verdict import spread, verdict
     from vjepa2_ac.reports.write import evaluate_subject
+    from vjepa2_ac.simulation.hand_in_images import hand_positions
 
     evaluations = []
     for subject, how in asked:
         say_places_elsewhere(subject)
         with ConsoleReporter() as reporter:
-            measured = evaluate_subject(subject, how, reporter)
+            measured = evaluate_subject(subject, how, reporter, hands=hand_positions)
         evaluations.append(measured.evaluation)
         console.print(f"{subject}: checkpoint {measured.checkpoint}" if measured.checkpoint else subject)
         for table in evaluation_tables(measured.evaluation):
             console.print(table)
         console.print(verdict(measured.evaluation))
+        for line in decoded_lines(measured.evaluation):
+            console.print(line)
         for path in measured.files:
             console.print(f"  {path}")
     if len(evaluations) > 1:

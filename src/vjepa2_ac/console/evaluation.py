@@ -8,6 +8,9 @@ from vjepa2_ac.console.progress import MetricsTable, with_interval
 from vjepa2_ac.evaluation.action_score.metrics import AXES, metrics_of, signed_along, ways_of
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.axis_fit import AxisFit
+from vjepa2_ac.evaluation.decoded.estimates import hand_of, similarity_of, skill_of
+from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES, Found
+from vjepa2_ac.evaluation.decoded.similarity import Reference
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, ActionRanking, Evaluation, Landscapes, PlanningStudy, Sensitivity
 from vjepa2_ac.intervals import Estimate
@@ -26,6 +29,29 @@ def evaluation_tables(evaluation: Evaluation) -> tuple[Table, ...]:
         *((_use_of_actions(evaluation),) if probed else ()),
         *((_plans(evaluation, study),) if study is not None else ()),
     )
+
+
+def decoded_lines(evaluation: Evaluation) -> tuple[str, ...]:
+    """Return two lines on the images of the rollouts; none without a decoder."""
+    found = evaluation.decoded
+    if found is None:
+        return ()
+    against: Reference = "decoded_truth" if "truth" in found.absent else "truth"
+    sources = (*NEIGHBOURS, *found.models)
+    psnr = {name: similarity_of(found, name, against, "whole", "psnr_db")[-1] for name in sources}
+    skill = {name: skill_of(found, name, against, "moving", "psnr_db")[-1] for name in found.models}
+    hand = {name: hand_of(found, name)[-1] for name in (TRUE_FRAMES, *NEIGHBOURS[:2], *found.models)}
+    ahead = f"{evaluation.seconds_ahead:.2g} s ahead"
+    lines = [f"Decoded, {ahead}, PSNR against the {against.replace('_', ' ')} (dB): {_named(psnr, '.1f')}."]
+    second = f"Skill where something moves (0 persistence, 1 decoded truth): {_named(skill, '.2f')}."
+    if found.hand is not None:
+        second += f" The hand is off by (px of {found.hand.size}): {_named(hand, '.1f')}."
+    return (*lines, second)
+
+
+def _named(found: dict[str, Found], form: str) -> str:
+    shown = {name: "none" if one.estimate is None else f"{one.value:{form}}" for name, one in found.items()}
+    return ", ".join(f"{name.replace('_', ' ')} {text}" for name, text in shown.items())
 
 
 def comparison_table(comparison: Comparison) -> Table:

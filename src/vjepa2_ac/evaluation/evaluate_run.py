@@ -18,11 +18,15 @@ from vjepa2_ac.data.clips.clip_reader import frames_of
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.streams import copies_for
+from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
 from vjepa2_ac.encoding.training_cache import with_latents_if_there
 from vjepa2_ac.episode import Batch, LatentBatch
 from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES
+from vjepa2_ac.evaluation.decoded_rollouts.measure import measure_decoded
+from vjepa2_ac.evaluation.decoded_rollouts.setup import HandsOf, decoding_of, require_fitting
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
 from vjepa2_ac.evaluation.examples import seen_by_the_encoder
 from vjepa2_ac.evaluation.measure import ClipSample
@@ -55,16 +59,23 @@ class Measured:
     folder: Path  # of the output
 
 
-def measure_subject(subject: str, asked: EvaluationOptions | None = None, *, reporter: Reporter = SILENT) -> Measured:
+def measure_subject(
+    subject: str,
+    asked: EvaluationOptions | None = None,
+    *,
+    reporter: Reporter = SILENT,
+    hands: HandsOf | None = None,
+) -> Measured:
     """Measure a run or a model on held-out episodes. Cheap failures first.
 
     Args:
         subject: The folder of a run; or a model, as in `model.base`.
         asked: The options.
         reporter: Shows the progress of each part of the work.
+        hands: Returns where the hand is in the images of a data set, if its data say so; with a decoder only.
 
     Raises:
-        InputError: The subject, the data, or a model to compare with cannot be used; the split is empty.
+        InputError: The subject, the data, the decoder, or a model to compare with cannot be used; the split is empty.
     """
     asked = asked or EvaluationOptions()
     config, planning, folder = settle(subject, asked)
@@ -73,6 +84,7 @@ def measure_subject(subject: str, asked: EvaluationOptions | None = None, *, rep
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
         try_writing_at(folder)
+    decoder = None if asked.decoder is None else load_decoder(asked.decoder)
     accelerator = make_accelerator(config)
     if asked.probes.planning_clips and planning.quantize != "off":
         dtype = getattr(torch, config.model.dtype)
@@ -82,6 +94,8 @@ def measure_subject(subject: str, asked: EvaluationOptions | None = None, *, rep
     run = load_run(Path(subject), asked.checkpoint) if is_run(subject) else None
     world_model = run.world_model if run else load_model(subject, config)
     require_widths(world_model, dataset.widths, where=subject)
+    if decoder is not None:
+        require_fitting(decoder, world_model, config, subject=subject)
     through_cache = with_latents_if_there(config, dataset, world_model)
     contenders, notes = contenders_of(subject, config, run, world_model, asked)
     if through_cache.config.is_cache and not asked.calibrate:
@@ -106,8 +120,13 @@ def measure_subject(subject: str, asked: EvaluationOptions | None = None, *, rep
             probes=replace(asked.probes, planning=planning, axis_clips=asked.probes.axis_clips * has_base_frame),
             reporter=reporter,
         )
+        decoded = None
+        if decoder is not None:
+            decoding = decoding_of(decoder.to(accelerator.device), world_model, through_cache, hands)
+            decoded = measure_decoded(contenders, clips, decoding, evaluation.examples, reporter=reporter)
     evaluation = replace(
         evaluation,
+        decoded=decoded,
         training=training_curves(Path(subject)) if run else (),
         calibration=calibration,
         notes=(*notes, *(_warnings(Path(subject)) if run else ()), *evaluation.notes),
@@ -159,7 +178,7 @@ def contenders_of(
     name = "adapter" if world_model.adaptation is not None and world_model.adaptation.kind == "lora" else "model"
     for other in against:
         if other != BASE:
-            taken = {each.name for each in found} | {name, BASE, "persistence"}
+            taken = {each.name for each in found} | {name, BASE, "persistence", TRUE_FRAMES, *NEIGHBOURS}
             called = Path(other).name if Path(other).name not in taken else other
             found.append(_contender(called, "other", _like(world_model, other, config, subject)))
     return [*found, _contender(name, "trained", world_model)], notes

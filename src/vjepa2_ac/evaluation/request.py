@@ -45,6 +45,7 @@ class EvaluationOptions:
     out: Path | None = None  # output folder; None: the run's
     probes: ProbeOptions = field(default_factory=ProbeOptions)
     calibrate: bool = False  # also measure the error at other strides
+    decoder: str | None = None  # folder of a decoder, or builtin:sim-tiny: rollouts are decoded and measured as images
     planning: tuple[str, ...] = ()  # settings in place of the config's, such as planning.samples=200
 
 

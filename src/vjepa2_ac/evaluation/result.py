@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.evaluation.axis_fit import AxisFit
+from vjepa2_ac.evaluation.decoded.record import DecodedRollouts
 from vjepa2_ac.evaluation.distribution.latent_sums import LatentDistribution
 from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
 from vjepa2_ac.intervals import Estimate
@@ -282,6 +283,7 @@ class Evaluation:
     planning: PlanningStudy | None = None
     metrics: tuple[Metric, ...] = METRICS  # of the errors
     persistence_distribution: PersistenceDistribution | None = None
+    decoded: DecodedRollouts | None = None  # None: no decoder was given
 
     @property
     def trained(self) -> str:

@@ -65,7 +65,10 @@ def ssim_map(
 
 
 def ms_ssim(
-    predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"], scales: int = 5
+    predicted: Float[Tensor, "*batch 3 height width"],
+    true: Float[Tensor, "*batch 3 height width"],
+    scales: int = 5,
+    where: Bool[Tensor, "*batch height width"] | None = None,
 ) -> Float[Tensor, "*batch"]:
     """Return the multi-scale structural similarity of each image.
 
@@ -78,6 +81,8 @@ def ms_ssim(
         predicted: Images in 0 .. 1.
         true: Likewise.
         scales: Each halves the image; 3 suit images of 96 pixels, 5 those of 256.
+        where: The pixels that count, at a coarser scale those that hold one of them; None: all. Where none is left
+            (finer scales leave out a border of 5 pixels), the image has NaN. There is no reference for it but ours.
 
     Raises:
         ValueError: Scales other than 1 to 5, or an image of fewer than 11 pixels at the coarsest one.
@@ -95,11 +100,13 @@ def ms_ssim(
     for scale, weight in enumerate(weights):
         similarity, contrast = _terms(predicted, true)
         if scale == scales - 1:
-            factor = similarity.mean(dim=(-3, -2, -1))
+            factor = mean_where(similarity.mean(dim=-3), where)
         else:  # without the border, where the window sees reflections
             inside = contrast[..., _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
-            factor = inside.mean(dim=(-3, -2, -1))
+            counted = None if where is None else where[..., _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
+            factor = mean_where(inside.mean(dim=-3), counted)
             predicted, true = _halved(predicted), _halved(true)
+            where = None if where is None else _halved(where[..., None, :, :].float())[..., 0, :, :] > 0
         product = product * _power(factor, weight)
     return product
 
@@ -169,6 +176,6 @@ def _halved(images: Float[Tensor, "*batch channel height width"]) -> Float[Tenso
 
 
 def _power(factor: Float[Tensor, "*batch"], weight: float) -> Float[Tensor, "*batch"]:
-    """Return the power of what is above 0, else 0, with a finite gradient in either case."""
-    positive = factor > 0
+    """Return the power of what is above 0, else 0, with a finite gradient in either case; of NaN NaN."""
+    positive = ~(factor <= 0)
     return torch.where(positive, torch.where(positive, factor, 1) ** weight, 0)

@@ -44,6 +44,7 @@ from vjepa2_ac.evaluation.result import (
 from vjepa2_ac.evaluation.verdict import uses_actions, verdict
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.reports.action_score_json import plans_as_dict, study_as_dict
+from vjepa2_ac.reports.decoded_json import decoded_as_dict
 from vjepa2_ac.storage import write_atomically
 from vjepa2_ac.storage.structured import finite_or_none, json_text, read_json_object, shown
 
@@ -120,6 +121,7 @@ def metrics_as_dict(evaluation: Evaluation) -> dict[str, Any]:
         },
         "calibration": evaluation.calibration,
         "planning": None if evaluation.planning is None else study_as_dict(evaluation.planning),
+        "decoded": None if evaluation.decoded is None else decoded_as_dict(evaluation.decoded),
         "notes": evaluation.notes,
     }
     return {name: _plain(value) for name, value in metrics.items()}

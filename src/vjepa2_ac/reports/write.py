@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from vjepa2_ac.evaluation.decoded_rollouts.setup import HandsOf
 from vjepa2_ac.evaluation.estimates import Curve, over_persistence
 from vjepa2_ac.evaluation.evaluate_run import measure_subject
 from vjepa2_ac.evaluation.request import EvaluationOptions
@@ -37,13 +38,19 @@ class Evaluated:
         return {name: over_persistence(one.errors, "rollout") for name, one in self.evaluation.models.items()}
 
 
-def evaluate_subject(subject: str, asked: EvaluationOptions | None = None, reporter: Reporter = SILENT) -> Evaluated:
+def evaluate_subject(
+    subject: str,
+    asked: EvaluationOptions | None = None,
+    reporter: Reporter = SILENT,
+    *,
+    hands: HandsOf | None = None,
+) -> Evaluated:
     """Measure as `measure_subject` does, and write metrics.json, report and figure.
 
     Raises:
         InputError: As `measure_subject`; or the folder cannot be written.
     """
-    measured = measure_subject(subject, asked, reporter=reporter)
+    measured = measure_subject(subject, asked, reporter=reporter, hands=hands)
     evaluation, folder = measured.evaluation, measured.folder
     files = (
         plot_evaluation(evaluation, folder / PLOT),

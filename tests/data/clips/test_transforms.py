@@ -10,7 +10,7 @@ import torch
 from paths import GOLDEN
 from vjepa2_ac.data.clips import transforms
 from vjepa2_ac.data.clips.augmentation import per_channel
-from vjepa2_ac.data.clips.transforms import CropBox, crop_box, pixels_to_input, view
+from vjepa2_ac.data.clips.transforms import CropBox, crop_box, images_to_input, input_to_pixels, pixels_to_input, view
 
 FLOAT16_ROUNDING = 2.0**-10  # half a step between 2 and 4
 
@@ -98,3 +98,11 @@ def test_what_inference_has_kept_can_be_trained_with() -> None:
     assert not any(
         per_channel(kept, torch.device("cpu")).is_inference() for kept in (transforms._MEAN, transforms._STD)
     )
+
+
+def test_images_become_the_input_that_shows_them() -> None:
+    pixels = torch.randint(0, 256, (2, 3, 3, 8, 8), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    inputs = images_to_input(pixels / 255)
+    assert torch.equal(input_to_pixels(inputs), pixels)
+    frames = pixels.permute(0, 1, 3, 4, 2)
+    torch.testing.assert_close(inputs, pixels_to_input(frames, 8), rtol=0, atol=1e-5)

@@ -38,14 +38,17 @@ def png_url(pixels: UInt8[np.ndarray, "height width channels"]) -> str:
     return _url("png", encode_png(pixels))
 
 
-def jpeg_urls(clips: Sequence[Sequence[UInt8[np.ndarray, "height width 3"]]], *, at_most: int) -> list[list[str]]:
+def jpeg_urls(
+    clips: Sequence[Sequence[UInt8[np.ndarray, "height width 3"]]], *, at_most: int, most_pixels: int = _MOST_PIXELS
+) -> list[list[str]]:
     """Return photographs as JPEG in data: URLs, in the best quality in which all of them fit together.
 
     Args:
         clips: Photographs, clip by clip.
         at_most: Bytes of all URLs together; if the lowest quality needs more, the photographs are left out.
+        most_pixels: Of a photograph along a side; larger ones are shrunk.
     """
-    small = [[_shrunk(frame) for frame in frames] for frames in clips]
+    small = [[_shrunk(frame, most_pixels) for frame in frames] for frames in clips]
     for quality in _JPEG_QUALITIES:
         urls = [[_url("jpeg", encode_jpeg(frame, quality=quality)) for frame in frames] for frames in small]
         if sum(len(url) for clip in urls for url in clip) <= at_most:
@@ -53,9 +56,9 @@ def jpeg_urls(clips: Sequence[Sequence[UInt8[np.ndarray, "height width 3"]]], *,
     return [[] for _ in clips]
 
 
-def _shrunk(frame: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
+def _shrunk(frame: UInt8[np.ndarray, "height width 3"], most_pixels: int) -> UInt8[np.ndarray, "_ _ 3"]:
     """Return a photograph of at most this size, by averaging squares of pixels."""
-    factor = -(-max(frame.shape[:2]) // _MOST_PIXELS)
+    factor = -(-max(frame.shape[:2]) // most_pixels)
     height, width = (size // factor for size in frame.shape[:2])
     squares = frame[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
     return np.asarray(squares.mean(axis=(1, 3)).round().astype(np.uint8))

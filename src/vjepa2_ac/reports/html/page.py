@@ -11,6 +11,7 @@ from vjepa2_ac.evaluation.estimates import cost_of_actions, gain_over, over_pers
 from vjepa2_ac.evaluation.metrics import L1
 from vjepa2_ac.evaluation.result import Evaluation
 from vjepa2_ac.reports.html.actions import actions_section, landscape_section
+from vjepa2_ac.reports.html.decoded import decoded_section
 from vjepa2_ac.reports.html.errors import base_section, error_section, spread_section, strata_section
 from vjepa2_ac.reports.html.examples import animation_style, examples_section
 from vjepa2_ac.reports.html.formatting import seconds, share, value
@@ -50,6 +51,7 @@ def report_page(evaluation: Evaluation, verdict: str) -> str:
         ("planning", "Plans beside demonstrations", planning_section(evaluation)),
         ("episodes", "Episodes, best and worst", episode_section(evaluation)),
         ("pictures", "Example clips", examples_section(evaluation)),
+        ("decoded", "What the model imagines, decoded", decoded_section(evaluation)),
         ("training", "Training", training_section(evaluation)),
         ("strides", "Length of a model step", calibration_section(evaluation)),
         ("glossary", "Words", render("glossary")),

@@ -1,0 +1,94 @@
+"""The records of decoded rollouts: plain arrays by clip and horizon, from which `decoded.estimates` computes the rest.
+
+Frame 0 is given, so horizons begin at 1 (index h - 1). A *source* is a model's rollout under the true actions, or one
+of its neighbours: decoded truth (the ceiling of this decoder), decoded persistence (the floor), and raw persistence, a
+copy of the pixels of frame 0, which beats any decoder in PSNR where little moves.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from vjepa2_ac.evaluation.decoded.similarity import Arrays
+from vjepa2_ac.evaluation.distribution.mmd import Discrepancy
+from vjepa2_ac.intervals import Estimate
+
+DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE = "decoded_truth", "decoded_persistence", "raw_persistence"
+NEIGHBOURS = (DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE)
+TRUE_FRAMES = "truth"
+
+
+@dataclass(frozen=True)
+class Found:
+    """A metric at one horizon, or the reason why it is absent."""
+
+    estimate: Estimate | None
+    reason: str = ""  # of None
+    identical: int = 0  # clips left out: identical images, whose PSNR is infinite
+    still: int = 0  # clips left out: nothing moves in them
+
+    @property
+    def value(self) -> float:
+        """The value; NaN: absent."""
+        return math.nan if self.estimate is None else self.estimate.value
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values, for JSON."""
+        numbers = Estimate(math.nan, math.nan, math.nan) if self.estimate is None else self.estimate
+        left_out = {name: count for name, count in (("identical", self.identical), ("still", self.still)) if count}
+        return numbers.as_dict() | left_out | ({"reason": self.reason} if self.estimate is None else {})
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedStrip:
+    """The images of one example clip."""
+
+    why: str
+    episode_id: str
+    start: int
+    rows: Mapping[str, UInt8[np.ndarray, "time size size 3"]]  # truth, decoded_truth, base, adapter; the first is given
+
+
+@dataclass(frozen=True)
+class VideoDiscrepancy:
+    """The V-JEPA 2 MMD of each source, of whole clips with the given frame."""
+
+    against_truth: Mapping[str, Discrepancy]  # empty: from a cache, which has no frames
+    against_decoded_truth: Mapping[str, Discrepancy]
+    noise_floor: Mapping[str, float]  # of truth and decoded truth: what two halves of their episodes stay below
+    frames: int  # of each video
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class HandErrors:
+    """How far the hand is from where it is, read from images by a probe that was fitted on true ones."""
+
+    pixels: Mapping[str, Float[np.ndarray, "clips horizon"]]  # by source, and of the true frames
+    size: int  # height and width of the images, in pixels
+    held_out: Estimate  # of the probe itself, on held-out true frames
+    fitted_on: tuple[int, int]  # frames, episodes of the training split
+    mean_position: float  # the error of always saying the mean position of the training frames: what a useless one has
+
+
+@dataclass(frozen=True)
+class DecodedRollouts:
+    """All that was measured of decoded rollouts."""
+
+    decoder: Mapping[str, Any]  # what is known of it: folder, size, encoder, data, frames, steps, held_out
+    episode_ids: tuple[str, ...]
+    models: tuple[str, ...]  # in the order of the evaluation
+    horizon: int
+    arrays: Arrays
+    moving_share: Float[np.ndarray, "clips horizon"] | None  # of the pixels; None: there are no true frames
+    cycle: Mapping[str, Float[np.ndarray, "clips horizon"]]  # of models and the decoded truth
+    video: VideoDiscrepancy | None = None
+    hand: HandErrors | None = None
+    strips: tuple[DecodedStrip, ...] = ()
+    absent: Mapping[str, str] = field(default_factory=dict)  # truth, ssim, ms_ssim, cycle, video, hand -> the reason

@@ -1,0 +1,1 @@
+"""Rollouts of models, decoded and measured: what is needed for it, and the pass over the clips."""

@@ -1,0 +1,301 @@
+"""Decoded rollouts of several models on the same clips: one pass, batch by batch; only numbers per clip are stored.
+
+Every image comes out of one decoder, in float32 and without autocast, in batches of one shape: a perfect prediction
+gives the bits of the decoded truth. Images are compared at the encoder's size, not rounded to 8 bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from einops import rearrange
+from jaxtyping import Float
+from torch import Tensor
+
+from vjepa2_ac.data.clips.transforms import images_to_input
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+from vjepa2_ac.decoding.frame_pairs import as_images, as_pixels
+from vjepa2_ac.episode import LatentBatch
+from vjepa2_ac.evaluation.decoded.hand import HandPositions, HandProbe
+from vjepa2_ac.evaluation.decoded.record import (
+    DECODED_PERSISTENCE,
+    DECODED_TRUTH,
+    RAW_PERSISTENCE,
+    TRUE_FRAMES,
+    DecodedRollouts,
+    DecodedStrip,
+    HandErrors,
+    VideoDiscrepancy,
+)
+from vjepa2_ac.evaluation.decoded.similarity import Reference, cycle_error, scales_for, similarities
+from vjepa2_ac.evaluation.distribution.mmd import discrepancy, noise_floor
+from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips
+from vjepa2_ac.evaluation.result import Example
+from vjepa2_ac.evaluation.video.features import MOST_FRAMES, frames_used, video_features
+from vjepa2_ac.intervals import mean_of
+from vjepa2_ac.media.image_similarity import moving_region
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.reporter import SILENT, Reporter
+
+LEAST_CLIPS, LEAST_EPISODES = 20, 5
+"""Of a video MMD: of fewer, pairs of episodes say nothing."""
+
+CACHE = "the latents come from a cache, which holds only small frames"
+_NO_ENCODER = "the latents come from a cache, and the encoder was set aside"
+_TOO_SMALL = "images of {} pixels are too small for its window"
+_NOT_ASKED = "no hand positions are known: the data were not simulated, or nobody was asked"
+
+
+@dataclass(frozen=True, eq=False)
+class HandReader:
+    """A probe and what it is measured by."""
+
+    probe: HandProbe
+    positions: HandPositions
+
+
+@dataclass(frozen=True, eq=False)
+class Decoding:
+    """How latents become images, and what the images are measured by."""
+
+    decoder: TrainedDecoder
+    has_frames: bool = True  # False: of cached latents there are only small ones
+    encoder: WorldModel | None = None  # whose frozen encoder sees the images; None: it was set aside
+    chunk: int = 16  # frames that go through the encoder at once
+    hand: HandReader | str = _NOT_ASKED  # or the reason why there is none
+
+
+def measure_decoded(
+    contenders: Sequence[Contender],
+    clips: RepeatableClips,
+    decoding: Decoding,
+    examples: Sequence[Example] = (),
+    *,
+    reporter: Reporter = SILENT,
+) -> DecodedRollouts:
+    """Decode the rollouts of all models under the true actions, and measure them beside their neighbours.
+
+    Args:
+        contenders: In the order of the table.
+        clips: What to measure on; they are read once.
+        decoding: The decoder and what else is needed.
+        examples: Clips whose images are returned, too.
+        reporter: Shows the progress.
+
+    Raises:
+        ValueError: No clips.
+    """
+    wanted = {(one.episode_id, one.start): one for one in examples}
+    names = tuple(one.name for one in contenders)
+    seen = _Seen(decoding, names)
+    progress = reporter.task("decoded rollouts")
+    for batch, frames_of_row in clips.read(None):
+        predicted = {one.name: _rollout(one, batch) for one in contenders}
+        images = _decoded(batch, predicted, decoding, frames_of_row)
+        seen.add(images, batch, predicted)
+        seen.keep_strips(images, batch, wanted, _shown_models(contenders))
+        progress(len(seen.ids), clips.count)
+    return seen.result()
+
+
+@dataclass(frozen=True, eq=False)
+class _Images:
+    """The images of a batch, in 0 .. 1."""
+
+    sources: Mapping[str, Float[Tensor, "batch horizon 3 size size"]]  # models and neighbours, after frame 0
+    decoded_first: Float[Tensor, "batch 1 3 size size"]
+    true: Float[Tensor, "batch time 3 size size"] | None  # as the encoder saw them; None: from a cache
+
+    @property
+    def references(self) -> dict[Reference, Float[Tensor, "batch horizon 3 size size"]]:
+        found: dict[Reference, Tensor] = {"decoded_truth": self.sources[DECODED_TRUTH]}
+        return found if self.true is None else {"truth": self.true[:, 1:], **found}
+
+    def video_of(self, source: str) -> Float[Tensor, "batch time 3 size size"]:
+        """Return whole clips, the given frame included."""
+        if source == TRUE_FRAMES and self.true is not None:
+            return self.true
+        return torch.cat([self.decoded_first, self.sources[source]], dim=1)
+
+
+class _Seen:
+    """The numbers of each clip so far."""
+
+    def __init__(self, decoding: Decoding, models: tuple[str, ...]) -> None:
+        self.decoding, self.models = decoding, models
+        self.ids: list[str] = []
+        self._arrays: dict[Any, list[np.ndarray]] = {}  # by what it is; [clips, ...]
+        self._strips: dict[ClipName, DecodedStrip] = {}
+        self._size, self._frames = decoding.decoder.card.shape.image_size, 0
+
+    @torch.no_grad()
+    def add(self, images: _Images, batch: LatentBatch, predicted: Mapping[str, Tensor]) -> None:
+        """Measure a batch of clips."""
+        self.ids += batch.episode_ids
+        self._frames = batch.latents.shape[1]
+        moving = None if images.true is None else moving_region(images.true)
+        if moving is not None:
+            self._add(("moving",), moving.float().mean(dim=(-2, -1)).double().cpu().numpy())
+        for source, shown in images.sources.items():
+            for reference, true in images.references.items():
+                for (region, metric), values in similarities(shown, true, moving).items():
+                    self._add((source, reference, region, metric), values)
+        if self.decoding.encoder is not None:
+            self._encode(self.decoding.encoder, images, {**predicted, DECODED_TRUTH: batch.latents[:, 1:]})
+        if isinstance(self.decoding.hand, HandReader):
+            self._read_hands(self.decoding.hand, images, batch)
+
+    def keep_strips(
+        self, images: _Images, batch: LatentBatch, wanted: Mapping[ClipName, Example], models: Sequence[str]
+    ) -> None:
+        """Store the images of the clips that are shown."""
+        for row, name in enumerate(zip(batch.episode_ids, batch.starts, strict=True)):
+            if name in wanted:
+                kinds = [*((TRUE_FRAMES,) * (images.true is not None)), DECODED_TRUTH, *models]
+                rows = {kind: as_pixels(images.video_of(kind)[row]) for kind in kinds}
+                self._strips[name] = DecodedStrip(wanted[name].why, *name, rows)
+        self._order = list(wanted)
+
+    def result(self) -> DecodedRollouts:
+        """Return what was measured.
+
+        Raises:
+            ValueError: No clips.
+        """
+        if not self.ids:
+            raise ValueError("no clips to decode")
+        arrays = {key: np.concatenate(parts) for key, parts in self._arrays.items()}
+        video, why_no_video = self._video(arrays)
+        hand, why_no_hand = self._hand(arrays)
+        return DecodedRollouts(
+            decoder=_description(self.decoding.decoder),
+            episode_ids=tuple(self.ids),
+            models=self.models,
+            horizon=self._frames - 1,
+            arrays={key: values for key, values in arrays.items() if len(key) == 4},
+            moving_share=arrays.get(("moving",)),
+            cycle={key[1]: values for key, values in arrays.items() if key[0] == "cycle"},
+            video=video,
+            hand=hand,
+            strips=tuple(self._strips[name] for name in self._order if name in self._strips),
+            absent=self._absent() | why_no_video | why_no_hand,
+        )
+
+    def _add(self, key: tuple[str, ...], values: np.ndarray) -> None:
+        self._arrays.setdefault(key, []).append(values)
+
+    def _encode(self, world_model: WorldModel, images: _Images, latents: Mapping[str, Tensor]) -> None:
+        """Encode images again: frame by frame for the cycle error, whole clips for the features of the video MMD."""
+        for source, true in latents.items():
+            again = world_model.encode(images_to_input(images.sources[source]), chunk=self.decoding.chunk)
+            self._add(("cycle", source), cycle_error(again, true))
+        if self._frames > MOST_FRAMES:
+            return
+        videos = [*self.models, DECODED_TRUTH, DECODED_PERSISTENCE, *((TRUE_FRAMES,) * (images.true is not None))]
+        for source in videos:
+            inputs = images_to_input(images.video_of(source))
+            features = video_features(world_model.present_encoder, inputs, self.decoding.chunk)
+            self._add(("video", source), features.double().cpu().numpy())
+
+    def _read_hands(self, hand: HandReader, images: _Images, batch: LatentBatch) -> None:
+        states = batch.states[:, 1:].double().cpu().numpy()
+        true = np.stack([hand.positions(*pair) for pair in zip(batch.episode_ids, states, strict=True)])
+        shown = dict(images.sources) | ({} if images.true is None else {TRUE_FRAMES: images.true[:, 1:]})
+        shown.pop(RAW_PERSISTENCE, None)
+        for source, one in shown.items():
+            self._add(("hand", source), np.linalg.norm(hand.probe.read(one) - true, axis=-1))
+        self._add(("hand_mean",), np.linalg.norm(hand.probe.offset.numpy() - true, axis=-1))
+
+    def _video(self, arrays: Mapping[Any, np.ndarray]) -> tuple[VideoDiscrepancy | None, dict[str, str]]:
+        features = {key[1]: values for key, values in arrays.items() if key[0] == "video"}
+        clips, episodes = len(self.ids), len(set(self.ids))
+        if self.decoding.encoder is None:
+            return None, {"video": _NO_ENCODER}
+        if not features:
+            return None, {"video": f"clips of {self._frames} frames; the encoder takes {MOST_FRAMES} at most"}
+        if clips < LEAST_CLIPS or episodes < LEAST_EPISODES:
+            found = f"{clips} clips of {episodes} episodes"
+            return None, {"video": f"{found}; it needs {LEAST_CLIPS} clips and {LEAST_EPISODES} episodes"}
+        used = frames_used(self._frames)
+        against = {
+            reference: {
+                source: discrepancy(values, features[reference], self.ids)
+                for source, values in features.items()
+                if source not in {reference, TRUE_FRAMES}
+            }
+            for reference in (TRUE_FRAMES, DECODED_TRUTH)
+            if reference in features
+        }
+        floors = {name: noise_floor(features[name], self.ids) for name in against}
+        notes = (
+            () if used == self._frames else (f"The last of {self._frames} frames is left out: tubelets are of two.",)
+        )
+        found_of_truth = against.get(TRUE_FRAMES, {})
+        return VideoDiscrepancy(found_of_truth, against[DECODED_TRUTH], floors, used, notes), {}
+
+    def _hand(self, arrays: Mapping[Any, np.ndarray]) -> tuple[HandErrors | None, dict[str, str]]:
+        hand = self.decoding.hand
+        if isinstance(hand, str):
+            return None, {"hand": hand}
+        pixels = {key[1]: values for key, values in arrays.items() if key[0] == "hand"}
+        if TRUE_FRAMES not in pixels:
+            return None, {"hand": CACHE}
+        by_clip, mean = np.nanmean(pixels[TRUE_FRAMES], axis=1), float(np.nanmean(arrays["hand_mean",]))
+        return HandErrors(pixels, self._size, mean_of(by_clip, self.ids), hand.probe.fitted_on, mean), {}
+
+    def _absent(self) -> dict[str, str]:
+        found = {} if self.decoding.has_frames else {"truth": CACHE}
+        if self.decoding.encoder is None:
+            found["cycle"] = _NO_ENCODER
+        if not scales_for(self._size):
+            found["ms_ssim"] = _TOO_SMALL.format(self._size)
+        return found
+
+
+def _rollout(contender: Contender, batch: LatentBatch) -> Float[Tensor, "batch horizon tokens dim"]:
+    """Return the frames after the first under the true actions; states are the recorded ones."""
+    extrinsics = None if batch.extrinsics is None else batch.extrinsics[:, :-1]
+    with contender.switched(), torch.no_grad():
+        return contender.model.rollout(batch.latents[:, :1], batch.actions, batch.states[:, :-1], extrinsics)
+
+
+@torch.no_grad()
+def _decoded(
+    batch: LatentBatch, predicted: Mapping[str, Tensor], decoding: Decoding, frames_of_row: FramesOfRow
+) -> _Images:
+    decoder, latents = decoding.decoder.decoder, batch.latents
+    true = _true_frames(batch, frames_of_row, latents.device) if decoding.has_frames else None
+    rollouts = {
+        **predicted,
+        DECODED_TRUTH: latents[:, 1:],
+        DECODED_PERSISTENCE: latents[:, :1].expand_as(latents[:, 1:]),
+    }
+    with torch.autocast(latents.device.type, enabled=False):
+        sources = {source: decoder.decode(one.float()) for source, one in rollouts.items()}
+        first = decoder.decode(latents[:, :1].float())
+    if true is not None:
+        sources[RAW_PERSISTENCE] = true[:, :1].expand_as(true[:, 1:])
+    return _Images(sources, first, true)
+
+
+def _true_frames(
+    batch: LatentBatch, frames_of_row: FramesOfRow, device: torch.device
+) -> Float[Tensor, "batch time 3 size size"]:
+    rows = [frames_of_row(row) for row in range(len(batch.starts))]
+    pixels = torch.from_numpy(np.stack([row for row in rows if row is not None])).to(device)
+    return as_images(rearrange(pixels, "batch time h w c -> batch time c h w"))
+
+
+def _shown_models(contenders: Sequence[Contender]) -> list[str]:
+    """Return the models whose images are shown: base and trained."""
+    return [one.name for one in contenders if one.role != "other"]
+
+
+def _description(trained: TrainedDecoder) -> dict[str, Any]:
+    card = trained.card
+    kept = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
+    return {"folder": str(trained.folder), "size": card.shape.size} | {name: asdict(card)[name] for name in kept}
