@@ -64,6 +64,7 @@ ORDERS: dict[str, list[str]] = {
         "network loss",
         "decoder_folder frame_pairs",
         "linear_fit held_out imagine",
+        "imagined_plan",
         "setup",
         "training",
     ],
