@@ -66,6 +66,7 @@ ORDERS: dict[str, list[str]] = {
         "network loss",
         "decoder_folder frame_pairs",
         "linear_fit held_out imagine optimizer_steps",
+        "imagined_plan",
         "setup",
         "training",
     ],

@@ -9,6 +9,7 @@ import torch
 from PIL import Image
 
 from adapted_run import write_adapted_run
+from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config
@@ -50,7 +51,7 @@ def workshop(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the image, which takes most of the time."""
-    monkeypatch.setattr("vjepa2_ac.reports.figures.plan.plot_plan", lambda _, path: path)
+    monkeypatch.setattr("vjepa2_ac.reports.figures.plan.plot_plan", lambda _, path, *__: path)
 
 
 def config(here: Path) -> Config:
@@ -218,3 +219,35 @@ def test_wrong_input_is_one_clear_error(
 def test_a_model_that_is_not_there_is_named(workshop: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(workshop, *QUICK, subject="nowhere")[0] == 2
     assert "nowhere: no such file or folder" in capsys.readouterr().err
+
+
+def test_a_decoder_shows_what_was_imagined_and_only_its_name_goes_into_the_file(
+    workshop: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_decoder(tmp_path / "decoder", tiny_model())
+    drawn = []
+    monkeypatch.setattr(
+        "vjepa2_ac.reports.figures.plan.plot_plan", lambda _, path, imagined: drawn.append(imagined) or path
+    )
+    _, plain = plan(workshop, *QUICK)
+    status, file = plan(workshop, *QUICK, "--decoder", str(folder))
+    assert status == 0
+    assert drawn[0] is None
+    assert list(drawn[1].steps) == [1]
+    assert file["decoder"] == {"name": str(folder), "encoder": tiny_model().encoder_fingerprint()}
+    assert file["actions"] == plain["actions"]
+    assert plain["decoder"] is None
+
+
+@pytest.mark.parametrize("kind", ["missing", "another encoder's"])
+def test_a_decoder_that_will_not_do_is_told_before_the_plan(
+    workshop: Path, tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = "vjepa2_ac.planning.session.load_to_plan" if kind == "missing" else "vjepa2_ac.planning.decision.decide"
+    monkeypatch.setattr(where, lambda *_, **__: pytest.fail("too late"))
+    if kind != "missing":
+        write_decoder(tmp_path / "decoder", tiny_model(), encoder="other")
+    assert plan(workshop, *QUICK, "--decoder", str(tmp_path / "decoder"))[0] == 2
+    said = capsys.readouterr().err
+    assert f"--decoder {tmp_path}/decoder" in said.replace("\n", "")
+    assert "Train one" in said

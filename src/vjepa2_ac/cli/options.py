@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from vjepa2_ac.config import Config
+    from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
     from vjepa2_ac.planning.session import PlanningSession
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -161,6 +162,24 @@ def load_planning_session(options: argparse.Namespace) -> PlanningSession:
 
     how = {"checkpoint": options.checkpoint, "config": options.config, "overrides": options.overrides}
     return load_to_plan(options.subject, **how)
+
+
+def add_decoder(parser: argparse._ActionsContainer, shows: str) -> None:
+    """Add `--decoder`.
+
+    Args:
+        parser: Gets the option.
+        shows: What is drawn with it.
+    """
+    text = f"shows {shows}: the folder that `vjepa2-ac decoder` made, or builtin:sim-tiny"
+    argument(parser, "--decoder FOLDER", text, as_model)
+
+
+def given_decoder(options: argparse.Namespace) -> TrainedDecoder | None:
+    """Load the decoder of `--decoder`, before the model that it is for."""
+    from vjepa2_ac.decoding.decoder_folder import load_decoder
+
+    return None if options.decoder is None else load_decoder(options.decoder)
 
 
 def parsed(parser: argparse.ArgumentParser, arguments: Sequence[str] | None) -> argparse.Namespace:

@@ -10,6 +10,7 @@ from vjepa2_ac.cli.options import (
     NEGATIVE_NUMBERS,
     Commands,
     add_checkpoint,
+    add_decoder,
     argument,
     as_local,
     as_model,
@@ -17,6 +18,7 @@ from vjepa2_ac.cli.options import (
     as_path,
     camera_pose,
     command,
+    given_decoder,
     load_planning_session,
     require_overrides,
     require_to_plan,
@@ -61,6 +63,7 @@ def add_to(commands: Commands) -> None:
     argument(parser, "--seed N", "default: the config's", whole_number(0, 2**31 - 1))
     text = "of an energy slice along each axis (13); below 3: no slices"
     argument(parser, "--nodes N", text, whole_number(0, 101), default=13)
+    add_decoder(parser, "what the planner imagined, beside the goal, in the image")
     argument(parser, "--out FOLDER", "for both files (plan)", as_path, default=Path("plan"))
 
 
@@ -78,6 +81,7 @@ def _plan(options: argparse.Namespace) -> int:
 
     from vjepa2_ac.console.plan import plan_table
     from vjepa2_ac.console.progress import ConsoleReporter, console
+    from vjepa2_ac.decoding.imagined_plan import imagine_plan
     from vjepa2_ac.planning.decision import PlanRequest, decide
     from vjepa2_ac.planning.plan_json import PLAN_FILE, write_plan
     from vjepa2_ac.planning.summary import summarize
@@ -85,18 +89,23 @@ def _plan(options: argparse.Namespace) -> int:
 
     request = PlanRequest(start, state, goals, durations, mask)
     say_places_elsewhere(options.subject)
+    decoder = given_decoder(options)
     session = load_planning_session(options)
+    if decoder is not None:
+        decoder.require_encoder(session.world_model, subject=options.subject)
     if not options.durations:
         request = request.with_equal_durations(session.config.planning.horizon)
     with ConsoleReporter() as reporter:
         progress = reporter.task("planning, iterations")
         controller = session.controller(seed=options.seed, extrinsics=extrinsics, progress=progress)
         found = decide(controller, request, nodes=options.nodes)
-    images_given = {"start": options.start, "goals": options.goal, "mask": options.mask}
+    about = session.as_dict() | {"start": options.start, "goals": options.goal, "mask": options.mask}
+    about["decoder"] = None if decoder is None else decoder.as_dict()
+    imagined = None if decoder is None else imagine_plan(found, decoder)
     with user_can_write(options.out):
         written = [
-            write_plan(found, session.as_dict() | images_given, options.out / PLAN_FILE),
-            plot_plan(found, options.out / PLAN_IMAGE),
+            write_plan(found, about, options.out / PLAN_FILE),
+            plot_plan(found, options.out / PLAN_IMAGE, imagined),
         ]
     console.print(plan_table(found))
     console.print(summarize(found))

@@ -10,12 +10,14 @@ from vjepa2_ac import output, places
 from vjepa2_ac.cli.options import (
     Commands,
     add_checkpoint,
+    add_decoder,
     argument,
     as_local,
     as_model,
     as_path,
     command,
     count,
+    given_decoder,
     load_planning_session,
     record_of_options,
     require_to_plan,
@@ -24,7 +26,7 @@ from vjepa2_ac.cli.options import (
 from vjepa2_ac.errors import InputError
 
 _OF_RECORD = ("cameras", "workers")
-_OF_A_MODEL = ("films", "checkpoint", "config", "out")
+_OF_A_MODEL = ("films", "decoder", "checkpoint", "config", "out")
 
 
 def add_to(commands: Commands) -> None:
@@ -51,6 +53,7 @@ def add_to(commands: Commands) -> None:
     add_checkpoint(group, default=None)
     argument(group, "--config CONFIG", "of a model: a config whose `planning` is used", as_local)
     argument(group, "--films N", "episodes in the video; 0: none (6)", whole_number(0))
+    add_decoder(group, "in the video what the model imagined of each frame, one step ago")
     text = "where figures and video go (closed_loop/TASK-DOMAIN, in the run's)"
     argument(group, "--out FOLDER", text, as_path)
     group = parser.add_argument_group("of record")
@@ -107,6 +110,9 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     if options.domain == "random":
         raise InputError(where="--domain random", found="a model that steers", needed="A or B")
     named_domain(options.domain)
+    if options.decoder is not None and options.films == 0:
+        found, fix = "--films 0: no video in which anything could be shown", "Leave out one of the two"
+        raise InputError(where=f"--decoder {options.decoder}", found=found, needed="a video", fix=fix)
     options.checkpoint = options.checkpoint or "selected"
     require_to_plan(options)
 
@@ -119,6 +125,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     load_mujoco()
     chosen = record_of_options(BenchmarkOptions, options)
     chosen = replace(chosen, films=min(chosen.films, chosen.episodes))
+    decoder = given_decoder(options)
     session = load_planning_session(options)
     name = f"closed_loop/{chosen.task}-{chosen.domain}"
     if options.out is None and is_run(options.subject):
@@ -126,7 +133,7 @@ def _run_benchmark(options: argparse.Namespace) -> int:
     home = Path(options.subject) if is_run(options.subject) else Path()
     folder = options.out or home / name
     with ConsoleReporter() as reporter:
-        benchmark, files = run_benchmark(session, chosen, folder, reporter)
+        benchmark, files = run_benchmark(session, chosen, folder, reporter, decoder)
     if session.checkpoint:
         console.print(f"{options.subject}: checkpoint {session.checkpoint}")
     console.print(benchmark_table(benchmark))

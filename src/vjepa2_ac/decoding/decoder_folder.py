@@ -60,13 +60,18 @@ class TrainedDecoder:
     card: DecoderCard
     decoder: Decoder
     linear: Decoder
-    folder: Path
+    name: str  # as given
+    where: str = "--decoder"  # the option or knob that names it
 
     def to(self, device: torch.device) -> TrainedDecoder:
         """Move both to a device."""
         self.decoder.to(device)
         self.linear.to(device)
         return self
+
+    def as_dict(self) -> dict[str, str]:
+        """Return its name and its encoder's fingerprint, for a JSON of what it has shown."""
+        return {"name": self.name, "encoder": self.card.encoder}
 
     def require_encoder(self, world_model: WorldModel, *, subject: str) -> None:
         """Refuse a model with another encoder than the decoder's.
@@ -78,14 +83,14 @@ class TrainedDecoder:
         sizes = (world_model.num_tokens, world_model.latent_dim, world_model.image_size)
         if sizes != (shape.grid**2, shape.dim, shape.image_size):
             raise InputError(
-                where=f"--decoder {self.folder}",
+                where=f"{self.where} {self.name}",
                 found=f"a decoder of {shape.grid**2}x{shape.dim} latents to images of {shape.image_size} px",
                 needed=f"{sizes[0]}x{sizes[1]} latents of images of {sizes[2]} px, as those of {subject}",
                 fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
             )
         if world_model.encoder_fingerprint() != self.card.encoder:
             raise InputError(
-                where=f"--decoder {self.folder}",
+                where=f"{self.where} {self.name}",
                 found=f"the decoder of another encoder than that of {subject}",
                 needed="one that was trained on the latents of this encoder: others would be read wrongly",
                 fix="Train one with `vjepa2-ac decoder CONFIG`, on the config of this model",
@@ -104,23 +109,24 @@ def save_decoder(folder: Path, card: DecoderCard, decoder: Mapping[str, Tensor],
         (fresh / CARD).write_text(json.dumps(asdict(card), indent=1) + "\n", encoding="utf-8")
 
 
-def load_decoder(name: str | Path) -> TrainedDecoder:
+def load_decoder(name: str | Path, *, where: str = "--decoder") -> TrainedDecoder:
     """Read a decoder, on the CPU.
 
     Args:
         name: Its folder; or builtin:sim-tiny, for the one in the package.
+        where: The option or knob that names it, for messages.
 
     Raises:
         InputError: There is none, or it is incomplete or damaged.
     """
     folder = _folder_of(str(name))
-    card = read_card(folder)
+    card = read_card(folder, where=where)
     linear_shape = DecoderShape("linear", card.shape.dim, card.shape.grid, card.shape.patch_size)
     decoder = _filled(card.shape, folder / WEIGHTS)
-    return TrainedDecoder(card, decoder, _filled(linear_shape, folder / LINEAR), folder)
+    return TrainedDecoder(card, decoder, _filled(linear_shape, folder / LINEAR), str(name), where)
 
 
-def read_card(folder: Path) -> DecoderCard:
+def read_card(folder: Path, *, where: str = "--decoder") -> DecoderCard:
     """Return what is known of a decoder.
 
     Raises:
@@ -130,9 +136,8 @@ def read_card(folder: Path) -> DecoderCard:
     try:
         values = read_json_object(path, needed=_NEEDED, fix=_FIX)
     except (FileNotFoundError, NotADirectoryError):
-        where = f"--decoder {folder}"
         fix = "Train one with `vjepa2-ac decoder CONFIG`; one that is unfinished goes on with the same command"
-        raise InputError(where=where, found=f"no {CARD} there", needed=_NEEDED, fix=fix) from None
+        raise InputError(where=f"{where} {folder}", found=f"no {CARD} there", needed=_NEEDED, fix=fix) from None
     except OSError as error:
         raise InputError(where=str(path), found=f"cannot be read ({error})", needed=_NEEDED, fix=_FIX) from None
     return record_of(DecoderCard, values, where=str(path), needed=_NEEDED, fix=_FIX)

@@ -18,6 +18,7 @@ from vjepa2_ac.data.clips.clip_reader import frames_of
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
 from vjepa2_ac.data.clips.streams import copies_for
+from vjepa2_ac.data.clips.transforms import frames_as_seen
 from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.distributed.launch import make_accelerator
 from vjepa2_ac.encoding.batch import encode_batch, require_widths
@@ -28,7 +29,6 @@ from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES
 from vjepa2_ac.evaluation.decoded_rollouts.measure import measure_decoded
 from vjepa2_ac.evaluation.decoded_rollouts.setup import HandsOf, decoding_of, require_fitting
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips, evaluate
-from vjepa2_ac.evaluation.examples import seen_by_the_encoder
 from vjepa2_ac.evaluation.measure import ClipSample
 from vjepa2_ac.evaluation.request import EvaluationOptions, settle
 from vjepa2_ac.evaluation.result import About, Evaluation, Role, TrainingCurve
@@ -244,7 +244,7 @@ def _clips(
 
 def _frames_of_row(dataset: Dataset, batch: Batch, size: int, row: int) -> UInt8[np.ndarray, "time size size 3"]:
     """Return the frames of a clip as the encoder sees them; of cached latents, enlarged small frames."""
-    return seen_by_the_encoder(torch.from_numpy(frames_of(dataset, batch, row)), size)
+    return frames_as_seen(frames_of(dataset, batch, row), size)
 
 
 def _about(subject: str, run: TrainedRun | None, config: Config, dataset: Dataset, asked: EvaluationOptions) -> About:

@@ -11,7 +11,6 @@ from einops import rearrange
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input
 from vjepa2_ac.distances import absolute_difference
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.measure import Predictor
@@ -86,14 +85,6 @@ def make_example(
         true_colours=colours.of(true),
         predicted_colours={name: colours.of(values) for name, values in predicted.items()},
     )
-
-
-def seen_by_the_encoder(
-    frames: UInt8[Tensor, "time height width 3"], size: int
-) -> UInt8[np.ndarray, "time size size 3"]:
-    """Return frames as the encoder sees them, as uint8: resized, in their own colours."""
-    shown = input_to_pixels(pixels_to_input(frames[None], size)[0])
-    return np.asarray(rearrange(shown, "time c h w -> time h w c").cpu().numpy())
 
 
 class Colours:

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
@@ -16,7 +15,7 @@ from vjepa2_ac.config import Config, LimitsConfig
 from vjepa2_ac.config.data import Split
 from vjepa2_ac.data.clips.dataset import Dataset, open_dataset
 from vjepa2_ac.data.clips.loader import batches_of, validation_windows
-from vjepa2_ac.data.clips.transforms import input_to_pixels, pixels_to_input, view
+from vjepa2_ac.data.clips.transforms import frames_as_seen, view
 from vjepa2_ac.data.clips.windows import in_split
 from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.decoding.imagine import (
@@ -232,16 +231,11 @@ def _seen(batch: Batch, size: int) -> UInt8[np.ndarray, "time size size 3"]:
     """Return the frames of the only clip of a batch as the encoder sees them."""
     if batch.frames is None:
         raise ValueError("a batch without frames")
-    return _resized(batch.frames, size)
+    return frames_as_seen(batch.frames[0].numpy(), size)
 
 
 def _as_seen(
     config: Config, size: int, frames: UInt8[np.ndarray, "time h w 3"]
 ) -> UInt8[np.ndarray, "time size size 3"]:
     """Return camera frames as the encoder sees them."""
-    return _resized(torch.from_numpy(np.ascontiguousarray(view(frames, config.data.crop)))[None], size)
-
-
-def _resized(frames: Tensor, size: int) -> UInt8[np.ndarray, "time size size 3"]:
-    pixels = input_to_pixels(pixels_to_input(frames, size))[0]
-    return np.asarray(pixels.permute(0, 2, 3, 1).contiguous().cpu().numpy())
+    return frames_as_seen(view(frames, config.data.crop), size)

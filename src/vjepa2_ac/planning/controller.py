@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from vjepa2_ac.config import Config
@@ -157,6 +157,11 @@ class Controller:
         )
 
     @property
+    def device(self) -> torch.device:
+        """Where the model is."""
+        return self._model.device
+
+    @property
     def space(self) -> SearchSpace:
         """The allowed changes of the state."""
         return self.planner.space
@@ -182,7 +187,7 @@ class Controller:
             require_image(image, where=f"goal {place}", like=goals[0] if place else None)
         if not goals:
             raise ValueError("no goal")
-        latents = torch.stack([self._encoded(image) for image in goals])
+        latents = torch.stack([self.encoded(image) for image in goals])
         self._goal = Goal(latents, durations, self._weights(mask, goals[0]))
         self._like, self._done, self.decision = goals[0], 0, None
         self._seen = []
@@ -208,11 +213,17 @@ class Controller:
         require_image(frame, where="frame", like=self._like)
         state = np.asarray(state, dtype=np.float64)
         require_numbers(state, self.spaces.state, where="state")
-        seen = [*self._seen, (self._encoded(frame), state)][-self.config.context :]
+        seen = [*self._seen, (self.encoded(frame), state)][-self.config.context :]
         before = self.decision
         decision = self._decided(self._goal, seen, None if before is None else before.plan)
         self._seen, self._done, self.decision = seen, self._done + 1, decision  # after an error nothing has changed
         return decision.action
+
+    def encoded(self, image: UInt8[np.ndarray, "height width 3"]) -> Float[Tensor, "tokens dim"]:
+        """Return the latents of what the model sees of an image, on its device."""
+        frames = torch.from_numpy(np.ascontiguousarray(view(image[None], self.crop)))[None]
+        frames = frames.to(self._model.device)
+        return self._model.encode(pixels_to_input(frames, self._model.image_size))[0, 0]
 
     def _decided(self, goal: Goal, seen: Sequence[Seen], before: Plan | None) -> Decision:
         latents, state = seen[-1]
@@ -249,11 +260,6 @@ class Controller:
             extrinsics=self._camera,
             axes=self._axes,
         )
-
-    def _encoded(self, image: np.ndarray) -> Float[Tensor, "tokens dim"]:
-        frames = torch.from_numpy(np.ascontiguousarray(view(image[None], self.crop)))[None]
-        frames = frames.to(self._model.device)
-        return self._model.encode(pixels_to_input(frames, self._model.image_size))[0, 0]
 
     def _weights(self, mask: np.ndarray | None, like: np.ndarray) -> Float[Tensor, " tokens"] | None:
         if mask is None:

@@ -10,7 +10,16 @@ import torch
 from paths import GOLDEN
 from vjepa2_ac.data.clips import transforms
 from vjepa2_ac.data.clips.augmentation import per_channel
-from vjepa2_ac.data.clips.transforms import CropBox, crop_box, images_to_input, input_to_pixels, pixels_to_input, view
+from vjepa2_ac.data.clips.transforms import (
+    CropBox,
+    crop_box,
+    frame_of_seen,
+    frames_as_seen,
+    images_to_input,
+    input_to_pixels,
+    pixels_to_input,
+    view,
+)
 
 FLOAT16_ROUNDING = 2.0**-10  # half a step between 2 and 4
 
@@ -106,3 +115,17 @@ def test_images_become_the_input_that_shows_them() -> None:
     assert torch.equal(input_to_pixels(inputs), pixels)
     frames = pixels.permute(0, 1, 3, 4, 2)
     torch.testing.assert_close(inputs, pixels_to_input(frames, 8), rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["released", "square", "letterbox"])
+@pytest.mark.parametrize("size", [(40, 100), (100, 40), (60, 60)])
+def test_what_is_seen_goes_back_to_its_place_in_the_frame(kind: transforms.Crop, size: tuple[int, int]) -> None:
+    rows, columns = np.linspace(0, 200, size[0]), np.linspace(0, 50, size[1])
+    frame = (rows[:, None, None] + columns[None, :, None] + np.zeros(3)).astype(np.uint8)
+    back = frame_of_seen(frames_as_seen(view(frame[None], kind), 96)[0], *size, kind)
+    box = CropBox(0, 0, *size) if kind == "letterbox" else crop_box(*size, kind)
+    inner = (slice(box.top + 2, box.top + box.height - 2), slice(box.left + 2, box.left + box.width - 2))
+    assert abs(back[inner].astype(int) - frame[inner]).max() <= 8
+    back[box.top : box.top + box.height, box.left : box.left + box.width] = 255
+    assert back.shape == frame.shape
+    assert (back == 255).all()

@@ -6,6 +6,10 @@ import numpy as np
 from PIL import Image
 
 from decisions import asked, image
+from random_decoder import write_decoder
+from tiny_models import tiny_model
+from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.decoding.imagined_plan import imagine_plan
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.reports.figures.plan import plot_plan
 
@@ -33,3 +37,11 @@ def test_many_goals_and_a_mask_are_shown(tmp_path: Path) -> None:
     masked = drawn(found, tmp_path)
     assert masked.shape == plain.shape
     assert not np.array_equal(masked, plain)
+
+
+def test_what_was_imagined_is_a_row_of_its_own_also_of_a_decision_without_a_plan(tmp_path: Path) -> None:
+    decoder = load_decoder(write_decoder(tmp_path / "decoder", tiny_model()))
+    for found in (asked(horizon=9, nodes=0), asked(start=100)):
+        plain, path = drawn(found, tmp_path), tmp_path / "imagined.png"
+        with Image.open(plot_plan(found, path, imagine_plan(found, decoder))) as picture:
+            assert picture.height > plain.shape[0] + 100

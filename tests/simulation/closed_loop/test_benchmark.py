@@ -13,15 +13,17 @@ import yaml
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 pytest.importorskip("av", reason="the extra `video` is not installed")
 
+from random_decoder import write_decoder
 from tiny_models import tiny_model
 from vjepa2_ac.cli import main
 from vjepa2_ac.console.closed_loop import benchmark_notes
+from vjepa2_ac.decoding.decoder_folder import load_decoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_reader import count_frames
 from vjepa2_ac.model.network.world_model import WorldModel
 from vjepa2_ac.planning.session import load_to_plan
 from vjepa2_ac.simulation.closed_loop.benchmark import FILE, FILM, JOINT_FIELDS, BenchmarkOptions, run_benchmark
-from vjepa2_ac.simulation.closed_loop.video import film_frames
+from vjepa2_ac.simulation.closed_loop.video import _about_imagined, _imagined, film_frames
 
 SMALL = ["planning.samples=6", "planning.iterations=2", "planning.cem.elites=3", "planning.limits.xyz=[0.03,0.03,0.03]"]
 TWICE = ["--episodes", "2", "--steps", "2", "--films", "1"]
@@ -62,6 +64,34 @@ def test_a_robot_of_joints_is_steered_by_its_joints(
     (tmp_path / "other.yaml").write_text(config.read_text().replace("joint_position", "other"))
     assert main([*given, "--config", str(tmp_path / "other.yaml"), "planning.limits.axes=[0.2]"]) == 2
     assert "other numbers than the simulated arm measures" in capsys.readouterr().err
+
+
+def test_a_decoder_adds_what_was_imagined_to_the_film_and_changes_no_metric(model: str, tmp_path: Path) -> None:
+    decoder = load_decoder(write_decoder(tmp_path / "decoder", tiny_model()))
+    session = load_to_plan(model, overrides=SMALL)
+    wanted = BenchmarkOptions(episodes=2, steps=2, films=1)
+    (plain, _), (shown, _) = (
+        run_benchmark(session, wanted, tmp_path / name, decoder=one) for name, one in {"p": None, "d": decoder}.items()
+    )
+    filmed, other = shown.results[0].episodes
+    frames, plain_frames = list(film_frames(shown.results[0])), list(film_frames(plain.results[0]))
+    assert [one is not None and one.shape for one in filmed.imagined] == [filmed.goal_image.shape] * 2
+    assert (other.imagined, plain.results[0].episodes[0].imagined) == ((), (None, None))
+    assert frames[0].shape[1] > 1.4 * plain_frames[0].shape[1]
+    assert metrics(tmp_path / "d")["about"]["decoder"] == str(tmp_path / "decoder")
+    one, two = (metrics(tmp_path / name)["policies"]["tiny"]["by_episode"] for name in "pd")
+    assert one["distance_cm"] == two["distance_cm"]
+
+
+def test_where_nothing_was_imagined_the_film_says_why(model: str, tmp_path: Path) -> None:
+    result = run_benchmark(load_to_plan(model, overrides=SMALL), BenchmarkOptions(episodes=1, steps=2), tmp_path)[0]
+    (episode,) = result.results[0].episodes
+    known = replace(episode, imagined=(episode.goal_image, None), whys=("planned", "at the goal"))
+    assert [_about_imagined(known, step) for step in range(3)] == [
+        "imagined one step ago: nothing yet", "imagined one step ago", "nothing imagined: at the goal",
+    ]  # fmt: skip
+    assert np.array_equal(_imagined(known, 1), episode.goal_image)
+    assert _imagined(known, 2).min() == 255
 
 
 def metrics(folder: Path) -> dict:
@@ -154,6 +184,9 @@ def test_what_was_unusual_is_noted(model: str, tmp_path: Path) -> None:
         (["record"], "one folder"),
         (["record", "{here}/x", "{here}/y"], "one folder"),
         (["record", "{here}/x", "--films", "1"], "--films"),
+        (["record", "{here}/x", "--decoder", "x"], "--decoder"),
+        (["builtin:sim-tiny", "--decoder", "x", "--films", "0"], "--films 0"),
+        (["builtin:sim-tiny", "--decoder", "no/such"], "no decoder.json"),
     ],
 )
 def test_what_cannot_be_is_one_line(

@@ -110,6 +110,33 @@ def images_to_input(images: Float[Tensor, "*batch 3 size size"]) -> Float[Tensor
     return (images.float() * 255.0 - per_channel(_MEAN, images.device)) / per_channel(_STD, images.device)
 
 
+def frames_as_seen(
+    frames: UInt8[np.ndarray, "time height width 3"], size: int
+) -> UInt8[np.ndarray, "time size size 3"]:
+    """Return cropped frames as the encoder sees them, for people to look at."""
+    inputs = pixels_to_input(torch.from_numpy(np.ascontiguousarray(frames))[None], size)[0]
+    return np.ascontiguousarray(input_to_pixels(inputs).permute(0, 2, 3, 1).numpy())
+
+
+def frame_of_seen(
+    seen: UInt8[np.ndarray, "size size 3"], height: int, width: int, kind: Crop = "released"
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Return what the encoder sees at its place in a camera frame, for people: white where nothing is seen."""
+    box = (
+        CropBox(0, 0, max(height, width), max(height, width)) if kind == "letterbox" else crop_box(height, width, kind)
+    )
+    frame = np.full((height, width, 3), 255, np.uint8)
+    part = torch.nn.functional.interpolate(
+        torch.tensor(seen).permute(2, 0, 1)[None].float(), size=(box.height, box.width), mode="bilinear"
+    )
+    pixels = part[0].round().to(torch.uint8).permute(1, 2, 0).numpy()
+    if kind == "letterbox":
+        top, left = (box.height - height) // 2, (box.width - width) // 2
+        return np.ascontiguousarray(pixels[top : top + height, left : left + width])
+    frame[box.top : box.top + box.height, box.left : box.left + box.width] = pixels
+    return frame
+
+
 def _augmented(clip: Tensor, image_size: int, augmentation: Augmentation) -> Float[Tensor, "time 3 size size"]:
     top, left, height, width = augmentation.box
     return jittered(_resized(clip[:, top : top + height, left : left + width], image_size), augmentation)

@@ -298,4 +298,4 @@ def _shown_models(contenders: Sequence[Contender]) -> list[str]:
 def _description(trained: TrainedDecoder) -> dict[str, Any]:
     card = trained.card
     kept = ("encoder", "crop", "data", "cameras", "episodes", "frames", "steps", "held_out")
-    return {"folder": str(trained.folder), "size": card.shape.size} | {name: asdict(card)[name] for name in kept}
+    return {"folder": trained.name, "size": card.shape.size} | {name: asdict(card)[name] for name in kept}

@@ -33,7 +33,7 @@ def require_fitting(decoder: TrainedDecoder, world_model: WorldModel, config: Co
         InputError: Encoder, image size or crop differ.
     """
     decoder.require_encoder(world_model, subject=subject)
-    card, where = decoder.card, f"--decoder {decoder.folder}"
+    card, where = decoder.card, f"{decoder.where} {decoder.name}"
     if card.shape.image_size != world_model.image_size:
         found, needed = card.shape.image_size, world_model.image_size
         raise InputError(where=where, found=f"images of {found} px", needed=f"{needed} px, as {subject} sees")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,33 +12,46 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from vjepa2_ac.data.clips.transforms import crop_box
+from vjepa2_ac.decoding.imagined_plan import ImaginedPlan
 from vjepa2_ac.planning.decision import PlanResult
 from vjepa2_ac.planning.energy_slices import EnergySlice
 from vjepa2_ac.planning.interfaces import Plan
 from vjepa2_ac.planning.summary import summarize
+from vjepa2_ac.reports.figures.film import MEANING, Kind
 from vjepa2_ac.reports.figures.page import BLUE, GREY, RED, written_page
 
 PLAN_IMAGE = "plan.png"
 
 _STYLE = {"font.size": 9, "legend.fontsize": 7.5}
 _FRAME = "#e8b10c"
+_ROW, _ROW_OF_IMAGINED = 3.4, 2.3  # inches
 _MOST_NUMBERS = 8  # of a vector
 _MOST_GOALS = 3  # that are shown: the first ones, and the last
 _STAR: dict[str, Any] = {"marker": "*", "s": 150, "color": RED, "edgecolors": "white", "zorder": 5}
 
 
-def plot_plan(answer: PlanResult, path: Path) -> Path:
-    """Write the figure of a decision as PNG; it is written atomically."""
+def plot_plan(answer: PlanResult, path: Path, imagined: ImaginedPlan | None = None) -> Path:
+    """Write the figure of a decision as PNG; it is written atomically.
+
+    Args:
+        answer: The decision.
+        path: The file.
+        imagined: What the planner imagined; None: nobody has decoded it.
+    """
     plan = answer.decision.plan
-    rows = 1 if plan is None else 3 if answer.slices else 2
-    with written_page(path, 13.0, 0.9 + 3.4 * rows, dpi=100, style=_STYLE, layout="constrained") as page:
+    rows: list[tuple[float, Callable[[Any], None]]] = [(_ROW, partial(_pictures, answer=answer))]
+    if imagined is not None:
+        rows.append((_ROW_OF_IMAGINED, partial(_imagined, answer=answer, imagined=imagined)))
+    if plan is not None:
+        rows.append((_ROW, partial(_search, answer=answer, plan=plan)))
+        if answer.slices:
+            rows.append((_ROW, partial(_slices, answer=answer)))
+    heights = [height for height, _ in rows]
+    with written_page(path, 13.0, 0.9 + sum(heights), dpi=100, style=_STYLE, layout="constrained") as page:
         page.headline(summarize(answer))
-        parts = page.figure.subfigures(rows, 1, squeeze=False)[:, 0]
-        _pictures(parts[0], answer)
-        if plan is not None:
-            _search(parts[1], answer, plan)
-            if answer.slices:
-                _slices(parts[2], answer)
+        parts = page.figure.subfigures(len(rows), 1, squeeze=False, height_ratios=heights)[:, 0]
+        for part, (_, draw) in zip(parts, rows, strict=True):
+            draw(part)
     return path
 
 
@@ -56,6 +71,25 @@ def _pictures(part: Any, answer: PlanResult) -> None:
         )
         axes.set_title(f"{name} (frame: what the model sees)")
         axes.set_axis_off()
+
+
+def _imagined(part: Any, answer: PlanResult, imagined: ImaginedPlan) -> None:
+    """Draw the start, the imagined steps and the goal, time from left to right; frames have the colours of films."""
+    last = answer.space.steps
+    panels: list[tuple[str, Kind, np.ndarray]] = [("start, decoded", "decoded", imagined.start)]
+    for step, image in imagined.steps.items():
+        name = f"imagined end\n(step {step})" if step == last else f"imagined,\nstep {step}"
+        panels.append((name, "imagined", image))
+    panels += [("goal, decoded", "decoded", imagined.decoded_goal), ("goal", "recorded", imagined.goal)]
+    for axes, (title, kind, image) in zip(part.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        colour = MEANING[kind][0]
+        axes.imshow(image)
+        axes.set(xticks=[], yticks=[])
+        for spine in axes.spines.values():
+            spine.set(visible=True, color=colour, linewidth=3)
+        axes.set_title(title, color=colour, fontsize=8)
+    note = "Imagined from the start and the plan's actions alone: what the model predicts, no evidence that it happens."
+    part.supxlabel(note, fontsize=8, color=GREY, x=0.01, ha="left")
 
 
 def _search(part: Any, answer: PlanResult, plan: Plan) -> None:

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from vjepa2_ac import __version__
 from vjepa2_ac.config import RldsData
 from vjepa2_ac.data.clips.windows import require_stride
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.video_writer import video_library
 from vjepa2_ac.planning.session import PlanningSession
@@ -60,6 +61,7 @@ class ClosedLoopBenchmark:
     planning_seed: int
     results: tuple[ClosedLoopResult, ...]
     warnings: tuple[str, ...] = ()  # of the session
+    decoder: str | None = None  # by which the video shows what was imagined
 
     @property
     def seconds_per_step(self) -> float:
@@ -68,7 +70,11 @@ class ClosedLoopBenchmark:
 
 
 def run_benchmark(
-    session: PlanningSession, options: BenchmarkOptions, folder: Path, reporter: Reporter = SILENT
+    session: PlanningSession,
+    options: BenchmarkOptions,
+    folder: Path,
+    reporter: Reporter = SILENT,
+    decoder: TrainedDecoder | None = None,
 ) -> tuple[ClosedLoopBenchmark, tuple[Path, ...]]:
     """Let all four solve the same problems; write closed_loop.json and the video. Cheap failures first.
 
@@ -77,19 +83,22 @@ def run_benchmark(
         options: The options.
         folder: The output folder; created if it is missing.
         reporter: Shows the progress of each policy.
+        decoder: Shows in the video, if there is one, what the model imagined; it does not affect the metrics.
 
     Raises:
-        InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, or a folder that is not
-            writable.
+        InputError: MuJoCo or PyAV is missing, no such domain, no stride, another frame, a folder that is not
+            writable, or a decoder of another encoder.
     """
     stride = _require_steerable(session)
+    if decoder is not None:
+        decoder.require_encoder(session.world_model, subject=session.subject)
     if options.films:
         video_library()
     with user_can_write(folder):
         folder.mkdir(parents=True, exist_ok=True)
     arm = arm_for(options.task, named_domain(options.domain), renderer=options.renderer)
     results = []
-    for policy in _policies(session, options, arm):
+    for policy in _policies(session, options, arm, decoder):
         films = options.films if isinstance(policy, Planning) else 0
         spec = RolloutSpec(options.task, arm.domain, options.episodes, options.seed, options.steps, stride, films)
         results.append(run_task(spec, policy, arm, reporter.task(f"{options.task}: {policy.name}")))
@@ -101,6 +110,7 @@ def run_benchmark(
         session.config.seed,
         tuple(results),
         session.warnings,
+        None if decoder is None else decoder.name,
     )
     path = folder / FILE
     write_atomically(path, json.dumps(benchmark_as_dict(benchmark), indent=1, allow_nan=False) + "\n")
@@ -141,6 +151,7 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
             "planning": benchmark.planning,
             "warnings": list(benchmark.warnings),
             "planning_seed": benchmark.planning_seed,
+            "decoder": benchmark.decoder,
             "version": __version__,
             "time": utc_now(),
         },
@@ -148,13 +159,15 @@ def benchmark_as_dict(benchmark: ClosedLoopBenchmark) -> dict[str, Any]:
     }
 
 
-def _policies(session: PlanningSession, options: BenchmarkOptions, arm: SimulatedArm) -> Sequence[Policy]:
+def _policies(
+    session: PlanningSession, options: BenchmarkOptions, arm: SimulatedArm, decoder: TrainedDecoder | None
+) -> Sequence[Policy]:
     limits = session.config.planning.limits
     uses_camera = session.world_model.sizes.predictor.use_extrinsics
     controller = session.controller(extrinsics=arm.extrinsics() if uses_camera else None)
     name = Path(session.subject).name or session.subject
     taken = {DoNothing.name, RandomActions.name, Oracle.name}
-    model = Planning(controller, name if name not in taken else f"model {name}")
+    model = Planning(controller, name if name not in taken else f"model {name}", decoder)
     return model, DoNothing(), RandomActions(limits, seed=options.seed), oracle_for(options.task, limits, arm)
 
 

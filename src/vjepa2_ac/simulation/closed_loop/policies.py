@@ -9,6 +9,9 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from vjepa2_ac.config.planning import LimitsConfig
+from vjepa2_ac.data.clips.transforms import frame_of_seen
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder
+from vjepa2_ac.decoding.imagined_plan import imagined_next
 from vjepa2_ac.planning.controller import Controller
 from vjepa2_ac.simulation.closed_loop.tasks import TaskProblem
 
@@ -37,6 +40,14 @@ class Policy(Protocol):
         self, image: UInt8[np.ndarray, "height width 3"], state: Float[np.ndarray, " dim"]
     ) -> Float[np.ndarray, " dim"]:
         """Return the action of the next model step from the camera image and the measured state, in base frame."""
+
+
+@runtime_checkable
+class Imagines(Protocol):
+    """A policy that can show what it expected of its last action."""
+
+    def imagined(self) -> UInt8[np.ndarray, "height width 3"] | None:
+        """Return the next camera image as it was imagined when the last action was chosen; None: nothing was."""
 
 
 class Reference:
@@ -122,10 +133,13 @@ class Planning:
     Args:
         controller: Plans with the model; its last `decision` can be read after every action.
         name: Of the model, as shown in tables.
+        decoder: Shows what it imagines, on the model's device; None: nothing does.
     """
 
-    def __init__(self, controller: Controller, name: str = "model") -> None:
+    def __init__(self, controller: Controller, name: str = "model", decoder: TrainedDecoder | None = None) -> None:
         self.controller, self.name, self.why = controller, name, ""
+        self._decoder = None if decoder is None else decoder.to(controller.device)
+        self._size = (0, 0)  # of the last image
         self.moves = Moves.FLANGE if controller.spaces.state.position is not None else Moves.JOINTS
 
     def reset(self, problem: TaskProblem, goal_image: UInt8[np.ndarray, "height width 3"]) -> None:  # noqa: ARG002
@@ -137,8 +151,18 @@ class Planning:
     ) -> Float[np.ndarray, " dim"]:
         """Return the first action of a plan; for joints as a change, whatever the model was taught."""
         action = self.controller.act(image, state)
+        self._size = image.shape[0], image.shape[1]
         self.why = self.controller.decision.why if self.controller.decision else ""
         return action - state if self.controller.spaces.action.follows == "target" else action
+
+    def imagined(self) -> UInt8[np.ndarray, "height width 3"] | None:
+        """Return the next camera image as it was imagined with the last action; white where the model sees nothing.
+
+        None: there is no decoder, or nothing was imagined, for example since the goal is reached.
+        """
+        decision = self.controller.decision
+        found = None if self._decoder is None or decision is None else imagined_next(decision, self._decoder)
+        return None if found is None else frame_of_seen(found, *self._size, self.controller.crop)
 
 
 def farthest(limits: LimitsConfig) -> Float[np.ndarray, " 7"]:

@@ -26,6 +26,7 @@ class EpisodeResult:
     unreachable: int  # commands that the arm could not follow completely
     goal_image: UInt8[np.ndarray, "height width 3"]
     frames: UInt8[np.ndarray, "time height width 3"] | None  # if they are stored
+    imagined: tuple[UInt8[np.ndarray, "height width 3"] | None, ...] = ()  # after each action, likewise; None: nothing
 
     @property
     def success(self) -> bool:

@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from vjepa2_ac.episode import Progress, no_progress
 from vjepa2_ac.geometry import apply_action
-from vjepa2_ac.simulation.closed_loop.policies import Moves, Policy
+from vjepa2_ac.simulation.closed_loop.policies import Imagines, Moves, Policy
 from vjepa2_ac.simulation.closed_loop.result import ClosedLoopResult, EpisodeResult
 from vjepa2_ac.simulation.closed_loop.tasks import STEPS, TaskName, TaskProblem, arm_for, make_problem
 from vjepa2_ac.simulation.world.arm import SimulatedArm
@@ -100,7 +100,7 @@ def run_episode(
     put(arm, problem.start, problem.block_start)
     policy.reset(problem, goal_image)
     states, blocks, frames = [arm.state], [arm.block], [arm.image()]
-    actions, seconds, whys, unreachable = [], [], [], 0
+    actions, seconds, whys, imagined, unreachable = [], [], [], [], 0
     for _ in range(steps):
         began = time.perf_counter()
         measured = states[-1] if policy.moves == Moves.FLANGE else np.append(arm.joints, arm.closedness)
@@ -108,6 +108,8 @@ def run_episode(
         seconds.append(time.perf_counter() - began)
         actions.append(_checked(action, policy))
         whys.append(policy.why)
+        if keep_frames and isinstance(policy, Imagines):
+            imagined.append(policy.imagined())
         unreachable += not (send_action if policy.moves == Moves.FLANGE else _send_joints)(arm, action, stride)
         states.append(arm.state)
         blocks.append(arm.block)
@@ -123,6 +125,7 @@ def run_episode(
         unreachable=unreachable,
         goal_image=goal_image,
         frames=np.stack(frames) if keep_frames else None,
+        imagined=tuple(imagined),
     )
 
 
