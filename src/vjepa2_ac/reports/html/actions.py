@@ -41,6 +41,7 @@ def actions_section(evaluation: Evaluation) -> Markup:
         drawings=drawings,
         moves=_moves(evaluation),
         axes=_axes(evaluation),
+        axes_not_to_use=_axes_not_to_use(evaluation),
     )
 
 
@@ -115,7 +116,6 @@ def _axes(evaluation: Evaluation) -> Table | None:
         [
             *(name, value(one.yaw_degrees, 0), value(one.error, 2), value(one.fitted_yaw_degrees, 0)),
             *(value(one.gain, 2), value(one.condition, 1), value(one.residual_cm, 1), str(one.pairs)),
-            "" if one.problem is None else f"not to plan by: {one.problem}",
         ]
         for name, one in measured.items()
     ]
@@ -129,7 +129,13 @@ def _axes(evaluation: Evaluation) -> Table | None:
         "off by (cm)",
         "pairs",
     ]
-    return [*head, ""], rows
+    return head, rows
+
+
+def _axes_not_to_use(evaluation: Evaluation) -> list[str]:
+    """Return, for each model whose axes are nothing to plan by, why."""
+    measured = {name: model.axes for name, model in evaluation.models.items() if model.axes is not None}
+    return [f"{name}: not to plan by: {one.problem}" for name, one in measured.items() if one.problem is not None]
 
 
 def _rank_chart(rankings: Sequence[tuple[Series, Ranking]]) -> Markup:
