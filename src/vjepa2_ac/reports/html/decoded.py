@@ -155,6 +155,7 @@ def _notes(found: DecodedRollouts) -> list[str]:
         "cycle": "Cycle error",
         "video": "V-JEPA 2 MMD",
         "hand": "The hand's position",
+        "ssim": "SSIM",
         "ms_ssim": "MS-SSIM",
     }
     notes = [f"{named[what]}: not measured, {reason}." for what, reason in found.absent.items()]
