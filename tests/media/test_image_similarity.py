@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from vjepa2_ac.media.image_similarity import mean_where, moving_region, ms_ssim, psnr, ssim, ssim_map
+from vjepa2_ac.media.image_similarity import mean_where, moving_region, ms_ssim, psnr, ssim, ssim_map, structure
 
 # size, case, PSNR, SSIM, MS-SSIM by scales: torchmetrics 1.9.0 on torch 2.13.0, data_range 1, `betas` the first scales'
 # default weights divided by their sum; images of `pair`.
@@ -151,3 +151,13 @@ def test_ms_ssim_of_a_region_does_not_see_what_is_far_from_it() -> None:
     changed[:, 120:, 120:] = 0.0
     torch.testing.assert_close(ms_ssim(changed, true, 3, where), ms_ssim(predicted, true, 3, where))
     assert ms_ssim(changed, true, 3) < ms_ssim(predicted, true, 3) - 0.01
+
+
+def test_structure_of_several_regions_is_that_of_each() -> None:
+    predicted, true = pair(1, (97, 64))
+    where = torch.zeros(97, 64, dtype=torch.bool)
+    where[20:60, 10:50] = True
+    whole, region = structure(predicted, true, 3, [None, where])
+    torch.testing.assert_close(whole, (ssim(predicted, true), ms_ssim(predicted, true, 3)))
+    expected = mean_where(ssim_map(predicted, true), where), ms_ssim(predicted, true, 3, where)
+    torch.testing.assert_close(region, expected)

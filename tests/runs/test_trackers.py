@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from vjepa2_ac.config import Config, TrackingConfig
@@ -45,6 +46,7 @@ class Kept:
 
     def __init__(self, fails_in: str = "") -> None:
         self.rows: list[tuple[int, dict[str, float]]] = []
+        self.images: list[tuple[int, str, np.ndarray]] = []
         self.fails_in = fails_in
         self.closed = 0
 
@@ -52,6 +54,11 @@ class Kept:
         if self.fails_in == "log":
             raise ConnectionError("the network\nis away")
         self.rows.append((step, dict(metrics)))
+
+    def log_image(self, name: str, image: np.ndarray, step: int) -> None:
+        if self.fails_in == "log":
+            raise ConnectionError("the network\nis away")
+        self.images.append((step, name, image))
 
     def close(self) -> None:
         self.closed += 1
@@ -262,3 +269,58 @@ def test_trackio_goes_on_in_the_same_run(tmp_path: Path) -> None:
         trackers.close()
     (run,) = trackio.Api().runs("arms")
     assert run.name == "abc123"
+
+
+IMAGE = np.arange(60, dtype=np.uint8).reshape(4, 5, 3)
+
+
+def test_images_come_after_the_rows_before_them_and_one_that_fails_costs_one_warning(caplog) -> None:
+    kept, bad = Kept(), Kept("log")
+    trackers = Trackers({"good": lambda: kept, "bad": lambda: bad})
+    trackers.log_image("validation", "imagined", 7, IMAGE)
+    trackers.log("validation", 7, {"error": 0.5})
+    trackers.close()
+    ((step, name, image),) = kept.images
+    assert (step, name) == (7, "validation/imagined")
+    assert np.array_equal(image, IMAGE)
+    assert len(kept.rows) == 1
+    assert [text.split(" (")[0] for text in warnings_in(caplog)] == ["bad failed"]
+
+
+def test_few_images_wait_for_a_tracker_and_rows_do_not_suffer(caplog, monkeypatch) -> None:
+    monkeypatch.setattr(tracker_thread, "MOST_IMAGES", 2)
+    opens, slow = threading.Event(), Kept()
+
+    def opened() -> Kept:
+        opens.wait(60)
+        return slow
+
+    trackers = Trackers({"slow": opened}, closing_s=60.0)
+    for step in range(5):
+        trackers.log_image("validation", "imagined", step, IMAGE)
+        trackers.log("validation", step, {"error": 0.5})
+    opens.set()
+    trackers.close()
+    assert [step for step, *_ in slow.images] == [0, 1]
+    assert [step for step, _ in slow.rows] == [0, 1, 2, 3, 4]
+    assert warnings_in(caplog) == ["slow was too slow for 3 rows, which are missing there"]
+
+
+def test_tensorboard_gets_images(tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    trackers = open_trackers(run_config(tmp_path, tensorboard=True), tmp_path, run_id="x", first_step=0)
+    trackers.log_image("validation", "imagined", 3, IMAGE)
+    trackers.close()
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    (event,) = events.Images("validation/imagined")
+    assert (event.step, event.height, event.width) == (3, 4, 5)
+
+
+def test_weights_and_biases_gets_images_without_a_network(tmp_path: Path) -> None:
+    pytest.importorskip("wandb")
+    trackers = open_trackers(run_config(tmp_path, wandb="offline"), tmp_path, run_id="abc", first_step=0)
+    trackers.log_image("validation", "imagined", 3, IMAGE)
+    trackers.close()
+    assert len(list((tmp_path / "wandb").rglob("imagined_3_*.png"))) == 1

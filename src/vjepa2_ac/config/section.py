@@ -17,6 +17,7 @@ Share = Annotated[float, Field(ge=0.0, lt=1.0)]
 OFF = BeforeValidator(lambda value: "off" if value is False else value)  # YAML reads off as a boolean
 Place = Annotated[str, AfterValidator(places.anywhere)]  # on this machine, where ~ is the user's home, or a URL
 Local = Annotated[str, AfterValidator(places.on_this_machine)]  # likewise, but no URL
+LocalOrBuiltin = Annotated[str, AfterValidator(places.of_a_model)]  # likewise, or a part of the package
 
 
 class Section(BaseModel):

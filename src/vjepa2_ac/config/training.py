@@ -7,7 +7,17 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from vjepa2_ac.config.effects import Affects
-from vjepa2_ac.config.section import OFF, Count, NonNegative, Place, Positive, PositiveInt, Section, ZeroToOne
+from vjepa2_ac.config.section import (
+    OFF,
+    Count,
+    LocalOrBuiltin,
+    NonNegative,
+    Place,
+    Positive,
+    PositiveInt,
+    Section,
+    ZeroToOne,
+)
 
 
 def _earlier_keep_best(value: object) -> object:
@@ -130,6 +140,9 @@ class ValidationConfig(Section):
     """Other actions per move, drawn in each of two ways: in a box, and of the same length in any direction."""
     ranking_reach_cm: Annotated[float, Field(gt=0.0, le=100.0), Affects.MEASURED] = 7.5
     """Half the width of the box along x, y and z: as far as plans should move in a model step."""
+    decoder: Annotated[LocalOrBuiltin | None, Affects.NOTHING] = None
+    """Folder of a decoder (docs/decoding.md), or builtin:sim-tiny: with it each validation draws what base and model
+    imagine of one validation clip, the one with the most motion: in RUN/imagined and in the trackers. null: none."""
 
 
 class CheckpointConfig(Section):

@@ -8,7 +8,9 @@ scores better than a sharp one 12 pixels off. State them beside LPIPS, and insid
 from __future__ import annotations
 
 import math
-from functools import lru_cache
+from collections.abc import Sequence
+from functools import lru_cache, reduce
+from operator import mul
 
 import torch
 from jaxtyping import Bool, Float
@@ -89,26 +91,22 @@ def ms_ssim(
 
     Source: Wang, Simoncelli, Bovik (2003), Multiscale structural similarity, equation 7.
     """
-    if not 1 <= scales <= len(_SCALE_WEIGHTS):
-        raise ValueError(f"{scales} scales; there are weights for 1 to {len(_SCALE_WEIGHTS)}")
-    if min(predicted.shape[-2:]) >> (scales - 1) < 2 * _RADIUS + 1:
-        size = " x ".join(str(side) for side in predicted.shape[-2:])
-        least = (2 * _RADIUS + 1) << (scales - 1)
-        raise ValueError(f"images of {size} px are too small for {scales} scales, which need {least} px a side")
-    weights = [weight / sum(_SCALE_WEIGHTS[:scales]) for weight in _SCALE_WEIGHTS[:scales]]
-    product = torch.ones(predicted.shape[:-3], device=predicted.device)
-    for scale, weight in enumerate(weights):
-        similarity, contrast = _terms(predicted, true)
-        if scale == scales - 1:
-            factor = mean_where(similarity.mean(dim=-3), where)
-        else:  # without the border, where the window sees reflections
-            inside = contrast[..., _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
-            counted = None if where is None else where[..., _RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
-            factor = mean_where(inside.mean(dim=-3), counted)
-            predicted, true = _halved(predicted), _halved(true)
-            where = None if where is None else _halved(where[..., None, :, :].float())[..., 0, :, :] > 0
-        product = product * _power(factor, weight)
-    return product
+    return _product(_maps(predicted, true, scales), where)
+
+
+def structure(
+    predicted: Float[Tensor, "*batch 3 height width"],
+    true: Float[Tensor, "*batch 3 height width"],
+    scales: int,
+    regions: Sequence[Bool[Tensor, "*batch height width"] | None],
+) -> list[tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]]:
+    """Return SSIM and MS-SSIM of each image in several regions (None: the whole image); nothing is computed twice.
+
+    Raises:
+        ValueError: As of `ms_ssim`.
+    """
+    maps = _maps(predicted, true, scales)
+    return [(mean_where(maps[0][0], where), _product(maps, where)) for where in regions]
 
 
 def moving_region(true: Float[Tensor, "*batch time 3 height width"]) -> Bool[Tensor, "*batch time-1 height width"]:
@@ -122,6 +120,40 @@ def moving_region(true: Float[Tensor, "*batch time 3 height width"]) -> Bool[Ten
     flat = moved.reshape(-1, 1, *moved.shape[-2:]).float()
     dilated = torch.nn.functional.max_pool2d(flat, 2 * DILATED_BY + 1, stride=1, padding=DILATED_BY)
     return (dilated > 0).reshape(moved.shape)
+
+
+def _maps(
+    predicted: Float[Tensor, "*batch 3 height width"], true: Float[Tensor, "*batch 3 height width"], scales: int
+) -> list[tuple[Tensor, Tensor]]:
+    """Return similarity and contrast at each pixel of each scale, as means over R, G and B."""
+    if not 1 <= scales <= len(_SCALE_WEIGHTS):
+        raise ValueError(f"{scales} scales; there are weights for 1 to {len(_SCALE_WEIGHTS)}")
+    if min(predicted.shape[-2:]) >> (scales - 1) < 2 * _RADIUS + 1:
+        size = " x ".join(str(side) for side in predicted.shape[-2:])
+        least = (2 * _RADIUS + 1) << (scales - 1)
+        raise ValueError(f"images of {size} px are too small for {scales} scales, which need {least} px a side")
+    maps = []
+    for scale in range(scales):
+        if scale:
+            predicted, true = _halved(predicted), _halved(true)
+        similarity, contrast = _terms(predicted, true)
+        maps.append((similarity.mean(dim=-3), contrast.mean(dim=-3)))
+    return maps
+
+
+def _product(
+    maps: Sequence[tuple[Tensor, Tensor]], where: Bool[Tensor, "*batch height width"] | None
+) -> Float[Tensor, "*batch"]:
+    """Return the MS-SSIM of a region from the maps of each scale."""
+    weights = [weight / sum(_SCALE_WEIGHTS[: len(maps)]) for weight in _SCALE_WEIGHTS[: len(maps)]]
+    *finer, (coarsest, _) = maps
+    factors = []
+    for _, contrast in finer:  # without the border, where the window sees reflections
+        inside = (..., slice(_RADIUS, -_RADIUS), slice(_RADIUS, -_RADIUS))
+        factors.append(mean_where(contrast[inside], None if where is None else where[inside]))
+        where = None if where is None else _halved(where[..., None, :, :].float())[..., 0, :, :] > 0
+    factors.append(mean_where(coarsest, where))
+    return reduce(mul, (_power(one, weight) for one, weight in zip(factors, weights, strict=True)))
 
 
 def mean_where(

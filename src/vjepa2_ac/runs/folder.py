@@ -9,6 +9,7 @@ RUN/metrics.jsonl       metrics, a row per line
 RUN/metrics.json        what `evaluate` measured; report.html and evaluation.png show it
 RUN/checkpoints/        step-XXXXXXXX folders
 RUN/tensorboard/        event files; RUN/wandb/ likewise
+RUN/imagined/           what is imagined at each validation, where `validation.decoder` is set; and films of `imagine`
 RUN/not_finite/         clips of a step that could not be done
 RUN/.mirror/            links to what is being sent to checkpoint.remote, while it is
 RUN/.lock               held by the process that is training, see `runs.lock`
@@ -48,12 +49,14 @@ METRICS = "metrics.jsonl"
 TENSORBOARD, WANDB = "tensorboard", "wandb"
 _ID = re.compile(r"[\w.-]{0,128}")
 _MOST_BYTES_OF_ID = 1_000
+IMAGINED = "imagined"  # images of what the model imagines
 NOT_FINITE = "not_finite"  # each process writes its own, on the disk that it sees
 
 _OWN = (
     *(LOCK, CONFIG, ENVIRONMENT, CALIBRATION, CHANGES, RUN_ID, METRICS),
-    *(CHECKPOINTS, HELD, TENSORBOARD, WANDB, NOT_FINITE),
+    *(CHECKPOINTS, HELD, TENSORBOARD, WANDB, NOT_FINITE, IMAGINED),
 )
+_FILLED = (NOT_FINITE, IMAGINED)  # folders of files that are written one by one
 
 
 def check_run_folder(config: Config, *, allow_config_change: bool = False) -> None:
@@ -70,7 +73,8 @@ def check_run_folder(config: Config, *, allow_config_change: bool = False) -> No
     folder = Path(config.run_dir)
     if folder.exists() and not folder.is_dir():
         raise InputError(where=str(folder), found="a file", needed="a folder for the run", fix="Set another run_dir")
-    refuse_links_out(folder, [*_OWN, *(f"{NOT_FINITE}/{path.name}" for path in (folder / NOT_FINITE).glob("*"))])
+    written = (f"{name}/{path.name}" for name in _FILLED for path in (folder / name).glob("*"))
+    refuse_links_out(folder, [*_OWN, *written])
     if (folder / CONFIG).exists():
         if not allow_config_change:
             _refuse_another_config(folder, config)

@@ -18,6 +18,7 @@ from typing import Any
 from vjepa2_ac.errors import InputError, UserError
 from vjepa2_ac.runs.folder import METRICS
 from vjepa2_ac.runs.slow_disk import warn_if_stalled
+from vjepa2_ac.runs.tracker_thread import Image
 from vjepa2_ac.runs.trackers import Trackers
 from vjepa2_ac.storage import read_bounded, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import finite_or_none, json_object
@@ -56,6 +57,10 @@ class MetricsLog:
         self._waiting += (json.dumps(row) + "\n").encode()
         self._write()
         self._trackers.log(kind, step, metrics)
+
+    def show(self, kind: str, name: str, step: int, image: Image) -> None:
+        """Send an image to the trackers; it is no part of metrics.jsonl."""
+        self._trackers.log_image(kind, name, step, image)
 
     @property
     def is_behind(self) -> bool:

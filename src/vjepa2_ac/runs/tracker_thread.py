@@ -9,9 +9,15 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+from jaxtyping import UInt8
+
 logger = logging.getLogger(__name__)
 
 MOST_ROWS = 10_000  # in the queue: some 15 MB
+MOST_IMAGES = 8  # likewise
+
+Image = UInt8[np.ndarray, "height width 3"]
 
 
 @runtime_checkable
@@ -22,12 +28,17 @@ class Tracker(Protocol):
         """Log the metrics of a row, named kind/metric, and its optimizer step."""
         ...
 
+    def log_image(self, name: str, image: Image, step: int) -> None:
+        """Log an image, named kind/image, and its optimizer step."""
+        ...
+
     def close(self) -> None:
         """Write pending rows."""
         ...
 
 
 Opening = Callable[[], Tracker]
+_Send = Callable[[Tracker], None]
 
 
 class TrackerThread:
@@ -41,7 +52,8 @@ class TrackerThread:
 
     def __init__(self, name: str, opening: Opening, *, patience_s: float) -> None:
         self._name, self._opening, self._patience_s = name, opening, patience_s
-        self._rows: queue.SimpleQueue[tuple[Mapping[str, float], int] | None] = queue.SimpleQueue()
+        self._rows: queue.SimpleQueue[_Send | None] = queue.SimpleQueue()
+        self._images = threading.BoundedSemaphore(MOST_IMAGES)  # free places in the queue
         self._problem, self._since_s = "cannot be opened", time.monotonic()  # of the current call
         self._warned, self._dropped = False, 0
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
@@ -49,10 +61,25 @@ class TrackerThread:
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
         """Queue a row."""
+        self._put(lambda tracker: tracker.log(metrics, step))
+
+    def log_image(self, name: str, image: Image, step: int) -> None:
+        """Queue an image."""
+
+        def send(tracker: Tracker) -> None:
+            self._images.release()
+            tracker.log_image(name, image, step)
+
+        if self._images.acquire(blocking=False):
+            self._put(send)
+        else:
+            self._dropped += 1
+
+    def _put(self, send: _Send) -> None:
         if not self._thread.is_alive():
             return
         if self._rows.qsize() < MOST_ROWS:
-            self._rows.put((metrics, step))
+            self._rows.put(send)
         else:
             self._dropped += 1
         if time.monotonic() - self._since_s > self._patience_s:
@@ -80,9 +107,9 @@ class TrackerThread:
         try:
             tracker = self._opening()
             self._idle()
-            while (row := self._rows.get()) is not None:
+            while (send := self._rows.get()) is not None:
                 self._call("failed")
-                tracker.log(*row)
+                send(tracker)
                 self._idle()
             after = "its last metrics may be missing there"
             self._call("did not close")

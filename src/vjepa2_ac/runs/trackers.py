@@ -12,7 +12,7 @@ import importlib.util
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from vjepa2_ac.config import Config, TrackingConfig
 from vjepa2_ac.config.loading import config_as_flat_dict
 from vjepa2_ac.errors import InputError, pip_install
 from vjepa2_ac.runs.folder import TENSORBOARD
-from vjepa2_ac.runs.tracker_thread import Opening, TrackerThread
+from vjepa2_ac.runs.tracker_thread import Image, Opening, TrackerThread
 
 PATIENCE_S = 60.0  # after which a warning says that a tracker does not answer
 CLOSING_S = 30.0  # that the end of a run waits for all of them
@@ -46,6 +46,11 @@ class Trackers:
         numbers = {f"{kind}/{key}": value for key, value in _numbers(metrics).items()}
         for thread in self._threads:
             thread.log(numbers, step)
+
+    def log_image(self, kind: str, name: str, step: int, image: Image) -> None:
+        """Log an image, which nobody changes any more."""
+        for thread in self._threads:
+            thread.log_image(f"{kind}/{name}", image, step)
 
     def close(self) -> None:
         """Close all; a second call does nothing."""
@@ -88,9 +93,9 @@ def open_trackers(config: Config, folder: Path, *, run_id: str, first_step: int)
     if tracking.tensorboard:
         openings["TensorBoard"] = lambda: _TensorBoard(folder / TENSORBOARD, first_step)
     if tracking.wandb != "disabled":
-        openings["Weights & Biases"] = lambda: _OnlineRun(_wandb_run(config, folder, run_id))
+        openings["Weights & Biases"] = lambda: _wandb_run(config, folder, run_id)
     if tracking.trackio:
-        openings["trackio"] = lambda: _OnlineRun(_trackio_run(config, run_id))
+        openings["trackio"] = lambda: _trackio_run(config, run_id)
     return Trackers(openings)
 
 
@@ -104,6 +109,9 @@ class _TensorBoard:
         for name, value in metrics.items():
             self._writer.add_scalar(name, value, step)
 
+    def log_image(self, name: str, image: Image, step: int) -> None:
+        self._writer.add_image(name, image, step, dataformats="HWC")
+
     def close(self) -> None:
         self._writer.close()
 
@@ -114,23 +122,26 @@ class _OnlineRun:
     W&B ignores rows of steps that it has already: a resumed run repeats the same metrics.
     """
 
-    def __init__(self, run: Any) -> None:
-        self._run = run
+    def __init__(self, run: Any, as_image: Callable[[Image], Any]) -> None:
+        self._run, self._as_image = run, as_image
 
     def log(self, metrics: Mapping[str, float], step: int) -> None:
         self._run.log(dict(metrics), step=step)
+
+    def log_image(self, name: str, image: Image, step: int) -> None:
+        self._run.log({name: self._as_image(image)}, step=step)
 
     def close(self) -> None:
         self._run.finish()
 
 
-def _wandb_run(config: Config, folder: Path, run_id: str) -> Any:
+def _wandb_run(config: Config, folder: Path, run_id: str) -> _OnlineRun:
     import wandb
 
     # Output is not captured: it would contain the console's progress bar. Times are bounded where W&B can.
     bounds: dict[str, Any] = {"init_timeout": 20.0, "login_timeout": 30.0, "finish_timeout": 20.0, "console": "off"}
     known = getattr(wandb.Settings, "model_fields", {})
-    return wandb.init(
+    run = wandb.init(
         project=config.tracking.project,
         id=run_id,
         name=folder.resolve().name,
@@ -141,14 +152,16 @@ def _wandb_run(config: Config, folder: Path, run_id: str) -> Any:
         allow_val_change=True,
         settings=wandb.Settings(**{name: value for name, value in bounds.items() if name in known}),
     )
+    return _OnlineRun(run, lambda image: wandb.Image(image))  # looked up late: an old version may have none
 
 
-def _trackio_run(config: Config, run_id: str) -> Any:
+def _trackio_run(config: Config, run_id: str) -> _OnlineRun:
     """Open trackio, which identifies a run by its name: that is therefore the run's id."""
     import trackio
 
     plain, project = config_as_flat_dict(config), config.tracking.project
-    return trackio.init(project=project, name=run_id, resume="allow", config=plain, embed=False)
+    run = trackio.init(project=project, name=run_id, resume="allow", config=plain, embed=False)
+    return _OnlineRun(run, lambda image: trackio.Image(image))
 
 
 def _numbers(metrics: Mapping[str, Any]) -> dict[str, float]:

@@ -8,6 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from vjepa2_ac.evaluation.result import Validation
 from vjepa2_ac.reporter import Reporter
+from vjepa2_ac.runs.tracker_thread import Image
 
 
 @runtime_checkable
@@ -32,6 +33,9 @@ class NullMetricsLog:
 
     def write(self, kind: str, step: int, metrics: Mapping[str, Any]) -> None:
         """Write nothing."""
+
+    def show(self, kind: str, name: str, step: int, image: Image) -> None:
+        """Show nothing."""
 
     is_behind = False
 

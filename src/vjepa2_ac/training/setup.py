@@ -18,6 +18,7 @@ from vjepa2_ac.data.clips.prefetch import Batches
 from vjepa2_ac.data.clips.streams import Copies, copies_for
 from vjepa2_ac.data.index.index_cache import fingerprints_of
 from vjepa2_ac.data.inspection.duplicates import find_duplicates
+from vjepa2_ac.decoding.decoder_folder import TrainedDecoder, load_decoder
 from vjepa2_ac.distributed.collectives import all_gather_object, broadcast_object
 from vjepa2_ac.distributed.device import PRECISIONS
 from vjepa2_ac.distributed.launch import make_accelerator
@@ -45,6 +46,7 @@ from vjepa2_ac.runs.torch_file import write_torch
 from vjepa2_ac.training.fsdp import full_optimizer_state_dict, full_state_dict
 from vjepa2_ac.training.loss import Objective
 from vjepa2_ac.training.micro_step import CapturedMicroStep, MicroStep, captured_on_cuda
+from vjepa2_ac.training.monitoring.imagined_strip import ImaginedStrip
 from vjepa2_ac.training.new_embodiment import check_heads, fit_to_data
 from vjepa2_ac.training.optim import make_optimizer, trained_parameters
 from vjepa2_ac.training.replay import open_replay, require_same_form
@@ -64,6 +66,7 @@ class RunData:
     calibration: Calibration | None  # if data.stride was auto and is now chosen
     world_model: WorldModel | None  # the base, if it has chosen the stride
     replayed: Dataset | None = None  # the second data set, if there is one
+    decoder: TrainedDecoder | None = None  # of `validation.decoder`
 
 
 @dataclass
@@ -81,6 +84,7 @@ class Run:
     micro_batches: int  # of this process, per optimizer step
     calibration: Calibration | None = None  # if data.stride was auto and is now chosen
     replayed: Dataset | None = None  # the second data set, if there is one
+    strip: ImaginedStrip | None = None  # of `validation.decoder`
 
     @property
     def folder(self) -> Path:
@@ -143,6 +147,7 @@ def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelera
     accelerator, is_auto = accelerator or make_accelerator(config), config.data.stride == "auto"
     if is_auto:
         require_learned(config.model)
+    decoder = _decoder_of(config)
     with accelerator.local_main_process_first():  # the others find the index of the first one on this machine
         dataset = open_dataset(config.data, progress=reporter.task(INDEXING))
         replayed = open_replay(config, dataset, reporter)
@@ -157,7 +162,7 @@ def open_data(config: Config, reporter: Reporter = SILENT, accelerator: Accelera
     first_clip = _read_one_clip_of_each_split(dataset)
     if replayed is not None:
         _require_fitting_clips(dataset, replayed, first_clip)
-    return RunData(config, accelerator, dataset, first_clip, calibration, world_model, replayed)
+    return RunData(config, accelerator, dataset, first_clip, calibration, world_model, replayed, decoder)
 
 
 def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool = False) -> Run:
@@ -174,6 +179,8 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
     config, accelerator, training = data.config, data.accelerator, data.config.training
     world_model = data.world_model or load_base(config.model, seed=config.seed)
     extrinsics_for(world_model, data.first_clip)
+    if data.decoder is not None:
+        data.decoder.require_encoder(world_model, subject=str(config.model.base or "the random model"))
     dataset = with_latents(config, data.dataset, world_model, accelerator, reporter, check_only=check_only)
     replayed = data.replayed
     if replayed is not None:
@@ -205,6 +212,7 @@ def open_model(data: RunData, reporter: Reporter = SILENT, *, check_only: bool =
         micro_batches=training.accumulation,
         calibration=data.calibration,
         replayed=replayed,
+        strip=None if data.decoder is None else ImaginedStrip(data.decoder, dataset, world_model.image_size),
     )
 
 
@@ -264,6 +272,11 @@ def save_checkpoint(run: Run, folder: Path) -> None:
     if writes:
         with warn_if_stalled(folder / CHECKPOINTS / checkpoint_name(run.state.step)):
             write_checkpoint(folder / CHECKPOINTS, run.state, write, keep=run.config.checkpoint.keep)
+
+
+def _decoder_of(config: Config) -> TrainedDecoder | None:
+    name = config.validation.decoder
+    return None if name is None else load_decoder(name, where="validation.decoder:")
 
 
 def _started(config: Config) -> Path | None:

@@ -35,10 +35,23 @@ def validate_if_due(run: Run, metrics_log: MetricsLog | NullMetricsLog, reporter
 def record(run: Run, metrics: dict[str, Any], metrics_log: MetricsLog | NullMetricsLog) -> bool:
     """Log a validation's metrics; return whether it is the best so far, by `checkpoint.keep_best`."""
     metrics_log.write("validation", run.state.step, metrics)
+    _draw_strip(run, metrics_log)
     by, before = run.config.checkpoint.keep_best, run.state
     if by != "off":
         run.state = before.measured(metrics[BEST_BY], metrics[RANK] if by == "ranking" else None)
     return run.state.best_step != before.best_step
+
+
+def _draw_strip(run: Run, metrics_log: MetricsLog | NullMetricsLog) -> None:
+    """Show what the model imagines now, if `validation.decoder` is set. All processes call, the first one draws."""
+    if run.strip is None:
+        return
+    with run.accelerator.autocast():
+        latents = run.strip.roll_out(run.world_model, run.accelerator.device)
+    if latents is not None and run.accelerator.is_main_process:
+        image = run.strip.write(latents, run.folder, run.state.step)
+        if image is not None:
+            metrics_log.show("validation", "imagined", run.state.step, image)
 
 
 def is_out_of_patience(run: Run) -> bool:
@@ -74,7 +87,7 @@ def validate(run: Run, reporter: TrainingReporter) -> Validation:
     batches = batches_of(run.dataset, windows, batch_size=config.validation.batch_size, copies=run.copies)
     moves: list[RolloutStart] = []
     with run.accelerator.autocast():
-        encoded = (encode(run, batch) for batch in batches)
+        encoded = (run.strip.seen(batch, encode(run, batch)) if run.strip else encode(run, batch) for batch in batches)
         errors = prediction_errors(run.world_model, _moves_kept(run, encoded, len(windows), moves))
         found = Validation(errors, _ranking(run, moves) if moves else None)
     reporter.validated(run.state.step, found)

@@ -24,7 +24,7 @@ def test_every_similarity_is_of_both_regions_and_a_change_elsewhere_does_not_cou
     np.testing.assert_allclose(found["moving", "ssim"], 1.0, atol=1e-6)
     assert (found["whole", "ssim"] < 0.99).all()
     assert set(similarities(shown, true, None)) == {("whole", metric) for metric in SIMILARITIES}
-    assert set(similarities(shown[..., :8, :8], true[..., :8, :8], None)) == {("whole", "psnr_db"), ("whole", "ssim")}
+    assert set(similarities(shown[..., :8, :8], true[..., :8, :8], None)) == {("whole", "psnr_db")}
 
 
 def test_a_cycle_error_is_the_mean_over_tokens_and_numbers() -> None:

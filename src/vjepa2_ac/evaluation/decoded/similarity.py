@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from vjepa2_ac.media.image_similarity import mean_where, ms_ssim, psnr, ssim_map
+from vjepa2_ac.media.image_similarity import psnr, structure
 
 Reference = Literal["truth", "decoded_truth"]
 Region = Literal["whole", "moving"]
@@ -27,7 +27,6 @@ SIMILARITIES: tuple[Similarity, ...] = get_args(Similarity)
 Key = tuple[str, Reference, Region, Similarity]  # the first: a model or a neighbour
 Arrays = Mapping[Key, Float[np.ndarray, "clips horizon"]]
 
-_LEAST_SSIM = 6  # pixels a side
 _WINDOW = 11  # pixels, which fit into the coarsest scale
 _SCALES_OF_LARGE, _SCALES_OF_SMALL, _LARGE = 5, 3, 176
 
@@ -45,25 +44,26 @@ def similarities(
 ) -> dict[tuple[Region, Similarity], Float[np.ndarray, "batch horizon"]]:
     """Return every similarity, of whole images and of the moving region.
 
-    PSNR of identical images is infinite; where nothing moves, the region's values are NaN. Images that are too small
-    for a metric have none.
+    PSNR of identical images is infinite; where nothing moves, the region's values are NaN. Images of fewer
+    than 11 pixels a side have PSNR alone.
 
     Args:
         shown: Images in 0 .. 1.
         true: Likewise.
         moving: The region; None: it is not known.
     """
-    side, found = shown.shape[-1], {}
-    regions: dict[Region, Tensor | None] = {"whole": None} | ({} if moving is None else {"moving": moving})  # type: ignore[assignment]
-    structure = ssim_map(shown, true) if side >= _LEAST_SSIM else None
-    scales = scales_for(side)
-    for region, where in regions.items():
-        found[region, "psnr_db"] = psnr(shown, true, where)
-        if structure is not None:
-            found[region, "ssim"] = mean_where(structure, where)
-        if scales:
-            found[region, "ms_ssim"] = ms_ssim(shown, true, scales, where)
-    return {key: one.double().cpu().numpy() for key, one in found.items()}  # type: ignore[misc]
+    regions: dict[Region, Tensor | None] = {"whole": None}
+    if moving is not None:
+        regions["moving"] = moving
+    found: dict[tuple[Region, Similarity], Tensor] = {
+        (region, "psnr_db"): psnr(shown, true, where) for region, where in regions.items()
+    }
+    scales = scales_for(shown.shape[-1])
+    if scales:
+        pairs = structure(shown, true, scales, list(regions.values()))
+        for region, (one, of_scales) in zip(regions, pairs, strict=True):
+            found[region, "ssim"], found[region, "ms_ssim"] = one, of_scales
+    return {key: one.double().cpu().numpy() for key, one in found.items()}
 
 
 def cycle_error(

@@ -252,7 +252,7 @@ class _Seen:
         if self.decoding.encoder is None:
             found["cycle"] = _NO_ENCODER
         if not scales_for(self._size):
-            found["ms_ssim"] = _TOO_SMALL.format(self._size)
+            found |= dict.fromkeys(("ssim", "ms_ssim"), _TOO_SMALL.format(self._size))
         return found
 
 

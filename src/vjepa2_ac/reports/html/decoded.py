@@ -83,8 +83,11 @@ _TITLES: dict[Similarity, str] = {"psnr_db": "PSNR (dB)", "ssim": "SSIM", "ms_ss
 
 
 def _charted(found: DecodedRollouts) -> tuple[Reference, Region, Similarity]:
-    """Return what the chart shows: where something moves, against the truth, if there are true frames."""
-    return ("decoded_truth", "whole", "ssim") if "truth" in found.absent else ("truth", "moving", "psnr_db")
+    """Return what the chart shows: where something moves, against the truth, if there are true frames and motion."""
+    if "truth" in found.absent:
+        return "decoded_truth", "whole", "ssim"
+    moving = similarity_of(found, DECODED_PERSISTENCE, "truth", "moving", "psnr_db")
+    return "truth", "moving" if any(one.estimate is not None for one in moving) else "whole", "psnr_db"
 
 
 def _lines(
@@ -142,7 +145,7 @@ def _shown(found: Found, digits: int) -> Markup | str:
 
 def _video_cell(found: DecodedRollouts, source: str) -> Markup | str:
     one = None if found.video is None else found.video.against_truth.get(source)
-    return NOT_MEASURED if one is None else value(one.squared) + f"; p {decimal(one.p_value)}"
+    return NOT_MEASURED if one is None else value(one.squared, 4) + f"; p {decimal(one.p_value)}"
 
 
 def _notes(found: DecodedRollouts) -> list[str]:
@@ -152,6 +155,7 @@ def _notes(found: DecodedRollouts) -> list[str]:
         "cycle": "Cycle error",
         "video": "V-JEPA 2 MMD",
         "hand": "The hand's position",
+        "ssim": "SSIM",
         "ms_ssim": "MS-SSIM",
     }
     notes = [f"{named[what]}: not measured, {reason}." for what, reason in found.absent.items()]
@@ -161,7 +165,9 @@ def _notes(found: DecodedRollouts) -> list[str]:
     if found.video is not None:
         floor = found.video.noise_floor.get(TRUE_FRAMES)
         notes += (
-            [] if floor is None else [f"Two halves of the true episodes stay below a V-JEPA 2 MMD of {decimal(floor)}."]
+            []
+            if floor is None
+            else [f"Two halves of the true episodes stay below a V-JEPA 2 MMD of {decimal(floor, 4)}."]
         )
         notes += found.video.notes
     if found.hand is not None:

@@ -1,0 +1,132 @@
+"""A validation draws what base and model imagine of one clip, and the run is the same with it and without."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from random_decoder import write_decoder
+from run_fixtures import set_up
+from same_run import assert_same_run
+from vjepa2_ac.data.clips.loader import validation_windows
+from vjepa2_ac.decoding.decoder_folder import load_decoder
+from vjepa2_ac.decoding.imagine import AS_RECORDED
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.image_file import read_image
+from vjepa2_ac.model.checkpoints.loading import load_base
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.runs.metrics_log import MetricsLog
+from vjepa2_ac.training import setup
+from vjepa2_ac.training.loop import train
+from vjepa2_ac.training.monitoring import imagined_strip
+from vjepa2_ac.training.validation import validate
+
+
+@pytest.fixture
+def decoder(tmp_path: Path, make_config) -> str:
+    model = load_base(make_config().model, seed=0)
+    assert isinstance(model, WorldModel)
+    return str(write_decoder(tmp_path / "decoder", model))
+
+
+def names(run: Path) -> list[str]:
+    return sorted(path.name for path in (run / "imagined").iterdir())
+
+
+STRIPS = ["step-00000000.png", "step-00000003.png", "step-00000006.png"]
+
+
+def test_a_run_with_strips_equals_the_one_without_bit_for_bit(
+    make_config, reporter, whole_run, decoder, monkeypatch
+) -> None:
+    sent = []
+    monkeypatch.setattr(MetricsLog, "show", lambda _, *given: sent.append(given))
+    run = train(make_config(validation__decoder=decoder), reporter)
+    assert_same_run(whole_run, run)
+    assert names(run) == STRIPS
+    assert [(kind, name, step) for kind, name, step, _ in sent] == [("validation", "imagined", n) for n in (0, 3, 6)]
+    assert np.array_equal(read_image(run / "imagined" / STRIPS[1]), sent[1][3])
+    assert not np.array_equal(sent[0][3][60:], sent[2][3][60:]), "the model has learned something"
+
+
+def test_the_clip_is_the_one_with_the_most_motion_and_its_rows_are_true(make_config, reporter, decoder) -> None:
+    run = set_up(make_config(validation__decoder=decoder), reporter)
+    validate(run, reporter)
+    assert run.strip is not None
+    rollouts = run.strip.roll_out(run.world_model, run.accelerator.device)
+    assert rollouts is not None
+    found = run.strip._imagination(run.strip._clip, rollouts, run.folder, 3)
+    windows = validation_windows(run.dataset, "validation", clips=4)
+    moved = {}
+    for episode, start in windows:
+        states = run.dataset.source.read(episode, None).states[start : start + run.dataset.config.clip_steps : 2, :3]
+        moved[run.dataset.table.identity(episode), start] = np.linalg.norm(np.diff(states, axis=0), axis=1).sum()
+    assert (found.episode_id, found.start) == max(moved, key=lambda name: moved[name])
+    assert [(one.model, one.name, len(one.frames)) for one in found.rollouts] == [
+        ("base", AS_RECORDED, 3), ("model now", AS_RECORDED, 3),
+    ]  # fmt: skip
+    assert np.array_equal(found.rollouts[0].frames, found.rollouts[1].frames), "a fresh adapter changes nothing"
+    assert found.truth is not None
+    assert found.truth.shape == (3, 32, 32, 3)
+
+
+def test_a_model_without_an_adapter_is_drawn_without_a_base(make_config, reporter, decoder) -> None:
+    run = set_up(make_config(validation__decoder=decoder, adapter__kind="none"), reporter)
+    validate(run, reporter)
+    assert run.strip is not None
+    assert list(run.strip.roll_out(run.world_model, torch.device("cpu")) or {}) == ["model now"]
+
+
+def test_of_a_latent_cache_the_small_frames_are_the_truth(make_config, reporter, decoder, tmp_path) -> None:
+    changes = {"data__cache": "auto", "data__cache_dir": str(tmp_path / "cache"), "training__steps": 3}
+    run = train(make_config(validation__decoder=decoder, **changes), reporter)
+    assert names(run) == STRIPS[:2]
+
+
+@pytest.mark.parametrize("failing", ["draw_strip", "frames_of", "write_atomically", "a file is there", "a link"])
+def test_a_strip_that_fails_costs_a_warning_and_never_the_run(
+    make_config, reporter, decoder, monkeypatch, caplog, tmp_path, failing: str
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    config = make_config(validation__decoder=decoder, training__steps=3)
+    if failing.startswith("a "):
+        train(
+            config.model_copy(update={"validation": config.validation.model_copy(update={"decoder": None})}), reporter
+        )
+        run = set_up(config, reporter)
+        validate(run, reporter)
+        assert run.strip is not None
+        place = run.folder / "imagined"
+        place.write_text("") if failing == "a file is there" else place.symlink_to(tmp_path)
+        rollouts = run.strip.roll_out(run.world_model, torch.device("cpu"))
+        assert run.strip.write(rollouts or {}, run.folder, 3) is not None, "trackers get it anyway"
+        assert not list(tmp_path.glob("*.png"))
+    else:
+        monkeypatch.setattr(imagined_strip, failing, fail)
+        run_folder = train(config, reporter)
+        assert list((run_folder / "checkpoints").iterdir())
+        assert "No space left" in caplog.text
+    assert any(text in caplog.text for text in ("could not be drawn", "could not be written"))
+
+
+def test_a_decoder_that_will_not_do_is_told_before_what_is_expensive(
+    make_config, reporter, decoder, tmp_path, monkeypatch
+) -> None:
+    other = write_decoder(tmp_path / "other", load_base(make_config().model, seed=0), encoder="other")
+    monkeypatch.setattr(setup, "with_latents", lambda *_, **__: pytest.fail("encodes"))
+    for check_only in (False, True):
+        with pytest.raises(InputError, match=r"validation\.decoder: .*other: the decoder of another encoder"):
+            train(make_config(validation__decoder=str(other)), reporter, check_only=check_only)
+    monkeypatch.setattr(setup, "open_dataset", lambda *_, **__: pytest.fail("opens the data"))
+    with pytest.raises(InputError, match=r"validation\.decoder: nowhere: no decoder\.json"):
+        train(make_config(validation__decoder="nowhere"), reporter)
+    assert load_decoder(decoder).where == "--decoder"
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_check_loads_the_decoder_and_writes_nothing(make_config, reporter, decoder, tmp_path) -> None:
+    train(make_config(validation__decoder=decoder), reporter, check_only=True)
+    assert not (tmp_path / "run").exists()
