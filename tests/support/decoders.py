@@ -1,0 +1,55 @@
+"""Decoders so small that they are trained in a second, on the frames of the tiny run."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from run_fixtures import MakeConfig, one_thread, tiny_config
+from vjepa2_ac.config import Config
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.decoding.frame_pairs import FramePairs, encode_pairs, wanted_frames
+from vjepa2_ac.decoding.training import train_decoder
+from vjepa2_ac.encoding.encode_dataset import encoder_on_device
+from vjepa2_ac.episode import no_progress
+from vjepa2_ac.model.checkpoints.loading import load_base
+
+KNOBS = {
+    "size": "tiny", "frames": 40, "held_out_frames": 8, "steps": 6, "batch_size": 4, "learning_rate": 2e-3,
+    "warmup_steps": 2, "average": 0.5, "noise": 0.1, "checkpoint_every": 2,
+}  # fmt: skip
+EncodeSplit = Callable[..., FramePairs]
+
+
+@pytest.fixture
+def make_decoder(make_config: MakeConfig, tmp_path: Path) -> MakeConfig:
+    """Return a config of a tiny decoder, in the folder `decoder`; knobs of the decoder, and dotted keys, change it."""
+
+    def make(folder: str = "decoder", knobs: dict | None = None, **changes: object) -> Config:
+        return make_config(decoder={**KNOBS, "folder": str(tmp_path / folder), **(knobs or {})}, **changes)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def whole_decoder(tmp_path_factory: pytest.TempPathFactory, data_folder: Path, base_folder: Path) -> Path:
+    """The folder of the decoder of `make_decoder()`, which nothing disturbed: to be read only."""
+    folder = tmp_path_factory.mktemp("whole") / "decoder"
+    with one_thread():
+        return train_decoder(
+            tiny_config(folder.parent / "run", data_folder, base_folder, decoder={**KNOBS, "folder": str(folder)})
+        )
+
+
+@pytest.fixture
+def encode_split(tmp_path: Path) -> EncodeSplit:
+    """Return a function that encodes frames of a split, as the training of a decoder does."""
+
+    def encode(config: Config, split: str = "train", frames: int = 40, folder: str = "pairs") -> FramePairs:
+        dataset = open_dataset(config.data)
+        encoder = encoder_on_device(config, load_base(config.model, seed=config.seed), torch.device("cpu"))
+        wanted = wanted_frames(dataset, split, frames=frames)  # type: ignore[arg-type]
+        return encode_pairs(dataset, wanted, encoder, tmp_path / folder, no_progress)
+
+    return encode
