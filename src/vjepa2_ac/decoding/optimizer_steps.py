@@ -26,7 +26,7 @@ class DecoderSteps:
 
     Args:
         shape: Of the decoder.
-        knobs: How it is trained.
+        config: How it is trained.
         seed: Of fresh weights and of noise.
         device: Where.
         autocast: The arithmetic of the network.
@@ -36,13 +36,13 @@ class DecoderSteps:
     def __init__(
         self,
         shape: DecoderShape,
-        knobs: DecoderConfig,
+        config: DecoderConfig,
         seed: int,
         device: torch.device,
         autocast: Autocast,
         linear: Decoder | None,
     ) -> None:
-        self._knobs, self._seed, self._device, self._autocast = knobs, seed, device, autocast
+        self._config, self._seed, self._device, self._autocast = config, seed, device, autocast
         self.decoder = Decoder(shape)
         self.decoder.initialise(torch.Generator().manual_seed(seed))
         if linear is not None:
@@ -50,8 +50,8 @@ class DecoderSteps:
         self.decoder.to(device)
         matrices = [one for one in self.decoder.parameters() if one.ndim > 1]
         others = [one for one in self.decoder.parameters() if one.ndim <= 1]
-        groups = [{"params": matrices, "weight_decay": knobs.weight_decay}, {"params": others, "weight_decay": 0.0}]
-        self.optimizer = torch.optim.AdamW(groups, lr=knobs.learning_rate, betas=_BETAS)
+        groups = [{"params": matrices, "weight_decay": config.weight_decay}, {"params": others, "weight_decay": 0.0}]
+        self.optimizer = torch.optim.AdamW(groups, lr=config.learning_rate, betas=_BETAS)
         self.average = {name: one.detach().clone() for name, one in self.decoder.state_dict().items()}
 
     def do(self, step: int, pairs: Pairs) -> dict[str, float]:
@@ -61,9 +61,9 @@ class DecoderSteps:
             InputError: Loss or gradients are not finite; nothing was changed.
         """
         latents, images = pairs.latents.to(self._device), as_images(pairs.images.to(self._device))
-        if self._knobs.noise:
+        if self._config.noise:
             latents = latents + self._noise(step, latents)
-        learning_rate = learning_rate_at(step, self._knobs)
+        learning_rate = learning_rate_at(step, self._config)
         for group in self.optimizer.param_groups:
             group["lr"] = learning_rate
         with self._autocast():
@@ -71,14 +71,14 @@ class DecoderSteps:
         loss, parts = decoder_loss(shown, images)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch
-        norm = torch.nn.utils.clip_grad_norm_(self.decoder.parameters(), self._knobs.max_grad_norm)
+        norm = torch.nn.utils.clip_grad_norm_(self.decoder.parameters(), self._config.max_grad_norm)
         numbers = {"loss": loss, **parts, "gradient_norm": norm}
         read = torch.stack([value.detach().float() for value in numbers.values()]).tolist()  # waits for the device once
         metrics = dict(zip(numbers, read, strict=True))
         if not math.isfinite(metrics["gradient_norm"]):
             raise InputError(
                 where="decoder.learning_rate",
-                found=f"{self._knobs.learning_rate:g}: loss or gradients of step {step} are not finite",
+                found=f"{self._config.learning_rate:g}: loss or gradients of step {step} are not finite",
                 fix="Lower it, delete the newest checkpoint if it was written by then, and start again",
             )
         self.optimizer.step()
@@ -102,20 +102,20 @@ class DecoderSteps:
     def _noise(self, step: int, latents: Tensor) -> Tensor:
         """Return noise of a strength that is drawn for each frame, up to `decoder.noise`."""
         drawn = torch.Generator().manual_seed(self._seed * 2**31 + step)
-        strength = self._knobs.noise * torch.rand(len(latents), 1, 1, generator=drawn)
+        strength = self._config.noise * torch.rand(len(latents), 1, 1, generator=drawn)
         return (strength * torch.randn(latents.shape, generator=drawn)).to(latents.device)
 
     @torch.no_grad()
     def _add_to_average(self, step: int) -> None:
-        decay = min(self._knobs.average, step / (step + _YOUNG))
+        decay = min(self._config.average, step / (step + _YOUNG))
         for name, one in self.decoder.state_dict().items():
             self.average[name].lerp_(one, 1.0 - decay)
 
 
-def learning_rate_at(step: int, knobs: DecoderConfig) -> float:
+def learning_rate_at(step: int, config: DecoderConfig) -> float:
     """Return the learning rate of step 1 .. steps: a linear warm-up, then half a cosine down to none."""
-    warmup = min(knobs.warmup_steps, knobs.steps - 1)
+    warmup = min(config.warmup_steps, config.steps - 1)
     if step <= warmup:
-        return knobs.learning_rate * step / warmup
-    done = (step - warmup) / max(1, knobs.steps - warmup)
-    return knobs.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done))
+        return config.learning_rate * step / warmup
+    done = (step - warmup) / max(1, config.steps - warmup)
+    return config.learning_rate * 0.5 * (1.0 + math.cos(math.pi * done))

@@ -66,7 +66,7 @@ class Setup:
     is_done: bool  # the folder holds the decoder already
 
     @property
-    def knobs(self) -> DecoderConfig:
+    def decoder(self) -> DecoderConfig:
         """How it is trained."""
         return self.config.decoder
 
@@ -155,10 +155,10 @@ def _interruptible(progress: Progress, folder: Path, stop: StopRequest) -> Progr
     return or_stop
 
 
-def _wanted(dataset: Dataset, knobs: DecoderConfig) -> dict[Split, list[FramesToEncode]]:
+def _wanted(dataset: Dataset, decoder: DecoderConfig) -> dict[Split, list[FramesToEncode]]:
     """Return the frames of each split; the test split may be empty."""
-    found: dict[Split, list[FramesToEncode]] = {"train": wanted_frames(dataset, "train", frames=knobs.frames)}
-    if held_out := wanted_frames(dataset, "test", frames=knobs.held_out_frames):
+    found: dict[Split, list[FramesToEncode]] = {"train": wanted_frames(dataset, "train", frames=decoder.frames)}
+    if held_out := wanted_frames(dataset, "test", frames=decoder.held_out_frames):
         found["test"] = held_out
     if not found["train"]:
         raise InputError(
@@ -181,7 +181,7 @@ def _require_frames(config: Config) -> None:
     require_stride(config.data, to="know which frames clips use")
 
 
-def _shape_for(model: WorldModel, knobs: DecoderConfig) -> DecoderShape:
+def _shape_for(model: WorldModel, decoder: DecoderConfig) -> DecoderShape:
     patch = model.sizes.patch_size
     if patch % UPSAMPLED or model.image_size < SMALLEST:
         raise InputError(
@@ -189,7 +189,7 @@ def _shape_for(model: WorldModel, knobs: DecoderConfig) -> DecoderShape:
             found=f"images of {model.image_size} px in patches of {patch} px",
             needed=f"{SMALLEST} px or more, and patches of a multiple of {UPSAMPLED} px",
         )
-    return DecoderShape(knobs.size, model.latent_dim, model.image_size // patch, patch)
+    return DecoderShape(decoder.size, model.latent_dim, model.image_size // patch, patch)
 
 
 def _require_own(folder: Path) -> None:

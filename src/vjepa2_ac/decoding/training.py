@@ -76,7 +76,7 @@ def _try_one_step(ready: Setup) -> None:
     """Run out of memory now, not after the frames are encoded."""
     if ready.device.type == "cuda":
         steps = _steps_of(ready, None)
-        shape, count = ready.shape, ready.knobs.batch_size
+        shape, count = ready.shape, ready.decoder.batch_size
         latents = torch.zeros(count, shape.grid**2, shape.dim)
         steps.do(1, Pairs(latents, torch.zeros(count, 3, shape.image_size, shape.image_size).byte(), ()))
 
@@ -99,7 +99,7 @@ class _Training:
                 with (folder / name).open("wb") as file:
                     write_torch(value, file)
 
-        state = RunState(step=step, clips_done=step * self.ready.knobs.batch_size)
+        state = RunState(step=step, clips_done=step * self.ready.decoder.batch_size)
         write_checkpoint(self.ready.folder / CHECKPOINTS, state, write, keep=_KEEP)
 
     def _restore(self, checkpoint: Path) -> None:
@@ -112,42 +112,44 @@ class _Training:
 
 
 def _steps_of(ready: Setup, linear: Decoder | None) -> DecoderSteps:
-    return DecoderSteps(ready.shape, ready.knobs, ready.config.seed, ready.device, ready.autocast, linear)
+    return DecoderSteps(ready.shape, ready.decoder, ready.config.seed, ready.device, ready.autocast, linear)
 
 
 def _train(training: _Training, pairs: FramePairs, reporter: Reporter, stop: StopRequest) -> None:
-    knobs, first = training.ready.knobs, training.done
+    config, first = training.ready.decoder, training.done
     progress = reporter.task("training the decoder", "steps")
     with (
         MetricsLog(training.ready.folder, first_step=first) as log,
-        contextlib.closing(_batches(pairs, knobs, training.ready.config.seed, first)) as batches,
+        contextlib.closing(_batches(pairs, config, training.ready.config.seed, first)) as batches,
     ):
         for step, batch in batches:
             metrics = training.steps.do(step, batch)
-            progress(step, knobs.steps)
-            is_last = step == knobs.steps
+            progress(step, config.steps)
+            is_last = step == config.steps
             if step % _LOG_EVERY == 0 or is_last:
                 log.write("train", step, metrics)
-            if step % knobs.checkpoint_every == 0 or is_last or stop.number:
+            if step % config.checkpoint_every == 0 or is_last or stop.number:
                 with log.before_a_checkpoint():
                     training.save(step)
             if stop.number and not is_last:
                 raise StoppedError(training.ready.folder, step, signal.Signals(stop.number).name)
 
 
-def _batches(pairs: FramePairs, knobs: DecoderConfig, seed: int, done: int) -> Generator[tuple[int, Pairs], None, None]:
+def _batches(
+    pairs: FramePairs, config: DecoderConfig, seed: int, done: int
+) -> Generator[tuple[int, Pairs], None, None]:
     """Yield the frames of each further step; the next ones are read meanwhile."""
 
     def read(step: int) -> Pairs:
-        places = range((step - 1) * knobs.batch_size, step * knobs.batch_size)
+        places = range((step - 1) * config.batch_size, step * config.batch_size)
         count = len(pairs)
         return pairs.read([permuted(at % count, size=count, seed=seed, epoch=at // count) for at in places])
 
     with ThreadPoolExecutor(1, thread_name_prefix="pairs") as pool:
-        ahead = pool.submit(read, done + 1) if done < knobs.steps else None
-        for step in range(done + 1, knobs.steps + 1):
+        ahead = pool.submit(read, done + 1) if done < config.steps else None
+        for step in range(done + 1, config.steps + 1):
             batch = ahead.result() if ahead is not None else read(step)
-            ahead = pool.submit(read, step + 1) if step < knobs.steps else None
+            ahead = pool.submit(read, step + 1) if step < config.steps else None
             yield step, batch
 
 
@@ -175,7 +177,7 @@ def _finish(
         cameras=tuple(data.cameras),
         episodes=len({file.episode_id for file in pairs.files}),
         frames=len(pairs),
-        steps=training.ready.knobs.steps,
+        steps=training.ready.decoder.steps,
         held_out=found,
         time=utc_now(),
     )
