@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import pytest
 import torch
 
 from vjepa2_ac.decoding.frame_pairs import Pairs
@@ -58,7 +57,7 @@ def test_it_is_the_same_each_time_and_reports_its_progress() -> None:
     assert reported == [(64, 150), (128, 150), (150, 150)]
 
 
-def test_what_latents_do_not_say_is_the_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_latents_do_not_say_is_the_mean() -> None:
     pairs = Linear()
     pairs.latents = torch.randn(pairs.latents.shape, generator=torch.Generator().manual_seed(5))  # of other frames
     shown = fit(pairs)(pairs.latents)
