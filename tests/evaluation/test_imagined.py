@@ -225,9 +225,7 @@ def test_a_file_of_the_wrong_length_is_refused(imagine: Imagine, tmp_path: Path,
         imagine(actions=(str(tmp_path / "file.npy"),))
 
 
-def test_under_vector_states_only_recorded_actions_can_be_imagined(
-    imagine: Imagine, make_config: MakeConfig, tmp_path: Path
-) -> None:
+def test_under_vector_states_only_recorded_actions_can_be_imagined(make_config: MakeConfig) -> None:
     vectors = {"states": "vector", "actions": "recorded", "join_actions": "last"}
     config = make_config(**{f"data__{key}": value for key, value in vectors.items()})
     dataset = open_dataset(config.data)
