@@ -70,7 +70,7 @@ def leaves(
 
 
 COMMANDS = leaves(program._parser())
-WITHOUT_SETTINGS = {("compare",), ("export",), ("download",)}
+WITHOUT_SETTINGS = {("compare",), ("export",), ("download",), ("imagine",)}
 BEHIND = {  # what each must be given, and an option with a value
     ("train",): (["c.yaml"], ["--check"]),
     ("evaluate",): (["run"], ["--clips", "3"]),
@@ -79,6 +79,7 @@ BEHIND = {  # what each must be given, and an option with a value
     ("data", "inspect"): (["c.yaml"], ["--rows", "3"]),
     ("data", "calibrate"): (["c.yaml"], ["--limit", "3"]),
     ("encode",): (["c.yaml"], ["--out", "folder"]),
+    ("decoder",): (["c.yaml"], ["--check"]),
     ("doctor",): (["c.yaml"], []),
     ("plan",): (["run"], ["--start", "a.png", "--state", "-0.1,0,0,0,0,0,0", "--goal", "b.png"]),
     ("config",): (["show", "c.yaml"], []),

@@ -208,7 +208,7 @@ def test_every_knob_is_read_somewhere() -> None:
     source = "\n".join(path.read_text() for path in (ROOT / "src").rglob("*.py"))
     for key in all_keys():
         *sections, name = key.split(".")
-        owners = "|".join(["config", "sizes", "self", *sections[-1:]])
+        owners = "|".join(["config", "sizes", "knobs", "self", *sections[-1:]])
         assert re.search(rf"\b_?({owners})\.{name}\b", source), f"nobody reads {key}"
 
 

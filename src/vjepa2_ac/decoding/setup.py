@@ -39,15 +39,8 @@ from vjepa2_ac.storage import try_writing_at, user_can_write, write_atomically
 from vjepa2_ac.storage.structured import read_json_object
 
 KEY, PAIRS = "key.json", "pairs"
-_OWN = {
-    KEY,
-    PAIRS,
-    LOCK,
-    CHECKPOINTS,
-    METRICS,
-    WEIGHTS,
-    LINEAR,
-}  # the last two: of a start that was killed while it wrote
+_OF_A_KILLED_START = {WEIGHTS, LINEAR}  # which wrote them, and not yet the card
+_OWN = {KEY, PAIRS, LOCK, CHECKPOINTS, METRICS} | _OF_A_KILLED_START
 
 
 @dataclass(frozen=True, eq=False)

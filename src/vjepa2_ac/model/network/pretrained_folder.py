@@ -71,7 +71,7 @@ def read_tensors(
         path: The file.
         like: Tensors of these names and shapes.
         needed: What the file should be, for messages.
-        fix: What to do if a number in it is not finite, as a sentence.
+        fix: What to do if it holds other tensors, or a number that is not finite, as a sentence.
         dtype: Type of the result; None: as in the file.
 
     Raises:
@@ -80,7 +80,7 @@ def read_tensors(
     try:
         with safe_open(path, framework="pt") as file:
             found = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118  # no iterator
-            check_tensors(found, {name: tuple(value.shape) for name, value in like.items()}, where=str(path))
+            check_tensors(found, {name: tuple(value.shape) for name, value in like.items()}, where=str(path), fix=fix)
             weights = {}
             for name in like:
                 value = file.get_tensor(name)
@@ -95,7 +95,13 @@ def read_tensors(
     return weights
 
 
-def check_tensors(found: dict[str, tuple[int, ...]], needed: dict[str, tuple[int, ...]], *, where: str) -> None:
+def check_tensors(
+    found: dict[str, tuple[int, ...]],
+    needed: dict[str, tuple[int, ...]],
+    *,
+    where: str,
+    fix: str = "Check model.base and model.sizes",
+) -> None:
     """Refuse tensors that are missing, unknown or of another shape, and name some of them.
 
     Raises:
@@ -114,7 +120,7 @@ def check_tensors(found: dict[str, tuple[int, ...]], needed: dict[str, tuple[int
             where=where,
             found=f"{len(problems)} tensors do not fit ({shown})",
             needed="every tensor of the model, and no other",
-            fix="Check model.base and model.sizes",
+            fix=fix,
         )
 
 

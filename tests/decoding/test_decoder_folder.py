@@ -1,0 +1,148 @@
+"""The folder of a decoder: read as it was written, and refused where it is not what it should be."""
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from run_fixtures import TINY
+from vjepa2_ac.config import ModelSizes
+from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, load_decoder, read_card, save_decoder
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.model.network.world_model import WorldModel
+
+
+@pytest.fixture
+def folder(whole_decoder: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(whole_decoder, tmp_path / "copy")
+
+
+def truncated(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-1])
+
+
+def with_nan(path: Path) -> None:
+    weights = load_file(path)
+    weights["linear.bias"][3] = float("nan")
+    save_file(weights, path)
+
+
+def without_a_tensor(path: Path) -> None:
+    save_file({name: one for name, one in load_file(path).items() if name != "linear.bias"}, path)
+
+
+def with_another_tensor(path: Path) -> None:
+    save_file(load_file(path) | {"more": torch.zeros(1)}, path)
+
+
+def of_another_shape(path: Path) -> None:
+    save_file(load_file(path) | {"linear.bias": torch.zeros(3)}, path)
+
+
+def test_a_decoder_is_read_as_it_was_written_bit_for_bit(whole_decoder: Path, tmp_path: Path) -> None:
+    one = load_decoder(whole_decoder)
+    save_decoder(tmp_path / "again", one.card, one.decoder.state_dict(), one.linear.state_dict())
+    other = load_decoder(tmp_path / "again")
+    assert other.card == one.card
+    for first, second in ((one.decoder, other.decoder), (one.linear, other.linear)):
+        assert first.state_dict().keys() == second.state_dict().keys()
+        assert all(torch.equal(value, second.state_dict()[name]) for name, value in first.state_dict().items())
+        assert not first.training
+        assert not any(weight.requires_grad for weight in first.parameters())
+    latents = torch.randn(2, 4, 24, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(one.decoder.decode(latents), other.decoder.decode(latents))
+    assert sorted(path.name for path in (tmp_path / "again").iterdir()) == sorted([CARD, WEIGHTS, LINEAR])
+
+
+@pytest.mark.parametrize("name", [WEIGHTS, LINEAR])
+@pytest.mark.parametrize(
+    ("damage", "found"),
+    [
+        (Path.unlink, "no such file"),
+        (truncated, "not a whole safetensors file"),
+        (lambda path: path.write_bytes(b""), "not a whole safetensors file"),
+        (with_nan, "NaN"),
+        (without_a_tensor, "missing: linear.bias"),
+        (with_another_tensor, "unknown: more"),
+        (of_another_shape, r"linear.bias is \[3\]"),
+    ],
+)
+def test_damaged_weights_are_refused_and_named(
+    folder: Path, name: str, damage: Callable[[Path], None], found: str
+) -> None:
+    damage(folder / name)
+    with pytest.raises(InputError, match=re.escape(name)) as caught:
+        load_decoder(folder)
+    text = str(caught.value)
+    assert re.search(found, text), text
+    assert re.search("again", text), f"no way out: {text}"
+
+
+@pytest.mark.parametrize(
+    ("changes", "found"),
+    [
+        ({"format": "vjepa2-ac decoder 2"}, "format"),
+        ({"steps": "six"}, "steps"),
+        ({"more": 1}, "more: unknown"),
+        ({"encoder": None}, "encoder"),
+        ({"shape": {"size": "huge", "dim": 24, "grid": 2, "patch_size": 16}}, "shape.size"),
+        ({"shape": {"size": "tiny", "dim": 0, "grid": 2, "patch_size": 16}}, "shape.dim"),
+        ({"shape": {"size": "tiny", "dim": 10**12, "grid": 2, "patch_size": 16}}, "shape.dim"),
+        ({"shape": {"size": "tiny", "dim": 24, "grid": 10**6, "patch_size": 16}}, "shape.grid"),
+        ({"shape": {"size": "tiny", "dim": 24, "grid": 2, "patch_size": 14}}, "shape.patch_size"),
+    ],
+)
+def test_a_card_with_wrong_values_is_refused_and_names_them(folder: Path, changes: dict, found: str) -> None:
+    values = json.loads((folder / CARD).read_text())
+    (folder / CARD).write_text(json.dumps(values | changes))
+    with pytest.raises(InputError, match=re.escape(found)) as caught:
+        load_decoder(folder)
+    assert str(folder / CARD) in str(caught.value)
+    assert "train the decoder again" in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": NaN}', "\x00"])
+def test_a_card_that_is_no_json_is_refused(folder: Path, text: str) -> None:
+    (folder / CARD).write_text(text)
+    with pytest.raises(InputError, match=re.escape(str(folder / CARD))):
+        read_card(folder)
+
+
+@pytest.mark.parametrize("name", ["nowhere", "file", "empty"])
+def test_a_folder_without_a_decoder_is_refused_with_the_command_that_makes_one(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"--decoder .*no decoder\.json there") as caught:
+        load_decoder(tmp_path / name)
+    assert "vjepa2-ac decoder CONFIG" in str(caught.value)
+
+
+def test_the_weights_of_another_size_are_refused(folder: Path) -> None:
+    values = json.loads((folder / CARD).read_text())
+    values["shape"]["size"] = "small"
+    (folder / CARD).write_text(json.dumps(values))
+    with pytest.raises(InputError, match="tensors do not fit"):
+        load_decoder(folder)
+
+
+def test_the_latents_of_another_encoder_are_refused(whole_decoder: Path, base_folder: Path) -> None:
+    decoder = load_decoder(whole_decoder)
+    decoder.require_encoder(WorldModel.from_pretrained(base_folder), subject="run")
+    other = WorldModel.random(ModelSizes.model_validate(TINY), seed=4)
+    with pytest.raises(InputError, match=r"another encoder than that of run.*vjepa2-ac decoder CONFIG"):
+        decoder.require_encoder(other, subject="run")
+
+
+def test_a_model_of_other_sizes_is_refused_even_with_these_weights(whole_decoder: Path) -> None:
+    """The weights of an encoder do not tell the size of its images."""
+    larger = WorldModel.random(ModelSizes.model_validate(TINY | {"image_size": 64}), seed=3)
+    decoder = load_decoder(whole_decoder)
+    same = replace(decoder, card=replace(decoder.card, encoder=larger.encoder_fingerprint()))
+    with pytest.raises(InputError, match="4x24 latents to images of 32 px"):
+        same.require_encoder(larger, subject="run")

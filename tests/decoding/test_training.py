@@ -1,0 +1,345 @@
+"""Training of a decoder: it learns what latents show, and goes on as if nothing had happened."""
+
+import json
+import math
+import os
+import shutil
+import signal
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from decoders import KNOBS, EncodeSplit
+from killable import KILLED, Nursery
+from run_fixtures import TINY, MakeConfig, SilentReporter, as_yaml
+from vjepa2_ac.cli import main
+from vjepa2_ac.config import Config, DecoderConfig, ModelSizes
+from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.decoding import setup as preparation
+from vjepa2_ac.decoding import training
+from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, load_decoder, read_card
+from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, as_images
+from vjepa2_ac.decoding.training import learning_rate_at, train_decoder
+from vjepa2_ac.distributed.preemption import EXIT_STATUS, StoppedError
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.media.image_similarity import psnr
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.runs.metrics_log import read_metrics_log
+
+FINISHED = {CARD, WEIGHTS, LINEAR, "key.json", "metrics.jsonl", ".lock"}
+
+
+def assert_same_decoder(one: Path, other: Path) -> None:
+    for name in (WEIGHTS, LINEAR):
+        first, second = load_file(one / name), load_file(other / name)
+        assert first.keys() == second.keys()
+        assert all(torch.equal(value, second[key]) for key, value in first.items()), name
+    assert read_card(one).held_out == read_card(other).held_out
+    rows = [list(read_metrics_log(folder / "metrics.jsonl")) for folder in (one, other)]
+    assert rows[0] == rows[1]
+    assert {path.name for path in other.iterdir()} == FINISHED
+
+
+# ---- what it learns ------------------------------------------------------------------------------------------------
+
+
+def test_it_memorises_four_frames(make_decoder: MakeConfig, encode_split: EncodeSplit) -> None:
+    knobs = {"frames": 4, "steps": 80, "warmup_steps": 5, "noise": 0.0, "average": 0.9, "checkpoint_every": 1000}
+    config = make_decoder(knobs=knobs, data__cache_dtype="fp32")
+    pairs = encode_split(config, frames=4).read(range(4))
+    decoder = load_decoder(train_decoder(config)).decoder
+    assert psnr(decoder.decode(pairs.latents), as_images(pairs.images)).min() > 30
+
+
+class Shuffled(FramePairs):
+    """Each latent has the image of another frame, always the same one."""
+
+    def read(self, numbers: Sequence[int]) -> Pairs:
+        others = torch.randperm(len(self), generator=torch.Generator().manual_seed(0)).tolist()
+        return replace(super().read(numbers), images=super().read([others[number] for number in numbers]).images)
+
+
+@pytest.fixture
+def _coloured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames whose halves have colours of their own."""
+    read = RldsSource.read
+
+    def reading(source: RldsSource, index: int, *more: object) -> object:
+        def frames(steps: list[int]) -> np.ndarray:
+            colours = [np.random.default_rng([index, step]).integers(0, 256, (1, 2, 3), np.uint8) for step in steps]
+            return np.stack([one.repeat(36, axis=0).repeat(24, axis=1) for one in colours])
+
+        return replace(read(source, index, *more), read_frames=frames)
+
+    monkeypatch.setattr(RldsSource, "read", reading)
+
+
+@pytest.mark.usefixtures("_coloured")
+def test_of_shuffled_pairs_it_learns_the_mean_image_at_best(
+    make_decoder: MakeConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else held-out figures would come from something that is not in the latents."""
+    knobs = {"frames": 120, "held_out_frames": 40, "steps": 40, "batch_size": 8, "warmup_steps": 5, "noise": 0.0}
+
+    def gains(folder: str) -> dict[str, float]:
+        held_out = read_card(train_decoder(make_decoder(folder, knobs, data__validation_share=0.0))).held_out
+        mean = held_out["mean_image"]["psnr_db"]["value"]
+        return {name: held_out[name]["psnr_db"]["value"] - mean for name in ("decoder", "linear")}
+
+    assert min(gains("true").values()) > 3
+    encode = preparation.encode_pairs
+
+    def shuffled(*values: object) -> FramePairs:
+        pairs = encode(*values)  # type: ignore[arg-type]
+        return Shuffled(pairs.files) if len(pairs) > 40 else pairs
+
+    monkeypatch.setattr(preparation, "encode_pairs", shuffled)
+    assert max(gains("shuffled").values()) < 0.3
+
+
+def test_the_card_says_what_the_decoder_is(whole_decoder: Path, make_decoder: MakeConfig) -> None:
+    card, config = read_card(whole_decoder), make_decoder()
+    assert (card.frames, card.steps, card.episodes) == (len_of_training(config), 6, 2)
+    assert (card.crop, card.precision, card.data) == ("released", "fp32", config.data.path)
+    assert card.cameras == config.data.cameras
+    assert (card.shape.size, card.shape.dim, card.shape.grid, card.shape.patch_size) == ("tiny", 24, 2, 16)
+    assert {"frames", "episodes", "decoder", "linear", "mean_image"} == set(card.held_out)
+    for name in ("decoder", "linear", "mean_image"):
+        assert set(card.held_out[name]) == {"psnr_db", "ssim"}
+    assert {path.name for path in whole_decoder.iterdir()} == FINISHED
+
+
+def len_of_training(config: Config) -> int:
+    from vjepa2_ac.data.clips.dataset import open_dataset
+    from vjepa2_ac.decoding.frame_pairs import wanted_frames
+
+    return sum(len(one.steps) for one in wanted_frames(open_dataset(config.data), "train", frames=40))
+
+
+def test_without_test_episodes_nothing_is_measured(make_decoder: MakeConfig) -> None:
+    assert read_card(train_decoder(make_decoder(data__test_share=0.0))).held_out == {}
+
+
+# ---- whatever happens ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def _signals_end_a_process() -> Iterator[None]:
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+@pytest.mark.usefixtures("_signals_end_a_process")
+@pytest.mark.parametrize("at", [1, 4])
+def test_a_training_that_was_asked_to_stop_goes_on_as_if_it_had_not(
+    make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, at: int
+) -> None:
+    learn = training._Training.step
+
+    def step(self: object, number: int, pairs: Pairs) -> dict:
+        if number == at:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return learn(self, number, pairs)  # type: ignore[arg-type]
+
+    config = make_decoder()
+    with monkeypatch.context() as patch:
+        patch.setattr(training._Training, "step", step)
+        with pytest.raises(StoppedError, match=f"stopped after step {at}"):
+            train_decoder(config)
+    assert not (tmp_path / "decoder" / CARD).exists()
+    train_decoder(config)
+    assert_same_decoder(whole_decoder, tmp_path / "decoder")
+
+
+@pytest.mark.usefixtures("_signals_end_a_process")
+def test_a_stop_while_frames_are_encoded_keeps_them_and_has_its_status(
+    make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    write = preparation.encode_pairs
+
+    def signalled(dataset, wanted, encoder, folder, progress):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return write(dataset, wanted, encoder, folder, progress)
+
+    config = make_decoder()
+    (tmp_path / "config.yaml").write_text(as_yaml(config))
+    with monkeypatch.context() as patch:
+        patch.setattr(preparation, "encode_pairs", signalled)
+        assert main(["decoder", str(tmp_path / "config.yaml")]) == EXIT_STATUS
+    assert len(list((tmp_path / "decoder" / "pairs").iterdir())) == 1
+    assert main(["decoder", str(tmp_path / "config.yaml")]) == 0
+    assert_same_decoder(whole_decoder, tmp_path / "decoder")
+
+
+@pytest.mark.parametrize("died_at", [(5, 12, 17), (46,), (78,), (89,), (95,), (97,)])
+def test_a_killed_training_goes_on_as_if_it_had_not(
+    nursery: Nursery, make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, died_at: tuple[int, ...]
+) -> None:
+    (tmp_path / "config.yaml").write_text(as_yaml(make_decoder()))
+    out = tmp_path / "decoder"
+    start = ("decoder", str(tmp_path / "config.yaml"))
+    statuses = [nursery.start(*start, folder=str(out), die_at=at).wait() for at in died_at]  # type: ignore[arg-type]
+    assert statuses == [KILLED] * len(died_at)
+    assert nursery.start(*start, folder=str(out)).wait() == 0  # type: ignore[arg-type]
+    assert_same_decoder(whole_decoder, out)
+
+
+def test_what_a_killed_start_left_in_a_finished_folder_is_removed(
+    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(whole_decoder, tmp_path / "decoder")
+    for name in ("pairs", "checkpoints"):
+        (tmp_path / "decoder" / name).mkdir()
+    train_decoder(make_decoder(), check_only=True)
+    assert (tmp_path / "decoder" / "pairs").exists(), "--check changes nothing"
+    train_decoder(make_decoder())
+    assert {path.name for path in (tmp_path / "decoder").iterdir()} == FINISHED
+
+
+# ---- what is refused -----------------------------------------------------------------------------------------------
+
+
+def test_a_finished_folder_is_left_as_it_is(
+    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, reporter: SilentReporter
+) -> None:
+    shutil.copytree(whole_decoder, tmp_path / "decoder")
+    before = {path.name: path.read_bytes() for path in (tmp_path / "decoder").iterdir()}
+    assert train_decoder(make_decoder(), reporter) == tmp_path / "decoder"
+    assert any("there already" in note for note in reporter.notes)
+    assert "training the decoder" not in reporter.tasks
+    assert {path.name: path.read_bytes() for path in (tmp_path / "decoder").iterdir()} == before
+
+
+def test_check_writes_nothing(make_decoder: MakeConfig, tmp_path: Path, reporter: SilentReporter) -> None:
+    train_decoder(make_decoder(), reporter, check_only=True)
+    assert any("GB of disk" in note for note in reporter.notes)
+    assert not (tmp_path / "decoder").exists()
+
+
+@pytest.mark.parametrize("is_finished", [True, False])
+@pytest.mark.parametrize(
+    ("changes", "name"),
+    [
+        ({"knobs": {"learning_rate": 1e-3}}, r"decoder\.learning_rate: 0\.002, not 0\.001"),
+        ({"seed": 1}, "seed: 0, not 1"),
+        ({"data__crop": "square"}, "crop"),
+        ({"data__test_share": 0.1}, r"data\.test_share: 0\.2, not 0\.1"),
+    ],
+)
+def test_the_folder_of_another_decoder_is_refused_and_what_differs_is_named(
+    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path, changes: dict, name: str, is_finished: bool
+) -> None:
+    shutil.copytree(whole_decoder, tmp_path / "decoder")
+    if not is_finished:
+        (tmp_path / "decoder" / CARD).unlink()
+    with pytest.raises(InputError, match=name):
+        train_decoder(make_decoder(**changes))
+
+
+def test_other_knobs_that_change_no_number_are_no_reason_to_refuse(
+    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(whole_decoder, tmp_path / "decoder")
+    train_decoder(make_decoder(knobs={"checkpoint_every": 5}, data__workers=1, training__steps=9))
+
+
+def test_a_folder_with_other_things_is_refused(make_decoder: MakeConfig, tmp_path: Path) -> None:
+    (tmp_path / "decoder").mkdir()
+    (tmp_path / "decoder" / "thesis.tex").touch()
+    with pytest.raises(InputError, match=r"other things in it, such as thesis\.tex"):
+        train_decoder(make_decoder())
+    assert [path.name for path in (tmp_path / "decoder").iterdir()] == ["thesis.tex"]
+
+
+@pytest.mark.parametrize("there", [CARD, "pairs", "checkpoints"])
+def test_what_nobody_knows_the_origin_of_is_refused(make_decoder: MakeConfig, tmp_path: Path, there: str) -> None:
+    (tmp_path / "decoder" / there).mkdir(parents=True)
+    if there == CARD:
+        (tmp_path / "decoder" / there).rmdir()
+        (tmp_path / "decoder" / there).write_text("{}")
+    with pytest.raises(InputError, match="of unknown origin"):
+        train_decoder(make_decoder())
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"data__source": "latents"}, r"data\.source: latents"),
+        ({"data__stride": "auto"}, r"data\.stride"),
+    ],
+)
+def test_what_cannot_be_decoded_is_refused_before_the_data_is_opened(
+    make_decoder: MakeConfig, tmp_path: Path, changes: dict, words: str
+) -> None:
+    with pytest.raises(InputError, match=words):
+        train_decoder(make_decoder(data__path=str(tmp_path / "nowhere"), **changes))
+    assert not (tmp_path / "decoder").exists()
+
+
+@pytest.mark.parametrize("sizes", [{"image_size": 28, "patch_size": 14}, {"image_size": 8, "patch_size": 8}])
+def test_a_model_whose_images_no_decoder_makes_is_refused(
+    make_decoder: MakeConfig, tmp_path: Path, sizes: dict
+) -> None:
+    WorldModel.random(ModelSizes.model_validate(TINY | sizes), seed=0).save_pretrained(tmp_path / "odd")
+    with pytest.raises(InputError, match="px in patches of"):
+        train_decoder(make_decoder(model__base=str(tmp_path / "odd")))
+
+
+def test_without_training_episodes_the_shares_are_named(make_decoder: MakeConfig) -> None:
+    with pytest.raises(InputError, match=r"no frames of train episodes.*test_share"):
+        train_decoder(make_decoder(data__validation_share=0.0, data__test_share=0.99))
+
+
+def test_a_learning_rate_that_is_too_high_is_named(make_decoder: MakeConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def exploded(images: torch.Tensor, targets: torch.Tensor) -> tuple[torch.Tensor, dict]:
+        return (images - targets).sum() * math.inf, {}
+
+    monkeypatch.setattr(training, "decoder_loss", exploded)
+    with pytest.raises(InputError, match=r"decoder\.learning_rate: .*not finite"):
+        train_decoder(make_decoder())
+
+
+# ---- schedule and noise --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("steps", "warmup"), [(100, 10), (100, 0), (5, 500), (2, 1)])
+def test_the_learning_rate_rises_to_its_peak_and_falls_to_none(steps: int, warmup: int) -> None:
+    knobs = DecoderConfig(steps=steps, warmup_steps=warmup, learning_rate=0.5)
+    rates = [learning_rate_at(step, knobs) for step in range(1, steps + 1)]
+    peak = min(warmup, steps - 1)
+    assert all(0 <= rate <= 0.5 for rate in rates)
+    assert rates[:peak] == pytest.approx([0.5 * (step + 1) / peak for step in range(peak)])
+    assert rates[peak:] == sorted(rates[peak:], reverse=True)
+    assert rates[-1] == pytest.approx(0.0, abs=1e-12)
+    if peak:
+        assert max(rates) == rates[peak - 1] == 0.5
+
+
+def test_noise_is_a_function_of_the_step(make_decoder: MakeConfig) -> None:
+    """A step of a resumed training has the noise that it would have had; another step another one."""
+    config = make_decoder()
+    with preparation.setup(config, SilentReporter(), check_only=True) as ready:
+        one, other = training._Training(ready), training._Training(ready)
+        latents = torch.zeros(64, 4, 24)
+        one._noise(1, latents)
+        torch.rand(3)
+        assert torch.equal(one._noise(2, latents), other._noise(2, latents))
+        assert not torch.equal(one._noise(2, latents), one._noise(3, latents))
+        strengths = one._noise(5, latents).flatten(1).std(dim=1)
+        assert 0.07 < strengths.max() < 0.14  # up to decoder.noise
+        assert strengths.min() < 0.02
+
+
+def test_how_often_a_checkpoint_is_written_changes_nothing(
+    make_decoder: MakeConfig, whole_decoder: Path, tmp_path: Path
+) -> None:
+    train_decoder(make_decoder(knobs={"checkpoint_every": 1}))
+    ours, theirs = (load_file(folder / WEIGHTS) for folder in (tmp_path / "decoder", whole_decoder))
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    assert json.loads((tmp_path / "decoder" / "key.json").read_text())["decoder"]["steps"] == KNOBS["steps"]

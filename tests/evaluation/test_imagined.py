@@ -1,0 +1,247 @@
+"""What a run or a model imagines of a held-out clip: the right clip, by the right models, with the right inputs."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from decoders import whole_decoder  # noqa: F401 - a fixture
+from run_fixtures import MakeConfig
+from vjepa2_ac.data.clips.dataset import open_dataset
+from vjepa2_ac.data.clips.loader import validation_windows
+from vjepa2_ac.decoding.imagine import AS_RECORDED, Imagination, Imagined
+from vjepa2_ac.errors import InputError
+from vjepa2_ac.evaluation import imagined
+from vjepa2_ac.evaluation.imagined import ImagineOptions, imagine_clip
+from vjepa2_ac.evaluation.request import EvaluationOptions
+from vjepa2_ac.geometry import actions_from_states
+from vjepa2_ac.model.network.world_model import WorldModel
+from vjepa2_ac.simulation.imagined_truth import with_what_happens
+
+STEPS = 3
+Imagine = Callable[..., Imagination]
+
+
+@pytest.fixture
+def imagine(whole_run: Path, whole_decoder: Path) -> Imagine:  # noqa: F811 - the fixture
+    def of(subject: Path = whole_run, **asked: object) -> Imagination:
+        options = {"decoder": str(whole_decoder), "steps": STEPS, **asked}
+        return imagine_clip(str(subject), ImagineOptions(**options)).imagination  # type: ignore[arg-type]
+
+    return of
+
+
+@pytest.fixture
+def given(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Tensor, ...]]:
+    """What every rollout was given: latents, actions, states."""
+    seen: list[tuple[Tensor, ...]] = []
+    roll = WorldModel.rollout
+
+    def remembering(model: WorldModel, *inputs: Tensor) -> Tensor:
+        seen.append(inputs)
+        return roll(model, *inputs)
+
+    monkeypatch.setattr(WorldModel, "rollout", remembering)
+    return seen
+
+
+@pytest.fixture
+def true_latents(monkeypatch: pytest.MonkeyPatch) -> list[Tensor]:
+    """The latents of the clip, once it is encoded."""
+    found: list[Tensor] = []
+    encode = imagined.encode_batch
+
+    def remembering(*values: object, **more: object) -> object:
+        batch = encode(*values, **more)  # type: ignore[arg-type]
+        found.append(batch.latents)
+        return batch
+
+    monkeypatch.setattr(imagined, "encode_batch", remembering)
+    return found
+
+
+def named(imagination: Imagination) -> dict[tuple[str, str], Imagined]:
+    return {(one.model, one.name): one for one in imagination.rollouts}
+
+
+def test_recorded_actions_are_imagined_by_base_and_adapter_others_by_the_adapter(imagine: Imagine) -> None:
+    found = imagine(actions=("true", "none", "close"))
+    assert list(named(found)) == [
+        ("base", AS_RECORDED), ("adapter", AS_RECORDED), ("adapter", "none"), ("adapter", "close"),
+    ]  # fmt: skip
+    for one in found.rollouts:
+        assert one.frames.shape == (STEPS, 32, 32, 3)
+        assert one.truth is None
+    assert found.seconds_per_step == pytest.approx(2 / 15)
+    base, adapter = found.rollouts[:2]
+    assert (base.frames != adapter.frames).any(), "the adapter of the run does nothing"
+
+
+def test_a_perfect_predictor_shows_decoded_truth_bit_for_bit(
+    imagine: Imagine, true_latents: list[Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(WorldModel, "rollout", lambda *_: true_latents[0][:, 1:])
+    found = imagine(actions=("true",))
+    for one in found.rollouts:
+        np.testing.assert_array_equal(one.frames, found.decoded_truth)
+    assert (found.decoded_truth != found.decoded_first).any()
+
+
+def test_persistence_shows_the_decoded_first_frame(imagine: Imagine, monkeypatch: pytest.MonkeyPatch) -> None:
+    def copied(_: WorldModel, context: Tensor, actions: Tensor, *__: object) -> Tensor:
+        return context[:, -1:].expand(-1, actions.shape[1], -1, -1)
+
+    monkeypatch.setattr(WorldModel, "rollout", copied)
+    found = imagine(actions=("true", "up"))
+    for one in found.rollouts:
+        np.testing.assert_array_equal(one.frames, np.broadcast_to(found.decoded_first, one.frames.shape))
+
+
+def test_a_model_is_given_one_frame_and_recorded_states_with_recorded_actions_only(
+    imagine: Imagine, given: list[tuple[Tensor, ...]], true_latents: list[Tensor], make_config: MakeConfig
+) -> None:
+    found = imagine(actions=("true", "right"))
+    dataset = open_dataset(make_config().data)
+    episode = dataset.table.find(found.episode_id)
+    steps = range(found.start, found.start + 2 * STEPS + 1, 2)
+    recorded = dataset.source.read(episode).states[list(steps)]
+    (*as_recorded, counterfactual) = given
+    assert len(as_recorded) == 2
+    for context, *_ in given:
+        assert torch.equal(context, true_latents[0][:, :1])
+    for _, actions, states, *_ in as_recorded:
+        np.testing.assert_allclose(states[0].numpy(), recorded[:-1], atol=1e-5)
+        np.testing.assert_allclose(actions[0].numpy(), actions_from_states(recorded), atol=1e-5)
+    _, actions, states, *_ = counterfactual
+    np.testing.assert_allclose(states[0, 0].numpy(), recorded[0], atol=1e-5)
+    assert (actions[0, :, 1] < 0).all()
+    np.testing.assert_allclose(np.diff(states[0, :, :3].numpy(), axis=0), actions[0, :-1, :3].numpy(), atol=1e-5)
+    np.testing.assert_allclose(states[0, :, 3:].numpy(), recorded[:1, 3:].repeat(STEPS, axis=0), atol=1e-5)
+    assert np.abs(states[0, 1:].numpy() - recorded[1:-1]).max() > 0.01, "else the recording would show nothing"
+
+
+def test_frames_are_those_of_the_clip_that_was_named(imagine: Imagine, make_config: MakeConfig) -> None:
+    dataset = open_dataset(make_config().data)
+    name = dataset.table.identity(int(dataset.episodes[2]))
+    found = imagine(actions=("true",), episode=name, start=5)
+    assert (found.episode_id, found.start) == (name, 5)
+    assert imagine(actions=("true",), episode=name).start == 0
+    assert len(found.truth) == len(found.decoded_truth) == STEPS
+    later = imagine(actions=("true",), episode=name, start=7)
+    np.testing.assert_array_equal(found.truth[0], later.first)
+    np.testing.assert_array_equal(found.truth[1:], later.truth[:-1])
+
+
+@pytest.mark.parametrize("split", ["test", "validation"])
+def test_the_clip_is_that_of_the_split_with_the_most_motion(
+    imagine: Imagine, make_config: MakeConfig, split: str
+) -> None:
+    found = imagine(actions=("true",), split=split)
+    dataset = open_dataset(make_config(data__frames=STEPS + 1).data)
+
+    def motion(name: str, start: int) -> float:
+        states = dataset.source.read(dataset.table.find(name)).states[start : start + 2 * STEPS + 1 : 2]
+        return float(np.linalg.norm(np.diff(states[:, :3], axis=0), axis=1).sum())
+
+    windows = [
+        (dataset.table.identity(episode), start)
+        for episode, start in validation_windows(dataset, split, clips=64)  # type: ignore[arg-type]
+    ]
+    motions = {window: motion(*window) for window in windows}
+    assert len(motions) > 3
+    assert motions[found.episode_id, found.start] == pytest.approx(max(motions.values()))
+
+
+def test_files_of_actions_have_their_names_and_never_that_of_the_recording(
+    imagine: Imagine, given: list[tuple[Tensor, ...]], tmp_path: Path
+) -> None:
+    rows = np.tile([0, 0, 0.02, 0, 0, 0, 0], (STEPS + 2, 1))
+    files = [tmp_path / "up.npy", tmp_path / f"{AS_RECORDED}.npy", tmp_path / "more" / "up.npy"]
+    (tmp_path / "more").mkdir()
+    for file in files:
+        np.save(file, rows)
+    np.savetxt(tmp_path / "up.csv", 2 * rows, delimiter=",")
+    found = imagine(actions=("up", *map(str, files), str(tmp_path / "up.csv")))
+    names = ["up", "up.npy", f"{AS_RECORDED}.npy", str(files[2]), "up.csv"]
+    assert [one.name for one in found.rollouts] == names
+    assert {one.model for one in found.rollouts} == {"adapter"}
+    for _, actions, states, *_ in given[1:4]:
+        np.testing.assert_allclose(actions[0].numpy(), rows[:STEPS], atol=1e-6)
+        np.testing.assert_allclose(states[0, :, 2] - states[0, 0, 2], 0.02 * np.arange(STEPS), atol=1e-5)
+
+
+def test_a_model_is_imagined_with_the_data_that_are_named(
+    imagine: Imagine, base_folder: Path, make_config: MakeConfig, tmp_path: Path
+) -> None:
+    options = EvaluationOptions(data=make_config(), out=tmp_path)
+    found = imagine(base_folder, actions=("true", "up"), evaluation=options)
+    assert list(named(found)) == [("model", AS_RECORDED), ("model", "up")]
+
+
+def test_where_nothing_was_simulated_nothing_is_said_of_what_would_happen(whole_run: Path, whole_decoder: Path) -> None:  # noqa: F811
+    film = imagine_clip(str(whole_run), ImagineOptions(decoder=str(whole_decoder), actions=("up",), steps=2))
+    assert with_what_happens(film) is film
+    assert film.imagination.notes == ()
+
+
+# ---- what is refused -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("asked", "found"),
+    [
+        ({"actions": ("sideways",)}, "--actions sideways: no such actions"),
+        ({"actions": ("nowhere.npy",)}, "nowhere.npy: cannot be read"),
+        ({"actions": ()}, "--actions"),
+        ({"size_m": 0.0}, "--size"),
+        ({"size_m": float("nan")}, "--size"),
+        ({"episode": "nobody"}, "--episode: no episode nobody"),
+        ({"episode": "first", "start": -1}, r"--start: -1, in an episode of 24 steps.*0 to 17"),
+        ({"episode": "first", "start": 18}, r"--start: 18, .*0 to 17: 3 model steps take 7 control steps"),
+        ({"episode": "first", "steps": 12}, "a longer episode"),
+        ({"steps": 12}, "shorter than a clip"),
+        ({"decoder": "nowhere"}, "--decoder nowhere"),
+    ],
+)
+def test_what_cannot_be_imagined_is_refused_and_named(
+    imagine: Imagine, make_config: MakeConfig, asked: dict, found: str
+) -> None:
+    if asked.get("episode") == "first":
+        dataset = open_dataset(make_config().data)
+        asked = asked | {"episode": dataset.table.identity(int(dataset.episodes[0]))}
+    with pytest.raises(InputError, match=found):
+        imagine(**asked)
+
+
+@pytest.mark.parametrize(
+    ("shape", "found"), [((STEPS - 1, 7), "2 actions.*3, one for each model step"), ((STEPS, 6), r"shape \(3, 6\)")]
+)
+def test_a_file_of_the_wrong_length_is_refused(imagine: Imagine, tmp_path: Path, shape: tuple, found: str) -> None:
+    np.save(tmp_path / "file.npy", np.zeros(shape))
+    with pytest.raises(InputError, match=found):
+        imagine(actions=(str(tmp_path / "file.npy"),))
+
+
+def test_under_vector_states_only_recorded_actions_can_be_imagined(make_config: MakeConfig) -> None:
+    vectors = {"states": "vector", "actions": "recorded", "join_actions": "last"}
+    config = make_config(**{f"data__{key}": value for key, value in vectors.items()})
+    dataset = open_dataset(config.data)
+    batch = next(imagined.batches_of(dataset, validation_windows(dataset, "test", clips=1), batch_size=1))
+    options = ImagineOptions(decoder="", actions=("true",))
+    assert list(imagined._actions_of(options, batch, dataset, limits=None)) == [AS_RECORDED]
+    options = ImagineOptions(decoder="", actions=("true", "up"))
+    with pytest.raises(InputError, match="--actions up: states that are no poses"):
+        imagined._actions_of(options, batch, dataset, limits=None)
+
+
+def test_another_encoder_is_refused(imagine: Imagine, make_config: MakeConfig, tmp_path: Path) -> None:
+    from run_fixtures import TINY
+    from vjepa2_ac.config import ModelSizes
+
+    WorldModel.random(ModelSizes.model_validate(TINY), seed=9).save_pretrained(tmp_path / "other")
+    options = EvaluationOptions(data=make_config(), out=tmp_path)
+    with pytest.raises(InputError, match="another encoder"):
+        imagine(tmp_path / "other", evaluation=options)
