@@ -20,11 +20,12 @@ from run_fixtures import TINY, MakeConfig, SilentReporter, as_yaml
 from vjepa2_ac.cli import main
 from vjepa2_ac.config import Config, DecoderConfig, ModelSizes
 from vjepa2_ac.data.sources.rlds.source import RldsSource
+from vjepa2_ac.decoding import optimizer_steps, training
 from vjepa2_ac.decoding import setup as preparation
-from vjepa2_ac.decoding import training
 from vjepa2_ac.decoding.decoder_folder import CARD, LINEAR, WEIGHTS, load_decoder, read_card
 from vjepa2_ac.decoding.frame_pairs import FramePairs, Pairs, as_images
-from vjepa2_ac.decoding.training import learning_rate_at, train_decoder
+from vjepa2_ac.decoding.optimizer_steps import DecoderSteps, learning_rate_at
+from vjepa2_ac.decoding.training import train_decoder
 from vjepa2_ac.distributed.preemption import EXIT_STATUS, StoppedError
 from vjepa2_ac.errors import InputError
 from vjepa2_ac.media.image_similarity import psnr
@@ -140,7 +141,7 @@ def _signals_end_a_process() -> Iterator[None]:
 def test_a_training_that_was_asked_to_stop_goes_on_as_if_it_had_not(
     make_decoder: MakeConfig, whole_decoder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, at: int
 ) -> None:
-    learn = training._Training.step
+    learn = DecoderSteps.do
 
     def step(self: object, number: int, pairs: Pairs) -> dict:
         if number == at:
@@ -149,7 +150,7 @@ def test_a_training_that_was_asked_to_stop_goes_on_as_if_it_had_not(
 
     config = make_decoder()
     with monkeypatch.context() as patch:
-        patch.setattr(training._Training, "step", step)
+        patch.setattr(DecoderSteps, "do", step)
         with pytest.raises(StoppedError, match=f"stopped after step {at}"):
             train_decoder(config)
     assert not (tmp_path / "decoder" / CARD).exists()
@@ -300,7 +301,7 @@ def test_a_learning_rate_that_is_too_high_is_named(make_decoder: MakeConfig, mon
     def exploded(images: torch.Tensor, targets: torch.Tensor) -> tuple[torch.Tensor, dict]:
         return (images - targets).sum() * math.inf, {}
 
-    monkeypatch.setattr(training, "decoder_loss", exploded)
+    monkeypatch.setattr(optimizer_steps, "decoder_loss", exploded)
     with pytest.raises(InputError, match=r"decoder\.learning_rate: .*not finite"):
         train_decoder(make_decoder())
 
@@ -325,7 +326,7 @@ def test_noise_is_a_function_of_the_step(make_decoder: MakeConfig) -> None:
     """A step of a resumed training has the noise that it would have had; another step another one."""
     config = make_decoder()
     with preparation.setup(config, SilentReporter(), check_only=True) as ready:
-        one, other = training._Training(ready), training._Training(ready)
+        one, other = training._steps_of(ready, None), training._steps_of(ready, None)
         latents = torch.zeros(64, 4, 24)
         one._noise(1, latents)
         torch.rand(3)

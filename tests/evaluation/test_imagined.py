@@ -202,7 +202,7 @@ def test_where_nothing_was_simulated_nothing_is_said_of_what_would_happen(whole_
         ({"episode": "first", "start": -1}, r"--start: -1, in an episode of 24 steps.*0 to 17"),
         ({"episode": "first", "start": 18}, r"--start: 18, .*0 to 17: 3 model steps take 7 control steps"),
         ({"episode": "first", "steps": 12}, "a longer episode"),
-        ({"steps": 12}, "shorter than a clip"),
+        ({"steps": 12}, "--steps: 12 model steps"),
         ({"decoder": "nowhere"}, "--decoder nowhere"),
     ],
 )

@@ -41,7 +41,7 @@ def test_of_simulated_data_the_truth_of_every_sequence_is_shown(simulated: Path,
     still = np.abs(truths["none"].astype(int) - found.first).mean()
     moved = np.abs(truths["up"].astype(int) - found.first).mean()
     assert moved > 1.5 * still
-    assert found.notes == ()
+    assert all("does not know this scene" in note for note in found.notes)  # the decoder is of other data
     for one, before in zip(found.rollouts, film.imagination.rollouts, strict=True):
         np.testing.assert_array_equal(one.frames, before.frames)
 
@@ -51,6 +51,5 @@ def test_if_it_cannot_be_simulated_again_a_note_says_why(simulated: Path, film_o
     film = film_of(data, "up")
     (data / SIMULATION_FILE).write_text("{}")
     found = with_what_happens(film).imagination
-    (note,) = found.notes
-    assert note.startswith("What really happens under other actions is not known: ")
+    assert found.notes[-1].startswith("What really happens under other actions is not known: ")
     assert [one.truth for one in found.rollouts] == [None]
