@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac.evaluation.axis_fit import TRIED_DEGREES, AxisFit, fit_axes
-from vjepa2_ac.evaluation.distribution.latent_sums import LatentDistribution
 from vjepa2_ac.evaluation.distribution.mmd import Discrepancy
+from vjepa2_ac.evaluation.distribution.record import LatentDistribution
 from vjepa2_ac.evaluation.estimates import episode_scores
 from vjepa2_ac.evaluation.metrics import L1, L2
 from vjepa2_ac.evaluation.result import (

@@ -9,8 +9,7 @@ from vjepa2_ac.evaluation.action_score.metrics import AXES, metrics_of, signed_a
 from vjepa2_ac.evaluation.action_score.protocol import BEST_SCORE, STEPS
 from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.decoded.estimates import hand_of, similarity_of, skill_of
-from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES, Found
-from vjepa2_ac.evaluation.decoded.similarity import Reference
+from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES, Found, Reference
 from vjepa2_ac.evaluation.estimates import one_step_over_persistence, over_persistence, stratum_over_persistence
 from vjepa2_ac.evaluation.result import ACTIONS, ActionRanking, Evaluation, Landscapes, PlanningStudy, Sensitivity
 from vjepa2_ac.intervals import Estimate

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from vjepa2_ac.config.planning import PlanningConfig
 from vjepa2_ac.evaluation.axis_fit import AxisFit
 from vjepa2_ac.evaluation.decoded.record import DecodedRollouts
-from vjepa2_ac.evaluation.distribution.latent_sums import LatentDistribution
+from vjepa2_ac.evaluation.distribution.record import LatentDistribution
 from vjepa2_ac.evaluation.metrics import L1, METRICS, Metric
 from vjepa2_ac.intervals import Estimate
 from vjepa2_ac.spaces import ActionSpace

@@ -12,9 +12,15 @@ from vjepa2_ac.evaluation.decoded.estimates import (
     similarity_of,
     skill_of,
 )
-from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, TRUE_FRAMES, DecodedRollouts
-from vjepa2_ac.evaluation.decoded.similarity import REFERENCES, REGIONS, SIMILARITIES
-from vjepa2_ac.evaluation.video.features import MEANING
+from vjepa2_ac.evaluation.decoded.record import (
+    MEANING,
+    NEIGHBOURS,
+    REFERENCES,
+    REGIONS,
+    SIMILARITIES,
+    TRUE_FRAMES,
+    DecodedRollouts,
+)
 
 
 def decoded_as_dict(found: DecodedRollouts) -> dict[str, Any]:

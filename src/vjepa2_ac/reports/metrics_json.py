@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vjepa2_ac.errors import InputError
-from vjepa2_ac.evaluation.distribution.latent_sums import LatentDistribution
+from vjepa2_ac.evaluation.distribution.record import LatentDistribution
 from vjepa2_ac.evaluation.estimates import (
     difference_to,
     gain_over,

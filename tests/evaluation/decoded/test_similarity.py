@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from vjepa2_ac.evaluation.decoded.similarity import REGIONS, SIMILARITIES, cycle_error, scales_for, similarities
+from vjepa2_ac.evaluation.decoded.record import REGIONS, SIMILARITIES
+from vjepa2_ac.evaluation.decoded.similarity import cycle_error, scales_for, similarities
 
 
 @pytest.mark.parametrize(("side", "scales"), [(256, 5), (176, 5), (96, 3), (44, 3), (32, 2), (11, 1), (10, 0)])

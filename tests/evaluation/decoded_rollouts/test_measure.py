@@ -13,8 +13,14 @@ from vjepa2_ac.data.clips.transforms import images_to_input
 from vjepa2_ac.episode import LatentBatch
 from vjepa2_ac.evaluation.decoded.estimates import cycle_of, hand_of, moving_share_of, similarity_of, skill_of
 from vjepa2_ac.evaluation.decoded.hand import HandProbe
-from vjepa2_ac.evaluation.decoded.record import DECODED_PERSISTENCE, DECODED_TRUTH, NEIGHBOURS, DecodedRollouts
-from vjepa2_ac.evaluation.decoded.similarity import REGIONS, SIMILARITIES
+from vjepa2_ac.evaluation.decoded.record import (
+    DECODED_PERSISTENCE,
+    DECODED_TRUTH,
+    NEIGHBOURS,
+    REGIONS,
+    SIMILARITIES,
+    DecodedRollouts,
+)
 from vjepa2_ac.evaluation.decoded_rollouts.measure import Decoding, HandReader, measure_decoded
 from vjepa2_ac.evaluation.result import Example
 from vjepa2_ac.reports.decoded_json import decoded_as_dict

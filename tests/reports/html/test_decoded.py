@@ -7,8 +7,15 @@ import numpy as np
 
 from evaluation_results import evaluation
 from vjepa2_ac.evaluation.decoded.estimates import hand_of, similarity_of
-from vjepa2_ac.evaluation.decoded.record import NEIGHBOURS, DecodedRollouts, DecodedStrip, HandErrors
-from vjepa2_ac.evaluation.decoded.similarity import REFERENCES, REGIONS, SIMILARITIES
+from vjepa2_ac.evaluation.decoded.record import (
+    NEIGHBOURS,
+    REFERENCES,
+    REGIONS,
+    SIMILARITIES,
+    DecodedRollouts,
+    DecodedStrip,
+    HandErrors,
+)
 from vjepa2_ac.intervals import mean_of
 from vjepa2_ac.reports.html.decoded import decoded_section
 from vjepa2_ac.reports.html.formatting import value

@@ -13,8 +13,10 @@ from vjepa2_ac.evaluation.decoded.record import (
     DecodedRollouts,
     Found,
     HandErrors,
+    Reference,
+    Region,
+    Similarity,
 )
-from vjepa2_ac.evaluation.decoded.similarity import Reference, Region, Similarity
 from vjepa2_ac.intervals import Estimate, bootstrapped, mean_of
 
 Curve = tuple[Found, ...]  # at horizon 1, 2, ...; index h - 1

@@ -10,16 +10,33 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from vjepa2_ac.evaluation.decoded.similarity import Arrays
 from vjepa2_ac.evaluation.distribution.mmd import Discrepancy
 from vjepa2_ac.intervals import Estimate
 
+Reference = Literal["truth", "decoded_truth"]
+Region = Literal["whole", "moving"]
+Similarity = Literal["psnr_db", "ssim", "ms_ssim"]
+REFERENCES: tuple[Reference, ...] = get_args(Reference)
+REGIONS: tuple[Region, ...] = get_args(Region)
+SIMILARITIES: tuple[Similarity, ...] = get_args(Similarity)
+
+Key = tuple[str, Reference, Region, Similarity]  # the first: a model or a neighbour
+Arrays = Mapping[Key, Float[np.ndarray, "clips horizon"]]
+
 DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE = "decoded_truth", "decoded_persistence", "raw_persistence"
+MEANING = (
+    "Squared MMD with JEDi's kernel on mean-pooled features of this model's own encoder, unbiased over episodes, x 100."
+    " Not JEDi (V-JEPA ViT-H, probe of Something-Something v2, another estimator). Comparable only for the same"
+    " encoder, clips, frames, stride and decoder. The encoder judges images that were made from its own features: what"
+    " it does not see, this does not see."
+)
+"""The words that stand beside a V-JEPA 2 MMD wherever it is shown."""
+
 NEIGHBOURS = (DECODED_TRUTH, DECODED_PERSISTENCE, RAW_PERSISTENCE)
 TRUE_FRAMES = "truth"
 

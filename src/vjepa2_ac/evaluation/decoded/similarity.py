@@ -7,25 +7,13 @@ better than a sharp one in the wrong place. They are therefore given inside the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Literal, get_args
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from vjepa2_ac.evaluation.decoded.record import Region, Similarity
 from vjepa2_ac.media.image_similarity import psnr, structure
-
-Reference = Literal["truth", "decoded_truth"]
-Region = Literal["whole", "moving"]
-Similarity = Literal["psnr_db", "ssim", "ms_ssim"]
-REFERENCES: tuple[Reference, ...] = get_args(Reference)
-REGIONS: tuple[Region, ...] = get_args(Region)
-SIMILARITIES: tuple[Similarity, ...] = get_args(Similarity)
-
-Key = tuple[str, Reference, Region, Similarity]  # the first: a model or a neighbour
-Arrays = Mapping[Key, Float[np.ndarray, "clips horizon"]]
 
 _WINDOW = 11  # pixels, which fit into the coarsest scale
 _SCALES_OF_LARGE, _SCALES_OF_SMALL, _LARGE = 5, 3, 176

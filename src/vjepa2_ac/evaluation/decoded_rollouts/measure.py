@@ -29,9 +29,10 @@ from vjepa2_ac.evaluation.decoded.record import (
     DecodedRollouts,
     DecodedStrip,
     HandErrors,
+    Reference,
     VideoDiscrepancy,
 )
-from vjepa2_ac.evaluation.decoded.similarity import Reference, cycle_error, scales_for, similarities
+from vjepa2_ac.evaluation.decoded.similarity import cycle_error, scales_for, similarities
 from vjepa2_ac.evaluation.distribution.mmd import discrepancy, noise_floor
 from vjepa2_ac.evaluation.evaluate import ClipName, Contender, FramesOfRow, RepeatableClips
 from vjepa2_ac.evaluation.result import Example

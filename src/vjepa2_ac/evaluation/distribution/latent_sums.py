@@ -9,7 +9,6 @@ and number: the mean squared deviation from the mean over clips), over that of t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -18,17 +17,10 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from vjepa2_ac.evaluation.distribution.mmd import Discrepancy, discrepancy, noise_floor
+from vjepa2_ac.evaluation.distribution.record import LatentDistribution
 from vjepa2_ac.intervals import Estimate, bootstrapped_by_weights
 
 MOST_SKETCHED = 8192  # numbers of a latent (tokens x dim); of more, a sketch of this length stands in for intervals
-
-
-@dataclass(frozen=True)
-class LatentDistribution:
-    """How the latents of one kind of prediction are distributed, by horizon (index h - 1), against the truth."""
-
-    spread: tuple[Estimate, ...]  # 1: as varied as the truth
-    mmd: tuple[Discrepancy, ...]  # of latents averaged over tokens
 
 
 class LatentSums:

@@ -16,14 +16,6 @@ from torch import Tensor
 from vjepa2_ac.model.network.dynamics import normalise_latents
 from vjepa2_ac.model.network.encoder import TUBELET, Encoder
 
-MEANING = (
-    "Squared MMD with JEDi's kernel on mean-pooled features of this model's own encoder, unbiased over episodes, x 100."
-    " Not JEDi (V-JEPA ViT-H, probe of Something-Something v2, another estimator). Comparable only for the same"
-    " encoder, clips, frames, stride and decoder. The encoder judges images that were made from its own features: what"
-    " it does not see, this does not see."
-)
-"""The words that stand beside a V-JEPA 2 MMD wherever it is shown."""
-
 MOST_FRAMES = 64  # the encoder was trained on 16 to 64
 
 

@@ -14,15 +14,17 @@ from vjepa2_ac.evaluation.decoded.estimates import Curve, cycle_of, hand_of, mov
 from vjepa2_ac.evaluation.decoded.record import (
     DECODED_PERSISTENCE,
     DECODED_TRUTH,
+    MEANING,
     RAW_PERSISTENCE,
     TRUE_FRAMES,
     DecodedRollouts,
     DecodedStrip,
     Found,
+    Reference,
+    Region,
+    Similarity,
 )
-from vjepa2_ac.evaluation.decoded.similarity import Reference, Region, Similarity
 from vjepa2_ac.evaluation.result import Evaluation
-from vjepa2_ac.evaluation.video.features import MEANING
 from vjepa2_ac.reports.figures.film import FilmStrip, Kind, Row, draw_strip
 from vjepa2_ac.reports.html.charts import Line, axis_at, line_chart, nice_axis
 from vjepa2_ac.reports.html.formatting import NOT_MEASURED, decimal, percent, seconds, value
