@@ -18,7 +18,7 @@ class DecoderConfig(Section):
     folder: Annotated[Local | None, Affects.NOTHING] = None
     """Folder of the decoder; null: `decoder`, beside run_dir. It is made for an encoder and a camera, not for a run."""
     size: DecoderSize = "small"
-    """tiny: 0.8 M parameters, for small encoders. small: 26 M at the released sizes. medium: 93 M."""
+    """Parameters at the released sizes: tiny 2 M, for small encoders; small 27 M; medium 96 M."""
     frames: PositiveInt = 40_000
     """Frames to learn from, at most, spread over the training episodes; each is encoded once. They take 0.9 MB of disk
     each at the released sizes with data.cache_dtype bf16, 0.6 MB with int8, until training ends."""
